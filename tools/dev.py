@@ -52,18 +52,17 @@ def run(*command: str | Path, **variables: str) -> None:
 
 
 def run_tests(python: Path, *arguments: str) -> None:
-    """Run the tests: first those that only compute, two at a time, then those in real time, one at a time.
+    """Run the tests, two at a time: first those that only compute, then those in real time.
 
-    A test that runs in real time would compete for the processor with one that computes.
+    A test in real time would compete for the processor with one that computes; another in real time mostly
+    waits, as it does.
     """
     if arguments:
         run(python, "-m", "pytest", *arguments)
         return
     ignored = [f"--ignore={folder}" for folder in REAL_TIME]
-    codes = [
-        call(python, "-m", "pytest", "-n", "2", "--dist", "loadfile", *ignored),
-        call(python, "-m", "pytest", *REAL_TIME),
-    ]
+    two_at_a_time = (python, "-m", "pytest", "-n", "2", "--dist", "loadfile")
+    codes = [call(*two_at_a_time, *ignored), call(*two_at_a_time, *REAL_TIME)]
     sys.exit(max(codes))
 
 

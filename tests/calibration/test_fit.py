@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from gliders import Glider, Gliders
-from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
@@ -71,18 +69,6 @@ def test_jacobian_is_the_derivative(some_samples: ResidualSamples) -> None:
         [(residuals(some_samples, c + h)[0] - residuals(some_samples, c - h)[0]) / 2 for h in np.eye(27)]
     ).T
     np.testing.assert_allclose(J, numeric, atol=1e-6 * np.abs(J).max())
-
-
-@pytest.mark.parametrize("memory", [0.0, 0.7])
-def test_normal_equations_in_pieces_are_those_of_all(
-    some_samples: ResidualSamples, memory: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    c = np.random.default_rng(3).normal(size=27) * 500.0
-    whole = normal_equations(some_samples, c, None, memory)
-    monkeypatch.setattr("magbridge.estimation.optimise.CHUNK_ROWS", 11)
-    pieces = normal_equations(some_samples, c, None, memory)
-    np.testing.assert_allclose(pieces.hessian, whole.hessian, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(pieces.gradient, whole.gradient, rtol=1e-10, atol=1e-8)
 
 
 def test_evidence_has_the_slope_it_says(glider: Gliders) -> None:
@@ -229,18 +215,6 @@ def test_every_method_fills_the_calibration(glider: Gliders, method: str) -> Non
     assert np.linalg.eigvalsh(calibration.covariance)[0] > -1e-6 * np.diag(calibration.covariance).max()
 
 
-def test_auto_is_twenty_times_faster_than_finite_differences(glider: Gliders) -> None:
-    runs = glider(4).runs
-    samples = polynomial_samples(runs, full_order(2, 3))
-    start = time.process_time()
-    fit(runs)
-    ours = time.process_time() - start
-    start = time.process_time()
-    # three of its Jacobians; a whole run takes dozens
-    least_squares(lambda c: residuals(samples, c)[0], np.zeros(90), max_nfev=3, x_scale=1000.0)
-    assert ours < 3.0 * (time.process_time() - start)
-
-
 def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
     runs = glider(0).runs
     k = len(runs)
@@ -379,15 +353,6 @@ def test_what_the_model_lacks_is_in_its_sigmas(glider: Gliders) -> None:
     elsewhere = [replace(one.survey, field=one.survey.field + shift) for shift in np.diag([15.0, 15.0, 15.0])]
     spread = [np.std(in_sensor_units(found, survey)[1]) for survey in elsewhere]
     assert max(spread) < 1.5
-
-
-def test_how_long_before_a_sample_the_last_one_came() -> None:
-    time = np.array([0.0, 4.0, 8.1, 16.0, 20.0, 24.0])
-    data = Observations(
-        np.ones((12, 3)) * 3e4, np.full(12, 5e4), np.empty((12, 0)),
-        runs=np.repeat([0, 1], 6), time=np.concatenate([time, time + 28.0]),
-    )  # fmt: skip
-    assert data.steps.tolist() == [np.inf, 1.0, 1.0, 2.0, 1.0, 1.0] * 2
 
 
 def test_a_long_log_is_fitted_with_a_part_of_its_samples() -> None:

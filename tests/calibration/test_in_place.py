@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,16 +12,12 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.fitting import in_place, rounds
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit, fit
 from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.model import Noise, identity
-from magbridge.estimation.blocks import ParameterBlock
-from magbridge.estimation.elimination import SampleSums
-from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.survey.gridding import gridded
 from magbridge.survey.samples import Samples
 
@@ -143,67 +138,6 @@ def test_straight_line_is_not_supported() -> None:
     error, sigma = error_of(found, data, true)
     assert error < 1.5 * sigma
     assert any("never crossed your own track" in line for line in found.warnings)
-
-
-def test_a_long_survey_is_searched_with_the_part_about_its_middle(
-    survey: Survey, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Amplitude and length of the field are those of the part, calibration and nodes those of all."""
-    used, few = [], rounds.Rounds._few
-
-    def counted(own: rounds.Rounds, field: GaussianField) -> SampleSums:
-        sums = few(own, field)
-        used.append(sums.samples)
-        return sums
-
-    monkeypatch.setattr(rounds, "SEARCHED", 600)
-    monkeypatch.setattr(rounds, "WIDE", 0.0)
-    monkeypatch.setattr(rounds.Rounds, "_few", counted)
-    data, true, _ = survey
-    found = fit(data)
-    assert 500 < max(used) <= 601
-    assert 300.0 < found.details["rock"]["length_m"] < 2000.0
-    error, sigma = error_of(found, data, true)
-    assert error < 1.15 * NOISE
-    assert 0.8 < error / sigma < 1.25
-
-
-def test_a_long_log_comes_to_rest_with_few_samples_and_ends_with_all(
-    survey: Survey, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What every sixth sample tells is a start; calibration and sigma are those of all samples."""
-    data, true, whole = survey
-    used, sums = [], rounds.Rounds._sums
-
-    def counted(own: rounds.Rounds, *args: Any) -> SampleSums:
-        found = sums(own, *args)
-        used.append(found.samples)
-        return found
-
-    monkeypatch.setattr(in_place, "FIRST_SAMPLES", len(data) // 6)
-    monkeypatch.setattr(rounds.Rounds, "_sums", counted)
-    found = fit(data)
-    all_of_them = [number for number in used if number > len(data) // 2]
-    assert used[-1] == all_of_them[-1]
-    assert len(all_of_them) < len(used) / 4
-    error, sigma = error_of(found, data, true)
-    assert error < 1.15 * NOISE
-    assert 0.8 < error / sigma < 1.25
-    assert found.calibration.noise.sensor == pytest.approx(whole.calibration.noise.sensor, rel=0.03)
-
-
-def test_steps_that_are_shortened_get_the_rounds_they_take(
-    survey: Survey, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As from a start far off: after a dozen rounds the residuals still move."""
-    damped = rounds.Rounds._damped
-    monkeypatch.setattr(
-        rounds.Rounds, "_damped", lambda own, step, reduced, field: damped(own, 0.2 * step, reduced, field)
-    )
-    data, true, _ = survey
-    error, sigma = error_of(fit(data), data, true)
-    assert error < 1.08 * NOISE
-    assert 0.8 < error / sigma < 1.25
 
 
 def test_a_zigzag_separates_crustal_field_and_heading_without_a_crossing() -> None:
@@ -361,21 +295,6 @@ def test_temperature_that_moves_nothing_is_left_out(survey: Survey) -> None:
     assert found.calibration.channels == ()
     assert found.creep is None
     assert error_of(found, data, true)[0] < 1.05 * error_of(plain, data, true)[0]
-
-
-def test_a_creep_that_distorted_the_field_goes_where_a_search_without_it_is_better(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """All offered terms are kept at first, as in a search in which the crustal field needs them."""
-
-    def all_of_little_gain(*of: Any, price: float = 0.0) -> tuple[ParameterBlock, ...]:
-        return tuple(one for one in of[2] if not (price and one.offered))
-
-    monkeypatch.setattr(rounds, "select_blocks", all_of_little_gain)
-    data, true = flown(legs=10)
-    found = fit(slowly(data))
-    assert found.creep is None
-    assert error_of(found, data, true)[0] < 1.15 * NOISE
 
 
 def test_creep_of_the_offset_goes_neither_into_the_field_nor_into_the_map() -> None:

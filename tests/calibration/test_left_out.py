@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.left_out import refitted
-from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 
@@ -34,30 +29,6 @@ def copter(seed: int, n: int = 600, size: float = 800.0, memory: float = 0.97) -
         np.empty((n, 0)),
         time=np.arange(n, dtype=float) * 0.1,
     )
-
-
-def predicted(data: Observations, runs: np.ndarray) -> float:
-    one = nominal(data)
-    fitted = replace(one.noise, autocorrelation=0.0, white=0.0)
-    return refitted(nominal_samples(data), one.prior, one.z, fitted, runs)
-
-
-def test_a_run_that_is_most_of_the_log_is_not_a_part() -> None:
-    """What the rest says of it would judge how far a fit can be carried, not how well it fits."""
-    data = copter(1)
-    quarters = np.zeros(600)
-    assert predicted(data, BOOTS) == predicted(data, quarters)
-    assert predicted(data, np.repeat([0, 1, 2], 200)) != predicted(data, quarters)
-
-
-def test_parts_are_predicted_by_fits_without_them() -> None:
-    data = copter(2, size=50.0, memory=0.0)
-    runs = np.repeat([0, 1, 2], 200)
-    errors = [
-        in_sensor_units(fit(data.part(runs != k), "nominal").calibration, data.part(runs == k))[0]
-        for k in range(3)
-    ]
-    assert predicted(data, runs) == pytest.approx(np.sqrt(np.mean(np.concatenate(errors) ** 2)), rel=0.1)
 
 
 def test_auto_is_better_than_one_ellipsoid_where_the_first_part_differs() -> None:

@@ -8,39 +8,15 @@ import numpy as np
 import pytest
 from posed import candidate, missed, right
 
-from magbridge.diagnose import run as deciding
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.columns import GridPoint
-from magbridge.diagnose.evidence import ODDS, bayes_factor_threshold
+from magbridge.diagnose.evidence import bayes_factor_threshold
 from magbridge.diagnose.leftover import varying
 from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.run import _possible_names, accept
-from magbridge.diagnose.search import SearchOutcome, search
+from magbridge.diagnose.run import accept
+from magbridge.diagnose.search import search
 
 ROWS = 300
-
-
-def test_names_stay_until_a_description_beats_them_by_their_margin() -> None:
-    """The name that loses least stays longest; 20:1 and the error of its regressor away none is left."""
-    t, rng = np.arange(ROWS), np.random.default_rng(8)
-    acts = np.sign(np.sin(t / 9.0))
-    output = {"a": acts, "like a": acts + 0.1 * rng.normal(size=ROWS), "b": rng.normal(size=ROWS)}
-    candidates = [candidate(cause, x) for cause, x in output.items()]
-    outcome = search(replace(right(ROWS), residual=0.5 * acts + rng.normal(size=ROWS)), candidates, 3)
-    limit = bayes_factor_threshold(outcome.chosen[0].ratio)
-    assert limit > ODDS
-    steps = np.linspace(0.0, limit, 30)
-    sets = [
-        {competitor.candidate.cause: competitor.behind for competitor in _possible_names(outcome, behind)}
-        for behind in steps
-    ]
-    assert sets[0].keys() == {"a", "like a"}
-    assert not sets[-1]
-    for behind, within, less in zip(steps, sets, [*sets[1:], {}], strict=True):
-        assert less.keys() <= within.keys()
-        assert all(
-            value < limit and np.isclose(value - behind, sets[0][cause]) for cause, value in within.items()
-        )
 
 
 def test_a_name_is_asserted_possible_or_ruled_out() -> None:
@@ -71,29 +47,6 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
             "a", bent + share * bent.std() * rng.normal(size=ROWS), point=GridPoint(likelier=300.0)
         )
         assert accept(problem, search(problem, [alike], 1), None)[0] == named
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5])
-def test_only_effects_found_without_slow_noise_are_searched_given_it(
-    share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem, rng = right(ROWS), np.random.default_rng(10)
-    beside: list[SearchOutcome] = []
-
-    def spied(found: SearchOutcome, *_: object) -> SearchOutcome:
-        beside.append(found)
-        return found
-
-    bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
-    problem = replace(problem, residual=bent + rng.normal(size=ROWS))
-    shape = bent + share * bent.std() * rng.normal(size=ROWS)
-    monkeypatch.setattr(deciding, "beside_slow_noise", spied)
-    name = candidate("a", shape, point=GridPoint(likelier=300.0))
-    outcome, asserted, rest = deciding.settle(problem, [name], 1, None)
-    assert outcome.chosen
-    assert asserted == (share == 0.0)
-    assert beside == [outcome][: int(asserted)]
-    assert asserted or rest is not None
 
 
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])

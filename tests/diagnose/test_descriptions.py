@@ -112,23 +112,6 @@ def test_what_the_sun_warms_at_the_surface_is_described() -> None:
     assert left_of(warm, near_surface(time, depth)(slice(None))) < 0.02
 
 
-def test_turns_and_the_surface_are_among_the_descriptions(
-    problem: Problem, listed: list[Description]
-) -> None:
-    """Seen through the projection; no other description holds half of what turns do."""
-    survey, rows = problem.survey, slice(0, len(problem))
-    assert survey.attitude is not None
-    columns = [one.columns(rows) for one in listed]
-    seen = problem.jacobian[:, 6:] @ [0.4, -0.8, 0.45]
-    turning = np.gradient(np.unwrap(np.radians(survey.attitude[:, 2])), survey.time)
-    best, second = sorted(left_of(followed(survey.time, turning, 15.0) * seen, X) for X in columns)[:2]
-    assert best < 0.2
-    assert second > 0.5
-    near = np.exp(-survey.channels["depth"].values / 10.0)
-    warm = followed(survey.time, near, 600.0) * seen
-    assert min(left_of(warm, X) for X in columns if X.shape[1] == 24) < 0.01
-
-
 def test_a_sensitivity_that_follows_a_channel_is_not_an_offset(
     problem: Problem, listed: list[Description]
 ) -> None:
@@ -140,15 +123,6 @@ def test_a_sensitivity_that_follows_a_channel_is_not_an_offset(
     assert [one.scales for one in of_channel] == [False, False, True]
     assert [one.covers([offset]) for one in of_channel] == [True, True, False]
     assert [one.covers([scale]) for one in of_channel] == [False, False, True]
-
-
-def test_where_a_channel_has_one_cause_its_sensitivity_is_not_an_alternative(
-    problem: Problem, listed: list[Description]
-) -> None:
-    """In a vehicle that turns little, a current's field looks like a sensitivity that follows the current."""
-    squeezed = next(c for c in CAUSES["pressure_offset"].candidates(problem) if c.channel == "depth")
-    of_channel = [one for one in listed if one.channel == "depth" and not one.remembers]
-    assert [one.covers([squeezed]) for one in of_channel] == [True, True, True]
 
 
 def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
@@ -185,13 +159,6 @@ def test_a_curve_through_a_mass_position_covers_its_order_and_its_past_the_hyste
     assert (curve.covers([order]), curve.covers([back])) == (True, False)
     assert (past.covers([order]), past.covers([back])) == (False, True)
     assert not any(one.covers([order]) or one.covers([back]) for one in late)
-
-
-def test_every_description_has_as_many_columns_as_widths(listed: list[Description]) -> None:
-    for one in listed:
-        columns = one.columns(slice(0, 50))
-        assert np.isfinite(columns).all()
-        assert {columns.shape[1]} == {len(width) for _, width in one.widths}
 
 
 def test_descriptions_of_a_long_log_do_not_fill_the_memory(problem: Problem) -> None:

@@ -7,14 +7,12 @@ import pytest
 from posed import candidate
 from scipy.stats import chi2
 
-from magbridge.diagnose.columns import Candidate, slices
+from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import (
-    FALSE_ALARM_RATE,
     Information,
     evidence_of,
     log_bayes,
     log_odds,
-    look_elsewhere_factors,
     score,
 )
 
@@ -60,19 +58,6 @@ def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: floa
     assert least <= np.mean(one.tail * chi2.sf(ratios, 1) < 0.1) < 0.12
 
 
-def test_numbers_of_one_size_are_not_weighed_twice() -> None:
-    one = sized("map_error", 40, spectra=np.ones((4, 40)))
-    assert evidence_of(one, 30.0, 1) == pytest.approx(15.0 - np.log(4.0))
-    assert log_odds(30.0, [one], {"map_error": 1.0}, 0.0) == pytest.approx(evidence_of(one, 30.0, 1))
-
-
-def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
-    model = [sized("clock_offset"), sized("reference_bias")]
-    look_elsewhere = {"clock_offset": 1.0, "reference_bias": 3.0}
-    price = log_bayes(200.0, 2) - log_odds(200.0, model, look_elsewhere, 200.0)
-    assert price == pytest.approx(np.log(20.0 * 2.0 * 3.0))
-
-
 def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
     """A free shape has a prior of its own: the evidence of a cause does not depend on it."""
     step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
@@ -81,29 +66,6 @@ def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
         200.0, [chart], look_elsewhere, 0.0
     )
     assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
-
-
-def counted(S: np.ndarray, sizes: list[int]) -> float:
-    """Independent hypotheses behind one cause."""
-    grid = [sized("hysteresis", size) for size in sizes]
-    info = Information(S, np.zeros(len(S)), np.zeros((0, len(S))))
-    return look_elsewhere_factors(info, grid, slices(grid))["hysteresis"]
-
-
-def test_hypotheses_count_as_often_as_one_of_them_passes() -> None:
-    """Against a million draws at the level at which a cause that is asked about alone is tested."""
-    apart = np.abs(np.subtract.outer(np.arange(12.0), np.arange(12.0)))
-    S = np.kron(0.9**apart, np.eye(2))
-    draws = np.linalg.cholesky(S) @ np.random.default_rng(4).standard_normal((24, 1_000_000))
-    level = FALSE_ALARM_RATE / 12.0
-    passed = (draws.reshape(12, 2, -1) ** 2).sum(axis=1).max(axis=0) > chi2.isf(level, 2)
-    assert counted(S, [2] * 12) == pytest.approx(passed.mean() / level, rel=0.1)
-
-
-def test_the_same_hypothesis_counts_once_and_strangers_each() -> None:
-    S = np.diag([4.0, 9.0, 1.0])
-    assert counted(np.tile(S, (5, 5)), [3] * 5) == pytest.approx(1.0)
-    assert counted(np.kron(np.eye(5), S), [3] * 5) == pytest.approx(5.0, rel=0.01)
 
 
 def test_a_score_is_the_ratio_its_evidence_and_the_shrunk_estimate() -> None:

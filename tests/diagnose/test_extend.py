@@ -57,15 +57,6 @@ def test_what_is_hardly_seen_is_hardly_widened() -> None:
     np.testing.assert_allclose(with_misfit([current(2)], before).covariance, before.covariance, rtol=1e-4)
 
 
-def test_two_causes_are_widened_each_by_its_own() -> None:
-    before = fit(np.array([2.0, 0.0, 0.0, 0.0]))
-    after = with_misfit([current(1), current(3)], before)
-    np.testing.assert_allclose(
-        after.covariance[5:, 5:] @ np.ones(3),
-        with_misfit([current(1)], before).covariance[5:, 5:] @ np.ones(3),
-    )
-
-
 def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     """Runs turn in five minutes, the survey in an hour; what the runs lost has gone into the gain."""
     rng, tau = np.random.default_rng(5), 1.5
@@ -143,13 +134,6 @@ def test_a_rate_that_is_noise_live_is_left_out() -> None:
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [4.0, 5.0, 6.0])
 
 
-def test_what_was_let_go_is_made_again(problem: Problem) -> None:
-    before = problem.coefficient_jacobian
-    problem.let_go()
-    assert problem.coefficient_jacobian is not before
-    np.testing.assert_array_equal(problem.coefficient_jacobian, before)
-
-
 def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
     """A field across the magnitude in the second half: linearised again, its value is right."""
     whole = right(300)
@@ -186,21 +170,3 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map() -> No
         for c in (extended, spread)
     )
     np.testing.assert_allclose(np.sqrt(after**2 - before**2), 15.0, rtol=0.02)
-
-
-def test_a_rate_that_is_there_twice_is_left_out_twice() -> None:
-    """A cause may need more than one term, and two rates are equal: each takes its own coefficients along."""
-    survey, calibration = skewed(right(300), 10.0)
-    skew, step = calibration.effects
-    plain = calibration.coefficients[:-6]
-    twice = replace(
-        calibration,
-        effects=(skew, skew, step),
-        coefficients=np.append(plain, [0.0, 0.3, 0.0, 0.0, 0.3, 0.0, 1.0, 2.0, 3.0]),
-        covariance=np.diag(np.append(np.diag(calibration.covariance)[:-6], np.arange(1.0, 10.0))),
-    )
-    calm, dropped = flyable(survey, twice)
-    assert dropped == [0, 1]
-    assert calm.effects == (step,)
-    np.testing.assert_array_equal(calm.coefficients, [*plain, 1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [7.0, 8.0, 9.0])

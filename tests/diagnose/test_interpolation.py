@@ -8,10 +8,8 @@ import numpy as np
 from posed import right
 
 from magbridge.diagnose.assessment import delays
-from magbridge.diagnose.causes.instrument import OffsetDrift
 from magbridge.diagnose.causes.timing import ChannelSkew
 from magbridge.diagnose.evidence import information
-from magbridge.diagnose.extend import relinearised
 from magbridge.diagnose.joint import fit_joint
 from magbridge.diagnose.problem import AXIS_DELAY_SIGMA_S, DELAYS, Problem, interpolation_error, pose
 from magbridge.diagnose.survey import Survey
@@ -62,16 +60,6 @@ def test_the_delays_are_found() -> None:
     late = delays(problem, fit)
     assert late is not None
     np.testing.assert_allclose(late.later, found[1:], atol=1e-9)
-
-
-def test_the_delays_stay_where_the_comparison_is_linearised_again() -> None:
-    """A calibration that is extended by another cause has no delays."""
-    whole = right(3000)
-    time = whole.survey.time
-    problem = pose(made(whole, interpolated(time), 1), whole.calibration)
-    drift = OffsetDrift().candidates(problem)[0]
-    _, _, fit = relinearised(problem, [drift], fit_joint(problem, [drift.columns], 1))
-    np.testing.assert_allclose(AXIS_DELAY_SIGMA_S * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
 
 def test_channels_taken_at_once_have_none() -> None:

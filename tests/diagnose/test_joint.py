@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from posed import right
 
-from magbridge.diagnose.joint import RIDGE, fit_joint, normal
-from magbridge.diagnose.problem import Problem, with_slow_noise
+from magbridge.diagnose.joint import RIDGE, fit_joint
 
 ROWS = 300
 
@@ -39,23 +38,3 @@ def test_a_likelihood_is_the_gaussian_s_less_what_the_priors_cost() -> None:
     assert gained == pytest.approx(naive[1] - naive[0] - 0.5 * RIDGE * fits[1].coefficients[0] ** 2, rel=0.05)
     assert gained > 200.0
     assert fits[1].coefficients[0] == pytest.approx(3.0, abs=0.2)
-
-
-def test_slow_noise_is_computed_for_the_rows_that_are_asked_for(problem: Problem) -> None:
-    """And the calibration's own derivatives are shared, not computed again."""
-    noisy, n = with_slow_noise(problem), len(problem)
-    assert noisy.coefficient_jacobian is problem.coefficient_jacobian
-    wave = np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * np.arange(1, 65))
-    slopes = problem.jacobian[:, 6:]
-    along = wave[:, 16:] * np.linalg.norm(slopes, axis=1)[:, None]
-    expected = np.hstack([(wave[:, :16, None] * slopes[:, None]).reshape(n, 48), along])
-    rows = slice(100, 300)
-    np.testing.assert_allclose(noisy.calibration_rows(rows)[:, noisy.slow], expected[rows], atol=1e-10)
-
-
-def test_a_stride_counts_every_other_piece_of_a_log() -> None:
-    X, y = np.random.default_rng(1).normal(size=(9000, 3)), np.ones(9000)
-    counted = np.arange(9000) // 2048 % 2 == 0
-    P, b = normal(X.__getitem__, y, stride=2)
-    np.testing.assert_allclose(P, X[counted].T @ X[counted])
-    np.testing.assert_allclose(b, X[counted].sum(axis=0))

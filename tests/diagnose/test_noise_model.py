@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.diagnose.evidence import certainty
-from magbridge.diagnose.noise import MAX_NOISE_ORDER, ResidualNoise, autoregressive_order, fit_noise
+from magbridge.diagnose.noise import ResidualNoise, autoregressive_order, fit_noise
 from magbridge.diagnose.survey import MAX_LAG, Past
 
 
@@ -32,36 +32,6 @@ def test_autoregression_and_level_are_found(rho: float) -> None:
     assert float(np.median(noise.scale)) == pytest.approx(1.0, abs=0.04)
     assert noise.nu > 10
     assert autoregressive_order(r, np.cumsum(steps)) == 1
-
-
-def test_noise_is_no_slower_than_a_log_can_tell() -> None:
-    """What wanders throughout a log is left for drifts to explain; slow noise is fitted as it is."""
-    v = np.random.default_rng(3).normal(size=4000)
-    steps = np.ones(len(v), int)
-    steps[0] = MAX_LAG
-    noise = fit_noise(np.cumsum(v), Past(steps, 5))
-    assert np.abs(np.roots(np.append(1.0, -noise.ar))).max() == pytest.approx(1.0 - 20.0 / len(v))
-    slow, _ = made("white", len(v), 0.98)
-    assert fit_noise(slow, Past(steps, 1)).ar[0] == pytest.approx(0.98, abs=0.01)
-
-
-@pytest.mark.parametrize("lost", [0.0, 0.05, 0.125])
-def test_a_correlation_is_taken_for_no_shorter_where_few_samples_have_all_of_their_past(lost: float) -> None:
-    """White noise upon a slow one: too low an order would make structure out of it."""
-    rng = np.random.default_rng(5)
-    n = 6000
-    slow, _ = made("white", n, 0.95, seed=6)
-    here = np.flatnonzero(rng.random(n) >= lost)
-    r = (1.4 * rng.normal(size=n) + np.sqrt(1.0 - 0.95**2) * slow)[here]
-    assert autoregressive_order(r, here) == MAX_NOISE_ORDER
-
-
-def test_a_correlation_is_no_longer_than_what_samples_with_a_whole_past_can_tell() -> None:
-    """As of a glider that samples fast near the surface only."""
-    slow, _ = made("white", 6000, 0.95, seed=6)
-    r = 1.4 * np.random.default_rng(5).normal(size=6000) + np.sqrt(1.0 - 0.95**2) * slow
-    here = np.flatnonzero((np.arange(6000) % 1000 < 60) | (np.arange(6000) % 4 == 0))
-    assert 1 < autoregressive_order(r[here], here) < MAX_NOISE_ORDER
 
 
 def test_heavy_tails_are_found_and_the_score_is_of_unit_variance() -> None:

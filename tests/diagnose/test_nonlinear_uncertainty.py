@@ -50,20 +50,6 @@ def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Probl
     assert found[-1, -1] > 1.1 * fit.covariance[-1, -1]
 
 
-def test_what_has_no_nonlinear_parameter_is_as_well_known_as_before(problem: Problem) -> None:
-    one = replace(decay(LAG), point=GridPoint())
-    fit = fitted(problem, one)
-    assert loosened(problem, [one], [one.columns], fit) is fit
-
-
-def test_parts_of_one_cause_have_each_their_own(problem: Problem) -> None:
-    both = decay(LAG).joined_with(decay(5.0))
-    fit = fitted(problem, both)
-    free = loosened(problem, [both], [both.columns], fit)
-    assert np.all(np.diag(free.covariance)[-2:] > np.diag(fit.covariance)[-2:])
-    np.linalg.cholesky(free.covariance)
-
-
 def step(onset: float) -> Candidate:
     """An effect of unknown onset."""
     x = (np.arange(ROWS) >= onset).astype(float)

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from posed import missed, right, thinned
+from posed import right, thinned
 
-from magbridge.diagnose.descriptions import lower_end, repeated
 from magbridge.diagnose.evidence import information
 from magbridge.diagnose.joint import Ridge, Statistic, fit_joint
 from magbridge.diagnose.packets import Packets, packets
@@ -82,18 +81,3 @@ def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(kept: str) -
     found, best = fitted(given)
     assert np.sum((found.columns(slice(None)) @ best.estimate - planted) ** 2) < 0.2 * np.sum(planted**2)
     assert found.period == pytest.approx(4.0 * 41.0, rel=0.1)
-
-
-def test_what_lies_loose_changes_ends_when_it_is_tipped_far_enough() -> None:
-    down = np.sin(np.radians([0.0, 4.0, 8.0, 4.0, -4.0, -8.0, -4.0, 4.0, 30.0]))
-    sides = lower_end(down)(slice(None))
-    steps = np.diff(sides, axis=0)
-    assert (steps[:, 1] != 0.0).tolist() == [False, True, False, False, True, False, False, True]
-
-
-def test_what_each_dive_repeats_holds_a_decay_from_its_start(problem: Problem) -> None:
-    survey = problem.survey
-    start = np.flatnonzero(np.diff(survey.dive, prepend=survey.dive[0] - 1))
-    since = survey.time - np.repeat(survey.time[start], np.diff([*start, len(survey.dive)]))
-    X, decay = repeated(problem)(slice(None)), np.exp(-since / 60.0)
-    assert missed(decay - decay.mean(), X) < 0.1

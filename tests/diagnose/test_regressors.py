@@ -19,11 +19,10 @@ from magbridge.calibration.effects import (
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.instrument import MAX_BEND_NT, OffsetStep
+from magbridge.diagnose.causes.instrument import OffsetStep
 from magbridge.diagnose.causes.masses import ActuatorOrder
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import effect_columns
-from magbridge.diagnose.joint import Statistic
 from magbridge.diagnose.problem import Problem, pose, rates
 from magbridge.diagnose.survey import MAX_LAG, TelemetryChannel
 
@@ -75,13 +74,6 @@ def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
             )
             seen += 1
     assert seen > 30
-
-
-def test_columns_in_pieces_are_the_columns(problem: Problem) -> None:
-    for cause in CAUSES.values():
-        for candidate in cause.candidates(problem):
-            whole = candidate.columns(slice(0, len(problem)))
-            np.testing.assert_array_equal(candidate.columns(slice(100, 230)), whole[100:230])
 
 
 @pytest.mark.parametrize("share", [0.05, 0.125])
@@ -176,24 +168,6 @@ def test_a_mass_that_moves_within_one_interval_is_seen_by_a_shift(problem: Probl
     assert any(rows and min(rows) >= 100 for shift, rows in seen.items() if shift < 0.0)
 
 
-def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> None:
-    cold = TelemetryChannel(problem.survey.channels["warm"].values[::-1].copy(), "degC", ("temperature",))
-    survey = replace(problem.survey, channels={**problem.survey.channels, "cold": cold})
-    seen = 0
-    for cause in CAUSES.values():
-        for candidate in cause.candidates(pose(survey, problem.calibration)):
-            if candidate.point.rebuild is None:
-                continue
-            shape = [value for value, _ in candidate.point.shape.values()]
-            once = candidate.point.rebuild(*shape)
-            assert once.point.rebuild is not None
-            twice = once.point.rebuild(*shape)
-            assert (twice.channel, twice.effects) == (candidate.channel, candidate.effects)
-            np.testing.assert_array_equal(twice.columns(slice(0, 100)), candidate.columns(slice(0, 100)))
-            seen += 1
-    assert seen > 50
-
-
 def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Problem) -> None:
     """Between the calibration's own logs and these there has been one, too."""
     t = problem.survey.time
@@ -205,14 +179,6 @@ def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Pro
     assert grid[0].point.rebuild is not None
     assert [grid[0].point.rebuild(t[at]).point.likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
     assert {candidate.point.likelier for candidate in OffsetStep().candidates(problem)} == {0.0}
-
-
-def test_a_cause_found_twice_is_one(problem: Problem) -> None:
-    first, second = CAUSES["hysteresis"].candidates(problem)[:2]
-    both = first.joined_with(second).joined_with(second)
-    assert both.size == len(set(both.names)) == 9
-    assert (len(both.point.shape), len(both.effects)) == (9, 3)
-    np.testing.assert_array_equal(both.columns(slice(0, 50))[:, :3], first.columns(slice(0, 50)))
 
 
 def test_a_mass_that_stops_while_another_goes_on_has_no_rate(problem: Problem) -> None:
@@ -279,35 +245,6 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
         field = np.sum(jacobian * (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3, axis=1)
         next_power = beyond(p[:, None] ** 4 * jacobian, field)
         assert min(beyond(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)
-
-
-def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Problem) -> None:
-    """If the field of a mass has changed, all orders together hold the part that one order misses."""
-    own, x = problem.calibration.parameters[0], np.linspace(-1.0, 1.0, len(problem))
-    values = own.centre + own.scale * x
-    channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=values)}
-    problem = replace(problem, survey=replace(problem.survey, channels=channels))
-    term, changed, *_ = (c.columns(slice(0, len(x))) for c in ActuatorOrder().candidates(problem))
-    jacobian = problem.jacobian[:, 6:]
-    residual = x**3 - np.polyval(np.polyfit(x, x**3, 2), x)
-    np.testing.assert_allclose(
-        term, term[-1] / jacobian[-1] * jacobian * (residual / residual[-1])[:, None], atol=1.0
-    )
-    field = jacobian @ [3.0, -2.0, 1.0] / (4.0 + x) ** 3
-
-    def missed(columns: np.ndarray) -> float:
-        return float(np.linalg.norm(field - columns @ np.linalg.lstsq(columns, field, rcond=1e-9)[0]))
-
-    assert missed(np.hstack([jacobian, changed])) < 0.02 * missed(np.hstack([jacobian, term]))
-
-
-def test_a_response_bends_by_no_more_than_is_plausible(problem: Problem) -> None:
-    """For any common size: a reference error of 140 nT does not count as a bend."""
-    bend = CAUSES["nonlinearity"].candidates(problem)[-1]
-    for size, sigma in ((20.0, 20.0), (140.0, MAX_BEND_NT)):
-        coefficients = size / bend.width
-        best = Statistic(1e6 * np.eye(9), bend.spectra).best(1e6 * coefficients)
-        np.testing.assert_allclose(np.sqrt(best.variance) * bend.width, sigma, rtol=0.2)
 
 
 def test_a_core_that_shows_through_changes_the_sensitivity_too(problem: Problem) -> None:

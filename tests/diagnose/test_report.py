@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,11 +17,9 @@ from magbridge.diagnose.diagnosis import Finding, small, verdict_of
 from magbridge.diagnose.evidence import Hypothesis
 from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
-from magbridge.diagnose.problem import Problem, isotropic
-from magbridge.diagnose.report import figures
+from magbridge.diagnose.problem import isotropic
 from magbridge.diagnose.report.page import marked_up
-from magbridge.diagnose.survey import TelemetryChannel, _channels
-from magbridge.diagnose.texts import chance, measured, number, sizes
+from magbridge.diagnose.texts import chance, measured, number
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -134,18 +131,6 @@ def test_the_command_reports_what_the_improvement_was_measured_on() -> None:
     assert "117 nT RMS, not held out;" in summary(plain, "")
 
 
-def test_sizes_of_one_unit_name_it_once() -> None:
-    smallest = {
-        "x": (0.5551, "nT/degC"),
-        "y": (np.inf, "nT/degC"),
-        "z": (0.2, "nT/degC"),
-        "delay": (1.0, "s"),
-    }
-    assert sizes(smallest) == "x 0.555, z 0.200 nT/degC, delay 1.00 s"
-    assert sizes({f"c{k}": (1.0, "nT") for k in range(30)}) == "c0 1.00, c1 1.00, c2 1.00 nT, and 27 more"
-    assert sizes({"x": (np.inf, "nT")}) == "no plausible size reaches it"
-
-
 def test_a_cause_of_unusual_size_is_questioned() -> None:
     """A constant of 1,200 nT where main-field models are 100 nT off."""
     bias = candidate("reference_bias", np.ones(1), width=np.array([100.0]))
@@ -187,22 +172,6 @@ def test_where_the_calibrations_own_numbers_do_as_well_nothing_needs_explaining(
     assert not small(problem, noise + 20.0 * (np.arange(1000) > 500), None)
 
 
-@pytest.mark.parametrize("unit", ["", "1"])
-def test_a_channel_without_a_unit_shows_none(unit: str) -> None:
-    """Not "nT/1" nor "nT per 0.3 1"."""
-    problem = right(100)
-    lights = np.linspace(0.0, 0.6, len(problem.survey))
-    columns = {"time": problem.survey.time, "Lights1": lights}
-    channels, _ = _channels(columns, {"Lights1": unit}, ())
-    shown = replace(problem, survey=replace(problem.survey, channels=problem.survey.channels | channels))
-    made = [
-        one for cause in ("unmodelled_actuator", "current_field") for one in CAUSES[cause].candidates(shown)
-    ]
-    units = {unit for one in made if one.channel == "Lights1" for unit in one.units}
-    assert {"nT per 0.3", "nT per 1"} <= units
-    assert not any(unit.endswith((" 1)", "/1", ".3 1")) for unit in units)
-
-
 def test_a_shift_of_the_whole_field_with_a_wrong_reference_is_reported() -> None:
     """A constant may belong to either; with a true reference it is the vehicle's."""
     problem = right(100)
@@ -239,39 +208,3 @@ def test_a_rival_on_another_channel_is_the_same_cause() -> None:
         assert "none comes within odds of 20:1" in output
     assert "cannot distinguish it from temperature offset (water) or offset drift (" in causes
     assert cause.disambiguation in causes
-
-
-def test_of_many_channels_the_difference_s_own_are_drawn(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rng = np.random.default_rng(1)
-    names = [f"c{k:02}" for k in range(30)]
-    values = {name: rng.normal(size=2000) for name in names}
-    survey = SimpleNamespace(
-        channels={name: TelemetryChannel(x, "V", ()) for name, x in values.items()}, still=(),
-        attitude=rng.normal(size=(2000, 3)),
-    )  # fmt: skip
-    before = values["c29"] + rng.normal(size=2000)
-    monkeypatch.setattr(figures, "png", lambda figure: figure)
-    diagnosis: Any = SimpleNamespace(
-        problem=SimpleNamespace(survey=survey), findings=(1,), before=before, after=before
-    )
-    drawn: Any = figures.channels(diagnosis)
-    shown = [axis.get_xlabel() for axis in drawn.axes if axis.get_visible()]
-    assert len(shown) == figures.CHANNELS
-    assert "c29 (V)" in shown
-
-
-def test_powers_have_units_of_their_own(problem: Problem) -> None:
-    """A number per (12 deg)^2 is none per 12 deg."""
-    bent = CAUSES["nonlinearity"].candidates(problem)[-1]
-    unit = f"{problem.calibration.reference.field:.0f} nT"
-    assert dict(zip(bent.names, bent.units, strict=True)) == {
-        **{f"{axis}1": f"nT per {unit}" for axis in "xyz"},
-        **{f"{axis}2": f"nT per ({unit})^2" for axis in "xyz"},
-        **{f"{axis}3": f"nT per ({unit})^3" for axis in "xyz"},
-    }
-    drift = CAUSES["offset_drift"].candidates(problem)[-1]
-    assert [unit.partition(")")[2] for unit in drift.units] == [""] * 3 + ["^2"] * 3
-    clipped = CAUSES["saturation"].candidates(problem)[0]
-    assert clipped.units == ("nT", f"nT per {unit}")

@@ -17,7 +17,6 @@ from magbridge.diagnose.columns import GridPoint
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
-from magbridge.diagnose.report.figures import ends, rolling
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.search import Outliers
 from magbridge.diagnose.texts import measured, number, write_text
@@ -188,22 +187,6 @@ def test_the_page_is_small_enough_to_send(clear: Diagnosis) -> None:
     assert len(page) < 800_000
 
 
-def test_a_running_mean_follows_the_mean_and_stops_at_gaps(clear: Diagnosis) -> None:
-    t = clear.problem.survey.time
-    late = np.where(t > t.mean(), t + 7200.0, t)
-    survey = replace(clear.problem.survey, time=late)
-    gapped = replace(clear, problem=replace(clear.problem, survey=survey))
-    _, mean = rolling(gapped, np.full(len(t), 3.0))
-    assert np.isnan(mean).any()
-    np.testing.assert_allclose(mean[np.isfinite(mean)], 3.0)
-
-
-def test_wild_samples_do_not_set_the_scale() -> None:
-    low, high = ends(np.append(np.linspace(-1.0, 1.0, 1000), 1e6), low=0.0, high=0.0)
-    assert -1.01 < low < -0.98
-    assert 0.98 < high < 1.01
-
-
 def test_terms_have_a_sigma_and_an_onset_is_a_date(clear: Diagnosis) -> None:
     first = clear.findings[0]
     point = GridPoint({"onset": (1780314641.5, "s")})
@@ -212,20 +195,6 @@ def test_terms_have_a_sigma_and_an_onset_is_a_date(clear: Diagnosis) -> None:
     assert '<tr><td>onset</td><td class="n">2026-06-01 11:50:41</td><td class="n"></td><td>UTC</td>' in output
     x = parameters(first, len(clear.problem))["x"]
     assert f'<td class="n">± {measured(x["sigma"], x["sigma"])}</td><td>nT/A</td>' in output
-
-
-def test_a_long_table_of_terms_is_folded_to_a_line(clear: Diagnosis) -> None:
-    first, flat = clear.findings[0], np.ones((len(clear.problem), 15))
-    many = replace(
-        first.candidate, names=tuple(f"x{k}" for k in range(15)), units=("nT",) * 15, width=np.ones(15),
-        columns=flat.__getitem__,
-    )  # fmt: skip
-    b = np.where(np.arange(15) < 12, 3.0, 0.1)
-    named = replace(first.hypothesis, candidate=many)
-    long = replace(first, hypothesis=named, coefficients=b, covariance=np.eye(15))
-    output = section(replace(clear, findings=(long,)), "Each cause")
-    assert "<summary>15 terms, 12 of them beyond 2 sigma<" in output
-    assert "<summary>3 terms" not in section(clear, "Each cause")
 
 
 def test_the_times_of_wrong_samples_are_all_or_the_first(clear: Diagnosis) -> None:

@@ -11,13 +11,12 @@ from posed import calibrated, candidate, right, surveyed
 from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
-from magbridge.diagnose.alternatives import exchanged
 from magbridge.diagnose.causes.reference import ReferenceBias
 from magbridge.diagnose.columns import Candidate
-from magbridge.diagnose.evidence import ODDS, Hypothesis
+from magbridge.diagnose.evidence import ODDS
 from magbridge.diagnose.problem import pose
 from magbridge.diagnose.run import odds_over_random_walk
-from magbridge.diagnose.search import LOST, _forward_selection, _surplus, beside_slow_noise, search, switches
+from magbridge.diagnose.search import beside_slow_noise, search
 from magbridge.diagnose.state import SearchState
 
 
@@ -70,50 +69,6 @@ def test_flicker_noise_gets_no_name_and_a_step_in_white_noise_its_own(
     assert (np.std(slow) > 0.3 * np.std(read)) == (noise == "flicker")
 
 
-def test_what_switches_is_not_searched_for_without_end() -> None:
-    """Beside a few regressors its many shifts still stand; telemetry that shows it describes them all."""
-    rng, n = np.random.default_rng(6), 3000
-    relay = (np.searchsorted(np.sort(rng.integers(0, n, 30)), np.arange(n)) % 2).astype(float)
-    steps = [fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in range(100, n, 100)]
-    current = fault("current_field", relay, 10.0)
-    noisy = replace(right(n), residual=16.0 * relay + rng.normal(size=n))
-    brief = SearchState(noisy, steps, 2, 2).with_brief_noise()
-    model, base = _forward_selection(brief, brief.round([], brief.null))
-    assert len(model[0].pieces) == LOST
-    assert switches(base, model, brief.causes)
-    assert not switches(brief.fit([*steps[:2], current]), [*steps[:2], current], brief.causes)
-
-
-def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
-    """A step is first found at a wrong time; then the true time is found given it."""
-    rng = np.random.default_rng(1)
-    n = 600
-    early, late = (fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
-    problem = replace(right(n), residual=5.0 * (np.arange(n) >= 60) + rng.normal(size=n))
-    state = SearchState(problem, [early, late], 1, 1)
-    state.round([], state.null)
-    both = early.joined_with(late)
-    assert exchanged(state, [both], state.fit([both]))[0] == [early]
-
-
-@pytest.mark.parametrize("alike", [True, False])
-def test_of_two_similar_causes_one_without_gain_on_new_dives_is_dropped(alike: bool) -> None:
-    """Where it is like none, its own test decides. By chance what does nothing may gain, in one of six."""
-    rng, n, dropped = np.random.default_rng(3), 600, 0
-    for _ in range(10):
-        acts, none = (np.arange(n) > 200.0).astype(float), rng.normal(size=n)
-        one = fault("offset_step", acts, 10.0)
-        like = fault("offset_drift", acts + 0.1 * none if alike else none, 10.0)
-        state = SearchState(replace(right(n), residual=5.0 * acts + rng.normal(size=n)), [one, like], 1, 2)
-        base = state.fit([one, like])
-        both = [
-            Hypothesis(own, 0.0, 0.0, 0.0, state.fit([other, own]))
-            for own, other in ((one, like), (like, one))
-        ]
-        dropped += _surplus(state, both, base) == 1
-    assert dropped >= 6 if alike else dropped == 0
-
-
 def test_a_further_cause_must_predict_better_than_a_free_description() -> None:
     rng, n = np.random.default_rng(4), 600
     shapes = {"offset_step": (np.arange(n) > 200.0).astype(float), "current_field": rng.normal(size=n)}
@@ -123,21 +78,6 @@ def test_a_further_cause_must_predict_better_than_a_free_description() -> None:
     for score, expected in ((-np.inf, {"offset_step", "current_field"}), (np.inf, {"offset_step"})):
         found = search(problem, candidates, 2, lambda *_, score=score: score)
         assert {one.candidate.cause for one in found.chosen} == expected
-
-
-def test_one_cause_gives_way_to_two_given_a_third() -> None:
-    """It was found first since it resembles their sum; neither of the two alone is better."""
-    rng = np.random.default_rng(1)
-    n = 600
-    one, two, third = rng.normal(size=(3, n))
-    alike = fault("nonlinearity", one + two + 0.3 * rng.normal(size=n), 10.0)
-    both = [fault("offset_drift", one, 10.0), fault("offset_step", two, 10.0)]
-    conditional_on = fault("current_field", third, 10.0)
-    problem = replace(right(n), residual=5.0 * (one + two + third) + rng.normal(size=n))
-    state = SearchState(problem, [alike, *both, conditional_on], 1, 4)
-    state.round([], state.null)
-    model, _ = exchanged(state, [alike, conditional_on], state.fit([alike, conditional_on]))
-    assert {c.cause for c in model} == {"offset_drift", "offset_step", "current_field"}
 
 
 def test_what_nature_cannot_do_is_the_vehicles() -> None:

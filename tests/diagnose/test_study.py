@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 from study.cases import PARTS, plan
-from study.deployment import CHARTS, LOSSES, MEMORY, charted, drawn, kept_rows, project, whiten
+from study.deployment import CHARTS, LOSSES, MEMORY, charted, drawn, project, whiten
 from study.ideal import SIZES, Draws, Span
 from study.table import needed_size
 
 from sitl import Twin, load
-from sitl.signals import correlated
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -27,19 +26,6 @@ def test_projection_equals_a_solve_with_the_full_covariance() -> None:
     prior = np.diag([0.1, 1.0, 10.0, 0.0, 1e-3]) * 0.1
     whole = np.eye(n) + A @ prior @ A.T
     np.testing.assert_allclose(project(X, A, prior), np.linalg.solve(whole, X), atol=1e-10)
-
-
-def test_whitened_noise_is_white() -> None:
-    rng = np.random.default_rng(2)
-    noise = correlated(rng.normal(size=(20_000, 1)), MEMORY)[:, 0]
-    assert np.std(noise) == pytest.approx(1.0, abs=0.03)
-    for losses in ("", *LOSSES):
-        rows = kept_rows(losses, len(noise), 3)
-        white = whiten(noise[rows], "ar", rows)
-        assert np.std(white) == pytest.approx(1.0, abs=0.02)
-        assert abs(np.mean(white[1:] * white[:-1])) < 0.02
-    every = np.arange(20_000)
-    assert np.std(whiten(1.5 * rng.normal(size=20_000), "half", every)) == pytest.approx(1.0, abs=0.02)
 
 
 def test_whitened_rows_with_gaps_keep_the_information() -> None:
@@ -63,14 +49,6 @@ def test_a_third_of_every_part_loses_samples() -> None:
             continue
         assert sum(map(bool, own)) == pytest.approx(len(own) / 3, abs=0.02 * len(own) + 1)
         assert set(own) == {"", *LOSSES}
-
-
-def test_every_dive_loses_the_same_number_of_samples() -> None:
-    rows = kept_rows("surfacing", 5000, 5)
-    gone = np.diff(rows)[np.diff(rows) > 1]
-    assert set(gone) == {12}
-    assert np.ptp(np.diff(np.flatnonzero(np.diff(rows) > 1))) <= 1
-    assert 15 <= len(gone) <= 100
 
 
 def test_a_continued_map_has_a_smaller_error() -> None:

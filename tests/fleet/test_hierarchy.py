@@ -59,16 +59,6 @@ def test_what_is_expected_is_the_dense_gaussians_answer(*, shaped: bool) -> None
     np.testing.assert_allclose(mean, (posterior @ h)[-3:], rtol=1e-6, atol=1e-9)
 
 
-def test_every_round_is_likelier(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, _ = observed(np.random.default_rng(1), (1.0, 0.2, 0.05), (5, 2, 2))
-    scores = []
-    for rounds in (1, 2, 3, 5, 10, 30):
-        monkeypatch.setattr(hierarchy, "ROUNDS", rounds)
-        scores.append(learn(seen, np.zeros(4, int)).log_likelihood)
-    assert (np.diff(scores) >= -1e-9).all()
-    assert scores[-1] > scores[0]
-
-
 def test_the_variances_are_those_that_it_was_drawn_from() -> None:
     sigmas = (0.8, 0.2, 0.05)
     seen, _ = observed(np.random.default_rng(2), sigmas, (15, 3, 3))

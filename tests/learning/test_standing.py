@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from magbridge.learning.alarms import (
     LOG_RATIO_PER_CAUSE,
-    MAX_WAIT_SAMPLES,
     QUIET,
     SURE,
     AlarmState,
     LearningAlarm,
 )
-from magbridge.records import Quality
 
 
 def alarm(strength: float, *causes: str) -> LearningAlarm:
@@ -41,29 +39,6 @@ def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
     assert standing(first, alarm(20.1 + SURE + LOG_RATIO_PER_CAUSE, *two)).ripe
     assert standing(first, alarm(20.1 + SURE, "offset_drift")).ripe
     assert standing(first).raised(alarm(22.0, "offset_drift")) == ""  # its cause is reported at its end
-
-
-def test_patience_is_for_each_cause_and_of_telling_samples() -> None:
-    """What tells nothing does not count."""
-    assert not standing(alarm(20.0, "offset_drift"), telling=MAX_WAIT_SAMPLES).ripe
-    assert standing(alarm(20.0, "offset_drift"), telling=MAX_WAIT_SAMPLES + 1).ripe
-    two = alarm(20.0, "offset_drift", "temperature_offset")
-    assert not standing(two, telling=2 * MAX_WAIT_SAMPLES).ripe
-    assert standing(two, telling=2 * MAX_WAIT_SAMPLES + 1).ripe
-
-
-def test_an_alarm_that_is_not_news_for_long_is_gone() -> None:
-    """One that grows by less than what makes it news is the same still; flag and sigma stand with it."""
-    first = alarm(20.0, "offset_step")
-    assert AlarmState().raised(first) == "unexplained: 5 nT, offset step"
-    assert standing(first).raised(alarm(21.0, "offset_step")) == ""
-    assert not standing(first, telling=QUIET).gone
-    gone = standing(first, telling=QUIET + 1)
-    assert gone.gone
-    assert (gone.flags, gone.variance) == (int(Quality.UNEXPLAINED), 25.0)
-    gone.end()
-    assert (gone.alarm, gone.flags, gone.variance) == (None, 0, 0.0)
-    assert not AlarmState().ripe
 
 
 def relapsed() -> AlarmState:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from ulogs import Output, ulog_of
 
 from magbridge import logs
@@ -227,17 +226,6 @@ def test_ulg_cut_in_its_definitions(tmp_path: Path) -> None:
     path.write_bytes(ulog()[:300])
     with pytest.raises(FormatError, match=r"log\.ulg: expected a PX4 log"):
         logs.read(path)
-
-
-def test_quaternion_of_known_attitudes() -> None:
-    pytest.importorskip("pyulog")
-    from magbridge.logs.px4 import _angles  # noqa: PLC0415 - needs pyulog
-
-    angles = np.random.default_rng(0).uniform([-180, -89, 0], [180, 89, 360], (50, 3))
-    x, y, z, w = Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat().T
-    np.testing.assert_allclose(
-        np.transpose(_angles({"q[0]": w, "q[1]": x, "q[2]": y, "q[3]": z})), angles, atol=1e-9
-    )
 
 
 def test_the_compass_that_vehicle_magnetometer_names(tmp_path: Path) -> None:

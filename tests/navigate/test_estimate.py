@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from math import hypot
-
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from voyages import Map, blocks, synthetic, track_over
+from voyages import blocks, track_over
 
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.estimate import SEARCH_SPREADS, Estimate
-from magbridge.navigate.integrity import Verdict
+from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import NavigationOptions, with_level
-from magbridge.navigate.record import NavigationState
 
 HOUR_US = 3_600_000_000
 
@@ -85,50 +81,6 @@ def test_a_wide_start_has_many_hypotheses_and_a_narrow_one_has_one(
     assert seen.accepted
     block, metres = measured[1]
     assert not estimate.update(block._replace(anomaly=block.anomaly + 1e4), metres).accepted
-
-
-def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
-    grid: AnomalyGrid, options: NavigationOptions
-) -> None:
-    """Over a field five times as rough as the map, which the map does not explain at any place or level."""
-    elsewhere = synthetic(Map(150, 1500), 9)
-    estimate, widths = None, []
-    for block, metres in blocks(track_over(elsewhere, options, 5, hours=0.5), grid, options):
-        estimate = estimate or begun(grid, options, block, 200.0)
-        jumps = len(estimate.jumps)
-        estimate.update(block, metres)
-        assert not estimate.valid
-        if len(estimate.jumps) > jumps:
-            assert estimate.jumps[-1].cause == Verdict.NOWHERE.value
-            assert estimate.state is NavigationState.LOST
-            widths.append((float(estimate.P[0, 0]) ** 0.5, estimate.jumps[-1].allowed))
-        if len(widths) == len(SEARCH_SPREADS):
-            break
-    expected = [
-        hypot(spread * grid.correlation_length, allowed)
-        for spread, (_, allowed) in zip(SEARCH_SPREADS, widths, strict=True)
-    ]
-    assert [width for width, _ in widths] == pytest.approx(expected, rel=1e-6)
-    assert max(widths)[0] > 3.5 * min(widths)[0]
-
-
-def test_rivals_of_a_filter_that_was_confirmed_begin_half_as_far_away(
-    grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]]
-) -> None:
-    """A start wider than they reach confirms it; either way they reach what dead reckoning may be off."""
-    first = measured[0][0]
-    length = grid.correlation_length
-    for sigma, confirmed in ((50.0, False), (1.1 * length, True)):
-        estimate = begun(grid, replace(options, start_sigma=sigma), first, sigma)
-        for block, metres in measured:
-            estimate.update(block, metres)
-            if estimate._monitor is not None:
-                break
-        assert estimate._monitor is not None
-        spread = float(estimate._monitor.elsewhere.moments()[1][0, 0]) ** 0.5
-        alone = float(estimate.alone[0, 0]) ** 0.5
-        reach = max(alone, 0.5 * length) if confirmed else max(alone, length)
-        assert spread == pytest.approx(hypot(reach, float(estimate.P[0, 0]) ** 0.5), rel=0.2)
 
 
 def test_other_places_have_the_level_that_was_met_where_the_position_was_known(

@@ -123,26 +123,6 @@ def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(
     np.testing.assert_array_equal(change(1.0), one)
 
 
-def test_several_add_up(flight: Flight, clean: xr.Dataset) -> None:
-    a, b = HiddenEffect("current_field", 3.0, 1), HiddenEffect("offset_step", 4.0, 2)
-    both, *each = (channels(seen(flight, *hidden)) - channels(clean) for hidden in ((a, b), (a,), (b,)))
-    np.testing.assert_allclose(both, sum(each), atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ["current_field", "pressure_offset"])
-def test_a_vehicles_field_is_the_same_on_another_track(flight: Flight, name: str) -> None:
-    """What the truth says per unit of a channel is what a fit without noise finds, on either track."""
-    twin, *_ = flight
-    for seed in (4, 5):
-        track = Twin.draw(twin.scenario, seed).fly()
-        there = (twin, track, np.arange(0.0, track.elapsed[-1] - 30.0, 4.0))
-        own, ds = effect(there, seen(there), name)
-        truth = json.loads(ds.attrs["truth"])
-        for k, axis in enumerate("xyz"):
-            slopes = [np.polyfit(ds[c], own[:, k], 1)[0] for c in ("amps_a", "amps_b", "depth")]
-            assert min(abs(s / truth[axis] - 1.0) for s in slopes) < 0.03
-
-
 def test_a_late_clock_shifts_the_telemetry_only(flight: Flight, clean: xr.Dataset) -> None:
     own, ds = effect(flight, clean, "clock_offset", 20.0)
     assert not own.any()
@@ -198,10 +178,3 @@ def test_heat_soaks_in_later_than_one_lag_and_all_the_way() -> None:
     assert np.all(np.diff(core) > -0.01)
     # the slab's middle does not feel the face at once; one time constant would be at 1 - exp(-0.1) by then
     assert core[np.searchsorted(t, 0.1 * lag)] < 0.5 * (1.0 - np.exp(-0.1))
-
-
-def test_foreign_effects_are_not_among_the_causes(flight: Flight, clean: xr.Dataset) -> None:
-    assert not set(EFFECTS) & set(FOREIGN)
-    relay, _ = effect(flight, clean, "relay")
-    levels = np.unique(np.round(np.linalg.norm(relay, axis=1), 2))
-    assert len(levels) == 2

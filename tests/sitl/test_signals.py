@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sitl.signals import autoregressive, first_order, first_order_at
+from sitl.signals import autoregressive, first_order
 
 TAU = 1 / (2 * np.pi * 0.33)
 
@@ -30,30 +30,6 @@ def test_a_sine_at_the_corner_loses_three_decibels() -> None:
     t = 0.01 * np.arange(6000)
     y = first_order(np.sin(2 * np.pi * 0.33 * t), 0.01, TAU)
     assert np.abs(y[3000:]).max() == pytest.approx(1 / np.sqrt(2), rel=1e-3)
-
-
-def test_between_points_is_what_a_finer_grid_gives() -> None:
-    rng = np.random.default_rng(0)
-    u = rng.normal(0, 1, 30)
-    fine = np.interp(0.01 * np.arange(1451), 0.5 * np.arange(30), u)
-    expected = first_order(fine, 0.01, TAU)
-    when = 0.01 * np.arange(1451.0)
-    np.testing.assert_allclose(
-        first_order_at(u, first_order(u, 0.5, TAU), 0.5, TAU, when), expected, atol=1e-9
-    )
-
-
-def test_it_is_causal() -> None:
-    u = np.zeros((50, 3))
-    later = u.copy()
-    later[25:] = 1.0
-    np.testing.assert_array_equal(first_order(u, 0.5, TAU)[:25], first_order(later, 0.5, TAU)[:25])
-
-
-def test_no_time_constant_no_lag() -> None:
-    u = np.random.default_rng(1).normal(0, 1, 20)
-    np.testing.assert_array_equal(first_order(u, 0.5, 0.0), u)
-    np.testing.assert_allclose(first_order_at(u, u, 0.5, 0.0, np.array([0.25])), [(u[0] + u[1]) / 2])
 
 
 @pytest.mark.parametrize("memory", [0.0, 3.0, 10.0])

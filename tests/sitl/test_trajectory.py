@@ -43,13 +43,6 @@ def test_depth_follows_the_path() -> None:
     assert climb.depth[-1] == 0
 
 
-def test_from_its_greatest_depth_it_climbs_at_once() -> None:
-    down, up = Leg(duration=600, pitch=-26), Leg(duration=300, pitch=26)
-    track = fly_legs(down, up, down, up, motion=Motion(wander=(0.0, 0.0, 0.0), max_depth=60.0))
-    assert track.depth[[1199, 2999]].tolist() == [60.0, 60.0]  # the dives would end at 100 m
-    assert track.depth[[1799, 3599]] == pytest.approx(60.0 - 300 * 0.35 * np.sin(np.radians(29)), abs=8.0)
-
-
 def test_in_a_month_it_meets_the_thermocline_as_often_late_as_early() -> None:
     legs = CrissCross(hours=720.0, pitch=(25.0, 2.5)).legs(np.random.default_rng(3), GLIDER)
     depth = fly(legs, START, 4.0, np.random.default_rng(4)).depth
@@ -67,11 +60,6 @@ def test_a_current_carries_the_vehicle() -> None:
     assert (north[-1], east[-1]) == pytest.approx((60, -120), abs=0.5)
 
 
-def test_a_new_heading_is_reached_the_shorter_way() -> None:
-    track = fly_legs(Leg(duration=300, pitch=-26, heading=350), Leg(duration=300, pitch=26, heading=10))
-    assert track.heading[-1] == pytest.approx(370, abs=0.1)
-
-
 def test_masses_move_as_fast_as_they_can_and_then_rest() -> None:
     track = fly_legs(
         Leg(duration=100, pitch=-26, parameters={"battpos": 0.5, "ballast": -200}),
@@ -83,13 +71,6 @@ def test_masses_move_as_fast_as_they_can_and_then_rest() -> None:
     assert set(np.round(battery[-100:], 9)) == {-0.5}
     assert set(track.parameters["ballast"]) == {-200.0}
     assert set(track.parameters["rollpos"]) == {0.0}
-
-
-def test_a_mass_that_has_no_time_goes_on_from_where_it_got() -> None:
-    hurried = [Leg(duration=5, pitch=0, parameters={"battpos": p}) for p in (0.0, 1.0, -1.0)]
-    battery = fly_legs(*hurried).parameters["battpos"]
-    assert battery.max() == pytest.approx(0.25, abs=0.03)
-    assert np.abs(np.diff(battery)).max() == pytest.approx(0.025)
 
 
 @pytest.mark.parametrize(("name", "value"), [("battpos", 1.2), ("ballast", -231.0), ("keel", 0.0)])
@@ -125,13 +106,6 @@ def test_the_survey_goes_out_and_comes_back() -> None:
     assert away[-1] < 0.4 * away.max()
     pitch = np.array([leg.pitch for leg in legs])
     assert np.all(np.sign(pitch) == [-1, 1] * (len(legs) // 2))
-
-
-def test_other_masses_are_moved_too() -> None:
-    limits = GLIDER | {"rollpos": LIMITS["rollpos"]}
-    legs = Spirals().legs(np.random.default_rng(3), limits)
-    assert len({leg.parameters["rollpos"] for leg in legs}) == 10
-    assert all(-3 <= leg.parameters["rollpos"] <= 3 for leg in legs)
 
 
 def test_a_planners_runs_are_flown_in_place_of_the_table() -> None:

@@ -27,19 +27,6 @@ def test_a_dipole_is_choclos_dipole() -> None:
         np.testing.assert_allclose(dipole_field(r, m), expected, rtol=1e-9)
 
 
-def test_on_its_axis_a_dipole_has_twice_the_field_of_its_equator() -> None:
-    m = np.array([0.0, 0.0, 3.0])
-    np.testing.assert_allclose(dipole_field(np.array([0.0, 0.0, 2.0]), m), 2 * 100.0 * m / 8)
-    np.testing.assert_allclose(dipole_field(np.array([0.0, 2.0, 0.0]), m), -100.0 * m / 8)
-
-
-def test_crustal_field_is_the_sum_of_its_dipoles() -> None:
-    rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(2))
-    points = np.random.default_rng(3).uniform([-2000, -2000, 0], [2000, 2000, 200], (50, 3))
-    one_by_one = sum(dipole_field(points - s, m) for s, m in zip(rock.position, rock.moment, strict=True))
-    np.testing.assert_allclose(rock.field(points, block=7), one_by_one, atol=1e-6)
-
-
 def test_rocks_field_has_neither_sources_nor_curl_where_the_vehicle_swims() -> None:
     rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(4))
     place, h = np.array([120.0, -340.0, 90.0]), 0.5
@@ -76,8 +63,3 @@ def test_without_crustal_field_there_is_only_the_main_field() -> None:
     field = world.field(np.full(2, WINTER), np.array([49.52, 49.53]), np.full(2, -57.87), np.zeros(2))
     assert 52_500 < np.linalg.norm(field[0]) < 53_200  # nT, ppigrf: 52 880
     np.testing.assert_allclose(world.anomaly_map(WINTER, 90.0, 500.0, 250.0).anomaly, 0.0, atol=1e-9)
-
-
-def test_water_has_two_layers() -> None:
-    water = Water(surface=1.0, deep=4.0, thermocline=50.0, thickness=10.0)
-    np.testing.assert_allclose(water.temperature(np.array([0.0, 50.0, 200.0])), [1.0, 2.5, 4.0], atol=1e-3)

@@ -21,7 +21,6 @@ from magbridge.link.component import Component
 from magbridge.link.fixes import Kind
 from magbridge.link.requests import needed_rates
 from magbridge.mavlink import Codec, spec
-from magbridge.mavlink.enums import MAV_RESULT
 
 BRIDGE = Codec(1, 191)
 FIXED_WING = 1
@@ -87,15 +86,6 @@ def test_ardupilot_takes_odometry_in_one_form_only(change: dict[str, Any], outco
     assert dict(autopilot.taken) == {outcome: 1}
 
 
-def test_a_nan_in_a_covariance_is_an_internal_error() -> None:
-    autopilot, now_us = flown(ArduPilot, 5)
-    autopilot.receive(
-        BRIDGE.pack("ODOMETRY", **{**POSE, "pose_covariance": (4.0,) * 11 + (nan,) * 10}), now_us
-    )
-    assert isinstance(autopilot, ArduPilot)
-    assert autopilot.internal_errors == 1
-
-
 def test_px4_takes_its_sensor_by_id_and_believes_a_nan_to_a_metre() -> None:
     autopilot, now_us = flown(Px4, 5)
     for change in ({"id": 0}, {"id": 2}):
@@ -105,14 +95,6 @@ def test_px4_takes_its_sensor_by_id_and_believes_a_nan_to_a_metre() -> None:
     autopilot.receive(BRIDGE.pack("GLOBAL_POSITION_SENSOR", **{**HERE, "eph": nan}), now_us + 60_000_000)
     assert autopilot.filter.position[0] > before + 25.0
     assert autopilot.filter.sigma < 1.0
-
-
-def test_px4_has_several_global_positions_and_modes() -> None:
-    far = {**HERE, "lat": round(PLACE[0] * 1e7) + 54_000}
-    for mode, airspeed, outcome in ((0, True, "fused"), (1, True, "refused: gate"), (1, False, "fused")):
-        autopilot, now_us = flown(Px4, 30, agp_mode=mode, airspeed=airspeed, agp_ids=(1, 2))
-        autopilot.receive(BRIDGE.pack("GLOBAL_POSITION_SENSOR", **{**far, "id": 2}), now_us)
-        assert dict(autopilot.taken) == {outcome: 1}, (mode, airspeed)
 
 
 def test_px4_refuses_an_external_position_only_if_it_is_not_a_number() -> None:
@@ -130,15 +112,6 @@ def test_px4_refuses_an_external_position_only_if_it_is_not_a_number() -> None:
         claims.append(autopilot.filter.sigma)
     assert claims[0] == pytest.approx(30.0)
     assert claims[1] < 15.0, "since December 2025 it is fused"
-
-
-def test_ardupilots_proposed_change_fuses_and_accepts_a_global_position() -> None:
-    autopilot, now_us = flown(ArduPilot, 60, fuses_positions=True)
-    before = autopilot.filter.position[0]
-    assert external(autopilot, now_us) == 0
-    assert before < autopilot.filter.position[0] < 30.0
-    autopilot.receive(BRIDGE.pack("GLOBAL_POSITION_SENSOR", **HERE), now_us)
-    assert autopilot.taken["fused"] == 1
 
 
 def test_ardupilot_cannot_arm_without_visual_odometry_and_reports_that_nothing_aids() -> None:
@@ -181,13 +154,6 @@ def test_the_bridge_requests_the_rates_that_a_started_autopilot_does_not_send(
     for name, wanted in rate.items():
         assert measured[-1][name] >= 0.9 * wanted, name
     assert bridge.streams.denied == {}
-
-
-def test_a_message_that_the_autopilot_does_not_have_is_refused() -> None:
-    autopilot = Px4(ORIGIN, START_US, rates=PX4_RATES_HZ)
-    request = BRIDGE.pack("COMMAND_LONG", command=511, param1=193.0, param2=1e6)
-    (answer,) = Codec(255, 1).parse(autopilot.receive(request, START_US))
-    assert (answer["command"], answer["result"]) == (511, MAV_RESULT.FAILED)
 
 
 @pytest.mark.parametrize("airspeed", [True, False])
