@@ -77,7 +77,7 @@ class Rm3100(FramedDriver):
 
     def configure(self, bus: Bus) -> None:
         """Stop the part, write all registers, test it and start it; OSError: no RM3100, or a broken one."""
-        _check_revision(bus.read(STATUS, 3))
+        _is_ready(bus)
         bus.write(CMM, b"\0")
         bus.write(CYCLE_COUNTS, self._options.cycle_count.to_bytes(2, "big") * 3)
         bus.write(TMRC, bytes([FASTEST_TMRC + self._step]))
@@ -132,14 +132,9 @@ def encode_line(results: bytes, time: float) -> bytes:
     return b"%s*%02X\n" % (text, nmea_checksum(text))
 
 
-def _check_revision(status: bytes) -> None:
-    """Check three bytes from STATUS on; OSError: a bus without the part reads zeros or ones there."""
+def _is_ready(bus: Bus) -> bool:
+    """Return True if a measurement is complete; OSError: a bus without the part reads zeros or ones."""
+    status = bus.read(STATUS, 3)
     if len(status) != 3 or status[2] != REVISION:
         raise OSError(f"no RM3100 answers: expected {REVISION:#x} in register 0x36, got 0x{status[2:].hex()}")
-
-
-def _is_ready(bus: Bus) -> bool:
-    """Return True if a measurement is complete; OSError: no RM3100 answers."""
-    status = bus.read(STATUS, 3)
-    _check_revision(status)
     return bool(status[0] & 0x80)

@@ -1,11 +1,24 @@
-"""``twinleaf``: vector magnetometers that send TIO (the packets: :mod:`magbridge.sensors.tio`)."""
+"""``twinleaf``: vector magnetometers that send Twinleaf I/O (TIO), of either generation.
+
+As the public drivers read them: ``libtio`` (protocol overview), ``tio-python`` (devices before 2025) and
+``twinleaf-rust`` (since). On a serial line a packet and its CRC-32 stand between SLIP delimiters (RFC 1055)::
+
+    packet = type u8, routing length in the low 4 bits u8, payload length u16, payload, routing
+
+All numbers are little-endian. Both generations describe a stream before its samples can be read:
+
+* generation 1: TIMEBASE, SOURCE and STREAM packets; samples of stream 0 begin with a 32-bit number;
+* generation 2: METADATA packets with records (device, stream, segment, column); samples of streams 1 to 127
+  begin with a 24-bit number and the segment they belong to. A record begins with the length of its fixed
+  part, which later firmware may extend; strings follow.
+"""
 
 from __future__ import annotations
 
-import struct
 from itertools import accumulate
 from math import nan
 from operator import itemgetter
+from struct import Struct, error
 from typing import Annotated, Any, ClassVar, NamedTuple
 from zlib import crc32
 
@@ -14,12 +27,46 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import MAX_MEASURED_NT, Reading
-from magbridge.sensors import tio
 from magbridge.sensors.framing import CRC32_RESIDUE, Framer, saturated
 
-__all__ = ["Twinleaf", "TwinleafOptions"]
+__all__ = ["Twinleaf", "TwinleafOptions", "pack", "slip", "unslip"]
 
-SEND_ALL, METADATA = 1, 2
+END = b"\xc0"
+MAX_FRAME_BYTES = 2 * (512 + 4)
+"""Longest SLIP frame, every byte escaped."""
+MAX_ROUTING = 8
+
+RPC_REQUEST, RPC_REPLY, RPC_ERROR, HEARTBEAT, TIMEBASE, SOURCE, STREAM, METADATA = 2, 3, 4, 5, 6, 7, 8, 11
+STREAM_TYPE = 128
+"""Samples of stream n have the type 128 + n."""
+DEVICE_RECORD, STREAM_RECORD, SEGMENT_RECORD, COLUMN_RECORD = 1, 2, 3, 4
+
+TYPE_FORMATS = {
+    0x10: "B", 0x11: "b", 0x20: "H", 0x21: "h", 0x40: "I", 0x41: "i", 0x42: "f",
+    0x80: "Q", 0x81: "q", 0x82: "d",
+}  # fmt: skip
+"""Data type: format character. The high nibble of a type is its size in bytes (24 bits have no character)."""
+
+TIO_HEADER = Struct("<BBH")
+RPC_HEADER = Struct("<HH")
+TIMEBASE_HEADER = Struct("<HBBQIIIf")
+"""Number, source, epoch, start, numerator and denominator of the period in µs, flags, stability."""
+SOURCE_HEADER = Struct("<HHIIiHHB")
+"""Number, timebase, period, offset, format, flags, channels, type; then name, columns, title,
+unit by tabs."""
+STREAM_HEADER = Struct("<HHIIQHH")
+"""Number, timebase, period in its ticks, offset, sample number, components, flags."""
+COMPONENT = Struct("<HHII")
+"""Source, flags, period, offset."""
+DEVICE_HEADER = Struct("<BBIBBB")
+"""Length, length of the name, session, lengths of two strings, streams."""
+STREAM_RECORD_HEADER = Struct("<BBBBHHB")
+"""Length, stream, columns, segments, bytes of a sample, samples kept, length of the name."""
+SEGMENT_HEADER = Struct("<BBBBBBIIIIfB")
+"""Length, stream, segment, flags, epoch, length of a string, session, start, rate, decimation, filter (2)."""
+COLUMN_HEADER = Struct("<BBBBBBB")
+"""Length, stream, index, type, lengths of name, unit and description."""
+SEND_ALL_REQUEST, METADATA_REQUEST = 1, 2
 """Numbers of our two requests."""
 WRAP_1, WRAP_2 = 1 << 32, 1 << 24
 """Where the sample numbers of the two generations wrap."""
@@ -45,12 +92,39 @@ class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         if self.unit is not None and self.unit not in NT_PER_UNIT:
             raise ValueError(f"unit: expected one of {' '.join(NT_PER_UNIT)}")
         hops = self.hops()
-        if len(hops) > tio.MAX_ROUTING or max(hops, default=0) > 255:
-            raise ValueError(f"route: expected at most {tio.MAX_ROUTING} numbers up to 255")
+        if len(hops) > MAX_ROUTING or max(hops, default=0) > 255:
+            raise ValueError(f"route: expected at most {MAX_ROUTING} numbers up to 255")
 
     def hops(self) -> list[int]:
         """Return the port numbers on the way from the root to the device."""
         return [int(hop) for hop in self.route.split("/") if hop]
+
+
+class StreamColumn(NamedTuple):
+    """One number of a sample; `type` from :data:`TYPE_FORMATS`."""
+
+    name: str
+    unit: str
+    type: int
+
+
+class StreamLayout(NamedTuple):
+    """Parts of a sample: sources (generation 1), or the numbers of the columns (generation 2).
+
+    `period` is in ticks of the `timebase` (generation 1 only).
+    """
+
+    parts: tuple[int, ...]
+    timebase: int = 0
+    period: int = 1
+
+
+class Segment(NamedTuple):
+    """Samples without a break: sample n was taken at ``(start * rate + n * decimation) / rate`` s."""
+
+    start: int
+    rate: int
+    decimation: int
 
 
 class _Row(NamedTuple):
@@ -61,7 +135,7 @@ class _Row(NamedTuple):
 
     sizes: frozenset[int]
     size: int
-    fields: struct.Struct
+    fields: Struct
     pick: Any
     scale: float
 
@@ -83,14 +157,14 @@ class Twinleaf:
         self._options = options
         self._routing = bytes(reversed(options.hops()))
         self.range_nt = options.range
-        self._framer = Framer(tio.END, tio.MAX_FRAME_BYTES)
+        self._framer = Framer(END, MAX_FRAME_BYTES)
         self.frames_bad = 0
         self._session: int | None = None
         self._timebases: dict[int, float] = {}
-        self._sources: dict[int, tuple[tio.StreamColumn, ...]] = {}
-        self._streams: dict[int, tio.StreamLayout] = {}
-        self._columns: dict[tuple[int, int], tio.StreamColumn] = {}
-        self._segments: dict[tuple[int, int], tio.Segment] = {}
+        self._sources: dict[int, tuple[StreamColumn, ...]] = {}
+        self._streams: dict[int, StreamLayout] = {}
+        self._columns: dict[tuple[int, int], StreamColumn] = {}
+        self._segments: dict[tuple[int, int], Segment] = {}
         self._rows: dict[int, _Row | None] = {}
         self._last: tuple[int, int, int] = (0, 0, 0)
 
@@ -101,12 +175,11 @@ class Twinleaf:
 
     def start(self) -> tuple[bytes, ...]:
         """Return a heartbeat, and the two generations' requests for descriptors."""
-        packets = (
-            tio.pack(tio.HEARTBEAT, b"", self._routing),
-            tio.request(SEND_ALL, "data.send_all", self._routing),
-            tio.request(METADATA, "dev.metadata", self._routing),
-        )
-        return (tio.END + b"".join(map(tio.slip, packets)),)
+        packets = [pack(HEARTBEAT, b"", self._routing)]
+        for number, method in ((SEND_ALL_REQUEST, b"data.send_all"), (METADATA_REQUEST, b"dev.metadata")):
+            call = RPC_HEADER.pack(number, 0x8000 | len(method)) + method
+            packets.append(pack(RPC_REQUEST, call, self._routing))
+        return (END + b"".join(map(slip, packets)),)
 
     def feed(self, data: bytes) -> list[Reading]:
         """Process received bytes; return the readings that they complete."""
@@ -114,11 +187,11 @@ class Twinleaf:
         for frame in self._framer.split(data):
             try:
                 kind, payload = self._open(frame)
-                if kind >= tio.STREAM_TYPE:
-                    readings += self._samples(kind - tio.STREAM_TYPE, payload)
+                if kind >= STREAM_TYPE:
+                    readings += self._samples(kind - STREAM_TYPE, payload)
                 else:
                     self._describe(kind, payload)
-            except (ValueError, IndexError, struct.error):
+            except (ValueError, IndexError, error):
                 self.frames_bad += 1
                 self._framer.skipped += len(frame)
         return readings
@@ -128,43 +201,55 @@ class Twinleaf:
 
         ValueError: the packet is damaged.
         """
-        packet = tio.unslip(frame)
+        packet = unslip(frame)
         if crc32(packet) != CRC32_RESIDUE:
             raise ValueError
-        kind, routing, length = tio.TIO_HEADER.unpack_from(packet)
+        kind, routing, length = TIO_HEADER.unpack_from(packet)
         end = 4 + length
         if len(packet) != end + (routing & 0x0F) + 4:
             raise ValueError
         return (kind if packet[end:-4] == self._routing else 0), packet[4:end]
 
     def _describe(self, kind: int, payload: bytes) -> None:
-        """Take a packet that is not samples."""
-        if kind == tio.METADATA:
+        """Read a packet that is not samples."""
+        if kind == METADATA:
             self._record(payload[0], payload[2:])
-        elif kind == tio.RPC_REPLY and int.from_bytes(payload[:2], "little") == METADATA:
+        elif kind == RPC_REPLY and int.from_bytes(payload[:2], "little") == METADATA_REQUEST:
             at = 2
             while at + 1 < len(payload):
-                self._record(payload[at], payload[at + 2 : at + 2 + payload[at + 1]])
-                at += 2 + payload[at + 1]
-        elif kind == tio.HEARTBEAT and len(payload) == 4:
+                end = at + 2 + payload[at + 1]
+                self._record(payload[at], payload[at + 2 : end])
+                at = end
+        elif kind == HEARTBEAT and len(payload) == 4:
             self._session = int.from_bytes(payload, "little")
-        elif kind == tio.TIMEBASE:
-            self._remember(self._timebases, *tio.timebase(payload))
-        elif kind == tio.SOURCE:
-            self._remember(self._sources, *tio.source(payload))
-        elif kind == tio.STREAM:
-            self._remember(self._streams, *tio.stream(payload))
+        elif kind == TIMEBASE:
+            number, _, _, _, numerator, denominator, _, _ = TIMEBASE_HEADER.unpack_from(payload)
+            self._remember(self._timebases, number, 1e-6 * numerator / (denominator or 1))
+        elif kind == SOURCE:
+            number, _, _, _, _, _, channels, code = SOURCE_HEADER.unpack_from(payload)
+            self._remember(self._sources, number, _columns(payload[SOURCE_HEADER.size :], channels, code))
+        elif kind == STREAM:
+            number, timebase, period, _, _, count, _ = STREAM_HEADER.unpack_from(payload)
+            places = range(STREAM_HEADER.size, STREAM_HEADER.size + COMPONENT.size * count, COMPONENT.size)
+            parts = tuple(COMPONENT.unpack_from(payload, place)[0] for place in places)
+            self._remember(self._streams, number, StreamLayout(parts, timebase, period))
 
     def _record(self, kind: int, record: bytes) -> None:
-        """Take a record of generation 2."""
-        if kind == tio.DEVICE_RECORD:
+        """Read a record of generation 2."""
+        if kind == DEVICE_RECORD:
             self._session = int.from_bytes(record[2:6], "little")
-        elif kind == tio.STREAM_RECORD:
-            self._remember(self._streams, *tio.stream_record(record))
-        elif kind == tio.COLUMN_RECORD:
-            self._remember(self._columns, *tio.column(record))
-        elif kind == tio.SEGMENT_RECORD:
-            self._remember(self._segments, *tio.segment(record))
+        elif kind == STREAM_RECORD:
+            _, number, columns, _, _, _, _ = STREAM_RECORD_HEADER.unpack_from(record)
+            self._remember(self._streams, number, StreamLayout(tuple(range(columns))))
+        elif kind == COLUMN_RECORD:
+            size, number, index, code, name, unit, _ = COLUMN_HEADER.unpack_from(record)
+            text = record[size:]
+            words = [part.decode("utf-8", "replace") for part in (text[:name], text[name : name + unit])]
+            self._remember(self._columns, (number, index), StreamColumn(words[0], words[1], code))
+        elif kind == SEGMENT_RECORD:
+            header = SEGMENT_HEADER.unpack_from(record)
+            segment = Segment(header[7], header[8] or 1, header[9] or 1)
+            self._remember(self._segments, (header[1], header[2]), segment)
 
     def _remember(self, table: dict[Any, Any], key: Any, value: Any) -> None:
         if table.get(key) != value:
@@ -199,22 +284,16 @@ class Twinleaf:
             values = row.pick(row.fields.unpack_from(payload, 4 + (n - first) * row.size))
             x, y, z = values[0] * row.scale, values[1] * row.scale, values[2] * row.scale
             temperature = values[3] if len(values) == 4 else nan
-            if (
-                not abs(x) + abs(y) + abs(z) < MAX_MEASURED_NT or abs(temperature) > MAX_MEASURED_NT
-            ):  # also NaN
+            is_field = abs(x) + abs(y) + abs(z) < MAX_MEASURED_NT  # False for NaN
+            if not is_field or abs(temperature) > MAX_MEASURED_NT:
                 self.frames_bad += 1
                 self._framer.skipped += row.fields.size
                 continue
-            readings.append(
-                Reading(
-                    (x, y, z),
-                    sequence=(zero + n) % WRAP_1,
-                    device_time=begin + n * period,
-                    temperature=temperature,
-                    power_cycle=self._session,
-                    saturated=saturated(x, y, z, self.range_nt),
-                )
-            )
+            reading = Reading(
+                (x, y, z), None, (zero + n) % WRAP_1, begin + n * period, temperature=temperature,
+                power_cycle=self._session, saturated=saturated(x, y, z, self.range_nt),
+            )  # fmt: skip
+            readings.append(reading)
         return readings
 
     def _timing(self, number: int, payload: bytes) -> tuple[int, int, int, float] | None:
@@ -242,7 +321,7 @@ class Twinleaf:
         self._last = key, number, turns
         return number + turns * wrap
 
-    def _described(self, number: int) -> list[tuple[tio.StreamColumn, ...]] | None:
+    def _described(self, number: int) -> list[tuple[StreamColumn, ...]] | None:
         """Return the parts of a stream's samples, each with its columns; None where not all are known yet."""
         stream = self._streams.get(number)
         if stream is None or (number == 0 and stream.timebase not in self._timebases):
@@ -253,7 +332,7 @@ class Twinleaf:
         columns = [self._columns.get((number, part)) for part in stream.parts]
         return [(column,) for column in columns if column is not None] if all(columns) else None
 
-    def _compile(self, parts: list[tuple[tio.StreamColumn, ...]]) -> _Row | None:
+    def _compile(self, parts: list[tuple[StreamColumn, ...]]) -> _Row | None:
         """Return how to read samples of these parts; None where our channels are not among them."""
         columns = [column for part in parts for column in part]
         names = [column.name for column in columns]
@@ -263,18 +342,43 @@ class Twinleaf:
         if self._options.temperature in names:
             wanted.append(names.index(self._options.temperature))
         scale = NT_PER_UNIT.get(self._options.unit or columns[wanted[0]].unit)
-        if scale is None or any(columns[index].type not in tio.TYPE_FORMATS for index in wanted):
+        if scale is None or any(columns[index].type not in TYPE_FORMATS for index in wanted):
             raise ValueError
         offsets = [0, *accumulate(column.type >> 4 for column in columns)]
         text, at = "<", 0
         for index in sorted(wanted):
-            text += f"{offsets[index] - at}x{tio.TYPE_FORMATS[columns[index].type]}"
+            text += f"{offsets[index] - at}x{TYPE_FORMATS[columns[index].type]}"
             at = offsets[index + 1]
         ends = accumulate(len(part) for part in parts)
         return _Row(
             frozenset(offsets[end] for end in ends),
             offsets[-1],
-            struct.Struct(text),
+            Struct(text),
             itemgetter(*(sorted(wanted).index(index) for index in wanted)),
             scale,
         )
+
+
+def unslip(frame: bytes) -> bytes:
+    """Return the packet in a SLIP frame, its CRC-32 still behind it."""
+    return frame.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
+
+
+def slip(packet: bytes) -> bytes:
+    """Return a packet as it stands on the line, with its CRC-32 and delimiter."""
+    packet += crc32(packet).to_bytes(4, "little")
+    return packet.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + END
+
+
+def pack(kind: int, payload: bytes, routing: bytes = b"") -> bytes:
+    """Return a packet of the type `kind`; `routing` names the device, last hop first."""
+    return TIO_HEADER.pack(kind, len(routing), len(payload)) + payload + routing
+
+
+def _columns(text: bytes, channels: int, code: int) -> tuple[StreamColumn, ...]:
+    """Return the columns of a source, named ``source.column``: name, columns, title and unit by tabs."""
+    texts = [*text.decode("utf-8", "replace").split("\t"), "", "", ""]
+    name, unit, names = texts[0], texts[3], texts[1].split(",")
+    if channels == 1 or len(names) != channels:
+        return (StreamColumn(name, unit, code),) * min(channels, 128)
+    return tuple(StreamColumn(f"{name}.{column}", unit, code) for column in names)

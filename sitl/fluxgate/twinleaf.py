@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from struct import pack
 from zlib import crc32
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import Reading
-from magbridge.sensors import tio
-from magbridge.sensors import twinleaf as wire
+from magbridge.sensors import twinleaf as tio
 from magbridge.sensors.framing import CRC32_RESIDUE, Framer
 from sitl.fluxgate.encoder import Encoder, clip
 
@@ -22,7 +22,7 @@ STREAM = {1: 0, 2: 1}
 class TwinleafEncoder(Encoder):
     """A TIO device; set `generation` before its first reading to have the older one."""
 
-    Options = wire.TwinleafOptions
+    Options = tio.TwinleafOptions
     generation = 2
 
     def power_on(self) -> None:
@@ -44,10 +44,10 @@ class TwinleafEncoder(Encoder):
         if self.options.temperature:
             values.append(reading.temperature)
         if self.generation == 1:
-            header = (number % wire.WRAP_1).to_bytes(4, "little")
+            header = (number % tio.WRAP_1).to_bytes(4, "little")
         else:
-            header = (number % wire.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
-        samples = header + b"".join(tio.FLOAT.pack(value) for value in values)
+            header = (number % tio.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
+        samples = header + b"".join(pack("<f", value) for value in values)
         packet = self._slip(tio.STREAM_TYPE + STREAM[self.generation], samples)
         if self._described:
             return packet
