@@ -64,18 +64,8 @@ def loosened(
 ) -> Joint:
     """Return the fit with the coefficients' covariance for nonlinear parameters that are free as well.
 
-    Parameters
-    ----------
-    problem : Problem
-        The survey.
-    model : sequence of Candidate
-        The causes found.
-    columns : sequence of Columns
-        Of the model, in this problem.
-    fit : Joint
-        Of the model, its nonlinear parameters held.
-    grid : sequence of Candidate
-        All candidates that were searched.
+    `columns` are those of the model in this problem, `fit` has its nonlinear parameters held, and `grid` are
+    all candidates of the search.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if all(piece.point.rebuild is None for piece in pieces):
@@ -217,12 +207,8 @@ def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list
     """Drop the rates of change and the delays that make the live correction worse.
 
     In flight the next sample is not known yet, so a rate is a backward difference, which is mostly noise if
-    the vehicle sways from sample to sample.
-
-    Returns
-    -------
-    Calibration, list of int
-        The calibration without those effects, and their places among the effects that it was given with.
+    the vehicle sways from sample to sample. Returned are the calibration without those effects, and their
+    places among the effects that it was given with.
     """
     dropped: list[int] = []
     # Greedy: each rate is dropped if the residual with live differences is smaller without it
@@ -287,21 +273,8 @@ def relinearised(
     """Fit again about the extended calibration until the linear model predicts the nonlinear residual.
 
     Gauss-Newton steps with step halving. Rates of change keep the central differences of the search, because
-    the backward differences of the live effects contain the noise of their own sample.
-
-    Parameters
-    ----------
-    problem : Problem
-        Comparison, linearised about the calibration as given.
-    model : sequence of Candidate
-        Causes that extend the calibration; without any, the calibration's own coefficients are refitted.
-    fit : Joint
-        Fit of the model in this problem.
-
-    Returns
-    -------
-    Problem, list of Columns, Joint
-        The problem linearised at the last point, the columns of the model's pieces there, and the fit.
+    the backward differences of the live effects contain the noise of their own sample. Returned are the
+    problem linearised at the last point, the columns of the model's pieces there, and the fit.
     """
     ridge, order, blocks = fit.prior[len(fit.z) :], fit.noise.past.order, fit.noise.uneven
     # The calibration as given is the point that a step which overshoots is halved towards

@@ -111,24 +111,11 @@ def extension_of(
 ) -> Extension:
     """Extend the calibration by the causes of a model; refuse an extension that its corrected field belies.
 
-    Parameters
-    ----------
-    problem : Problem
-        Comparison, linearised about the calibration as given.
-    model : sequence of Candidate
-        Named causes; without any, the calibration's own coefficients are refitted.
-    fit : Joint
-        Fit of the model in this problem.
-    counts : (n,) bool array
-        Samples by which the improvement is measured.
-    grid : sequence of Candidate
-        All candidates that were searched, for the uncertainty of nonlinear parameters.
-
-    Returns
-    -------
-    Extension
-        The first of the attempts, each with a tighter prior than the one before, that passes all checks; the
-        first attempt with its reason for refusal where none passes.
+    The `fit` of the model is linearised about the calibration as given; without a model the calibration's own
+    coefficients are refitted. `counts` (n,) are the samples by which the improvement is measured. All
+    candidates of the search (`grid`) give the uncertainty of nonlinear parameters. Returned is the first
+    attempt, each with a tighter prior than the one before, that passes all checks; or else the first attempt
+    with its reason for refusal.
     """
     # From the prior as given to a tighter one, until the corrected field passes every check
     first = None
@@ -284,22 +271,9 @@ def check_written(
 ) -> tuple[float, float] | None:
     """Read a written calibration back and correct the logs with it as ``magbridge correct`` does.
 
-    Parameters
-    ----------
-    content : bytes
-        Content of ``calibration.json``.
-    given : Calibration
-        Calibration before the extension.
-    datasets : sequence of Dataset
-        Logs that were diagnosed; of a long log the first :data:`MAX_CHECKED_ROWS` rows are corrected.
-    grid : AnomalyGrid, optional
-        Added to the main field where a log has no reference of its own.
-
-    Returns
-    -------
-    tuple of 2 float or None
-        RMS error with the calibration as given and with the written one, nT, if the latter is larger by more
-        than the noise; None if the file performs as computed.
+    `content` is that of ``calibration.json``; of a long log the first :data:`MAX_CHECKED_ROWS` rows are
+    corrected. Returned are the RMS errors with the calibration as `given` and with the written one, nT, if
+    the latter is larger by more than the noise; None if the file performs as computed.
     """
     written = decode_calibration(content, "calibration.json")
     errors: dict[bool, list[FloatArray]] = {False: [], True: []}

@@ -91,14 +91,7 @@ def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 class JointDesign:
-    """The columns of a hypothesis, the calibration's and the effects'.
-
-    Parameters
-    ----------
-    problem : Problem
-    columns : sequence of Columns
-        The effects'.
-    """
+    """The columns of a hypothesis, the calibration's and those of the effects."""
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
         self.problem, self.columns, self.pieces = problem, columns, row_blocks(len(problem))
@@ -189,14 +182,10 @@ class Ridge:
 
 
 class Statistic:
-    """The likelihood ratio of one candidate's coefficients.
+    """The likelihood ratio of one candidate's coefficients, of information S (k, k).
 
-    Parameters
-    ----------
-    S : (..., k, k) array
-        Of one candidate or, without spectra, of several with as many coefficients.
-    spectra : (l, k) array, optional
-        Alternatives for the prior variances, up to a common factor; without any, each coefficient is free.
+    `spectra` (l, k) are alternatives for the prior variances, up to a common factor. Without them each
+    coefficient is free, and S (..., k, k) may be that of several candidates.
     """
 
     def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:
@@ -291,27 +280,20 @@ def fit_joint(
 
     Parameters
     ----------
-    problem : Problem
-        The survey, with the prior of its q calibration coefficients.
-    columns : sequence of Columns
-        The effects'.
-    order : int
-        Of the noise's autoregression.
+    problem, columns, order, rounds
+        The comparison, the k columns of the effects, the order of the noise's autoregression, most rounds.
     *starts : (q + k,) array
         Starting points, of which the best is taken; without any, the prior mean.
     plain : bool
         Try the result of plain least squares as a starting point, too.
     spectra : sequence of (l, k) array or None
-        For each of `columns` whose coefficients have one common size (:mod:`.joint`): l alternatives
-        for their prior variances.
+        For each of `columns` whose coefficients have one common size: l alternatives for their variances.
     like : Joint, optional
         A fit of similar noise, from which this one's begins: saves time.
     blocks, brief : bool, optional
         See :func:`~magbridge.diagnose.noise.fit_noise`.
     ridge : float or (k,) array
         Prior precision of the effects, in units of their widths.
-    rounds : int
-        At most.
     stride : int
         Pieces of the log of which one counts in the normal equations; the noise is that of every sample.
     """
@@ -480,16 +462,9 @@ def paired(
 ) -> Improvement:
     """Compare two residuals on the same samples.
 
-    The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
-
-    Parameters
-    ----------
-    error_before, error_after : (n,) array
-        nT.
-    dive : (n,) int array
-        Number of the dive that each sample belongs to.
-    counts : (n,) bool array
-        Samples that count.
+    The errors (n,) are in nT, `dive` (n,) is the number of each sample's dive, `counts` (n,) says which
+    samples count. The interval comes from a bootstrap of whole dives, so correlation within a dive does no
+    harm.
     """
     # Sums of squares of each dive: the bootstrap then draws dives, not samples
     number = np.unique(dive[counts], return_inverse=True)[1]

@@ -52,16 +52,7 @@ def varying(
 
     A cause of the table has one size in a log: its true name leaves nothing of this kind. A name that stands
     for something else (a current's, where its leads move, or where a joint closes under pressure) leaves its
-    own regressor times a function of that.
-
-    Parameters
-    ----------
-    problem : Problem
-        The survey.
-    candidate : Candidate
-        The cause; None is returned for one that takes almost any shape.
-    look_elsewhere : mapping
-        Cause -> number of independent hypotheses behind it.
+    own regressor times a function of that. None is returned for a cause that takes almost any shape.
     """
     if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
         return None

@@ -187,20 +187,8 @@ class ResidualNoise:
 class Predictors:
     """Predictors of the samples shortly after a gap.
 
-    Parameters
-    ----------
-    past : Past
-    ar : (p,) array
-
-    Attributes
-    ----------
-    past, ar
-    a : (l, p) array
-        a of the module's notes, for each pattern of lags.
-    f : (l,) array
-        f of the module's notes.
-    weights : (l, p + 1) array
-        Of a sample, f, and of those before it, ``-f a``.
+    For each of l patterns of lags they have `a` (l, p) and `f` (l,) of the module's notes, and the `weights`
+    (l, p + 1) of a sample, f, and of those before it, ``-f a``.
     """
 
     def __init__(self, history: Past, ar: FloatArray) -> None:
@@ -298,20 +286,11 @@ def fit_noise(
     like: ResidualNoise | None = None,
     brief: bool = False,
 ) -> ResidualNoise:
-    """Fit the noise model.
+    """Fit the noise model to a residual (n,), nT, with an autoregression of the order of its `history`.
 
-    Parameters
-    ----------
-    residual : (n,) array
-        nT.
-    history : Past
-        The samples before each one; its order is that of the autoregression.
-    blocks : bool, optional
-        Let the level change from block to block; decided by the data if not given.
-    like : Noise, optional
-        A noise that it will resemble: the fit begins from its level and tails.
-    brief : bool
-        Allow no longer time constant than :data:`BRIEFEST`.
+    The level changes from block to block if `blocks` is true; the data decide if it is None. The fit begins
+    from the level and tails of a noise that it will be `like`. `brief` allows no longer time constant than
+    :data:`BRIEFEST`.
     """
     n, order, whole = len(residual), history.order, history.whole
     count = _counts(n)

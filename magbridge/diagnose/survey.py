@@ -86,15 +86,7 @@ not the position of a mass but a code for "not known"."""
 
 
 def kinds_of(name: str, unit: str) -> tuple[str, ...]:
-    """Return the kinds that a telemetry series may be, of ``temperature current pressure position``.
-
-    Parameters
-    ----------
-    name : str
-        The column's.
-    unit : str
-        As declared; empty if it is not.
-    """
+    """Return the kinds that a telemetry series may be, of ``temperature current pressure position``."""
     # A unit decides where it is specific; else the words of the name; else every kind is possible
     if unit in UNIT_KINDS:
         return UNIT_KINDS[unit]
@@ -141,19 +133,11 @@ def dives_of(table: Table) -> IntArray:
 
 
 def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
-    """Return the number of each sample's day, or None where the diagnosed log is of fewer than two days.
+    """Return the number (n,) of each sample's day, or None where the diagnosed log is of fewer than two days.
 
-    Parameters
-    ----------
-    time : (n,) array
-        Times of the samples, s.
-    learned : (n,) bool array
-        Samples that serve only as a comparison; they have the number -1.
-
-    Notes
-    -----
     A day begins with the first sample, after :data:`DAY_S`, and after a gap of :data:`NIGHT_S`. Days of fewer
-    than :data:`MIN_SAMPLES_A_DAY` samples count to the day before.
+    than :data:`MIN_SAMPLES_A_DAY` samples count to the day before. Samples that serve only as a comparison
+    (`learned`) have the number -1.
     """
     day, number, start, last = np.full(len(time), -1), -1, -np.inf, -np.inf
     fresh = np.flatnonzero(~learned)
@@ -192,25 +176,18 @@ def _part(table: Table, rows: BoolArray) -> Table:
 
 
 class Past:
-    """The p samples before each sample, and their lags.
+    """The p samples before each sample (`order` p), and their lags.
 
-    Parameters
-    ----------
-    steps : (n,) int array
-        Intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none.
-    order : int
-        p.
+    `steps` (n,) are the intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none.
 
     Attributes
     ----------
-    order : int
     whole : (n,) bool array
         True if no gap precedes: the p previous samples have the lags 1 to p.
     rows : (m,) int array
-        Samples where there is one.
+        Samples where a gap precedes.
     lags : (l, p) int array
-        Patterns of lags at `rows`, in intervals; :data:`MAX_LAG` where a sample is too long ago,
-        or there is none.
+        Patterns of lags at `rows`, in intervals; :data:`MAX_LAG` where a sample is too long ago.
     pattern : (m,) int array
         Pattern of each of `rows`.
     """
@@ -327,18 +304,10 @@ class Survey:
 def assemble(
     table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
 ) -> Survey:
-    """Make a survey from complete columns: find channels, dives and gaps.
+    """Make a survey from complete columns (n,) in order of time: find channels, dives and gaps.
 
-    Parameters
-    ----------
-    table : dict of (n,) arrays
-        In order of time; ``fitted`` and ``learned`` are 1 where the survey's are true.
-    units : dict
-        Column -> unit.
-    source : str
-        The logs that are diagnosed, for people to read.
-    needed : sequence of str
-        Channels that are kept even if they never change.
+    Columns ``fitted`` and ``learned`` are 1 where the survey's are true; the `needed` channels are kept even
+    if they never change.
     """
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
