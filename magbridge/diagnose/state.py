@@ -59,13 +59,15 @@ class SearchState:
         Group -> degrees of freedom of the noise's level.
     groups : dict
         Cause and channel -> places of its candidates.
+    stride : int
+        Pieces of a long log of which one is used to choose what is fitted to all samples.
     brief : bool
         Whether noise may be correlated for a short time only: :meth:`with_brief_noise`.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
         self.problem, self.candidates, self.order, self.causes = problem, list(candidates), order, causes
-        self.brief = False
+        self.brief, self.stride = False, max(len(problem) // MAX_SCREENED_SAMPLES, 1)
         self.at = slices(self.candidates)
         self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
         self.look_elsewhere: dict[str, float] = {}
@@ -135,13 +137,12 @@ class SearchState:
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Fit the best causes given `model`, each on its own, and list them, the likeliest first."""
         # Score all candidates: under the noise of the model, then under that without the best of every cause
-        stride = max(len(self.problem) // MAX_SCREENED_SAMPLES, 1)
-        screened = self._information_under(base.noise, model, base, stride) if stride > 1 else None
+        screened = self._information_under(base.noise, model, base, self.stride) if self.stride > 1 else None
         as_fitted = (screened or self.conditional_on(model, base)).fitted(base)
         if not self.look_elsewhere:
             self.look_elsewhere = look_elsewhere_factors(as_fitted, self.candidates, self.at)
         under: dict[Group, list[Best]] = {}
-        for info in (as_fitted, self._cleared(model, base, as_fitted, stride)):
+        for info in (as_fitted, self._cleared(model, base, as_fitted)):
             for group, best in self.best(info).items():
                 under.setdefault(group, []).append(best)
         # The likeliest of each group are fitted jointly with calibration and noise
@@ -160,7 +161,7 @@ class SearchState:
         assert info is not None
         return info
 
-    def _cleared(self, model: list[Candidate], base: Joint, info: Information, stride: int) -> Information:
+    def _cleared(self, model: list[Candidate], base: Joint, info: Information) -> Information:
         """Information under the noise that remains when the best candidate of every cause is fitted."""
         # The best candidate of each cause, all in one model with the prior of plausible sizes
         top: dict[str, Best] = {}
@@ -179,14 +180,14 @@ class SearchState:
             ridge=1.0,
             rounds=1,
             brief=self.brief,
-            stride=stride,
+            stride=self.stride,
         )
         # How well the noise's level is known at the frequencies of each group (F test)
         if not model:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
             certain = certainty(everything.residual, everything.noise, middle)
             self.certain = dict(zip(self.groups, certain, strict=True))
-        return self._information_under(everything.noise, model, base, stride).fitted(base)
+        return self._information_under(everything.noise, model, base, self.stride).fitted(base)
 
     def _information_under(
         self, noise: ResidualNoise, model: Sequence[Candidate], base: Joint, stride: int = 1
@@ -286,12 +287,11 @@ def _profiled(
             shape = [v for v, _ in best.candidate.point.shape.values()]
             shape[position] = float(value)
             made.append(rebuild(*shape))
-        info = information(
-            state.problem, best.fit.noise, base, [*(c.columns for c in made), *columns]
-        ).fitted(base)
+        every = [*(c.columns for c in made), *columns]
+        info = information(state.problem, best.fit.noise, base, every, stride=state.stride).fitted(base)
         at = slices(made)
         scores = [score(info, own, made[0]) for own in at]
-        ratios = np.array([s.ratio for s in scores])
+        ratios = state.stride * np.array([s.ratio for s in scores])
         k = int(np.argmax(ratios))
         if not stage:
             # as a share of one cell: the bracket spans two

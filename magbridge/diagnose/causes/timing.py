@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IntArray
 from magbridge.calibration.effects import ClockEffect
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.diagnose.causes.base import Cause
@@ -92,6 +92,14 @@ class ChannelSkew(_Rate):
     on, width_s = "skew", 0.5
 
 
+@cached_per_problem
+def _legs(problem: Problem) -> tuple[FloatArray, IntArray]:
+    """(n, k) positions of the masses, (n,) number of the leg: every shift of the telemetry shares them."""
+    survey = problem.survey
+    p = survey.values([parameter.name for parameter in problem.calibration.parameters])
+    return p, np.cumsum(~survey.follows(MAX_MISSING_SAMPLES))
+
+
 def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
     r"""Return the mean rates of change of the nine coefficients over a shift of the telemetry.
 
@@ -104,9 +112,8 @@ def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
     A mass that moves within one sampling interval has no rate at any sample, but it has moved after a shift.
     Positions between samples are interpolated, and none across a gap.
     """
-    survey, kernel = problem.survey, problem.calibration.kernel
-    p, t = survey.values([parameter.name for parameter in problem.calibration.parameters]), survey.time
-    leg = np.cumsum(~survey.follows(MAX_MISSING_SAMPLES))
+    kernel, t = problem.calibration.kernel, problem.survey.time
+    p, leg = _legs(problem)
 
     def rows_of(rows: slice) -> FloatArray:
         later = t[rows] + shift
