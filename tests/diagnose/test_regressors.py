@@ -70,7 +70,7 @@ def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
                 for effect in candidate.effects
             ]
             np.testing.assert_allclose(
-                candidate.columns(slice(0, None)) / candidate.width, np.hstack(stepped), rtol=1e-9, atol=1e-9
+                candidate.columns(slice(0, None)) / candidate.width, np.hstack(stepped), rtol=1e-6, atol=1e-6
             )
             seen += 1
     assert seen > 30
