@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
-from gliders import make
+from gliders import Glider, make
 
 from magbridge.cli import main
 from magbridge.fleet.catalogue import CATALOGUE_TABLES, Row
@@ -16,9 +17,14 @@ from magbridge.logs.deployment import deployment
 DAY = 86_400.0
 
 
+@cache
+def _glider(vehicle: int) -> Glider:
+    return make(vehicle, masses=1)
+
+
 def fly(path: Path, vehicle: int, number: int, start: float | None = None, sensor: str = "") -> Path:
     """Write a vehicle's calibration runs, one moving mass; each deployment has an offset of its own."""
-    runs = make(vehicle, masses=1).runs
+    runs = _glider(vehicle).runs
     rows = np.arange(0, len(runs), 2)
     rng = np.random.default_rng([vehicle, number])
     field = runs.field[rows] + rng.normal(0, 5, 3) + rng.normal(0, 1, (len(rows), 3))

@@ -23,6 +23,8 @@ DECLARED = 1.0
 """s without GPS after which it dead-reckons: AP_NavEKF3.h, deadReckonDeclare_ms."""
 POSITION_NOISE = 0.5
 """m: EK3_POSNE_M_NSE, AP_NavEKF3.cpp."""
+VISO_QUAL_MIN = 0
+"""Percent: the parameter of that name."""
 VISO_NOISE = 0.2
 """m: VISO_POS_M_NSE, AP_VisualOdom.cpp."""
 AIDED = 15.0
@@ -42,14 +44,6 @@ class ArduPilot(Autopilot):
 
     Its source set is switched to external navigation when GPS is lost, as a user or a script does.
 
-    Parameters
-    ----------
-    viso_quality_min : int
-        VISO_QUAL_MIN.
-    fuses_positions : bool
-        With the change that is proposed (pull request 31738): EXTERNAL_POSITION_ESTIMATE is fused, and
-        GLOBAL_POSITION_SENSOR is accepted and fused.
-
     Attributes
     ----------
     internal_errors : int
@@ -63,15 +57,9 @@ class ArduPilot(Autopilot):
     WALK = 5e-4
     """AP_NavEKF3_core.cpp: each 12 ms the variance grows by sq(dt * EK3_WIND_P_NSE), 0.2."""
 
-    def __init__(
-        self, *args: Any, viso_quality_min: int = 0, fuses_positions: bool = False, **settings: Any
-    ) -> None:
+    def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
         self.internal_errors = 0
-        self._fuses = fuses_positions
-        if fuses_positions:
-            self._takes[spec("GLOBAL_POSITION_SENSOR").id] = self._sensor
-        self._quality_min = viso_quality_min
         self._visual_us = self._fused_us = -(10**12)  # came; was fused
         self._reset_counter: int | None = None
         self._takes[spec("ODOMETRY").id] = self._odometry
@@ -109,20 +97,9 @@ class ArduPilot(Autopilot):
         age = min(max(message["param2"], 0.0), 5.0)  # moved on by its own velocity, for 5 s at most
         north, east = self.local((message["x"] * 1e-7, message["y"] * 1e-7))
         vn, ve = self.filter.velocity
-        if self._fuses:
-            self.filter.fuse((north + vn * age, east + ve * age), sigma**2)
-            return MAV_RESULT.ACCEPTED
         self.filter.reset((north + vn * age, east + ve * age), sigma**2)
         self._resets += 1
         return MAV_RESULT.ACCEPTED
-
-    def _sensor(self, message: Message) -> str:
-        if self.since_gps() < DECLARED or not self.aiding:
-            return "unused: GPS is the source"
-        eph = message["eph"]
-        sigma = max(POSITION_NOISE if isnan(eph) else eph, POSITION_NOISE)
-        self.filter.fuse(self.local((message["lat"] * 1e-7, message["lon"] * 1e-7)), sigma**2)
-        return "fused"
 
     @property
     def can_arm(self) -> bool:
@@ -147,7 +124,7 @@ class ArduPilot(Autopilot):
             sigma = 50.0 if isnan(sigma) else sigma
         # AP_VisualOdom_MAV.cpp, handle_pose_estimate
         self._visual_us = self._now_us
-        if message["quality"] < self._quality_min:
+        if message["quality"] < VISO_QUAL_MIN:
             return "dropped: quality"
         sigma = min(max(sigma, VISO_NOISE), 100.0)
         # AP_NavEKF3_Measurements.cpp, writeExtNavData

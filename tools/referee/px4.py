@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
@@ -18,6 +17,8 @@ PX4_RATES_HZ = {
 }  # fmt: skip
 """Hz after a start: mavlink/mavlink_main.cpp, configure_streams_to_default, MAVLINK_MODE_NORMAL."""
 
+AGP0_ID = 1
+"""Id of the one auxiliary source: EKF2_AGP0_ID."""
 STOPPED = 5.0
 """s without data, after which an auxiliary position stops: aux_global_position_control.cpp in ekf2/EKF."""
 RETRY = 7.0
@@ -37,11 +38,6 @@ class Px4(Autopilot):
 
     Parameters
     ----------
-    agp_ids : sequence of int
-        EKF2_AGP0_ID, EKF2_AGP1_ID ...; 0 is off. Each is a source of its own (since early 2026).
-    agp_mode : int
-        EKF2_AGPn_MODE: 0, a source that was refused for long is reset to; 1, only if nothing else gives a
-        velocity, as airspeed does.
     replaces_claim : bool
         Up to version 1.16: EXTERNAL_POSITION_ESTIMATE replaces the uncertainty; later it is fused.
     """
@@ -51,28 +47,16 @@ class Px4(Autopilot):
     WALK = 2.5e-3
     """EKF2_WIND_NSD, 0.05 m/s²/√Hz."""
 
-    def __init__(
-        self,
-        *args: Any,
-        agp_ids: Sequence[int] = (1,),
-        agp_mode: int = 0,
-        replaces_claim: bool = False,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, *args: Any, replaces_claim: bool = False, **settings: Any) -> None:
         super().__init__(*args, **settings)
-        self._mode, self._replaces = agp_mode, replaces_claim
-        never = -(10**12)
-        self._pushed_us = {number: never for number in agp_ids if number}
-        self._fused_us = dict(self._pushed_us)
+        self._replaces = replaces_claim
+        self._pushed_us = self._fused_us = -(10**12)
         self._takes[spec("GLOBAL_POSITION_SENSOR").id] = self._sensor
         self._takes[spec("ODOMETRY").id] = self._odometry
 
     def _active(self) -> bool:
         """Return whether an auxiliary position aids."""
-        return any(
-            self._now_us - min(self._fused_us[number], self._pushed_us[number]) < STOPPED * 1e6
-            for number in self._fused_us
-        )
+        return self._now_us - min(self._fused_us, self._pushed_us) < STOPPED * 1e6
 
     def _gps_wins(self) -> bool:
         # ekf2/EKF/aid_sources/gnss/gps_control.cpp: reset only while no other position aids
@@ -113,18 +97,16 @@ class Px4(Autopilot):
 
     def _sensor(self, message: Message) -> str:
         # mavlink/mavlink_receiver.cpp: one slot an id, the arrival is the time
-        number = message["id"]
-        if number not in self._pushed_us:
+        if message["id"] != AGP0_ID:
             return "dropped: id"
-        self._pushed_us[number] = self._now_us
+        self._pushed_us = self._now_us
         # ekf2/EKF/aid_sources/aux_global_position_control.cpp: max(eph, EKF2_AGPn_NOISE) drops a NaN
         eph = message["eph"]
         variance = max(1.0 if isnan(eph) else eph, 1.0) ** 2
         place = self.local((message["lat"] * 1e-7, message["lon"] * 1e-7))
-        unfused = (self._now_us - max(self._fused_us.values())) * 1e-6
-        # aux_global_position_control.cpp, isResetAllowed: no other position aids; with mode 1, nor does a
-        # velocity, as which airspeed with sideslip counts (estimator_interface.cpp)
-        allowed = self.since_gps() > RETRY and not (self._mode == 1 and self._airspeed)
+        unfused = (self._now_us - self._fused_us) * 1e-6
+        # aux_global_position_control.cpp, isResetAllowed with EKF2_AGP0_MODE 0: no other position aids
+        allowed = self.since_gps() > RETRY
         if self.filter.distance(place, variance) <= GATE:
             self.filter.fuse(place, variance)
         elif unfused > RETRY and allowed:
@@ -132,7 +114,7 @@ class Px4(Autopilot):
             self._resets += 1
         else:
             return "refused: gate"
-        self._fused_us[number] = self._now_us
+        self._fused_us = self._now_us
         return "fused"
 
     def _odometry(self, message: Message) -> str:
