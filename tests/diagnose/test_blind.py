@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 import xarray as xr
 from study import deployment
 from study.cases import case
-from study.deployment import GLIDER, LOSSES, NOISES
+from study.deployment import GLIDER, LOSSES
 from study.ideal import cause_names
 from study.table import is_worse, sets
 
@@ -64,15 +65,13 @@ def test_outliers_are_found() -> None:
     assert [found[0] for found in row["found"]] == ["outliers"]
 
 
-@pytest.mark.parametrize("noise", NOISES)
-def test_nothing_is_found_where_nothing_is(noise: str) -> None:
-    assert blind("null", (), 0.0, noise, number=6)["verdict"] == "nothing_found"
-
-
-@pytest.mark.parametrize("losses", LOSSES)
-def test_samples_that_are_lost_are_nothing_either(losses: str) -> None:
-    """Noise remembers longer than the log goes without a gap."""
-    assert blind("null", (), 0.0, "mixed", number=6, losses=losses)["verdict"] == "nothing_found"
+@pytest.mark.parametrize(
+    ("noise", "losses"),
+    [*product(("white", "ar", "half"), [""]), *zip(("mixed", "heavy", "uneven", "map"), LOSSES, strict=True)],
+)
+def test_nothing_is_found_where_nothing_is(noise: str, losses: str) -> None:
+    """In noise of each kind; nor where samples are lost, and noise remembers longer than between gaps."""
+    assert blind("null", (), 0.0, noise, number=6, losses=losses)["verdict"] == "nothing_found"
 
 
 def test_samples_that_are_lost_hide_nothing() -> None:
