@@ -5,6 +5,8 @@ then the rows. A heading may itself be a comment. A file without headings is rea
 declared by their numbers: ``column_1`` is the first. The separator is the one by which headings and rows have
 the same number of fields; decimal commas are known by cells like ``-12,5``. Assumptions are kept for the
 user.
+
+:class:`Layout` is a frozen record: each step of :mod:`.naming` returns a new one.
 """
 
 from __future__ import annotations
@@ -12,21 +14,23 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from math import nan
 from pathlib import Path
+from typing import NamedTuple
 
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.headings import CELL_NUMBER, is_unit
 from magbridge.logs.mapping import ColumnMapping, declared_by_maker
-from magbridge.logs.naming import name_columns, units_of_angles
-from magbridge.logs.validity import Validity, validity_of
+from magbridge.logs.validity import Validity
 from magbridge.wording import counted
 
-__all__ = ["BLANKS", "LAYOUT_LINES", "Layout", "cells", "is_remark", "layout_of"]
+__all__ = ["BLANKS", "LAYOUT_LINES", "Layout", "Rows", "cells", "header_of", "is_remark", "rows_among"]
 
+Rows = Sequence[Sequence[str]]
+"""The cells of some rows."""
 LAYOUT_LINES = 200
 """Lines at the start of a file by which its layout is found."""
 MAX_COLUMNS = 4_096
@@ -44,30 +48,30 @@ DECIMAL_COMMA = re.compile(r"[-+]?(\d{1,3}(\.\d{3})+|\d+),\d+([eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+\.\d*")
 
 
-@dataclass
+@dataclass(frozen=True)
 class Layout:
     """The layout of a file."""
 
     separator: str = ","
     decimal: str = "."
     """`separator`, `decimal`: Between fields (:data:`BLANKS` for any number of blanks), and in a number."""
-    names: list[str] = field(default_factory=list)
+    names: tuple[str, ...] = ()
     """One for each field, ours where it is known; '' for a field that is not read."""
-    units: dict[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
     """Name -> unit, where one is declared."""
-    headings: list[str] = field(default_factory=list)
+    headings: tuple[str, ...] = ()
     """As the file has them."""
     declared: ColumnMapping = field(default_factory=ColumnMapping)
     """What the user says of the columns, or their maker."""
-    stamp: list[int] = field(default_factory=list)
+    stamp: tuple[int, ...] = ()
     """Which fields are the time, joined by blanks: one, or date and time of day ..."""
     by_hour: bool = False
     """The time of day is written as HHMM.mmm."""
-    calendar: list[int] = field(default_factory=list)
+    calendar: tuple[int, ...] = ()
     """Fields that give date and time of day next to a time that may count from a boot."""
-    validity: list[Validity] = field(default_factory=list)
+    validity: tuple[Validity, ...] = ()
     """Columns that state which values are valid."""
-    hemispheres: dict[str, int] = field(default_factory=dict)
+    hemispheres: Mapping[str, int] = field(default_factory=dict)
     """``latitude``, ``longitude`` -> which field has N or S, E or W."""
     open_ended: bool = False
     """Rows may have more fields, which are not read."""
@@ -77,14 +81,42 @@ class Layout:
     """Which of the lines is the first row, counted from 0."""
     rate: float | None = None
     """Rows a second, of a file that has no column of times."""
-    attrs: dict[str, str | float] = field(default_factory=dict)
+    attrs: Mapping[str, str | float] = field(default_factory=dict)
     """What the comments declare."""
     fill: float = nan
     """The number that stands for a missing value."""
     foreign: bool = True
     """Not written by this program: without metadata next to it."""
-    guesses: list[str] = field(default_factory=list)
+    guesses: tuple[str, ...] = ()
     """What the file does not say and was taken for granted."""
+
+    @property
+    def column_units(self) -> dict[str, str]:
+        """Units of the columns without that of the time, which is a form."""
+        return {name: unit for name, unit in self.units.items() if name != "time"}
+
+    def guessing(self, *guesses: str) -> Layout:
+        """Return the layout with more assumptions."""
+        return replace(self, guesses=(*self.guesses, *guesses))
+
+    def with_units(self, units: Mapping[str, str]) -> Layout:
+        """Return the layout with other units of some columns."""
+        return replace(self, units={**self.units, **units})
+
+    def number(self, cell: str) -> str:
+        """Return a cell with a decimal point."""
+        return cell.replace(",", ".") if self.decimal == "," else cell
+
+
+class Comments(NamedTuple):
+    """The comments above the headings."""
+
+    lines: int
+    """Number of lines that they take."""
+    attrs: Mapping[str, str | float]
+    """What they declare."""
+    fill: float
+    """The number that stands for a missing value; NaN where they do not say."""
 
 
 def cells(line: str, separator: str) -> list[str]:
@@ -96,54 +128,59 @@ def cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def layout_of(
-    path: Path,
-    lines: Sequence[str],
-    declared: ColumnMapping,
-    *,
-    foreign: bool = True,
-    further: Sequence[str] = (),
-) -> Layout:
-    """Return the layout of the file that begins with these lines; `foreign`: without metadata next to it.
+def rows_among(lines: Sequence[str]) -> list[str]:
+    """Return the lines that are rows: neither empty nor remarks."""
+    return [line for line in lines if line.strip() and not is_remark(line)]
 
-    `further` are lines behind them, by whose values units are found.
 
-    FormatError: no headings, two of one name, or a declared column that is not there.
+def header_of(
+    path: Path, lines: Sequence[str], declared: ColumnMapping, *, foreign: bool
+) -> tuple[Layout, list[str], list[list[str]]]:
+    """Return the layout with its headings, the units in a row under them, and the cells of the first rows.
+
+    FormatError: no headings, or too many.
     """
-    found = Layout(foreign=foreign)
-    comments = _comments(path, lines, found)
-    body = [line for line in lines[comments:] if line.strip() and not is_remark(line)]
-    if not body or not lines[comments].strip():
-        raise FormatError(path, "expected a header row, the file is empty", row=comments + 1)
-    found.separator = declared.separator or _separator(body)
-    if (width := _count(body[0], found.separator)) > MAX_COLUMNS:
-        raise FormatError(path, f"expected at most {MAX_COLUMNS} columns, got {width}", row=comments + 1)
-    start = comments + _preamble(lines[comments:], found)
-    headings = cells(lines[start].lstrip("#% "), found.separator)
-    found.first = start + 1
-    if _are_values(headings) or (comments and _mostly_digits(headings)):
-        start, headings = _headings_elsewhere(path, lines, comments, start, declared, found)
-    found.row = start + 1
-    units = _units_row(lines, found)
-    remaining = (line for line in lines[found.first :] if line.strip() and not is_remark(line))
-    rows = [cells(line, found.separator) for line in remaining]
-    if rows and all(len(cell) == len(headings) + 1 and not cell[-1] for cell in rows):
+    comments = _comments(path, lines)
+    body = rows_among(lines[comments.lines :])
+    if not body or not lines[comments.lines].strip():
+        raise FormatError(path, "expected a header row, the file is empty", row=comments.lines + 1)
+    separator = declared.separator or _separator(body)
+    if (width := _count(body[0], separator)) > MAX_COLUMNS:
+        expected = f"expected at most {MAX_COLUMNS} columns, got {width}"
+        raise FormatError(path, expected, row=comments.lines + 1)
+    guesses = []
+    if passed := _preamble(lines[comments.lines :], separator):
+        guesses.append(f"{counted(passed, 'line')} above the headings passed over")
+    start = comments.lines + passed
+    headings, first = cells(lines[start].lstrip("#% "), separator), start + 1
+    if _are_values(headings) or (comments.lines and _mostly_digits(headings)):
+        first = start
+        start, headings = _headings_elsewhere(path, lines, comments.lines, start, separator, declared)
+        guesses += [f"headings from the comment in line {start + 1}"] if start < first else []
+    units = _units_row(lines[first], separator) if first < len(lines) else []
+    first += bool(units)
+    rows = [cells(line, separator) for line in rows_among(lines[first:])]
+    if rows and all(len(row) == len(headings) + 1 and not row[-1] for row in rows):
         headings = [*headings, "(nothing)"]  # each row ends in a separator
         units = [*units, ""] if units else units
-    found.decimal = declared.decimal or _decimal(rows, found)
-    if NMEA_HEADING in headings:  # MagArrow: sentences with commas of their own, at the end of some rows
-        found.open_ended, headings = True, headings[: headings.index(NMEA_HEADING)]
-    maker, found.declared = declared_by_maker(headings, declared)
-    if maker:
-        found.guesses.append(f"columns as {maker} writes them")
-    name_columns(path, found, headings, units, rows)
-    if foreign:
-        rows += [cells(line, found.separator) for line in further if line.strip() and not is_remark(line)]
-        units_of_angles(found, rows)
-        found.validity = validity_of(found.names, rows)
-        for rule in found.validity:
-            found.guesses.append(rule.text)
-    return found
+    decimal = declared.decimal or _decimal(rows)
+    if decimal == "," and not declared.decimal:
+        guesses.append("decimal commas")
+    # MagArrow: sentences with commas of their own, at the end of some rows
+    open_ended = NMEA_HEADING in headings
+    headings = headings[: headings.index(NMEA_HEADING)] if open_ended else headings
+    maker, declared = declared_by_maker(headings, declared)
+    guesses += [f"columns as {maker} writes them"] if maker else []
+    layout = Layout(
+        separator, decimal, headings=tuple(headings), declared=declared, open_ended=open_ended, row=start + 1,
+        first=first, attrs=comments.attrs, fill=comments.fill, foreign=foreign, guesses=tuple(guesses),
+    )  # fmt: skip
+    return layout, units, rows
+
+
+def _count(line: str, separator: str) -> int:
+    """Return the number of fields of a line."""
+    return len(cells(line, separator))
 
 
 def _are_values(row: Sequence[str]) -> bool:
@@ -153,22 +190,25 @@ def _are_values(row: Sequence[str]) -> bool:
 
 
 def _mostly_digits(row: Sequence[str]) -> bool:
+    """Return True if most cells begin with a digit."""
     return sum(cell.lstrip("+-.")[:1].isdigit() for cell in row) > len(row) / 2
 
 
-def _comments(path: Path, lines: Sequence[str], found: Layout) -> int:
-    """Read the comments above the headings; return how many lines they take."""
+def _comments(path: Path, lines: Sequence[str]) -> Comments:
+    """Return the comments above the headings; FormatError: a setting that is not a number."""
+    attrs: dict[str, str | float] = {}
+    fill = nan
     for k, line in enumerate(lines):
         if not is_remark(line):
-            return k
+            return Comments(k, attrs, fill)
         if match := ATTRIBUTE_LINE.fullmatch(line.strip()):
             name, text = match.groups()
             if name == "fill_value":
-                found.fill = _declared_number(path, name, text, k + 1)
+                fill = _declared_number(path, name, text, k + 1)
             else:
                 number = name.startswith(SETTINGS)
-                found.attrs[name] = _declared_number(path, name, text, k + 1) if number else text
-    return len(lines) - 1
+                attrs[name] = _declared_number(path, name, text, k + 1) if number else text
+    return Comments(len(lines) - 1, attrs, fill)
 
 
 def _declared_number(path: Path, name: str, text: str, row: int) -> float:
@@ -178,10 +218,6 @@ def _declared_number(path: Path, name: str, text: str, row: int) -> float:
         raise FormatError(path, f"expected a number, not {text!r}", row=row, column=name) from None
 
 
-def _count(line: str, separator: str) -> int:
-    return len(cells(line, separator))
-
-
 def _separator(body: Sequence[str]) -> str:
     """Return the separator by which most lines have the same number of fields, and more than one."""
     best, best_score = ",", 0.0
@@ -189,42 +225,37 @@ def _separator(body: Sequence[str]) -> str:
         counts = Counter(_count(line, separator) for line in body)
         most, often = max(counts.items(), key=lambda item: (item[1], item[0]))
         if most > 1 and (often > 1 or len(body) == 1):
-            share = often / len(body) + 0.5 * (separator != BLANKS and _count(body[0], separator) == most)
+            headed = _count(body[0], separator) == most
+            share = often / len(body) + 0.5 * (separator != BLANKS and headed)
             # a comma may be a decimal's: the headings must have as many fields as the rows
-            if _count(body[0], separator) != most and share < 0.5:
+            if not headed and share < 0.5:
                 share *= 0.1
             if share > best_score + 0.05:
                 best, best_score = separator, share
     return best
 
 
-def _preamble(lines: Sequence[str], found: Layout) -> int:
+def _preamble(lines: Sequence[str], separator: str) -> int:
     """Return the number of lines before the headings: lines with fewer fields than most rows."""
-    counts = [_count(line, found.separator) if line.strip() else 0 for line in lines]
+    counts = [_count(line, separator) if line.strip() else 0 for line in lines]
     usual, often = Counter(counts[1:] or counts).most_common(1)[0]
     if counts[0] >= usual or often < max(2, len(counts) // 2) or usual < 2:
         return 0
     first = next(k for k, count in enumerate(counts) if count >= usual)
-    if first and _are_values(cells(lines[first], found.separator)):
-        return 0
-    found.guesses.append(f"{counted(first, 'line')} above the headings passed over")
-    return first
+    return 0 if first and _are_values(cells(lines[first], separator)) else first
 
 
 def _headings_elsewhere(
-    path: Path, lines: Sequence[str], comments: int, start: int, declared: ColumnMapping, found: Layout
+    path: Path, lines: Sequence[str], comments: int, start: int, separator: str, declared: ColumnMapping
 ) -> tuple[int, list[str]]:
     """Return position and text of headings in a comment above the rows, or as declared."""
-    width = _count(lines[start], found.separator)
+    width = _count(lines[start], separator)
     for k in reversed(range(comments)):
-        headings = cells(lines[k].lstrip("#%/ "), found.separator)
+        headings = cells(lines[k].lstrip("#%/ "), separator)
         named = all(any(map(str.isalpha, cell)) for cell in headings)
         if len(headings) == width and named and not ATTRIBUTE_LINE.fullmatch(lines[k].strip()):
-            found.first = start
-            found.guesses.append(f"headings from the comment in line {k + 1}")
             return k, headings
     if any((source.heading or "").startswith("column_") for source in declared.columns.values()):
-        found.first = start
         return start, [f"column_{k + 1}" for k in range(width)]
     there = lines[start].strip()[:40]
     otherwise = 'without one, say what each column is, as --column time="column_1 [s]"'
@@ -232,20 +263,17 @@ def _headings_elsewhere(
     raise FormatError(path, expected, row=start + 1)
 
 
-def _units_row(lines: Sequence[str], found: Layout) -> list[str]:
-    """Return the units if the first row has units and no numbers, and skip that row."""
-    if found.first >= len(lines):
-        return []
-    row = cells(lines[found.first], found.separator)
+def _units_row(line: str, separator: str) -> list[str]:
+    """Return the units in a line that has units and no numbers; none for another line."""
+    row = cells(line, separator)
     if any(cell and CELL_NUMBER.fullmatch(cell) for cell in row) or not any(map(is_unit, row)):
         return []
-    found.first += 1
     return [cell.strip("[]()") for cell in row]
 
 
-def _decimal(rows: Sequence[Sequence[str]], found: Layout) -> str:
+def _decimal(rows: Rows) -> str:
+    """Return the decimal sign of the numbers in some rows."""
     written = [cell for row in rows for cell in row if "," in cell]
     if not any(map(DECIMAL_COMMA.fullmatch, written)) or any(map(THOUSANDS.fullmatch, written)):
         return "."
-    found.guesses.append("decimal commas")
     return ","

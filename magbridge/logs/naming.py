@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from math import hypot
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -16,12 +16,8 @@ from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usua
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import SECONDS_OF_DAY
 from magbridge.logs.headings import CELL_NUMBER, WITH_UNIT, aliases, bare, is_unit, split
+from magbridge.logs.layout import Layout, Rows
 from magbridge.logs.stamps import DAY
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from magbridge.logs.layout import Layout
 
 __all__ = ["HEMISPHERES", "READING_RANGE_NT", "name_columns", "on_side", "units_of_angles"]
 
@@ -62,37 +58,41 @@ UNIT_CELL_COLUMNS = "depth", "total_field", "sensor_temperature"
 HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 
 
-def name_columns(
-    path: Path, found: Layout, headings: list[str], units: Sequence[str], rows: Sequence[Sequence[str]]
-) -> None:
-    """Set name and unit of each column: as declared, by its heading, or by a known other name.
+def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -> Layout:
+    """Return a layout with name and unit of each column: as declared, by its heading, or by another name.
 
-    `units` are those of a row of units, or empty; `rows` the cells of the first rows.
+    Parameters
+    ----------
+    path : path
+        Named in errors.
+    layout : Layout
+        With the headings.
+    units : sequence of str
+        Those of a row of units, or empty.
+    rows : sequence of sequence of str
+        Cells of the first rows.
 
     Raises
     ------
     FormatError
         A declared column that is not there, or two of one name of ours.
     """
-    found.headings = headings
-    if found.separator != ",":
+    if layout.separator != ",":
         signs = {"\t": "tabs", " ": "blanks"}
-        found.guesses.append(f"fields separated by {signs.get(found.separator, repr(found.separator))}")
-    parts = [split(heading) for heading in headings]
+        sign = signs.get(layout.separator, repr(layout.separator))
+        layout = layout.guessing(f"fields separated by {sign}")
+    parts = [split(heading) for heading in layout.headings]
     declares = [parts[k][1] or (units[k] if k < len(units) else "") for k in range(len(parts))]
-    found.names = _named(path, found, [name for name, _ in parts], declares)
-    for k, name in enumerate(found.names):
-        _take_unit(found, name, headings[k], declares[k])
-    _find_time(found, rows)
-    _find_calendar(found, rows)
-    units_of_axes(found, rows)
-    find_total(found, rows)
-    _leave_texts(found, rows)
+    layout = _with_names(path, layout, [name for name, _ in parts], declares)
+    for k, name in enumerate(layout.names):
+        layout = _with_unit(layout, name, layout.headings[k], declares[k])
+    layout = _with_calendar(_with_time(layout, rows), rows)
+    return _without_texts(with_total(with_units_of_axes(layout, rows), rows), rows)
 
 
-def _named(path: Path, found: Layout, names: list[str], units: Sequence[str]) -> list[str]:
-    """Return the names of the columns; '' for columns that are not read."""
-    headings, row = found.headings, found.row
+def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[str]) -> Layout:
+    """Return the layout with the names of the columns; '' for columns that are not read."""
+    headings = layout.headings
     # a name that stands twice, with different units: the second keeps them in its name
     names = [name if name not in names[:k] else headings[k] for k, name in enumerate(names)]
     # a foreign 'Quality' is not our set of flags
@@ -101,16 +101,16 @@ def _named(path: Path, found: Layout, names: list[str], units: Sequence[str]) ->
         low if low in COLUMNS and lower.count(low) == 1 else name
         for name, low in zip(names, lower, strict=True)
     ]
-    taken = _declared(path, found, names)
+    layout = replace(layout, rate=_declared_rate(path, layout))
+    taken = _declared(path, layout, names)
     open_to_all = ["" if k in taken else name for k, name in enumerate(names)]
     known = {k: name for k, name in aliases(open_to_all, units).items() if name not in taken.values()}
     if "time" not in {*taken.values(), *known.values(), *names}:
         timed = [k for k, name in enumerate(names) if TIMED.search(name) and k not in taken]
         known |= dict.fromkeys(timed[:1], "time") if len(timed) == 1 else {}
-    for k, name in known.items():
-        found.guesses.append(f"{name} is {headings[k]!r}")
+    layout = layout.guessing(*(f"{name} is {headings[k]!r}" for k, name in known.items()))
     if nameless := [str(k + 1) for k, heading in enumerate(headings) if not heading and k not in taken]:
-        found.guesses.append(f"left out, no heading: column {', '.join(nameless)}")
+        layout = layout.guessing(f"left out, no heading: column {', '.join(nameless)}")
     chosen = taken | known
     unnamed = [name for k, name in enumerate(names) if k not in chosen and name in chosen.values()]
     final: list[str] = []
@@ -118,18 +118,18 @@ def _named(path: Path, found: Layout, names: list[str], units: Sequence[str]) ->
         ours = chosen.get(k, "" if name in unnamed or headings[k] == "(nothing)" else name)
         if ours in final and ours:
             if ours in COLUMNS:
-                raise FormatError(
-                    path, f"expected a name of its own for column {k + 1}, not {ours!r}", row=row
-                )
+                expected = f"expected a name of its own for column {k + 1}, not {ours!r}"
+                raise FormatError(path, expected, row=layout.row)
             ours = f"{ours}_{k + 1}"
         final.append(ours)
-    return final
+    return replace(layout, names=tuple(final))
 
 
-def _take_unit(found: Layout, name: str, heading: str, unit: str) -> None:
-    source = found.declared.columns.get(name)
+def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
+    """Return the layout with the unit of a column, and with what its heading states to refer to."""
+    source = layout.declared.columns.get(name)
     if name == "heading" and (match := re.search(r"\b(magnetic|mag)\b", f"{heading} {unit}".lower())):
-        found.attrs.setdefault("heading_reference", "magnetic")
+        layout = replace(layout, attrs={"heading_reference": "magnetic", **layout.attrs})
         unit = unit.replace(match[1], "").strip(" ,")
     if name in COLUMNS and unit.lower() in REMARKS:
         unit = ""
@@ -137,21 +137,26 @@ def _take_unit(found: Layout, name: str, heading: str, unit: str) -> None:
         unit = source.unit
     elif source is not None and source.heading and source.heading.strip() != heading.strip():
         unit = split(source.heading)[1] or unit
-    if name and unit:
-        found.units[name] = unit
+    return layout.with_units({name: unit}) if name and unit else layout
 
 
-def _declared(path: Path, found: Layout, names: Sequence[str]) -> dict[int, str]:
+def _declared_rate(path: Path, layout: Layout) -> float | None:
+    """Return the rows a second that the user declares in place of a column of times."""
+    source = layout.declared.columns.get("time")
+    match = ROW_COUNT.fullmatch(source.heading or "time") if source else None
+    if match and not float(match[1]):
+        raise FormatError(path, "expected a rate other than 0 Hz", column="time")
+    return float(match[1]) if match else None
+
+
+def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str]:
     """Return position -> our name of the columns that the caller declares."""
     taken: dict[int, str] = {}
-    for name, source in found.declared.columns.items():
+    for name, source in layout.declared.columns.items():
         theirs = source.heading or name
-        if name == "time" and (match := ROW_COUNT.fullmatch(theirs)):
-            found.rate = float(match[1])
-            if not found.rate:
-                raise FormatError(path, "expected a rate other than 0 Hz", column="time")
+        if name == "time" and layout.rate:
             continue
-        for candidates in (found.headings, list(names)):
+        for candidates in (layout.headings, names):
             for wanted in (theirs, split(theirs)[0]):
                 if wanted in candidates:
                     taken.setdefault(candidates.index(wanted), name)
@@ -159,51 +164,64 @@ def _declared(path: Path, found: Layout, names: Sequence[str]) -> dict[int, str]
             if name in taken.values():
                 break
         else:
-            there = " ".join(repr(heading) if " " in heading else heading for heading in found.headings)
+            there = " ".join(repr(heading) if " " in heading else heading for heading in layout.headings)
             expected = f"expected this column; there are: {there}"
-            raise FormatError(path, expected, row=found.row, column=theirs)
+            raise FormatError(path, expected, row=layout.row, column=theirs)
     return taken
 
 
-def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the column of the time, or the columns that form it, such as date and time of day."""
-    place = found.names.index("time") if "time" in found.names else None
-    ours = [name if name in found.declared.columns else "" for name in found.names]
-    called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, found.headings, strict=True)]
-    dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
+def _with_time(layout: Layout, rows: Rows) -> Layout:
+    """Return the layout with the column of the time, or the columns that form it, as date and time of day."""
+    place = layout.names.index("time") if "time" in layout.names else None
+    ours = [name if name in layout.declared.columns else "" for name in layout.names]
+    called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, layout.headings, strict=True)]
     for kind, patterns in JOINED.items():
         places = [[k for k, name in enumerate(called) if re.fullmatch(one, name)] for one in patterns]
         if all(len(one) == 1 for one in places) and (place is None or [place] in places):
-            found.stamp = [one[0] for one in places]
-            found.units["time"] = kind if len(patterns) == 2 else ""
-            break
-    else:
-        if place is None and len(dates) == 1:
-            clocks = [k for k in range(len(called)) if k not in dates and _all_match(CLOCK, rows, k)]
-            near = [k for k in clocks if called[k][:4] == called[dates[0]][:4]]
-            place = next((group[0] for group in (clocks, near) if len(group) == 1), dates[0])
-        found.stamp = [] if place is None else [place]
-        if place is not None and len(dates) == 1 and dates != [place]:
-            cells = [row[place] for row in rows if len(row) > place]
-            counted = SECONDS_HEADING.search(found.headings[place]) and all(map(_in_a_day, cells))
-            undated = "%" in (unit := found.units.get("time", "")) and not {"%d", "%j"} & {
-                *re.findall("%.", unit)
-            }
-            by_hour = not unit and not counted and _by_hour(cells)
-            if (any(map(HOUR.fullmatch, cells)) or counted or by_hour) and not undated:
-                found.stamp = [*dates, place]
-            if by_hour or (counted and not all(map(HOUR.fullmatch, cells))):
-                found.units["time"] = SECONDS_OF_DAY
-                found.by_hour = by_hour
-    if found.rate or not found.stamp:
-        return
-    if len(found.stamp) > 1 or found.names[found.stamp[0]] != "time":
-        found.guesses.append(f"time from {' and '.join(repr(found.headings[k]) for k in found.stamp)}")
-    for k in found.stamp:
-        found.names[k] = "time" if k == found.stamp[-1] else ""
+            stamp = tuple(one[0] for one in places)
+            unit = kind if len(patterns) == 2 else ""
+            return _with_stamp(replace(layout, stamp=stamp).with_units({"time": unit}))
+    dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
+    if place is None and len(dates) == 1:
+        clocks = [k for k in range(len(called)) if k not in dates and _all_match(CLOCK, rows, k)]
+        near = [k for k in clocks if called[k][:4] == called[dates[0]][:4]]
+        place = next((group[0] for group in (clocks, near) if len(group) == 1), dates[0])
+    if place is None:
+        return layout
+    layout = replace(layout, stamp=(place,))
+    if len(dates) == 1 and dates != [place]:
+        layout = _with_date(layout, dates[0], place, rows)
+    return _with_stamp(layout)
 
 
-def _all_match(pattern: re.Pattern[str], rows: Sequence[Sequence[str]], place: int) -> bool:
+def _with_date(layout: Layout, date: int, place: int, rows: Rows) -> Layout:
+    """Return the layout in which a date belongs to the time, if the time is a time of day."""
+    cells = [row[place] for row in rows if len(row) > place]
+    counted = SECONDS_HEADING.search(layout.headings[place]) and all(map(_in_a_day, cells))
+    unit = layout.units.get("time", "")
+    undated = "%" in unit and not {"%d", "%j"} & {*re.findall("%.", unit)}
+    by_hour = not unit and not counted and _by_hour(cells)
+    if (any(map(HOUR.fullmatch, cells)) or counted or by_hour) and not undated:
+        layout = replace(layout, stamp=(date, place))
+    if by_hour or (counted and not all(map(HOUR.fullmatch, cells))):
+        layout = replace(layout, by_hour=by_hour).with_units({"time": SECONDS_OF_DAY})
+    return layout
+
+
+def _with_stamp(layout: Layout) -> Layout:
+    """Return the layout whose last field of the time has the name ``time``, and the others none."""
+    stamp = layout.stamp
+    if layout.rate:
+        return layout
+    if len(stamp) > 1 or layout.names[stamp[0]] != "time":
+        layout = layout.guessing(f"time from {' and '.join(repr(layout.headings[k]) for k in stamp)}")
+    names = list(layout.names)
+    for k in stamp:
+        names[k] = "time" if k == stamp[-1] else ""
+    return replace(layout, names=tuple(names))
+
+
+def _all_match(pattern: re.Pattern[str], rows: Rows, place: int) -> bool:
     """Return True if all non-empty cells of a column match a pattern and there is at least one."""
     values = {row[place] for row in rows if place < len(row) and row[place]}
     return bool(values) and all(map(pattern.fullmatch, values))
@@ -216,16 +234,17 @@ def _by_hour(cells: Sequence[str]) -> bool:
     return bool(long) and all(map(HOUR_AND_MINUTE.fullmatch, there)) and any("." in cell for cell in there)
 
 
-def _find_calendar(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the fields, other than those of the time, that give date and time of day."""
-    others = [k for k in range(len(found.headings)) if k not in found.stamp]
+def _with_calendar(layout: Layout, rows: Rows) -> Layout:
+    """Return the layout with the fields, other than those of the time, that give date and time of day."""
+    others = [k for k in range(len(layout.headings)) if k not in layout.stamp]
     moments = [k for k in others if _all_match(DATE_AND_TIME, rows, k)]
-    dates = [k for k in others if DATED.search(found.headings[k])]
+    dates = [k for k in others if DATED.search(layout.headings[k])]
     clocks = [k for k in others if _all_match(CLOCK, rows, k)]
     if len(moments) == 1:
-        found.calendar = moments
-    elif len(dates) == len(clocks) == 1:
-        found.calendar = [*dates, *clocks]
+        return replace(layout, calendar=tuple(moments))
+    if len(dates) == len(clocks) == 1:
+        return replace(layout, calendar=(*dates, *clocks))
+    return layout
 
 
 def _in_a_day(cell: str) -> bool:
@@ -235,27 +254,28 @@ def _in_a_day(cell: str) -> bool:
         return False
 
 
-def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Drop columns of text from other programs; N and S, E and W are the signs of a position."""
+def _without_texts(layout: Layout, rows: Rows) -> Layout:
+    """Return the layout without columns of text; N and S, E and W are the signs of a position."""
+    names, units, hemispheres = list(layout.names), dict(layout.units), dict(layout.hemispheres)
     left = []
-    for k, name in enumerate(found.names):
+    for k, name in enumerate(layout.names):
         values = {row[k] for row in rows if k < len(row) and row[k]}
         if not name or (name in COLUMNS and name not in UNIT_CELL_COLUMNS) or not values:
             continue
-        text = [cell.replace(",", ".") if found.decimal == "," else cell for cell in values]
+        text = [layout.number(cell) for cell in values]
         if any(CELL_NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
             continue
-        if found.foreign and (unit := _unit_behind(text)):
-            found.units.setdefault(name, unit)
+        if layout.foreign and (unit := _unit_behind(text)):
+            units.setdefault(name, unit)
             continue
-        found.names[k] = ""
+        names[k] = ""
         side = [one for one, letters in HEMISPHERES.items() if {v.upper() for v in values} <= {*letters}]
-        if side and side[0] in found.names:
-            found.hemispheres[side[0]] = k
+        if side and side[0] in names:
+            hemispheres[side[0]] = k
         else:
             left.append(name)
-    if left:
-        found.guesses.append(f"left out, no numbers: {', '.join(left)}")
+    layout = replace(layout, names=tuple(names), units=units, hemispheres=hemispheres)
+    return layout.guessing(f"left out, no numbers: {', '.join(left)}") if left else layout
 
 
 def _unit_behind(cells: Sequence[str]) -> str:
@@ -288,48 +308,49 @@ NEAR_HALF_TURN_RAD = 0.1
 """Largest distance, rad, of the extreme heading from half a turn or a whole turn, to be in rad."""
 
 
-def units_of_angles(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the unit of an attitude whose unit the file does not state: rad, if headings end at a turn.
+def units_of_angles(layout: Layout, rows: Rows) -> Layout:
+    """Return the layout with the unit of an attitude that has none: rad, if headings end at a turn.
 
     Headings in rad that cover half a circle end just below pi or 2 pi.
     """
-    names = [name for name in ANGLES if name in found.names and name not in found.units]
+    names = [name for name in ANGLES if name in layout.names and name not in layout.units]
     if "heading" not in names:
-        return
-    values = {name: _numbers(found, rows, found.names.index(name)) for name in names}
+        return layout
+    values = {name: _numbers(layout, rows, layout.names.index(name)) for name in names}
     heading = values["heading"]
     if len(heading) < 3 or any(np.abs(one).max(initial=0.0) > 2.0 * np.pi + 1e-3 for one in values.values()):
-        return
+        return layout
     largest = float(np.abs(heading).max())
     ends = [end - NEAR_HALF_TURN_RAD < largest < end + 1e-3 for end in (np.pi, 2.0 * np.pi)]
-    if any(ends) and np.ptp(heading) > np.pi:
-        found.units |= dict.fromkeys(names, "rad")
-        found.guesses.append(f"{', '.join(names)} in rad, since headings end at {largest:.4g}")
+    if not any(ends) or np.ptp(heading) <= np.pi:
+        return layout
+    guess = f"{', '.join(names)} in rad, since headings end at {largest:.4g}"
+    return layout.with_units(dict.fromkeys(names, "rad")).guessing(guess)
 
 
-def units_of_axes(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the unit of the axes where the file does not state it: one that has it, or the field's length."""
-    undeclared = found.foreign and not set(CHANNELS) & set(found.declared.columns)
-    if not undeclared or not set(CHANNELS) <= set(found.names):
-        return
-    stated = {found.units.get(name, "") for name in CHANNELS}
+def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
+    """Return the layout with the unit of axes that have none: one that has it, or the field's length."""
+    undeclared = layout.foreign and not set(CHANNELS) & set(layout.declared.columns)
+    if not undeclared or not set(CHANNELS) <= set(layout.names):
+        return layout
+    stated = {layout.units.get(name, "") for name in CHANNELS}
     if stated == {""}:
-        unit = _unit_by_length(found, rows)
-        if unit:
-            found.guesses.append(f"mag_x, mag_y, mag_z in {unit}, by the field's length")
+        unit = _unit_by_length(layout, rows)
+        guess = f"mag_x, mag_y, mag_z in {unit}, by the field's length"
     elif len(stated) == 2 and "" in stated:
         unit = max(stated)
-        found.guesses.append(f"mag_x, mag_y, mag_z all in {unit}")
+        guess = f"mag_x, mag_y, mag_z all in {unit}"
     else:
-        return
-    if unit:
-        further = [name for name in found.names if FURTHER_AXIS.fullmatch(name) and name not in found.units]
-        found.units |= dict.fromkeys([*CHANNELS, *further], unit)
+        return layout
+    if not unit:
+        return layout
+    further = [name for name in layout.names if FURTHER_AXIS.fullmatch(name) and name not in layout.units]
+    return layout.with_units(dict.fromkeys([*CHANNELS, *further], unit)).guessing(guess)
 
 
-def _unit_by_length(found: Layout, rows: Sequence[Sequence[str]]) -> str:
+def _unit_by_length(layout: Layout, rows: Rows) -> str:
     """Return the unit in which the field has the length of the Earth's; "" for nT, or where there is none."""
-    length = _length(found, rows, [found.names.index(name) for name in CHANNELS])
+    length = _length(layout, rows, [layout.names.index(name) for name in CHANNELS])
     if READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
         return ""
     factors = ((unit, factor) for unit, factor in NT_PER_UNIT.items() if unit != "nT")
@@ -338,42 +359,40 @@ def _unit_by_length(found: Layout, rows: Sequence[Sequence[str]]) -> str:
     )
 
 
-def find_total(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find a scalar magnetometer's column: the only one of its kind, and as large as the Earth's field."""
-    if not found.foreign or "total_field" in found.names:
-        return
-    has_vector = set(CHANNELS) <= set(found.names)
-    pattern = SCALAR_NAME if has_vector else TOTAL_NAME
+def with_total(layout: Layout, rows: Rows) -> Layout:
+    """Return the layout with a scalar magnetometer's column: the only one, as large as the Earth's field."""
+    if not layout.foreign or "total_field" in layout.names:
+        return layout
+    pattern = SCALAR_NAME if set(CHANNELS) <= set(layout.names) else TOTAL_NAME
     fields = [
-        k for k, name in enumerate(found.names) if pattern.fullmatch(bare(name)) and name not in COLUMNS
+        k for k, name in enumerate(layout.names) if pattern.fullmatch(bare(name)) and name not in COLUMNS
     ]
-    if len(fields) == 1:
-        name = found.names[fields[0]]
-        factor = NT_PER_UNIT.get(usual(found.units.get(name, "nT")), 0.0)
-        if READING_RANGE_NT[0] < _length(found, rows, fields) * factor < READING_RANGE_NT[1]:
-            found.names[fields[0]] = "total_field"
-            found.units["total_field"] = found.units.pop(name, "nT")
-            found.guesses.append(f"total_field is {found.headings[fields[0]]!r}")
+    if len(fields) != 1:
+        return layout
+    (k,) = fields
+    unit = layout.units.get(layout.names[k], "nT")
+    length = _length(layout, rows, fields) * NT_PER_UNIT.get(usual(unit), 0.0)
+    if not READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
+        return layout
+    units = {name: unit for name, unit in layout.units.items() if name != layout.names[k]}
+    names = (*layout.names[:k], "total_field", *layout.names[k + 1 :])
+    named = replace(layout, names=names, units={**units, "total_field": unit})
+    return named.guessing(f"total_field is {layout.headings[k]!r}")
 
 
-def _numbers(found: Layout, rows: Sequence[Sequence[str]], place: int) -> FloatArray:
+def _numbers(layout: Layout, rows: Rows, place: int) -> FloatArray:
     """Return the numbers (m,) of one column, without other cells."""
-    texts = [
-        row[place].replace(",", ".") if found.decimal == "," else row[place]
-        for row in rows
-        if place < len(row)
-    ]
+    texts = [layout.number(row[place]) for row in rows if place < len(row)]
     numbers = np.asarray(pd.to_numeric(pd.Series(texts, dtype="str"), errors="coerce"), np.float64)
     return numbers[np.isfinite(numbers)]
 
 
-def _length(found: Layout, rows: Sequence[Sequence[str]], places: Sequence[int]) -> float:
+def _length(layout: Layout, rows: Rows, places: Sequence[int]) -> float:
     """Return the median length of the vector that stands in some columns; 0 without numbers."""
     lengths = []
     for row in rows:
         try:
-            texts = (row[k].replace(",", ".") if found.decimal == "," else row[k] for k in places)
-            lengths.append(hypot(*map(float, texts)))
+            lengths.append(hypot(*(float(layout.number(row[k])) for k in places)))
         except (ValueError, IndexError):
             continue
     return float(np.median(lengths)) if lengths else 0.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
         for name, k in layout.hemispheres.items():
             columns[name] = on_side(name, columns[name], batch.column(k).to_pandas())
         numbers = range(row, row + batch.num_rows)
-        piece = deployment(path, time, columns, layout.units, attrs | layout.attrs, meanings)
+        piece = deployment(path, time, columns, layout.column_units, {**attrs, **layout.attrs}, meanings)
         yield known(path, piece) if layout.foreign else piece, numbers
         row = numbers.stop
 
@@ -86,11 +87,11 @@ def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TimeFormat
         raise FormatError(path, "expected rows, there are none")
     cells = [["" if one is None else str(one) for one in column.to_pylist()] for column in first.columns]
     units = [_text(field.metadata, b"units") for field in schema]
-    layout = Layout(foreign=foreign)
-    name_columns(path, layout, schema.names, units, list(zip(*cells, strict=True)))
+    layout = Layout(foreign=foreign, headings=tuple(schema.names))
+    layout = name_columns(path, layout, units, list(zip(*cells, strict=True)))
     if not layout.stamp:
         raise FormatError(path, absent("time", schema.names), column="time")
-    time, unit = schema.field(layout.stamp[-1]), layout.units.pop("time", "")
+    time, unit = schema.field(layout.stamp[-1]), layout.units.get("time", "")
     clock = None
     if not pa.types.is_timestamp(time.type):
         texts = [" ".join(parts) for parts in zip(*(cells[k] for k in layout.stamp), strict=True)]
@@ -98,11 +99,13 @@ def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TimeFormat
             clock = clock_of(time.name, unit, texts, None)
         except ValueError as error:
             raise FormatError(path, str(error), column=time.name) from None
-        layout.guesses += [f"time: {clock.assumed}"] if clock.assumed else []
-        layout.attrs |= {"time_reference": "boot"} if clock.boot else {}
+        layout = layout.guessing(f"time: {clock.assumed}") if clock.assumed else layout
+        attrs = {**layout.attrs, **({"time_reference": "boot"} if clock.boot else {})}
+        layout = replace(layout, attrs=attrs)
     if foreign and layout.guesses:
         note = "; ".join(layout.guesses)
-        layout.attrs |= {GUESSED_ATTRIBUTE: note, HISTORY_ATTRIBUTE: f"{path.name} was read with: {note}"}
+        notes = {GUESSED_ATTRIBUTE: note, HISTORY_ATTRIBUTE: f"{path.name} was read with: {note}"}
+        layout = replace(layout, attrs={**layout.attrs, **notes})
     return layout, clock
 
 

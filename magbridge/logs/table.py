@@ -95,7 +95,7 @@ class TextTable:
     def _clock_by(self, first_lines: Sequence[str]) -> TimeFormat:
         """Return the format of the times, from the heading, the unit and the first cells."""
         layout = self._layout
-        heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.pop("time", "")
+        heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.get("time", "")
         if order := date_order([layout.headings[k] for k in layout.stamp]):
             heading = order
         lines = first_lines[layout.first : max(LAYOUT_LINES, layout.first + 1)]

@@ -21,6 +21,7 @@ import codecs
 import csv
 import io
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, islice
 from math import isnan
 from pathlib import Path
@@ -34,10 +35,13 @@ from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, lasting, with_losses
-from magbridge.logs.layout import LAYOUT_LINES, is_remark, layout_of
+from magbridge.logs.layout import LAYOUT_LINES, Layout, cells, header_of, is_remark, rows_among
+from magbridge.logs.mapping import ColumnMapping
+from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.options import Options
 from magbridge.logs.registry import metadata_path, opened
 from magbridge.logs.table import TextTable
+from magbridge.logs.validity import validity_of
 from magbridge.records import Quality
 
 __all__ = ["FileWriter", "chunks"]
@@ -108,9 +112,8 @@ def _chunks(
         header = list(islice(lines, LAYOUT_LINES))
     further = list(islice(lines, FURTHER))
     beside = _attributes(path)
-    layout = layout_of(
-        path, header, options.declared, foreign=not metadata_path(path).is_file(), further=further
-    )
+    foreign = not metadata_path(path).is_file()
+    layout = layout_of(path, header, further, options.declared, foreign=foreign)
     table = TextTable(path, layout, [*header, *further], strict=options.strict)
     attrs = {**beside, **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
@@ -124,11 +127,30 @@ def _chunks(
     wanted = ((row, line) for row, line in numbered if line.strip() and not is_remark(line))
     while block := list(islice(wanted, rows)):
         time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])
-        piece = deployment(path, time, columns, layout.units, attrs)
+        piece = deployment(path, time, columns, layout.column_units, attrs)
         yield with_losses(piece, *table.faults.since_last()), numbers
     table.faults.finish()
     if not table.faults.rows:
         raise FormatError(path, "expected rows after the header", row=layout.first + 1)
+
+
+def layout_of(
+    path: Path, lines: Sequence[str], further: Sequence[str], declared: ColumnMapping, *, foreign: bool
+) -> Layout:
+    """Return the layout of the file that begins with these lines; `foreign`: without metadata next to it.
+
+    `further` are lines behind them, by whose values units are found.
+
+    FormatError: no headings, two of one name, or a declared column that is not there.
+    """
+    layout, units, rows = header_of(path, lines, declared, foreign=foreign)
+    layout = name_columns(path, layout, units, rows)
+    if not foreign:
+        return layout
+    rows += [cells(line, layout.separator) for line in rows_among(further)]
+    layout = units_of_angles(layout, rows)
+    validity = validity_of(layout.names, rows)
+    return replace(layout, validity=tuple(validity)).guessing(*(rule.text for rule in validity))
 
 
 def _lines(file: TextIO) -> Iterator[str]:
