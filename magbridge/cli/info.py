@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 WIDE_TERMINAL = 110
 """Characters of a terminal from which on the meanings are shown."""
+MAX_LISTED_LOGS = 3
+"""Largest number of logs whose names are listed above what they hold together."""
 
 
 @command("info FILE... [OPTIONS]")
@@ -42,16 +44,19 @@ def info(*files: Path, reading: ReadingOptions = AS_THEY_SAY, json: Json = False
     from magbridge.logs import read
     from magbridge.logs.deployment import join
     from magbridge.logs.info import info as facts_of
+    from magbridge.logs.reading import without_companions
     from magbridge.logs.sensor_log import combine
 
     logs = {}
     with waiting("reading"):
-        for file in dict.fromkeys((*files, *reading.sensor_log)):
+        for file in without_companions(list(dict.fromkeys((*files, *reading.sensor_log)))):
             logs[str(file)] = read(file, options=reading.without_sensor_logs)
         named = [Path(name) in reading.sensor_log for name in logs]
         combined = combine(list(logs.values()), named, reading.clock_offset)
         if len(combined) < len(logs):
-            logs[" and ".join(Path(name).name for name in logs) + " together"] = join(combined)
+            names = [Path(name).name for name in logs]
+            listed = " and ".join(names) if len(names) <= MAX_LISTED_LOGS else f"{len(names)} logs"
+            logs[f"{listed} together"] = join(combined)
     found = {}
     for name, log in logs.items():
         found[name] = facts_of(log)

@@ -8,7 +8,7 @@ Bad rows and values are dropped, counted and named in attributes
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from inspect import signature
 from itertools import accumulate, chain, pairwise
@@ -25,7 +25,7 @@ from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["read", "read_chunks", "read_each"]
+__all__ = ["read", "read_chunks", "read_each", "without_companions"]
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
@@ -168,14 +168,18 @@ def _paths(paths: Paths, options: Options) -> list[Path]:
     checked = list(dict.fromkeys([*map(Path, several), *options.sensor_log]))
     for path in checked:
         format_of(path if is_bag(path) else existing(path))
-    given = set(checked)
-    return [path for path in checked if not _with_another(path, given)]
+    return without_companions(checked)
 
 
-def _with_another(path: Path, given: Collection[Path]) -> bool:
-    """Return True if the companion file is also given, such as the science file of a flight file."""
-    leads = LEADS.get(path.suffix.lower())
-    return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
+def without_companions(paths: Sequence[Path]) -> list[Path]:
+    """Return the files without those that are read with another, as a Slocum's science file is."""
+    given = set(paths)
+
+    def is_companion(path: Path) -> bool:
+        leads = LEADS.get(path.suffix.lower())
+        return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
+
+    return [path for path in paths if not is_companion(path)]
 
 
 def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:

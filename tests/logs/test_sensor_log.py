@@ -147,7 +147,10 @@ def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Comma
     assert "in common" in done.err
     command("correct", *files, "--calibration", calibration, "-o", corrected)
     assert logs.read(corrected).sizes["time"] == len(time)
-    assert "together" in command("info", *files[:2]).out
+    # a science file is read with its flight file, not once more
+    done = command("info", *files, *(path.with_suffix(".ebd") for path in flight))
+    assert f"{len(files)} logs together" in done.out
+    assert "duplicate" not in done.err
 
 
 def _in_body(field: np.ndarray, roll: np.ndarray, pitch: np.ndarray, heading: np.ndarray) -> np.ndarray:
