@@ -24,6 +24,7 @@ __all__ = [
     "FURTHER_AXIS",
     "HEADINGS",
     "NT_PER_UNIT",
+    "TEMPERATURE",
     "Column",
     "absent",
     "counts_from_boot",
@@ -53,6 +54,8 @@ FURTHER_AXIS = re.compile(r"mag[1-9]\d*_[xyz]")
 AGE = "age_"
 """Before the name of a parameter: how old its value was, in s, in the log of a bridge."""
 
+TEMPERATURE = "sensor_temperature"
+"""Column of the temperature at the fluxgate, the only channel of a calibration that is part of a reading."""
 COLUMNS: dict[str, Column] = {
     "time": Column("s", "seconds since 1970-01-01 UTC"),
     "mag_x": Column("nT", "raw magnetic field, sensor x (forward)"),

@@ -9,24 +9,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import inf, isfinite, nan, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magbridge.align import Aligner, Sample
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
+from magbridge.columns import TEMPERATURE
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
 from magbridge.filter_lag import LagCorrection
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
 from magbridge.health.consistency import MASS_FRACTION
-from magbridge.learning import Learner
-from magbridge.learning.model import TEMPERATURE
 from magbridge.parts import OptionalParts
 from magbridge.records import MAX_MEASURED_NT, Corrected, Quality, Reading, Vector
 from magbridge.toml import convert
 from magbridge.track import Input
 
-__all__ = ["TEMPERATURE", "Correction"]
+if TYPE_CHECKING:
+    from magbridge.learning import Learner  # imported by those who learn
+
+__all__ = ["Correction"]
 
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
 MOVING = int(Quality.MOVING)
@@ -54,6 +56,8 @@ class Correction:
         Messages about flagged samples since the caller last emptied the list, each once.
     corrector : Corrector
         Applies the calibration.
+    is_contradicted : bool
+        Whether another sensor contradicts the last sample: the learner then does not use the next one.
     stated_sigma : float
         1-sigma of the last sample's total field without what the plausibility checks added, nT.
     """
@@ -89,6 +93,7 @@ class Correction:
         self._was_moving = False
         self._conditions = _unmodelled_conditions(calibration)
         self.stated_sigma = nan
+        self.is_contradicted = False
         cutoff_hz = calibration.sensor.filter_cutoff
         self._filter_lag = LagCorrection(cutoff_hz) if cutoff_hz else None
 
@@ -269,7 +274,7 @@ class Correction:
             self.corrector.regressors,
             sample.values,
             quality,
-            faulty=self.health is not None and self.health.is_fault,
+            faulty=self.is_contradicted or (self.health is not None and self.health.is_fault),
             reference=main_field,
             position=position,
             age=sample.age,

@@ -11,12 +11,11 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import vector_covariance
 from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
-from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, require
+from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, require
 from magbridge.correction import Correction
 from magbridge.field.igrf import magnitude
 from magbridge.field.nearby import HeldField
 from magbridge.field.reference import main_field
-from magbridge.learning.model import TEMPERATURE
 from magbridge.records import Quality, Reading
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from magbridge.calibration.model import Calibration
-from magbridge.correction import TEMPERATURE
+from magbridge.columns import TEMPERATURE
 from magbridge.logs.telemetry_fields import MAVLINK_FIELDS
 from magbridge.sensors.options import options_of
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections import deque
 from math import hypot, sqrt
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magbridge.calibration.file import calibration_id, load, save
 from magbridge.calibration.model import Calibration, Parameter
 from magbridge.config import Config
 from magbridge.errors import CalibrationError, ConfigError, WriteError
-from magbridge.learning import Learner
-from magbridge.learning.alarms import CAUSE_UNITS
-from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
 from magbridge.link.output import Rate
 from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
+
+if TYPE_CHECKING:
+    from magbridge.learning import Learner  # imported with [learning] only: the bridge starts sooner
 
 __all__ = ["LearningService", "first_calibration", "keep", "kept_path", "open_learner"]
 
@@ -41,6 +42,8 @@ def first_calibration(config: Config) -> Calibration | None:
                   0.5 * (low + high), 0.5 * (high - low))
         for name, (low, high) in settings.ranges.items()
     ]  # fmt: skip
+    from magbridge.learning.start import class_prior  # noqa: PLC0415 - only with [learning]
+
     return class_prior(tuple(parameters))
 
 
@@ -70,6 +73,8 @@ def open_learner(
     settings = config.learning
     if settings is None or calibration is None:
         return None
+    from magbridge.learning import Learner  # noqa: PLC0415 - only with [learning]
+
     grid, spread = None, config.align.reference_sigma
     if settings.reference != "igrf":
         from magbridge.field.read import read_grid  # noqa: PLC0415 - it brings scipy
@@ -109,6 +114,9 @@ class LearningService:
     """
 
     def __init__(self, learner: Learner, component: Component) -> None:
+        from magbridge.learning.alarms import CAUSE_UNITS  # noqa: PLC0415 - only with [learning]
+
+        self._causes = tuple(CAUSE_UNITS)
         self.learner, self._component = learner, component
         self.to_keep: deque[Calibration] = deque(maxlen=4)
         self._published = learner.calibration
@@ -165,7 +173,7 @@ class LearningService:
             rms_learned=state.rms[2],
             better=state.better,
             alarm_amplitude=state.size,
-            causes=sum(1 << bit for bit, name in enumerate(CAUSE_UNITS) if name in state.causes),
+            causes=sum(1 << bit for bit, name in enumerate(self._causes) if name in state.causes),
             state=MAG_LEARNING_STATE.FROZEN if learner.frozen else going,
         )
 

@@ -178,7 +178,7 @@ class LiveCheck:
             return
         for one in self.arrived:
             is_autopilot = one.sender == f"{system}:{self._link.autopilot}"
-            # another component may send what is expected of the autopilot
+            # another component may send a message that the autopilot is expected to send
             rate_hz = max(one.rate_hz, streams.measured.get(one.name, 0.0)) if is_autopilot else one.rate_hz
             if rate_hz < MIN_RATE_FRACTION * one.needed_hz:
                 self._warn(

@@ -288,6 +288,8 @@ class Pipeline:
                 severity = MAV_SEVERITY.ERROR if comparison.is_wrong else MAV_SEVERITY.INFO
                 self.component.announcer.send_statustext(comparison.message, severity)
                 comparison.message = ""
+        if isinstance(stream.correction, Correction):
+            stream.correction.is_contradicted = bool(flags or variance)
         # the checks of the sensor itself may have added that difference already
         missing = stated * stated + variance - corrected.total_field_sigma**2
         if not flags and not (variance and missing > 0.0):

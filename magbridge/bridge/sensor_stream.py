@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from glob import has_magic
 from math import nan
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -13,11 +14,10 @@ from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.file import load
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.scalar import ScalarSensor
-from magbridge.columns import COLUMNS, may_be
+from magbridge.columns import COLUMNS, TEMPERATURE, may_be
 from magbridge.config import Align, Config, Sensor
-from magbridge.correction import TEMPERATURE, Correction
+from magbridge.correction import Correction
 from magbridge.errors import ConfigError
-from magbridge.learning import Learner
 from magbridge.link.component import Component
 from magbridge.link.publish import Publisher
 from magbridge.mavlink.enums import MAG_PORT_STATE
@@ -25,6 +25,9 @@ from magbridge.records import Reading, Vector
 from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
 from magbridge.sensors import Driver, is_scalar, open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
+
+if TYPE_CHECKING:
+    from magbridge.learning import Learner
 
 __all__ = [
     "SensorStream", "check", "check_channels", "open_correction", "open_drivers", "other_calibrations",

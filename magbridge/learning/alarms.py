@@ -32,9 +32,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.columns import TEMPERATURE
 from magbridge.estimation.sequential import ALARM_LOG_RATIO, RESTART_PERIODS, SequentialTest
 from magbridge.learning.estimator import Estimator
-from magbridge.learning.model import TEMPERATURE, LearnedTerms
+from magbridge.learning.model import LearnedTerms
 from magbridge.learning.samples import Observation
 from magbridge.records import Quality, Vector
 

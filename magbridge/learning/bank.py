@@ -24,11 +24,12 @@ from math import log
 from typing import Final
 
 from magbridge.arrays import FloatArray
+from magbridge.columns import TEMPERATURE
 from magbridge.estimation.sequential import ALARM_LOG_RATIO
 from magbridge.learning.alarms import LearningAlarm
 from magbridge.learning.estimator import Estimator, Nuisance
 from magbridge.learning.judge import BEYOND_CHANCE
-from magbridge.learning.model import TEMPERATURE, LearnedTerms
+from magbridge.learning.model import LearnedTerms
 
 __all__ = ["EstimatorBank"]
 

@@ -16,12 +16,10 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration, coefficient_tensor
+from magbridge.columns import TEMPERATURE
 from magbridge.errors import CalibrationError
 
-__all__ = ["TEMPERATURE", "LearnedTerms"]
-
-TEMPERATURE = "sensor_temperature"
-"""Name of the only channel that is part of the sensor's reading instead of telemetry."""
+__all__ = ["LearnedTerms"]
 
 
 class LearnedTerms:

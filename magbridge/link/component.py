@@ -68,7 +68,7 @@ class Component:
     file_requests : deque of Message
         Requests for files; the bridge takes them out.
     more_reports : list of callable
-        Functions that send what is sent with each MAG_STATUS.
+        Functions that send the messages with the rate of MAG_STATUS.
     metadata : mapping of str to bytes
         The files that describe the parameters, by path.
     parameters, rates, announcer, vehicle, publisher

@@ -104,11 +104,14 @@ def calibration(*sensors: ScalarSensor) -> Calibration:
 class Bench:
     """A bridge with two sensors, and the messages that it sent."""
 
-    def __init__(self, folder: Path, name: str, columns: str, settings: str, *sensors: ScalarSensor) -> None:
+    def __init__(
+        self, folder: Path, name: str, columns: str, settings: str, *sensors: ScalarSensor, more: str = ""
+    ) -> None:
         save(calibration(*sensors), folder / "flux.json")
         save(calibration(), folder / "other.json")
         self.config = folder / "bridge.toml"
-        self.config.write_text(CONFIG.format(name=name, columns=columns, settings=settings), encoding="utf-8")
+        text = CONFIG.format(name=name, columns=columns, settings=settings) + more
+        self.config.write_text(text, encoding="utf-8")
         self.bridge = set_up(load(self.config), StartEvent(START))
         self.messages: list[Message] = []
         self._ear = Codec(0, 0)
@@ -181,6 +184,25 @@ def test_a_sensor_that_jumps_is_named_and_its_sigma_grows(tmp_path: Path, wrong:
     assert last[1 - wrong]["total_field_sigma"] < 5.0
     good = [one for one in bench.field(1 - wrong) if one["total_field_sigma"] > 5.0]
     assert len(good) < 60
+
+
+@pytest.mark.parametrize(("jump_at", "is_used"), [(0, False), (600, True)])
+def test_the_learner_does_not_use_samples_that_another_sensor_contradicts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_at: int, is_used: bool
+) -> None:
+    """The tail is wrong: by its jump that is known, and without a jump either sensor may be wrong."""
+    bench = Bench(tmp_path, "tail", *VECTOR, more="[learning]\n")
+    assert bench.bridge.learning is not None
+    faulty: list[bool] = []
+    learner = bench.bridge.learning.learner
+    monkeypatch.setattr(learner, "sample", lambda *_, **values: faulty.append(values["faulty"]))
+    random = np.random.default_rng(1)
+    for k in range(jump_at + 200):
+        for sensor_id in (0, 1):
+            total = FIELD_NT + (300.0 if sensor_id and k >= jump_at else 0.0)
+            x, y, z = attitude(np.array([0.1 * k]))[0] * total / FIELD_NT + random.normal(size=3)
+            bench.vector(0.1 * k + 0.02 * sensor_id, x, y, z, sensor_id)
+    assert set(faulty[-100:]) == {not is_used}
 
 
 def test_a_scalar_is_compensated_by_the_vector_of_its_time(tmp_path: Path) -> None:

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import CalibratedRange, Calibration, Parameter
 from magbridge.calibration.terms import Exponents
+from magbridge.columns import TEMPERATURE
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
 
-__all__ = ["TEMPERATURE", "Observations", "monomials", "polynomial_samples"]
-
-TEMPERATURE = "sensor_temperature"
-"""The column of the fluxgate's temperature."""
+__all__ = ["Observations", "monomials", "polynomial_samples"]
 
 RARE = 0.001
 """Share of the samples at either end that does not count for the range of a condition: it may be wrong."""

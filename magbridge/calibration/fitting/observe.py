@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
-from magbridge.columns import CHANNELS, COLUMNS, require
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, require
 from magbridge.errors import CalibrationError
 from magbridge.field.geodesy import separation
 from magbridge.field.reference import earth_field, placed, positions, with_true_heading

@@ -16,8 +16,9 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, held, lagged
-from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
+from magbridge.columns import TEMPERATURE
 from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, slow_functions
 
 __all__ = ["Creep", "in_words", "offered", "with_creep", "with_temperature"]
