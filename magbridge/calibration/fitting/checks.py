@@ -205,6 +205,11 @@ sigmas."""
 GAIN = 0.08
 """Departure of the middle scale from 1 that few sensors have, four sigmas of the prior. A wrong reference
 shrinks all scales: in a real flight over an unmapped crustal anomaly to 0.88 to 0.94."""
+MAX_PRIOR_CHI_SQUARED = 27.9
+"""Sum of the squares of nine coefficients over their prior's sigmas that one sensor in 1,000 exceeds."""
+MAX_SCALE_SIGMA_RATIO = 0.25
+"""Sigma of a scale over its prior's, from which on the prior shows in the scale: at 0.25 it moves the scale by
+a sixteenth of its departure. A gain of 0.8 came out as 0.84 to 0.98 at ratios of 0.36 to 1."""
 MAX_NOISE_AUTOCORRELATION = 0.98
 """Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
 MAX_HEADING_GAP_DEG = 270.0
@@ -232,6 +237,7 @@ def judged(found: Fit, data: Observations) -> Fit:
         *_warnings(ratio, noise, heading_gap(data), lasting),
         *_noise_for_attitudes(found.samples.field, noise),
         *rough_rock(data, found.details.get("rock"), noise),
+        *_contradicted_prior(found),
     )
     if ratio > UNSUPPORTED:
         warnings = (*warnings, *found.open)
@@ -275,6 +281,18 @@ def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterato
         yield (
             f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
             "cannot be distinguished from the Earth's"
+        )
+
+
+def _contradicted_prior(found: Fit) -> Iterator[str]:
+    """Report scales that the prior of an ellipsoid does not expect, and attitudes that do not prove them."""
+    unlikely = found.details.get("prior_chi_squared", 0.0) > MAX_PRIOR_CHI_SQUARED
+    if unlikely and found.details["scale_sigma_ratio"] > MAX_SCALE_SIGMA_RATIO:
+        low, high = found.scales
+        yield (
+            f"the readings ask for a gain that is further from 1 than sensors have (so far {low:.2f} to "
+            f"{high:.2f}), and their attitudes are too few to separate it from the offset: check the unit and "
+            "the reference, or fly dives, climbs and banked turns"
         )
 
 

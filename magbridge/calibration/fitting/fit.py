@@ -47,8 +47,10 @@ MAIN_FIELD_SIGMA_NT = 145.0
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 MAX_FIT_SAMPLES = 250_000
 """Samples at most that are fitted: more only cost time, because the model's error does not average out."""
-ROCK, JUDGED = 3.0 * MAIN_FIELD_SIGMA_NT, 3000
-"""RMS that an unmapped crustal field never exceeds over a whole track, nT; samples that suffice to see it."""
+MAX_CRUST_NT = 3.0 * MAIN_FIELD_SIGMA_NT
+"""RMS that an unmapped crustal field never exceeds over a whole track, nT."""
+CRUST_TEST_SAMPLES = 3000
+"""Samples that suffice to see whether the crustal field may show."""
 
 
 def fit(
@@ -146,7 +148,11 @@ def _first_solution(
     failures: list[CalibrationError] = []
     for name, part, own, notes in attempts:
         try:
-            return _function(name)(part, order, **own), name, notes
+            found = _function(name)(part, order, **own)
+            # a field in place larger than any crust is the sensor's own error, put into places
+            if in_place and name == "survey" and found.details["rock"]["rms_nT"] > MAX_CRUST_NT:
+                raise NoSolutionError("survey: the fitted crustal field is larger than any crust's")
+            return found, name, notes
         except NoSolutionError as error:
             failures.append(error)
         except CalibrationError as error:
@@ -164,11 +170,11 @@ def _function(method: str) -> Callable[..., Fit]:
 
 def _rock_may_show(data: Observations, order: int) -> bool:
     """Return True if a fit without the crustal field leaves a residual that this field can explain."""
-    few = data.part(np.arange(len(data)) % max(len(data) // JUDGED, 1) == 0)
+    few = data.part(np.arange(len(data)) % max(len(data) // CRUST_TEST_SAMPLES, 1) == 0)
     for method in ("nominal", "auto"):
         try:
             with threadpool_limits(1, "blas"):
-                if robust_scale(_function(method)(few, order).residual) <= ROCK:
+                if robust_scale(_function(method)(few, order).residual) <= MAX_CRUST_NT:
                     return True
         except CalibrationError:
             return True

@@ -195,6 +195,7 @@ def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:
         "widths_nT": dict(zip(names, np.exp(found.widths.eta).tolist(), strict=True)),
         "offsets_nT": {one.name: rms(survey.offset(latent, [one])) for one in survey.offsets},
         "rock": {
+            "rms_nT": rms(found.lacking),
             "size_nT": choice.ratio * found.widths.sigma,
             "length_m": field.length,
             "smoothness": field.alpha - 1,

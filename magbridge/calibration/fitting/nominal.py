@@ -64,7 +64,16 @@ def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # n
     """Return the fit of :func:`nominal` as a calibration without parameters."""
     one, left = _chosen(data, **options)
     samples = nominal_samples(data)
-    return assemble(data, samples, (), ((),), one.coefficients, one.covariance, one.noise, "nominal", left)
+    # a prior that the fit contradicts matters only where the samples do not overrule it
+    before = one.prior.E @ np.linalg.inv(one.prior.precision) @ one.prior.E.T
+    known = np.diag(one.covariance)[:6] / np.maximum(np.diag(before)[:6], 1e-300)
+    details = {
+        "prior_chi_squared": float(one.z @ one.prior.precision @ one.z),
+        "scale_sigma_ratio": float(np.sqrt(known.max())),
+    }
+    return assemble(
+        data, samples, (), ((),), one.coefficients, one.covariance, one.noise, "nominal", left, details=details
+    )
 
 
 def nominal_samples(data: Observations) -> ResidualSamples:
