@@ -149,9 +149,8 @@ def _first_solution(
     for name, part, own, notes in attempts:
         try:
             found = _function(name)(part, order, **own)
-            # a field in place larger than any crust is the sensor's own error, put into places
-            if in_place and name == "survey" and found.details["rock"]["rms_nT"] > MAX_CRUST_NT:
-                raise NoSolutionError("survey: the fitted crustal field is larger than any crust's")
+            if in_place:
+                _refuse_large_crust(found)
             return found, name, notes
         except NoSolutionError as error:
             failures.append(error)
@@ -160,6 +159,14 @@ def _first_solution(
                 raise
             failures.append(error)
     raise failures[0]
+
+
+def _refuse_large_crust(found: Fit) -> None:
+    """Refuse a field in place that is larger than any crust's: it is the sensor's own error, put into places."""
+    if (size := found.details.get("rock", {}).get("rms_nT", 0.0)) > MAX_CRUST_NT:
+        raise NoSolutionError(
+            f"survey: a crustal field of {size:.0f} nT RMS was fitted, larger than any crust's"
+        )
 
 
 def _function(method: str) -> Callable[..., Fit]:

@@ -72,7 +72,16 @@ def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # n
         "scale_sigma_ratio": float(np.sqrt(known.max())),
     }
     return assemble(
-        data, samples, (), ((),), one.coefficients, one.covariance, one.noise, "nominal", left, details=details
+        data,
+        samples,
+        (),
+        ((),),
+        one.coefficients,
+        one.covariance,
+        one.noise,
+        "nominal",
+        left,
+        details=details,
     )
 
 
