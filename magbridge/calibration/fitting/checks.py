@@ -208,8 +208,8 @@ shrinks all scales: in a real flight over an unmapped crustal anomaly to 0.88 to
 MAX_PRIOR_CHI_SQUARED = 27.9
 """Sum of the squares of nine coefficients over their prior's sigmas that one sensor in 1,000 exceeds."""
 MAX_SCALE_SIGMA_RATIO = 0.25
-"""Sigma of a scale over its prior's, from which on the prior shows in the scale: at 0.25 it moves the scale by
-a sixteenth of its departure. A gain of 0.8 came out as 0.84 to 0.98 at ratios of 0.36 to 1."""
+"""Sigma of a scale over its prior's, from which on the prior shows in it: at 0.25 it moves the scale by a
+sixteenth of its departure. A gain of 0.8 came out as 0.84 to 0.98 at ratios of 0.36 to 1."""
 MAX_NOISE_AUTOCORRELATION = 0.98
 """Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
 MAX_HEADING_GAP_DEG = 270.0
@@ -291,8 +291,8 @@ def _contradicted_prior(found: Fit) -> Iterator[str]:
         low, high = found.scales
         yield (
             f"the readings ask for a gain that is further from 1 than sensors have (so far {low:.2f} to "
-            f"{high:.2f}), and their attitudes are too few to separate it from the offset: check the unit and "
-            "the reference, or fly dives, climbs and banked turns"
+            f"{high:.2f}), and their attitudes are too few to separate it from the offset: check the unit "
+            "and the reference, or fly dives, climbs and banked turns"
         )
 
 

@@ -151,18 +151,19 @@ def _first_solution(
             found = _function(name)(part, order, **own)
             if in_place:
                 _refuse_large_crust(found)
-            return found, name, notes
         except NoSolutionError as error:
             failures.append(error)
         except CalibrationError as error:
             if not in_place or failures:
                 raise
             failures.append(error)
+        else:
+            return found, name, notes
     raise failures[0]
 
 
 def _refuse_large_crust(found: Fit) -> None:
-    """Refuse a field in place that is larger than any crust's: it is the sensor's own error, put into places."""
+    """Refuse a field in place that is larger than any crust's: it is the sensor's own error."""
     if (size := found.details.get("rock", {}).get("rms_nT", 0.0)) > MAX_CRUST_NT:
         raise NoSolutionError(
             f"survey: a crustal field of {size:.0f} nT RMS was fitted, larger than any crust's"
