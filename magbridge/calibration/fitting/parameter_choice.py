@@ -94,6 +94,7 @@ def worths(
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
+    # regress the residual on u, c u, c^2 u with and without the column, and compare held-out errors
     corrected = correct(calibration, data.field, data.parameters, data.time)
     residual = corrected.total - data.reference
     direction = corrected.vector / corrected.total[:, None]
@@ -143,6 +144,9 @@ FAILURES = 2
 """Columns in a row that were not worth it, after which no more are tried."""
 MAX_HELD_OUT_ERROR_RATIO = 0.95
 """Share of the error on parts left out that may be left, for a column to be worth its coefficients."""
+USUAL_DEPARTURE = 0.15
+"""Departure of a scale from 1 that sensors have. Beyond it a parameter must not move the scales further away:
+its coefficients have then absorbed attitudes, because it moved with them."""
 HINTED = 0.98
 """Share of the residual that may be left, for a column to be tried."""
 
@@ -183,6 +187,8 @@ def best_parameters(
     found = fit(observations(deployment, taken, grid=grid), **options)
     offers: list[Offer] = []
     failures = 0
+    # Forward selection: offer the column that explains most of the residual; keep it if a new fit predicts
+    # held-out parts better, both those between others and the later ones.
     while len(taken) < MAX_PARAMETERS and failures < FAILURES:
         name = _most_promising(deployment, found, taken, [*offered], {one.name for one in offers}, grid)
         if name is None:
@@ -200,12 +206,18 @@ def best_parameters(
         if {"forward_nT"} <= found.details.keys() & further.details.keys():
             forward = further.details["forward_nT"] / found.details["forward_nT"]
             worth_it = worth_it and forward < MAX_HELD_OUT_ERROR_RATIO
+        worth_it = worth_it and _departure(further) <= max(_departure(found), USUAL_DEPARTURE)
         offers.append(Offer(name, without, left, worth_it))
         if worth_it:
             found, taken, failures = further, (*taken, name), 0
         else:
             failures += 1
     return taken, offers
+
+
+def _departure(found: Fit) -> float:
+    """Return the largest departure of a scale from 1."""
+    return max(abs(scale - 1.0) for scale in found.scales)
 
 
 def lines(offers: Sequence[Offer]) -> list[str]:
