@@ -93,6 +93,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
         **{name: getattr(calibration, name) for name in AS_IN_MEMORY},
     )
     encode = msgspec.json.encode
+    # keys that older readers do not know are left out where they are empty
     optional = "doubts", "level", "sensors", "conditions"
     names = [name for name in _File.__struct_fields__ if name not in optional or getattr(content, name)]
     values = {name: getattr(content, name) for name in names}
@@ -134,6 +135,7 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
         The numbers do not hold together.
     """
     try:
+        # the number of the format first: a newer file gets a message of its own
         version = msgspec.json.decode(data, type=_Version).format
         if version > CALIBRATION_FORMAT:
             raise FormatError(
@@ -141,6 +143,7 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
                 f"written by a newer magbridge (format {version}; this one reads up to {CALIBRATION_FORMAT})",
             )
         raw = msgspec.json.decode(data)
+        # format 1 had another name for the autocorrelation
         if version < 2 and isinstance(raw.get("noise"), dict) and "memory" in raw["noise"]:
             raw["noise"]["autocorrelation"] = raw["noise"].pop("memory")
         content = msgspec.convert(raw, _File)
@@ -196,6 +199,7 @@ def _term_in(raw: dict[str, Any], file: str | Path) -> Term:
 
 def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...]) -> Calibration:
     """Build the calibration; refuse inconsistent numbers."""
+    # shapes before values: a ragged covariance has no array
     coefficients = np.array(content.coefficients, float)
     rows = {len(row) for row in content.covariance}
     if rows != {coefficients.size} or len(content.covariance) != coefficients.size:
@@ -207,6 +211,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         if np.abs(content.boresight.rotation).max() > 2.0 * np.pi:
             raise CalibrationError("boresight: rotation: expected a rotation vector, rad, up to a full turn")
     _check_settings(content)
+    # plugins may define either kind; each must stand in its own list
     positions = tuple(term for term in terms if isinstance(term, PositionTerm))
     others = tuple(effect for effect in effects if isinstance(effect, Effect))
     if len(positions) < len(terms) or len(others) < len(effects):
@@ -268,6 +273,7 @@ def _check_covariance(covariance: FloatArray, prefix: str = "") -> None:
     """Symmetric and positive semidefinite, up to rounding."""
     if np.abs(covariance).max(initial=0.0) > MAX_STATED_SIGMA**2:
         raise CalibrationError(f"{prefix}covariance: expected standard deviations up to {MAX_STATED_SIGMA:g}")
+    # a correlation beyond 1 cannot be a covariance; the scale makes the test independent of units
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     with np.errstate(over="ignore"):  # a covariance with a variance of zero: rejected below
         correlation = covariance / scale / scale[:, None]

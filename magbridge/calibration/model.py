@@ -231,6 +231,8 @@ class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def matrix(self) -> FloatArray:
         """(3, 3) rotation matrix: Rodrigues' formula."""
+        # R = I + sinc(a) K + (1 - cos a)/a^2 K^2; 1 - cos a = 2 sin^2(a/2), so that both factors stay
+        # finite at a = 0
         x, y, z = self.rotation
         angle = float(np.sqrt(x * x + y * y + z * z))
         K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -256,6 +258,7 @@ class CalibratedRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def excess(self, value: float) -> float:
         """Return how far a value lies outside the range, in half ranges; 0 inside, or where it is NaN."""
+        # in half ranges from the middle: 1 is the edge
         half = max(0.5 * (self.high - self.low), MIN_HALF_RANGE[self.name])
         distance = abs(value - 0.5 * (self.low + self.high)) / half
         return distance - 1.0 if distance > 1.0 else 0.0
@@ -303,6 +306,7 @@ class Calibration:
     """Ranges of depth and temperature in the data that it was fitted to."""
 
     def __post_init__(self) -> None:
+        # every term checks its own settings; then the vector must have one number for each coefficient
         names = tuple(parameter.name for parameter in self.parameters)
         for term in (*self.terms, *self.effects):
             term.check(names)
@@ -345,6 +349,7 @@ class Calibration:
 
     def without_effects(self) -> Calibration:
         """Return the position terms alone, with their part of coefficients and covariance."""
+        # position terms come first in the vector, effects after them
         own = slice(sum(term.size for term in self.terms))
         return replace(
             self, effects=(), coefficients=self.coefficients[own], covariance=self.covariance[own, own],
@@ -356,6 +361,7 @@ class Calibration:
 
         A whole one may move the offset by 100 nT across the field: the total field is not linear in that.
         """
+        # the level moves the first coefficients together, along one direction
         moved = self.coefficients.copy()
         many = min(len(moved), len(self.level))
         moved[:many] += LEVEL_STEP_SIGMA * np.asarray(self.level[:many])
@@ -375,6 +381,7 @@ class Calibration:
         T : (n, 3) array
             nT.
         """
+        # theta (n, 9): the six entries of A - I, then T
         theta = self.kernel.monomials_of(positions).T @ self.kernel.position_weights
         return symmetric(theta), theta[:, 6:]
 

@@ -138,6 +138,7 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
 
     def check(self, parameters: tuple[str, ...]) -> None:
         """Require one exponent for each parameter, a total degree of at most 30, and no monomial twice."""
+        # a high power of a position beyond its range grows without bounds
         for exponent in self.exponents:
             if len(exponent) != len(parameters) or min(exponent, default=0) < 0 or sum(exponent) > MAX_ORDER:
                 raise CalibrationError(
@@ -149,6 +150,7 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
 
     def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:  # noqa: ARG002  (a dipole needs them)
         """Return the polynomial as itself."""
+        # coefficient 9 m + s adds 1 to slot s of monomial m
         m = len(self.exponents)
         return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
 
@@ -228,6 +230,7 @@ class Effect(Term, frozen=True, kw_only=True):
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
     """All monomials of total degree up to `order`, cross terms included, the constant first."""
     return tuple(
+        # each choice of `degree` parameters, with repetition, is one monomial
         tuple(picks.count(k) for k in range(parameters))
         for degree in range(order + 1)
         for picks in combinations_with_replacement(range(parameters), degree)
@@ -239,6 +242,7 @@ def term_class(kind: str) -> type[Term]:
 
     CalibrationError: neither has that name.
     """
+    # classes are imported only when a file names them
     found: Any
     if kind in TERMS:
         module, _, name = TERMS[kind].partition(":")

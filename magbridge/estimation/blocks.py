@@ -75,6 +75,7 @@ class SlowFunctions:
         _, first, size = np.unique(self.stretch, return_index=True, return_counts=True)
         self.start = time[first]
         self.span = np.maximum(time[first + size - 1] - self.start, 1e-9)
+        # as many half waves as the stretch has periods of the fastest change
         self.count = np.minimum(self.span / fastest, MAX_SLOW_FUNCTIONS).astype(int)
         self.levels = len(first) > 1
         """True if each has a level against the others, too."""
@@ -83,6 +84,7 @@ class SlowFunctions:
     @property
     def shape(self) -> FloatArray:
         """The functions' widths (r,)."""
+        # weights of a random walk fall as 1/k
         level = [1.0] * self.levels
         return np.concatenate([[*(1.0 / np.arange(1, count + 1)), *level] for count in self.count])
 
@@ -116,6 +118,7 @@ class BlockColumns:
         return np.concatenate([part[rows] for part in self.parts], axis=1)
 
     def __matmul__(self, weights: FloatArray) -> FloatArray:
+        # product column by column: the columns of slow functions are never all in memory
         pieces = zip(self.parts, np.split(weights, self.edges[1:-1]), strict=True)
         return np.asarray(sum(part @ mine for part, mine in pieces))
 

@@ -53,6 +53,7 @@ def flown(residual: FloatArray) -> BoolArray:
     residual : (n,) array
         Of a robust fit, in the order of the log, nT.
     """
+    # an end is cut where most of its samples are outliers
     off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
     kept = np.ones(len(off), bool)
     kept[: _end(off)] = False
@@ -96,9 +97,11 @@ def fit_auto(
     CalibrationError
         No start reached a maximum, or the best one collapsed.
     """
+    # 1. coefficients, widths and noise that maximise the evidence, from several starts
     posed = pose(data, order, vehicle, known)
     samples, family = posed.samples, posed.family
     best = _best(samples, family)
+    # 2. a crash or a launch at an end of the log is not flight: fit again without it
     kept = flown(residuals_of(samples, best.family.prior(best.widths.eta).coefficients(best.solution.z)))
     if not kept.all():
         found = fit_auto(data.part(kept), order, vehicle=vehicle, known=known)
@@ -106,11 +109,13 @@ def fit_auto(
         if inner is not None:
             kept[kept] = inner
         return replace(found, details={**found.details, "flown": kept})
+    # 3. noise as a slow and a white part, where the residuals show both
     best = _remembering(samples, best)
     prior = best.family.prior(best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
+    # 4. the posterior covariance, and what held-out parts say of it
     left = leave_out(samples, prior, best.solution.z, best.noise, data.runs, attitudes=True)
     covariance = prior.E @ covariance_of(precision) @ prior.E.T
     found = assemble(
@@ -180,6 +185,7 @@ def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
 
 def _best(samples: ResidualSamples, family: PriorFamily) -> Climbed:
     """Return the answer with the largest evidence among several starts."""
+    # climb from each start with a part of the samples, at narrow and at wide priors; then the best with all
     few = thinned(samples)
     answers = []
     for start in starts(few):

@@ -60,8 +60,10 @@ def _vectors(calibration: Calibration, data: Observations) -> FloatArray:
 
 def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
     """Return the rotation of vectors b to v, (n, 3) each, and the median angle that it leaves, deg."""
+    # Wahba's problem: the rotation that minimises the sum of |v - R b|^2
     rotation, _ = Rotation.align_vectors(v, b)
     turned = rotation.apply(b)
+    # angles by the arctangent, which is accurate for small ones
     left = np.arctan2(np.linalg.norm(np.cross(v, turned), axis=1), np.sum(v * turned, axis=1))
     return rotation, float(np.degrees(np.median(left)))
 
@@ -80,6 +82,7 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> str:
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
         return ""
+    # compare two boresights: with the headings as they are, and with the declination added
     declination = np.arctan2(reference_ned[:, 1], reference_ned[:, 0])
     D = float(np.degrees(np.arctan2(np.sin(declination).mean(), np.cos(declination).mean())))
     b = _vectors(calibration, data.part(known))
@@ -116,6 +119,7 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
     part = data.part(known)
     assert part.attitude is not None
     assert part.reference_ned is not None
+    # tilt needs the size and the inclination of the field, not the heading
     total = np.linalg.norm(part.reference_ned, axis=1)
     inclination = np.arcsin(part.reference_ned[:, 2] / total)
     _, runs = np.unique(part.runs, return_inverse=True)
@@ -149,6 +153,7 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     v, b = field_body(attitude, reference_ned), _vectors(calibration, part)
     rotation, angle = _wahba(v, b)
     turned = rotation.apply(b)
+    # the derivative of the misfit by a small rotation, for each sample
     score = np.cross(v, turned - v)
     if angle > MISMATCH:
         raise CalibrationError(
@@ -156,6 +161,8 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
             "pitch, heading and IGRF say: a channel or an angle has the other sign, two are swapped, angles "
             "are not in degrees, or the place is another; no boresight, so the vector stays in sensor axes"
         )
+    # Sandwich covariance: attitude errors last as long as a run, so the scores are summed within runs, and
+    # the scatter of these sums takes the place of the noise (Liang & Zeger 1986, Biometrika 73:13).
     information = np.sum(v * v) * np.eye(3) - v.T @ v
     _, which = np.unique(part.runs, return_inverse=True)
     between = np.stack([np.bincount(which, column) for column in score.T], axis=1)

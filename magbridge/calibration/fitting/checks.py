@@ -71,6 +71,7 @@ def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: floa
     sigma : float
         nT, noise of a sample.
     """
+    # thin the rows, and scale them so that they carry the information of all
     step = max(len(samples.field) // JACOBIAN_ROWS, 1)
     part = samples.part(slice(None, None, step))
     _, g = residuals(part, coefficients)
@@ -78,6 +79,7 @@ def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: floa
     # columns are scaled to one norm: a coefficient's unit must not decide whether it is estimable
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0.0, size, 1.0)
+    # singular values over the noise: 1 / value is the 1-sigma of a combination of coefficients
     _, values, vectors = np.linalg.svd(J / scale * np.median(scale), full_matrices=False)
     rank = int((values > RANK_TOLERANCE * values[0]).sum())
     return Combinations(rank, 1.0 / values[:rank], vectors[:rank])
@@ -100,6 +102,7 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
             (e[k] for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents),
             default=0,
         )
+        # group the positions: a gap in their sorted values separates two places
         column = np.sort(data.parameters[:, k])
         jumps = np.flatnonzero(np.diff(column) > MIN_POSITION_STEP_FRACTION * parameter.scale)
         groups = [g for g in np.split(column, jumps + 1) if len(g) > MIN_POSITION_STEP_FRACTION * len(column)]
@@ -119,6 +122,7 @@ def _moved_together(calibration: Calibration, data: Observations) -> Iterator[st
     names = [parameter.name for parameter in calibration.parameters]
     if len(names) < 2:
         return
+    # correlated positions have collinear columns in the Jacobian
     together = np.atleast_2d(np.corrcoef(data.parameters[:, : len(names)].T))
     for i, one in enumerate(names):
         for j, other in enumerate(names[:i]):
@@ -136,6 +140,7 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
     if not len(known):
         return
     roll, pitch, heading = np.degrees(known).T
+    # roll separates the vertical offset from the vertical scale
     low, high = np.quantile(roll, [0.02, 0.98])
     variance = calibration.covariance[8, 8]  # of T's z
     if high - low < BANKED and variance > (5.0 * calibration.noise.sensor) ** 2:
@@ -168,6 +173,7 @@ def heading_gap(data: Observations) -> float:
 
 def _widest_gap(heading: FloatArray) -> tuple[float, float]:
     """Return where the widest gap between headings begins, and its width, deg."""
+    # gaps on the circle, the one through north included
     courses = np.sort(heading % 360.0)
     gaps = np.diff(np.append(courses, courses[0] + 360.0))
     widest = int(np.argmax(gaps))
@@ -218,6 +224,7 @@ MAX_HEADING_GAP_DEG = 270.0
 
 def judged(found: Fit, data: Observations) -> Fit:
     """Return the fit with its boresight and with warnings about undetermined quantities."""
+    # 1. boresight; 2. reasons against the fit, which `--strict` refuses; 3. remarks that leave it valid
     whole, mismatch = found.calibration, []
     calibration = whole.without_effects()
     if whole.effects or found.creep:  # they have been subtracted
@@ -230,6 +237,7 @@ def judged(found: Fit, data: Observations) -> Fit:
             data = replace(data, attitude=None)
         if magnetic := magnetic_headings(calibration, data):
             mismatch.append(magnetic)
+    # the level is common to all samples, and no manoeuvre reduces it: leave it out of the expected error
     ratio = expected_ratio(apart_from_level(calibration), data)
     lasting = found.details.get("autocorrelation", 0.0)
     noise = calibration.noise.sensor
@@ -298,6 +306,7 @@ def _contradicted_prior(found: Fit) -> Iterator[str]:
 
 def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[str]:
     """Report if the sensor's noise (nT) is not small against the variation of the field (n, 3), nT."""
+    # smallest variation of the field along any axis: noise must be small against it (errors in variables)
     least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(field.T))[0], 0.0)))
     if least < MIN_SIGNAL_TO_NOISE * noise:
         yield (

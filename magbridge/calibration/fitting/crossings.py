@@ -56,6 +56,7 @@ def tells_rock(data: Observations) -> bool:
     """
     if data.place is None:
         return False
+    # two kinds of evidence: enough legs whose courses differ, or cells that were passed on other courses
     whole = np.isfinite(data.place[:, :2]).all(axis=1)
     place, course = courses(data.place[whole & ~far_off(data.place[:, :2]), :2])
 
@@ -63,8 +64,10 @@ def tells_rock(data: Observations) -> bool:
         places = len(np.unique(np.floor(place / cell), axis=0))
         return sum(crossed(place, course, cell)) >= max(OFTEN * places, TWICE)
 
+    # within a small area the crustal field is one constant
     if not len(place) or np.hypot(*np.ptp(place, axis=0)) < AREA:
         return False
+    # the mean of exp(i course) is near 1 on a straight track
     legs = len(np.unique(np.floor(place / PLACES[-1]), axis=0)) >= LEGS
     return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(revisits_cells, PLACES))
 
@@ -109,6 +112,7 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
     place = courses(track)[0]
     if len(place) < FEW:
         return
+    # spacing of the lines: the area of the hull over the length of the track
     way = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
     apart = float(ConvexHull(place, qhull_options="QJ").volume) / way  # in a plane its volume is an area
     if length < MIN_LENGTH_SPACINGS * apart:
@@ -125,6 +129,7 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
 
 def far_off(place: FloatArray) -> BoolArray:
     """Return a mask (n,) of places (n, 2), m, that are too far from all others to be right."""
+    # robust: the median is the middle, and the 99 % quantile the usual distance
     distance = np.linalg.norm(place - np.nanmedian(place, axis=0), axis=1)
     usual = max(float(np.nanquantile(distance, 0.99)), NEAR)
     return np.asarray(~(distance <= FARTHEST * usual))
@@ -151,6 +156,7 @@ def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
 
 def jumps(place: FloatArray, time: FloatArray) -> IndexArray:
     """Return the indices of places (n, 2), m, at times (n,), s, after which the track jumps."""
+    # a jump is a step that the usual speed does not explain
     step = np.linalg.norm(np.diff(place, axis=0), axis=1)
     usual = float(np.median(step / np.maximum(np.diff(time), 1e-3)))
     beyond = step - FARTHEST * usual * np.diff(time)
@@ -162,6 +168,7 @@ def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, in
 
     `place` (n, 2) and `cell`, the size of one place, are in m.
     """
+    # number the cells, and go through the samples cell by cell
     _, of = np.unique(np.floor(place / cell).astype(np.int64), axis=0, return_inverse=True)
     of = of.ravel()
     order = np.argsort(of, kind="stable")
@@ -170,6 +177,7 @@ def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, in
     for first, last in pairwise(edges):
         here = np.sort(order[first:last])
         new = np.flatnonzero(np.diff(here, prepend=-9) > 1)  # another visit
+        # mean course of each visit, then the angles between all pairs of visits
         passes = np.angle(np.add.reduceat(np.exp(1j * course[here]), new))
         apart = np.degrees(np.abs(np.angle(np.exp(1j * (passes[:, None] - passes)))))
         if ((apart > MIN_CROSSING_DEG) & (apart < REVERSED_COURSE_DEG)).any():

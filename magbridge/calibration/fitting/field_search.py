@@ -60,6 +60,7 @@ class Weighed:
 
     def score(self, reduced: FieldEliminated, field: GaussianField, ratio: float) -> float:
         """Return the log evidence, the noise's size being the likeliest one."""
+        # profile sigma out, then add the Gaussian priors of log size and log length
         log_sigma, value = float(np.log(self.sigma)), -np.inf
         for _ in range(4):  # Newton's: in log sigma it is nearly a parabola of curvature -2n
             value, slope, _ = log_evidence(reduced.quadratic, self.family, self.eta, log_sigma)
@@ -104,6 +105,9 @@ def choose(
     most : int
         Nodes at most.
     """
+    # 1. length by a ladder at the usual smoothness; 2. falling off upwards or not; 3. smoothness; 4.
+    # sources at a depth. Each step starts from the best so far and maximises the evidence over size, memory
+    # and length.
     move_rho, memory = rho is None, 0.3 if rho is None else rho
 
     def search_lengths(alpha: int) -> tuple[Choice, bool]:
@@ -112,6 +116,7 @@ def choose(
         worse, ratio, rho = 0, start, memory
         for length in ladder(place)[::-1]:
             nodes = nodes_for(place, length, alpha, most)
+            # too few nodes are allowed for this length: the grid cannot show it
             if length < RESOLVED * nodes.spacing:
                 continue
             field = GaussianField(nodes, float(length), alpha, harmonic)
@@ -133,12 +138,14 @@ def choose(
         best = rough if rough.score > best.score else best
 
     def tried(choice: Choice, alpha: int, harmonic: bool, buried: bool = False) -> Choice:
+        # keep the correlation similar when the power changes, so that the climb starts near its maximum
         length = choice.field.length * ((choice.field.alpha - 1) / (alpha - 1)) ** BENDS
         nodes = nodes_for(place, length, alpha, most if alpha <= SMOOTH else FEWER)
         field = GaussianField(nodes, length, alpha, harmonic, buried)
         begin = replace(choice, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
+    # try both kinds if the depth varies; where neither is decisively better, try again after the smoothness
     kinds = [tried(best, best.field.alpha, kind) for kind in ((True, False) if harmonic else (False,))]
     kinds.sort(key=lambda one: one.score)
     best = _smoothness(kinds[-1], tried)
@@ -153,6 +160,8 @@ def choose(
 
 def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> Choice:
     """Increase the power alpha from that of `best`, or decrease it if that is not better; return the best."""
+    # one direction at a time: evidence is unimodal in the smoothness, so stop at the first power that is
+    # worse
     at = SMOOTHNESS_POWERS.index(best.field.alpha)
     for others in (SMOOTHNESS_POWERS[at + 1 :], SMOOTHNESS_POWERS[:at][::-1]):
         before = best
@@ -187,6 +196,7 @@ def climb(
 
     Its length or its noise's memory change, too, if need be.
     """
+    # unknowns without bounds: log ratio, logit of rho over its largest value, log length
     share = np.clip(max(start.rho, 0.01) / MAX_FIT_AUTOCORRELATION, 1e-6, 1.0 - 1e-6)
     moves = [0] + [1] * move_rho + [2] * move_length
     first = np.array([0.0, np.log(share / (1.0 - share)), 0.0])
@@ -207,6 +217,7 @@ def climb(
         except np.linalg.LinAlgError:
             return 1e300
 
+    # Nelder-Mead: the score has no cheap derivative by the length, and three unknowns at most
     begin = first[moves]
     simplex = begin + np.vstack([np.zeros(len(moves)), np.diag(np.array([0.7, 0.8, 0.3])[moves])])
     found = minimize(
@@ -241,6 +252,7 @@ def same_noise(sums: SampleSums, choice: Choice, weighed: Weighed) -> Choice:
         except np.linalg.LinAlgError:
             return 1e300
 
+    # rho alone, by its logit: everything else keeps its value
     found = minimize_scalar(downhill, bounds=(-5.0, 5.0), method="bounded", options={"maxiter": 12})
     rho = float(MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-found.x)))
     return replace(choice, rho=rho if rho > WHITE_AUTOCORRELATION else 0.0)

@@ -95,6 +95,7 @@ def fit(
     """
     if method not in METHODS:
         raise CalibrationError(f"method: {one_of(method, METHODS)}")
+    # without a true field, try the survey fit where the track separates the crustal field from the vehicle
     bias = _default_bias(data) if site_bias is None else site_bias
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
     if in_place:
@@ -110,6 +111,7 @@ def fit(
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would converge
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
+        # positions that jump would put one place's field into another
         away: tuple[str, ...] = ()
         if method in ("auto", "survey") and data.place is not None:
             known = np.isfinite(data.place[:, :2]).all(axis=1) | (method == "survey")
@@ -134,6 +136,7 @@ def _first_solution(
 
     CalibrationError: no method has one; the message is that of the first.
     """
+    # each attempt: method, data, options, and the notes that explain why it is not the first choice
     bare = replace(data, parameters=data.parameters[:, :0], names=(), units=())
     attempts: list[tuple[str, Observations, dict[str, Any], tuple[str, ...]]] = []
     if method == "survey":
@@ -202,6 +205,7 @@ def _biased(found: Fit, sigma: float) -> Fit:
         return found
     calibration = found.calibration
     field = calibration.reference.field
+    # A scales with the reference: a bias of dF moves A by A dF / F, and leaves T
     v = calibration.coefficients.reshape(-1, 9) / field
     v[0, :3] += 1.0
     v[:, 6:] = 0.0
@@ -218,6 +222,7 @@ def _refuse_one_attitude(data: Observations) -> None:
         raise CalibrationError(
             f"{which} is {data.field[0, stuck[0]]:g} in every sample: the channel is stuck"
         )
+    # angles between the readings and their mean direction
     unit = data.field / np.linalg.norm(data.field, axis=1)[:, None]
     middle = unit.mean(axis=0)
     off = np.degrees(np.arccos(np.clip(unit @ middle / np.linalg.norm(middle), -1.0, 1.0)))

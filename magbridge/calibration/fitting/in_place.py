@@ -90,6 +90,8 @@ def fit_in_place(
         raise CalibrationError(
             "method survey: expected latitude and longitude, and a field that is not known"
         )
+    # Unknowns: coefficients of the masses' positions, level and gradient of the reference, slow changes,
+    # offset terms, drift of the track, and the crustal field. The last is eliminated in every round.
     posed = pose(data, order, vehicle, known)
     samples, q = posed.samples, posed.family.E.shape[1]
     groups = (*_groups(data, level), *offered(data))
@@ -103,10 +105,12 @@ def fit_in_place(
     check_scales(samples, coefficients)
     covariance = found.covariance()
     creep = survey.offset(z[q:], [one for one in survey.offsets if one.lag is None])
+    # with what the survey found added to the reference, the samples are those of a fit with a true field
     lifted = replace(
         samples, reference=samples.reference + found.lacking, field=samples.field - survey.offset(z[q:])
     )
     noise = NoiseModel(found.widths.sigma, found.choice.rho)
+    # the coefficients' part of the prior, without that of the other unknowns
     own = Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset)
     # predict parts from the others, the field in place as found: a figure to compare parameters by
     left = leave_out(lifted, own, z[:q], replace(noise, weight=survey.kept.astype(float)), data.runs)
@@ -135,6 +139,7 @@ def fit_in_place(
 def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
     """Return the unknowns other than coefficients and field: the level, its slope, changes with time."""
     assert data.place is not None
+    # the level is one constant of 1-sigma `level`, and changes by as much over 25 km
     away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REFERENCE_ERROR_LENGTH_M
     level = max(level, 1e-3)
     groups = [ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)]
@@ -160,6 +165,7 @@ def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, Survey
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), family)
     answer = best.settle()
+    # compare the evidence with and without each term that gained little
     for one in sorted(best.unsure):
         few = survey.thinned(step)
         few.keep(tuple(group for group in few.groups if group.name in best.names - {one}))

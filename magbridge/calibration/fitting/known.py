@@ -56,6 +56,7 @@ class Known:
 
         CalibrationError: the data have others, or in other units.
         """
+        # names, units and order must agree: coefficients have no meaning for other positions
         mine = [(one.name, one.unit) for one in self.parameters]
         theirs = list(zip(data.names, data.units, strict=True))
         if mine != theirs:
@@ -69,6 +70,7 @@ class Known:
 
     def prior(self, F_0: float) -> PriorFamily:
         """Return the prior of a fit whose coefficients refer to the field `F_0` (nT)."""
+        # c = L mean + chol(L P L^T) z: z is N(0, 1) times a width that the evidence chooses
         L = rescaling(self.exponents, self.parameters, self.parameters, self.field, F_0)
         size = len(self.mean)
         return PriorFamily(
@@ -112,6 +114,7 @@ def rescaling(
     field_old, field_new : float
         nT, F_0.
     """
+    # x_old = s x_new + t, so x_old^p = sum of binom(p, q) s^q t^(p-q) x_new^q; A is over F_0, T is not
     s = [n.scale / o.scale for o, n in zip(old, new, strict=True)]
     t = [(n.centre - o.centre) / o.scale for o, n in zip(old, new, strict=True)]
     M = np.zeros((len(exponents), len(exponents)))

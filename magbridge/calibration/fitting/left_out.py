@@ -118,13 +118,17 @@ def _left_out(
 ) -> LeftOut:
     """Predict each of the `parts` from the others; and, `forward`, from the earlier ones."""
     c = prior.coefficients(z)
+    # Normal equations are sums over samples. Those without a part are the whole minus the part's, and one
+    # Newton step from the common fit gives the coefficients without it: no fit is repeated.
     normals = [_normal(samples, c, weighted, rows).reduced(prior.E) for rows in parts]
+    # at the minimum the whole gradient balances the prior, so the part's own gradient is what is lacking
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
     every = max(len(samples.field) // TESTED, 1)
     counted = np.ones(len(samples.field), bool)
     if noise.weight is not None and noise.rejected <= ISOLATED * len(counted):
         counted = noise.weight > 0.0
     missing = [(k, hessian - normal.hessian, normal.gradient) for k, normal in enumerate(normals)]
+    # forward chaining: part k is predicted from the parts before it
     if forward:
         for k in range(1, len(parts)):
             later = np.sum([normal.gradient for normal in normals[k:]], axis=0)
@@ -135,8 +139,10 @@ def _left_out(
         tested = samples.part(parts[k][counted[parts[k]]][::every])
         off, g = residuals(tested, c)
         J = jacobian(tested.phi, g) @ prior.E
+        # prediction error, and its variance: noise plus J P J^T
         e.append(off + J @ (P @ lacking / weighted.sigma**2))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
+    # as many independent errors as the noise's memory allows
     count = len(samples.field) * effective_fraction(*noise.shape)
     among = _judged(np.concatenate(e[: len(parts)]), np.concatenate(s2[: len(parts)]), count)
     if not forward:
@@ -157,6 +163,7 @@ def refitted(
     for rows in _parts(runs):
         others = np.delete(np.arange(len(weight)), rows)
         kept = samples.part(others)
+        # neighbours across the gap are not successive
         kept.steps[1:][np.diff(others) > 1] = np.inf
         found = gauss_newton(kept, prior, replace(noise, weight=weight[others]), z, steps=REFIT_STEPS)
         e[rows] = residuals_of(samples.part(rows), prior.coefficients(found.z))
@@ -196,6 +203,7 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
         if ratio2 < 1.01 * last:
             break
     rms = float(np.sqrt(np.minimum(e * e, OUTLIER_SIGMA**2 * ratio2 * s2).mean()))
+    # a mean square of n independent errors scatters by sqrt(2 / n)
     chance = 1.0 + CHANCE * np.sqrt(2.0 / max(count, 1.0))
     return LeftOut(rms, float(np.sqrt(ratio2)) if ratio2 > chance else 1.0, rms)
 
@@ -209,6 +217,7 @@ def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
     _, first, label, count = np.unique(runs, return_index=True, return_inverse=True, return_counts=True)
     if len(first) < 3 or count.max() > len(runs) / 2:
         return np.array_split(np.arange(len(runs)), BLOCKS)
+    # runs in the order of the log, several in one part where there are many
     order = np.argsort(np.argsort(first))  # labels in the order of the log
     part = order[label] * min(PARTS, len(first)) // len(first)
     return [np.flatnonzero(part == k) for k in range(part.max() + 1)]

@@ -79,6 +79,7 @@ class _Mass:
 
     def columns(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``dc/dl`` (order, 9, 12) and c (order, 9): its coefficients c at latent numbers l."""
+        # linear in the first six latent numbers (moments), so that c is their product with the derivative
         by = mass_columns(self.at, self.travel, self.parameter, len(self.rows), latent)
         moved = by[1:]  # the constant is absorbed by the hard iron
         return moved, moved[..., :6] @ latent[:6]
@@ -100,6 +101,8 @@ def mass_columns(
     latent : (12,) array
         Moment (nT), induced moment (nT), shift (m), change of the travel (m per unit).
     """
+    # A dipole's field is evaluated at Chebyshev points of the travel, together with its derivatives, and
+    # expanded in powers of the position: these are the coefficients of the monomials x, x^2 ...
     moment, pulled, shift, stretch = latent.reshape(4, 3)
     induced = gain_rotation() @ pulled
     p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * order + 4)
@@ -107,6 +110,7 @@ def mass_columns(
     # moments stay scaled by the measured distance, or a shift would change them too
     by = dipole_columns(r, moment, induced, float(np.linalg.norm(place)))
     by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
+    # a change of the travel moves the mass by p times it
     by = np.concatenate([by, by[6:] * p[:, None]])
     return np.moveaxis(expand_dipole(by, order), 0, -1)
 
@@ -137,6 +141,8 @@ def mounted_prior(
     """
     names = [parameter.name for parameter in parameters]
     masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]
+    # Latent numbers: those of the free polynomials, then for each mass 3 of the moment, 3 of the induced
+    # moment, 3 of the shift and 3 of the travel. log sigma = constant + design @ eta for each.
     labels = tuple(f"{name} {kind}" for name in vehicle for kind in ("moment", "induced"))
     q, h, extra = free.design.shape[0], free.design.shape[1], len(labels)
     design = np.zeros((q + LATENT * len(masses), h + extra))
@@ -151,6 +157,7 @@ def mounted_prior(
         constant[first + 6 : first + 9] = np.log(mass.sigma)
         constant[first + 9 : first + 12] = np.log(TRAVEL_SIGMA * np.linalg.norm(mass.travel))
     centre = np.append(free.centre, np.log([MOMENT, INDUCED] * len(masses)))
+    # what the dipole does not describe is small: narrow the mass's own polynomials
     for name in vehicle:
         k = 3 + 3 * names.index(name)
         centre[k], centre[k + 1] = np.log(REST_T), np.log(REST_A)
@@ -181,6 +188,7 @@ def _mass(
     order = max(powers[k] for powers in exponents)
     rows = [exponents.index(tuple(n * (i == k) for i in range(len(names)))) for n in range(1, order + 1)]
     parameter, travel = parameters[k], np.array(mounting.travel)
+    # a power series in x converges only if the mass stays well away from the sensor
     middle = np.linalg.norm(np.array(mounting.at) + parameter.centre * travel)
     if middle < 3.0 * parameter.scale * np.linalg.norm(travel) or middle == 0.0:
         raise CalibrationError(f"vehicle: mass {name!r} passes within three half-travels of the sensor")
@@ -190,6 +198,7 @@ def _mass(
 def _linearised(family: PriorFamily, masses: list[_Mass], latent: FloatArray) -> PriorFamily:
     """Return the prior with the dipoles linearised about `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
     size, q = family.E.shape
+    # c = E z + offset, with the dipoles' columns appended to E and their remainder in the offset
     J = np.zeros((size, q + LATENT * len(masses)))
     J[:, :q] = family.E
     offset = np.zeros(size)

@@ -133,6 +133,7 @@ def _chosen(
 ) -> tuple[Ellipsoid, LeftOut]:
     """Return the ellipsoid of :func:`nominal`, and its errors on parts left out."""
     samples = nominal_samples(data)
+    # Constraints of the paper as c = E z: S_x = S_z shares a column, M = I leaves the rotations out
     E = np.eye(9)
     if equal_xz:
         E[2, 0] = 1.0
@@ -169,6 +170,7 @@ def _every(samples: ResidualSamples, step: int) -> ResidualSamples:
     if step == 1:
         return samples
     part = samples.part(np.arange(0, len(samples.field), step))
+    # intervals between the samples that stay, in units of `step`, within each run
     begins = np.isinf(samples.steps)
     run, slot = np.cumsum(begins)[::step], np.cumsum(np.where(begins, 0.0, samples.steps))[::step]
     part.steps[:] = np.inf
@@ -193,6 +195,7 @@ def _fitted(samples: ResidualSamples, prior: Prior, start_z: FloatArray | None =
             last, (noise, weighted) = weighted, _weighted(samples, prior, found, weighted)
             if abs(weighted.sigma - last.sigma) < SAME_WEIGHT * last.sigma:
                 break
+        # negative log posterior, by which the starts are compared
         value = 0.5 * found.normal.cost / weighted.sigma**2 + 0.5 * float(z @ prior.precision @ z)
         if found.settled and (best is None or value < 0.999 * best[0]):
             best = (value, found, noise, weighted)
@@ -220,6 +223,7 @@ def _weighted(
     e, g = residuals(samples, prior.coefficients(found.z))
     noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
     limit = CLIP_SIGMA * noise.sigma
+    # scale the gradient by the posterior's root, so that all nine coefficients count alike
     root = np.linalg.cholesky(covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision))
     pulls = np.clip(e, -limit, limit)[:, None] * (g @ (prior.E @ root))
     repeats = samples_per_independent(pulls, samples.steps)
@@ -243,6 +247,7 @@ def _slow_and_white(lasting: float, neighbours: float) -> tuple[float, float]:
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
     """Return the prior precision, in units of the field, of the numbers that E leaves free."""
+    # independent soft iron and hard iron, plus a gain that is common to the three axes
     covariance = np.diag(np.array([scale_sigma] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += gain_sigma**2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
@@ -272,6 +277,7 @@ def check_scales(samples: ResidualSamples, coefficients: FloatArray) -> None:
     """
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
     scales, T = scales_and_offsets(seen, coefficients)
+    # the sample with the most unlikely scale or offset
     worst = int(
         np.argmax(np.maximum(np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1), T / (2.0 * samples.F_0)))
     )

@@ -85,6 +85,7 @@ class Observations:
         k = parameters.shape[1]
         put(self, "names", tuple(self.names) or tuple(f"p{i + 1}" for i in range(k)))
         put(self, "units", tuple(self.units) or ("",) * k)
+        # one name and one unit for each column, no name twice
         if len(self.names) != k or len(self.units) != k:
             raise CalibrationError(
                 f"parameters: {k} columns, but {len(self.names)} names and {len(self.units)} units"
@@ -96,6 +97,7 @@ class Observations:
         time = np.asarray(self.time, float) if len(self.time) else np.arange(n, dtype=float)
         runs = np.asarray(self.runs) if len(self.runs) else np.zeros(n, int)
         field = np.asarray(self.field, float)
+        # a missing or impossible reading is NaN from here on, and its row is left out
         absent = (field == 0.0).all(axis=1, keepdims=True)  # what an absent sensor reads
         field = np.where((np.abs(field) < MAX_MEASURED_NT) & ~absent, field, np.nan)
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
@@ -152,6 +154,7 @@ class Observations:
         A shorter step counts as one interval: the noise's correlation is estimated at one interval, and not
         extrapolated to less.
         """
+        # in units of the median interval; independent across runs
         steps = np.full(len(self), np.inf)
         apart = np.diff(self.time)
         if apart.size:
@@ -178,6 +181,7 @@ class Observations:
         """
         found = []
         for name, unit, column in zip(self.names, self.units, self.parameters.T, strict=True):
+            # x = (p - centre) / scale is in [-1, 1]
             low, high = float(column.min()), float(column.max())
             if not high - low > 1e-9 * max(abs(high), abs(low)):
                 raise CalibrationError(
@@ -200,6 +204,7 @@ def _enough(
         if not (reference[complete] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
         return
+    # name the column with too few numbers, or say that the rows do not match
     columns = zip(
         ("mag_x", "mag_y", "mag_z", *names, "reference field"),
         (*field.T, *parameters.T, reference),
@@ -218,6 +223,7 @@ def _enough(
 def _plausible(names: Sequence[str], positions: FloatArray) -> None:
     """Refuse a position far from all others, such as an undeclared missing-value code."""
     for name, column in zip(names, positions.T, strict=True):
+        # the span of 99 % of the positions is the scale: a code such as -999 lies many spans away
         low, middle, high = np.quantile(column, [COMMON, 0.5, 1.0 - COMMON])
         far = np.abs(column - middle) > FAR * (high - low)
         if high > low and far.any():
@@ -231,6 +237,7 @@ def monomials(
     positions: FloatArray, parameters: Sequence[Parameter], exponents: Sequence[Exponents]
 ) -> FloatArray:
     """Return (n, m) monomials of positions (n, k), in their units, scaled as the k `parameters` say."""
+    # each monomial is the product of the scaled positions to its powers
     x = (positions - [p.centre for p in parameters]) / [p.scale for p in parameters]
     return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
 

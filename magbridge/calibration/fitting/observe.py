@@ -58,12 +58,14 @@ def observations(
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
+    # channels that were read in turn first, because everything else refers to the rows' times
     ds = at_one_time(ds)
     columns = {name: _column(ds, name) for name in names}
     total, vector, model = earth_field(ds, grid)
     if "daily_variation" in ds:
         total = total + _column(ds, "daily_variation")
     ds = with_true_heading(ds)
+    # angles that the log lacks are NaN
     attitude, unknown = None, np.full(ds.sizes["time"], np.nan)
     if "roll" in ds and "pitch" in ds:  # a boresight needs no heading
         angles = [_column(ds, name) if name in ds else unknown for name in ("roll", "pitch", "heading")]
@@ -116,6 +118,7 @@ def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple
 
     The first two are None without positions, or if the true field is known all along.
     """
+    # a true field at a row makes its place irrelevant
     known = ds["reference_field"].notnull().to_numpy() if "reference_field" in ds else np.array(False)
     if not {"latitude", "longitude"} <= set(ds.variables) or known.all():
         return None, None, (0.0, 0.0)
@@ -123,6 +126,7 @@ def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple
     if not np.isfinite(latitude).any():
         return None, None, (0.0, 0.0)
     latitude = np.where(placed(ds), latitude, np.nan)
+    # a flat frame about the middle of the track
     origin = float(np.nanmedian(latitude)), float(np.nanmedian(longitude))
     north, east = separation(*origin, latitude, longitude)
     unmapped = np.broadcast_to(np.where(known, 0.0, 1.0), len(north))
@@ -147,6 +151,7 @@ def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
     for name in ("run", "dive"):
         if name in ds:
             return np.asarray(ds[name].values)
+    # a long gap separates runs: noise and attitude errors are independent across it
     step = np.diff(time, prepend=time[:1])
     return (
         np.cumsum(step > MIN_GAP_INTERVALS * np.median(step[1:]))

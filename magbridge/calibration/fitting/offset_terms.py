@@ -54,6 +54,7 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
     groups = []
     if data.temperature is not None and TEMPERATURE not in data.names:
         for lag in TEMPERATURE_LAGS_S:
+            # a constant temperature is not distinguished from the offset
             warm = _temperature(data, lag)
             if np.std(warm) > VARIES:
                 column = (warm - warm.mean())[:, None]
@@ -61,6 +62,7 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
                 groups.append(
                     OffsetBlock(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag)
                 )
+    # a random walk of the offset, by slow functions of time on each axis
     waves, shape = slow_functions(data.time, SHORTEST_DRIFT_HALF_PERIOD_S)
     if len(shape):
         groups.append(
@@ -95,6 +97,8 @@ def with_temperature(
     found : tuple of (q,), (q, q), (9 m, q) arrays
         The unknowns, their covariance, and what they do to the coefficients.
     """
+    # The offset by temperature becomes a channel effect with three more coefficients: the rows of z that
+    # are its own are copied into them, with their covariance with all others.
     z, covariance, E = found
     row = E.shape[1] - sum(len(one.shape) for one in groups)
     for one in groups:
@@ -114,6 +118,7 @@ def with_temperature(
 def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
     """Return the calibration with the spread of the offsets (n, 3), nT, of the survey."""
     covariance = calibration.covariance.copy()
+    # beyond the survey the offset may have any value that it had: add its variance to that of T
     covariance[6:9, 6:9] += creep.T @ creep / len(creep)
     return replace(calibration, covariance=covariance)
 

@@ -63,6 +63,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     """
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)
+    # eq. 8: each of the nine coefficients is a polynomial in the positions; start with the nominal ones
     samples = polynomial_samples(data, exponents, PLAIN)
     start = np.zeros(9 * len(exponents))
     start[:9] = _start(data)
@@ -71,10 +72,12 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     for _ in range(2):  # once far from the answer, once with the noise found there
         found = gauss_newton(samples, prior, noise, start, steps=200)
         start = found.z
+        # the data cannot have determined more numbers than half the samples
         free = min(float(len(start)), len(data) / 2)
         noise = NoiseModel(estimate_noise(residuals_of(samples, start), samples.steps, free).sigma)
     check_scales(samples, start)
     covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
+    # report residuals in the sensor's units, as of every other method
     plain = polynomial_samples(data, exponents)
     as_magnitude = NoiseModel(noise.sigma * PLAIN)  # A is near I, so the sensor's noise is the magnitude's
     return assemble(data, plain, ranges, exponents, start, covariance, as_magnitude, "cubic")
@@ -111,15 +114,19 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     middle, noise = one.coefficients, one.noise
     prior = Prior(np.diag((WIDTHS * samples.F_0) ** -2.0), np.eye(9), middle)
     size = 9 * len(exponents)
+    # Information form: a run at monomials m says Lambda (C m) = Lambda c_run, so the polynomial's precision
+    # is the sum of (m m^T) x Lambda, and its vector the sum of m x Lambda c_run.
     precision, right, runs = np.eye(size) / ANYTHING**2, np.zeros(size), 0
     for label in np.unique(data.runs):
         rows = data.runs == label
         typical = np.median(samples.phi[rows], axis=0)
+        # only samples with the masses at rest: one run is one position
         rows &= np.abs(samples.phi - typical).max(axis=1) < AT_REST
         if rows.sum() < MIN_RUN_SAMPLES:
             continue
         runs += 1
         part, z, scatter = single.part(rows), np.zeros(9), NoiseModel(noise.sigma)
+        # alternate the ellipsoid and the noise of its residuals
         for _ in range(3):
             found = gauss_newton(part, prior, scatter, z)
             z = found.z
@@ -167,6 +174,8 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     assert data.reference_ned is not None
     samples = nominal_samples(data)
     F_0 = samples.F_0
+    # Turn the reading by pitch and roll alone: its horizontal and vertical parts are then those of the Earth,
+    # whatever the heading. B = R A takes in the mounting; the polar decomposition separates it from A.
     level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
     ned = data.reference_ned
     horizontal, vertical = np.hypot(ned[:, 0], ned[:, 1]), ned[:, 2]
@@ -178,6 +187,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         parts = np.concatenate([np.hypot(l[:, 0], l[:, 1]) - horizontal, l[:, 2] - vertical])
         return np.concatenate([parts / sigma, x / widths])
 
+    # robust least squares, each time with the noise that the last one left
     sigma, x = FIRST_NOISE * F_0, np.zeros(12)
     for _ in range(3):
         found = least_squares(misfit, x, args=(sigma,), loss="soft_l1", f_scale=3.0)
@@ -185,6 +195,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
     covariance = np.linalg.inv(found.jac.T @ found.jac)
     steps = DIFFERENCE_STEP * np.eye(12)
+    # covariance of (A, T) from that of (B, T), by symmetric differences
     J = np.array([_coefficients(x + h, F_0) - _coefficients(x - h, F_0) for h in steps]).T / (
         2.0 * DIFFERENCE_STEP
     )

@@ -53,6 +53,7 @@ def pose(data: Observations, order: int, vehicle: Vehicle | None = None, known: 
     CalibrationError
         Both are given, or `known` is of other parameters.
     """
+    # without an expectation: priors of physical width, and dipoles where masses have a place
     if known is None:
         ranges = data.ranges()
         exponents = full_order(len(ranges), order)

@@ -65,6 +65,7 @@ class Fit:
     @property
     def scales(self) -> tuple[float, float]:
         """Smallest and largest scale of A at the samples: a fit can reduce its residual by shrinking them."""
+        # 1,000 samples show the range of the scales over the positions
         step = max(len(self.samples.phi) // 1000, 1)
         scales, _ = scales_and_offsets(
             self.samples.part(slice(None, None, step)), self.calibration.without_effects().coefficients
@@ -109,6 +110,7 @@ def assemble(
     prior : Prior, optional
         Of all coefficients, as they were fitted with it.
     """
+    # sigma and covariance grow by the ratio of held-out errors to claimed ones
     e = residuals_of(samples, coefficients)
     information = None if prior is None else _without_prior(prior, coefficients, covariance)
     if left_out is not None:
@@ -140,6 +142,7 @@ def assemble(
 
 def _without_prior(prior: Prior, coefficients: FloatArray, covariance: FloatArray) -> GaussianInformation:
     """Return the information of the data alone, from the posterior (K,), (K, K) and its prior."""
+    # information of the data = posterior's minus the prior's
     before = prior.E @ np.linalg.inv(prior.precision) @ prior.E.T
     centre = np.broadcast_to(prior.offset, coefficients.shape)
     return GaussianInformation.from_posterior(coefficients, covariance, centre, before)

@@ -54,6 +54,9 @@ class Answer:
 
     def covariance(self) -> FloatArray:
         """Return that of z (q, q), with what the data leave open of the field's size and length."""
+        # Posterior of z at the chosen field: (H / sigma^2 + P)^-1. The data leave the field's size and
+        # length open, so average over plausible choices: the mean covariance, plus the scatter of the
+        # means.
         s2 = self.widths.sigma**2
         precision = self.family.prior(self.widths.eta).precision
         weighed = Weighed(self.family, self.widths.eta, self.widths.sigma, self.middle)
@@ -67,6 +70,7 @@ class Answer:
         ):
             quadratic = reduced(one).quadratic
             P = covariance_of(quadratic.precision / s2 + precision)
+            # its mean is P b / sigma^2, with b the vector of the quadratic form
             moved = P @ quadratic.vector / s2 - self.z
             total += weight * (P + np.outer(moved, moved))
         return total
@@ -75,6 +79,8 @@ class Answer:
 def start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float]:
     """Return z (q,) near the solution, with the crustal field as noise, and the RMS of that noise."""
     samples, prior = survey.samples, family.prior(family.centre)
+    # From each start a few short fits, each with a noise as large as the residuals of the last: far from the
+    # solution a small noise would make steps that overshoot. The start with the smaller residuals wins.
     found: list[tuple[float, FloatArray]] = []
     for one in starts(samples):
         z = family.nearest_latent(one)
@@ -120,9 +126,11 @@ class Rounds:
 
     def __init__(self, survey: SurveySamples, family: PriorFamily) -> None:
         self.survey, self.own, self.q = survey, family, family.E.shape[1]
+        # the field is searched in the rounds up to `until`, and only then may the iterations end
         self.until = INITIAL_ITERATIONS + SEARCHES
         self.offers = any(one.offered for one in survey.groups)
         self.family = with_blocks(family, survey.groups)
+        # a part about the middle shows size and length of the field as well as all samples do
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
         self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
@@ -142,6 +150,7 @@ class Rounds:
 
     def worth(self, answer: Answer) -> float:
         """Return its log evidence: a sample left out counts as one at the limit, an offer has its price."""
+        # a sample at the limit costs half its squared residual, and the logarithm of sigma
         survey, each = self.survey, 0.5 * FIT_OUTLIER_SIGMA**2 + float(np.log(answer.widths.sigma))
         left_out = int((survey.at_rest & ~survey.kept).sum())
         return (
@@ -153,6 +162,7 @@ class Rounds:
     def go_on(self, survey: SurveySamples, step: int) -> None:
         """Continue with `survey`, of which the samples so far were every `step`-th one, without a search."""
         self.survey, self.until = survey, -1
+        # samples are now closer by `step`: AR(1) noise has rho^(1/step) between neighbours
         self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
         field = self.choice.field
         survey.bend(field, self.w, self.z[self.q :])
@@ -165,14 +175,17 @@ class Rounds:
         """Return the answer; NoSolutionError: the iterations do not converge."""
         survey, moved = self.survey, np.inf
         for turn in range(MAX_SURVEY_ITERATIONS):
+            # dipoles are not linear in their places: linearise the prior about the last answer
             if self.own.renew is not None and turn:
                 self.own = self.own.renew(self.z[: self.q])
                 self.family = with_blocks(self.own, survey.groups)
             answer = self._round(turn)
             e = self._residuals(answer.z, answer.lacking)
+            # converged when the residuals no longer move, whatever combination of coefficients still does
             if self.last is not None:
                 moved = float(np.sqrt(np.mean((e - self.last) ** 2)))
             self.last = e
+            # leave outliers out only when the residuals are no longer those of a wrong start
             if turn >= INITIAL_ITERATIONS:
                 survey.kept = survey.at_rest & (np.abs(e) <= FIT_OUTLIER_SIGMA * robust_scale(e))
             still = turn > self.until and moved < MAX_LAST_CHANGE * self.sigma
@@ -189,6 +202,7 @@ class Rounds:
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
         if searched := self.until - SEARCHES <= turn <= self.until:
             self._search(weighed, anew=turn == self.until - SEARCHES)
+        # 1. normal equations about the last answer, and the sparse field eliminated from them
         sums = self._sums(self.choice.field)
         if searched and self.step > 1:
             self.choice = same_noise(sums, self.choice, weighed)
@@ -196,12 +210,15 @@ class Rounds:
             self.choice,
             eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho),
         )
+        # 2. widths of the priors, and sigma, by the evidence of what is left
         widths = maximise_evidence(reduced.quadratic, self.family, self.eta, self.sigma)
         self.eta, self.sigma = widths.eta, widths.sigma
+        # 3. the Gauss-Newton step of z, then the field's coefficients w given z
         precision = reduced.quadratic.precision / self.sigma**2 + self.family.prior(self.eta).precision
         step = np.linalg.solve(precision, reduced.quadratic.vector / self.sigma**2) - self.z
         self.z, lacking = self._damped(np.asarray(step, float), reduced, choice.field)
         self.w, self.nodes = reduced.field(self.z), choice.field.nodes
+        # 4. move the track, and linearise its drift about the new one
         if self.survey.drift is not None:
             self.survey.bend(choice.field, self.w, self.z[self.q :])
             lacking = self._slow(self.z) + self.survey.rock(choice.field, self.w)
@@ -211,6 +228,7 @@ class Rounds:
     def _search(self, weighed: Weighed, *, anew: bool) -> None:
         """Choose the field with a part of the samples, and put it on nodes about them all."""
         place, before = self.survey.place[self.part], self.choice
+        # first from nothing over a ladder of lengths, later from the last choice
         if anew:
             found = choose(self._few, place, weighed, before.ratio, harmonic=self.harmonic)
         else:
@@ -236,6 +254,8 @@ class Rounds:
 
         Wait until the iterations have converged with all terms: until then they fit outliers.
         """
+        # keep a term if its evidence pays its price; the terms that stay without being decisive are noted,
+        # and a search without them follows
         survey, choice = self.survey, self.choice
         self.offers = False
         reduced = eliminate_field(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
@@ -248,6 +268,7 @@ class Rounds:
 
     def _regroup(self, groups: tuple[ParameterBlock, ...]) -> None:
         """Continue with other groups of unknowns; existing ones keep their values."""
+        # read the present values by name, and put them where the same group stands in the new order
         at, width, row, column = {}, {}, self.q, len(self.own.centre)
         for one in self.survey.groups:
             at[one.name], width[one.name] = self.z[row : row + len(one.shape)], self.eta[column : column + 1]
@@ -267,6 +288,7 @@ class Rounds:
         A track that bends from the last answer's to that of z meets the field's slopes on its way.
         """
         precision, survey = self.family.prior(self.eta).precision, self.survey
+        # the reference lacks `here + part * change` along the step, linear in the part of it
         here, change = survey.rock(field, np.column_stack([reduced.field(self.z), reduced.follow @ step])).T
         here, change = here + self._slow(self.z), change + self._slow(step)
         if survey.slopes.size:
@@ -277,6 +299,7 @@ class Rounds:
             e = self._residuals(z, here + part * change)[survey.kept]
             return float(e @ e) / self.sigma**2 + float(z @ precision @ z)
 
+        # halve the step until the objective stays within OVERSHOT of what it was
         before, part = objective(0.0), 1.0
         while part > MIN_ITERATION_STEP and not objective(part) < OVERSHOT * before:
             part *= 0.5

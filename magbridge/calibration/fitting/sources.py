@@ -31,6 +31,7 @@ def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
 
     Of logs that have all channels at the same time it is the first, as when they are joined.
     """
+    # from the last log to the first, so that the first one wins
     which = np.full(len(time), -1)
     for k in reversed(range(len(logs))):
         which[np.isin(time, _sampled(logs[k]))] = k
@@ -73,6 +74,7 @@ def heterogeneous_logs(
     """
     if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
         return ""  # the residuals are noise from one sample to the next
+    # compare the residual of one common fit with those of a fit to each of the largest logs
     which = source_of(logs, data.time)
     count = np.bincount(which[which >= 0], minlength=len(logs))
     alone: list[tuple[int, float]] = []
@@ -82,6 +84,7 @@ def heterogeneous_logs(
         except CalibrationError:  # too little in it for a fit of its own
             continue
     judged = [k for k, _ in alone]
+    # RMS of the separate fits, weighted by samples
     own = float(np.sqrt(np.average([one**2 for _, one in alone], weights=count[judged]))) if alone else 0.0
     if len(alone) < 2 or (found and rms(found.residual[np.isin(which, judged)]) < MAX_JOINT_RMS_RATIO * own):
         return ""

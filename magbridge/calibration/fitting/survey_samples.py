@@ -52,6 +52,7 @@ def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> Bo
     spans : (k,) array
         Range of each mass.
     """
+    # a step of a position by more than its slowest motion allows means that the mass moves
     fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
     step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
     moving = np.zeros(len(time), bool)
@@ -111,6 +112,7 @@ class SurveySamples:
         few, rows = copy(self), np.arange(0, len(self.kept), step)
         for name in ("unmapped", "place", "as_logged", "deeper", "at_rest", "kept"):
             setattr(few, name, getattr(self, name)[rows])
+        # intervals are counted in units of `step`, so that the noise has one autocorrelation per row
         few.samples = replace(self.samples.part(rows), steps=np.append(np.inf, self._intervals(rows)) / step)
         if self.drift is not None:
             few.drift = self.drift._replace(waves=self.drift.waves[rows])
@@ -125,6 +127,7 @@ class SurveySamples:
         self.bent = len(self.steady) + sum(len(group.shape) for group in self.offsets)
         """Where the unknowns of the positions begin."""
         many = 0 if self.drift is None else len(self.drift.shape)
+        # columns: reference blocks, offset blocks (x, y, z of each), drift north, drift east
         self.slopes = np.zeros((len(self.kept), 2 * many))
 
     def slow(self, latent: FloatArray) -> FloatArray:
@@ -136,6 +139,7 @@ class SurveySamples:
 
         `latent` (p,) are the unknowns of all groups; `blocks` are the offsets that count, by default all.
         """
+        # an offset block has its functions on each axis in turn: d = (x..., y..., z...)
         out, start = np.zeros((len(self.kept), 3)), len(self.steady)
         for group in self.offsets:
             d = latent[start : start + len(group.shape)]
@@ -160,6 +164,7 @@ class SurveySamples:
         """
         if self.drift is None:
             return
+        # f(x + dx) = f(x) + grad f . dx, dx = waves @ (north, east): the slope is taken at the new place
         north, east = latent[self.bent :].reshape(2, -1)
         waves = self.drift.waves[:]
         self.place = self.as_logged + np.stack([waves @ north, waves @ east], axis=1)
@@ -176,6 +181,9 @@ class SurveySamples:
         step: int = 1,
     ) -> Iterator[LinearisedRows]:
         """Yield `rows` (m,), every `step`-th sample, linearised about z (q,) and w (nodes,)."""
+        # One row of the linearised residual: e(z, w) = e_0 + D (z - z_0) + B (w - w_0). D holds the
+        # derivatives by coefficients, reference blocks, offsets and drift; everything is over s, the size
+        # of a sensor nT.
         latent = z[family.E.shape[1] - sum(len(group.shape) for group in self.groups) :]
         slow, offset = self.slow(latent), self.offset(latent)
         follows = np.zeros(len(rows), bool)
@@ -183,6 +191,7 @@ class SurveySamples:
         c = family.E @ z + family.offset
         E = family.E[:, : len(z) - len(latent)]
         for start in range(0, len(rows), BLOCK_ROWS):
+            # one row of overlap: whitening needs the previous row of the last block
             part = slice(max(start - 1, 0), start + BLOCK_ROWS)
             mine = rows[part]
             B, samples = self.basis(field, mine), self.samples.part(mine)
@@ -191,7 +200,9 @@ class SurveySamples:
             )
             e, g = residuals(piece, c)
             size = sizes(piece, c)
+            # a higher reference lowers the residual: -1/s
             steady = self.steady[mine] * (-self.unmapped[mine] / size)[:, None]
+            # an offset acts as T does: columns 6 to 8 of the derivative by the nine numbers
             offsets = [g[:, 6 + k, None] * one.functions[mine] for one in self.offsets for k in range(3)]
             slopes = -self.slopes[mine] / size[:, None]
             D = np.hstack([jacobian(piece.phi, g) @ E, steady, *offsets, slopes])
@@ -202,6 +213,7 @@ class SurveySamples:
 
     def _intervals(self, rows: IndexArray) -> FloatArray:
         """Return sampling intervals between successive `rows`; infinite across runs."""
+        # a run begins 1e9 intervals after the last: no correlation is left
         steps = np.where(np.isfinite(self.samples.steps), self.samples.steps, 1e9)
         steps[0] = 0.0
         return np.diff(np.cumsum(steps)[rows])
