@@ -210,6 +210,11 @@ class SequentialTest:
         a = self.amplitude[row]
         return float(np.sqrt(max(float(a @ self._energy[row] @ a) / float(self.count[row]), 0.0)))
 
+    def misfit(self, row: int) -> float:
+        """Return the mean normalised square that a row's change does not explain: 1 if it explains all."""
+        explained = float(self._y[row] @ self.amplitude[row])
+        return (float(self._squares[row]) - explained) / max(float(self._samples[row]), 1.0)
+
     def variation(self, row: int) -> float:
         """Return the root mean square about its mean of what a row's change adds to the residual."""
         constant = float(self._mean[row] @ self.amplitude[row])

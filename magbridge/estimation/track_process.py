@@ -24,7 +24,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "Course", "TrackProcess"]
+__all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "Course", "ReferenceSteps", "TrackProcess"]
 
 TRACK_STATES = 4
 """Crustal field (nT) and its slope (nT/m), slow noise (nT), and the constant (nT)."""
@@ -60,6 +60,32 @@ class Course:
         before, self.angle = self.angle, atan2(self._east, self._north)
         self._north = self._east = 0.0
         return self.angle - before if isfinite(before) else 0.0
+
+
+MAX_REFERENCE_STEP_NT = 20.0
+MAX_STEP_TIME_US = 60_000_000
+"""Change of a reference from one sample to the next, within so short a time, that no main field has."""
+
+
+class ReferenceSteps:
+    """Steps of a reference along a track that the field does not have, as from one sheet of a map to another.
+
+    Attributes
+    ----------
+    total : float
+        Sum of the steps, nT.
+    """
+
+    def __init__(self) -> None:
+        self.total = 0.0
+        self._reference, self._time_us = nan, 0
+
+    def follow(self, time_us: int, reference: float) -> None:
+        """Add a sample's reference, nT; NaN where it is not known."""
+        step = reference - self._reference
+        if abs(step) > MAX_REFERENCE_STEP_NT and time_us - self._time_us < MAX_STEP_TIME_US:
+            self.total += step
+        self._reference, self._time_us = reference, time_us
 
 
 class TrackProcess:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import inf, sqrt
+from math import inf, isfinite, sqrt
 from typing import Final
 
 from magbridge.calibration.model import Noise
-from magbridge.estimation.track_process import Course
+from magbridge.estimation.track_process import Course, ReferenceSteps
 from magbridge.field.geodesy import separation
 from magbridge.health.axes import RepetitionCheck
 from magbridge.health.consistency import ConsistencyCheck, TestedSample
@@ -65,6 +65,7 @@ class HealthMonitor:
         self._consistency = ConsistencyCheck(noise, masses, messages)
         self._position: tuple[float, float] | None = None
         self._course = Course()
+        self._reference_steps = ReferenceSteps()
         self._unit: Vector = (0.0, 0.0, 0.0)
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> None:
@@ -129,6 +130,7 @@ class HealthMonitor:
                 level.check(time_us, total, sigma, reference, reference_sigma, steady=True)
                 self.flags = IMPLAUSIBLE
             return 0.0
+        self._reference_steps.follow(time_us, reference)
         steady = not quality & UNSTEADY
         variance = level.check(time_us, total, sigma, reference, reference_sigma, steady)
         doubtful = stuck or level.is_wrong
@@ -149,7 +151,7 @@ class HealthMonitor:
         consistency = self._consistency
         speed = trend.crossing_speed
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
-            anomaly = total - reference if reference == reference else total  # noqa: PLR0124 - NaN
+            anomaly = total - reference + self._reference_steps.total if isfinite(reference) else total
             changes, course = tuple(mass_changes()), self._course.angle
             new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, changes, speed, course)
             consistency.add(new)

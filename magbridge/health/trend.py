@@ -252,6 +252,8 @@ class TrendCheck:
             self._checkpoints.pop()
         if self._checkpoints and self._now is not None and self._now.time_us > since_us:
             self._now = self._checkpoints[-1]
+        elif self._now is not None and self._accepted < AGREEING and not self._now.jumps:
+            self._now = None  # the motion had begun before the first sample: it tells no level
         self._agreed, self._unrest, self._quiet = 0, 0.0, BURST_SAMPLES
         self.has_moved = True
 

@@ -224,6 +224,11 @@ class ChangeDetector:
             by -= weight * G @ a
         return by, np.asarray(covariance - np.outer(by, by))
 
+    @property
+    def misfit(self) -> float:
+        """Mean normalised square that the likeliest cause does not explain."""
+        return self._test.misfit(self._fitting[0])
+
     def _moves(self, row: int) -> FloatArray:
         """(n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
         cause, unit, start = self._causes[row], float(self._unit[row]), float(self._start[row])

@@ -155,6 +155,11 @@ GONE: Final = 9.0
 """Log-likelihood ratio below which an alarm's cause is closed as gone instead of learned."""
 
 
+MAX_MISFIT: Final = 2.0
+"""Mean normalised square of the innovations that a cause leaves, up to which it explains them. A cause that
+leaves more is not the true one, as where a current has no telemetry."""
+
+
 class Decision:
     """Evaluates every sample and decides what to publish.
 
@@ -178,6 +183,7 @@ class Decision:
         self._publication, self._standing, self._notify = publication, standing, notify
         self.samples = 0
         self._unconfirmed = False  # a cause was learned, and nothing was published since
+        self._expected = False  # the cause that was learned explains the samples
         self._refuted = False  # another alarm came before later samples confirmed it
 
     def learned(self, knowledge: Knowledge) -> Calibration:
@@ -314,7 +320,10 @@ class Decision:
         if knowledge.start is not None and not publication.learned:  # no calibration is published
             return publication.judge.better > BEYOND_CHANCE
         change = best.coefficients - publication.coefficients
-        return publication.judge.adopt and knowledge.coverage.is_significant(change, best.covariance)
+        expected = self._standing.pending and self._expected
+        return publication.judge.adopt(expected=expected) and knowledge.coverage.is_significant(
+            change, best.covariance
+        )
 
     def _publish_learned(self, knowledge: Knowledge) -> None:
         """Publish the learned calibration; close the alarm that it explains."""
@@ -342,7 +351,8 @@ class Decision:
         Return True if learning has to restart, because no later samples confirmed the learned calibration.
         """
         standing, publication = self._standing, self._publication
-        if standing.pending and publication.judge.improves > 0.0:
+        judge = publication.judge
+        if standing.pending and (judge.improves > 0.0 or not judge.is_complete):
             return False
         if not standing.gone:
             if standing.ripe:
@@ -373,6 +383,7 @@ class Decision:
             self.gone(knowledge)
             return
         assert alarm is not None
+        self._expected = knowledge.detector.misfit < MAX_MISFIT
         if "temperature_offset" not in alarm.causes or not bank.take_over(strength):
             moved = knowledge.detector.learned()
             if moved is None:

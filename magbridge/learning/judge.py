@@ -89,15 +89,23 @@ class Blocks:
         self._ended.append(self._sums)
         self._sums = np.zeros_like(self._sums)
 
+    @property
+    def count(self) -> int:
+        """Number of blocks that have ended."""
+        return len(self._ended)
+
     def log_ratio(self, crust: int) -> float:
         """Return the log-likelihood ratio of the candidates over the calibration, by one of the crusts."""
         information, confirmed = sum(self._ended, self._sums)[crust].tolist()
         return float(confirmed - 0.5 * information)
 
-    def significance(self, crust: int) -> float:
-        """Return by how many times its bound the share of the last blocks differs from 1/2."""
+    def significance(self, crust: int, *, expected: bool = False) -> float:
+        """Return by how many times its bound the share of the last blocks differs from 1/2.
+
+        If the change was `expected`, one block suffices, and the normal quantile.
+        """
         largest = 0.0
-        for count in range(MIN_BLOCKS, len(self._ended) + 1):
+        for count in range(1 if expected else MIN_BLOCKS, len(self._ended) + 1):
             information, confirmed = np.array(list(self._ended)[-count:])[:, crust].T
             total = float(information.sum())
             if total <= 0.0:
@@ -105,9 +113,10 @@ class Blocks:
             share = float(confirmed.sum()) / total
             # what a block confirms more or less than the common share
             excess = confirmed - share * information
-            by_blocks = float(excess @ excess) / total**2 * count / (count - 1)
+            by_blocks = float(excess @ excess) / total**2 * count / max(count - 1, 1)
             sigma = sqrt(max(1.0 / total, by_blocks))
-            significance = (share - 0.5) / (student_quantile(count - 1) * sigma)
+            quantile = SIGNIFICANCE_SIGMA if expected else student_quantile(count - 1)
+            significance = (share - 0.5) / (quantile * sigma)
             if abs(significance) > abs(largest):
                 largest = significance
         return largest
@@ -244,10 +253,17 @@ class Judge:
         """Log-likelihood ratio of the candidates over the published calibration, in the last blocks."""
         return self._to_published.log_ratio(self._crust)
 
+    def adopt(self, *, expected: bool = False) -> bool:
+        """Return True if the candidates have significantly smaller errors than the published calibration.
+
+        Their change is `expected` if an alarm has shown its cause, which explains the samples.
+        """
+        return self._to_published.significance(self._crust, expected=expected) > 1.0
+
     @property
-    def adopt(self) -> bool:
-        """Return True if the candidates have significantly smaller errors than the published calibration."""
-        return self._to_published.significance(self._crust) > 1.0
+    def is_complete(self) -> bool:
+        """Return True if as many blocks as are compared have ended."""
+        return self._to_published.count == MAX_BLOCKS
 
     @property
     def roll_back(self) -> bool:

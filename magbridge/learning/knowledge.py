@@ -10,6 +10,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
+from magbridge.estimation.track_process import ReferenceSteps
 from magbridge.learning.alarms import ChangeDetector, LateTelemetryTest, LearningAlarm, Signs, StoredSample
 from magbridge.learning.bank import EstimatorBank
 from magbridge.learning.estimator import Estimator, Nuisance
@@ -76,6 +77,7 @@ class Knowledge:
         self.late_telemetry, self._outliers = LateTelemetryTest(), 0
         self.coverage = Coverage(model.size)
         self._before: FloatArray | None = None
+        self._reference_steps = ReferenceSteps()
         self.start: BatchFit | None = None
         if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
             self.start = BatchFit(model, coefficients, covariance, self._field)
@@ -124,6 +126,7 @@ class Knowledge:
             Regressors of the causes to test.
         """
         before, self._before = self._before, sample.phi
+        self._reference_steps.follow(sample.time_us, sample.reference)
         quiet = self.bank.quiet
         for other in self.bank.all[1:]:
             other.propagate(way)
@@ -138,7 +141,9 @@ class Knowledge:
             clock = (
                 self._observation_with(quiet)(sample.field, before, sample.reference).e - now.e
             ) / seconds
-        offset, level = now.by_nine[6:], -1.0 / now.s
+        # the main field's model alone is smooth: without a map and without a step it has no error to test
+        may_step = self._mapless is not None or self._reference_steps.total != 0.0
+        offset, level = now.by_nine[6:], -1.0 / now.s if may_step else 0.0
         signs = Signs(sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level)
         return best, signs
 

@@ -133,3 +133,14 @@ def test_constant_part_of_a_change_does_not_vary() -> None:
         test.update(kalman.update())
     assert 5.0 < test.rms(5) < 5.8
     assert 1.9 < test.variation(5) < 2.1
+    assert test.misfit(5) < 0.5
+
+
+def test_pulses_are_a_misfit_of_every_constant_change() -> None:
+    kalman, test = KalmanFilter(np.zeros(1), np.zeros((1, 1))), SequentialTest(1, 1)
+    for k in range(400):
+        kalman.innovate(20.0 * (k % 10 < 2), np.zeros(1), 1.0)
+        test.begin(float(k), 0.0)
+        test.test(kalman, np.tile([20.0, 0.0, 0.0], (6, 1)))
+        test.update(kalman.update())
+    assert test.misfit(5) > 5.0

@@ -127,3 +127,32 @@ def test_motion_that_is_reported_late_is_not_a_jump() -> None:
         health.check(time_us, field, field, (total, 1.5), quality, (FIELD, 145.0), nan, 0.0, list)
         flags.append(health.flags)
     assert not any(flags[1200:])
+
+
+def test_motion_that_had_begun_before_the_first_sample_leaves_no_jump() -> None:
+    """The first sample is off by 130 nT, and the telemetry reports the motion only then."""
+    health, rng, flags = HealthMonitor(Noise(1.0)), np.random.default_rng(3), []
+    for k in range(100):
+        quality = int(Quality.MOVING) if 1 <= k < 10 else 0
+        if k == 1:
+            health.begin_motion(0)
+        total = FIELD + float(rng.normal()) - 130.0 * (k == 0)
+        field = (0.3 * total, 0.2 * total, 0.93 * total)
+        time_us = 4_000_000 * (k + 1)
+        health.check(time_us, field, field, (total, 1.5), quality, (FIELD, 145.0), nan, 0.0, list)
+        flags.append(health.flags)
+    assert not any(flags[10:])
+    assert health.messages == []
+
+
+def test_step_of_the_reference_widens_nothing() -> None:
+    """Another sheet of a map: the total field has no step."""
+    u, crust = glide(3)
+    total = FIELD + crust + np.random.default_rng(7).normal(0.0, 1.0, len(u))
+    health, more = HealthMonitor(Noise(1.0)), []
+    for k, F in enumerate(total.tolist()):
+        health.set_position(4_000_000 * (k + 1), 47.0 + 0.35 * 4.0 * k / 111_200.0, -59.0)
+        field = tuple((F * u[k]).tolist())
+        main = FIELD + 60.0 * (k > 1000), 145.0
+        more.append(health.check(4_000_000 * (k + 1), field, field, (F, 1.5), 0, main, nan, 0.0, list))
+    assert max(more) < 1.0

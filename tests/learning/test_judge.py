@@ -31,23 +31,31 @@ def judged(hours: float, first: float, candidate: float, pulses: float = 0.0) ->
 
 
 def test_a_candidate_with_smaller_errors_is_adopted_after_some_turns() -> None:
-    assert not judged(0.5, 3.0, 0.0).adopt
-    assert judged(2.0, 3.0, 0.0).adopt
+    assert not judged(0.5, 3.0, 0.0).adopt()
+    assert judged(2.0, 3.0, 0.0).adopt()
     assert not judged(2.0, 3.0, 0.0).roll_back
 
 
 def test_a_candidate_with_errors_of_its_own_is_not_adopted() -> None:
     """Not if its errors are as large as those of the first, and it is rolled back if they are larger."""
     equal = judged(3.0, 1.0, -1.0)
-    assert (equal.adopt, equal.roll_back) == (False, False)
+    assert (equal.adopt(), equal.roll_back) == (False, False)
     worse = judged(3.0, 0.0, 3.0)
-    assert (worse.adopt, worse.roll_back) == (False, True)
+    assert (worse.adopt(), worse.roll_back) == (False, True)
     assert worse.mean_square[FIRST] == worse.mean_square[PUBLISHED] < worse.mean_square[CANDIDATE]
+
+
+def test_an_expected_change_is_adopted_after_one_turn() -> None:
+    """As after an alarm whose cause explains the samples."""
+    judge = judged(0.3, 3.0, 0.0)
+    assert judge.adopt(expected=True)
+    assert not judge.adopt()
+    assert not judged(0.3, 0.0, 3.0).adopt(expected=True)
 
 
 def test_pulses_that_no_calibration_explains_decide_nothing() -> None:
     judge = judged(3.0, 0.3, -0.3, pulses=20.0)
-    assert (judge.adopt, judge.roll_back) == (False, False)
+    assert (judge.adopt(), judge.roll_back) == (False, False)
 
 
 def test_a_new_candidate_begins_with_the_level_of_the_last() -> None:
