@@ -47,6 +47,7 @@ class Repetition:
         self.run += 1
         if self.run >= min_run and self.run * log(max(self.fraction, probability)) < log(MAX_PROBABILITY):
             return True
+        # exponential average of how often a healthy channel repeats
         self.fraction += (1.0 - self.fraction) / LEARNING_SAMPLES
         return False
 
@@ -93,6 +94,7 @@ class RepetitionCheck:
         return stuck
 
     def _repeat_all(self, white_sigma: float) -> bool:
+        # probability that one channel repeats: step of the readings over sigma, as in the module
         axis_probability = min(self._step / (2.0 * sqrt(pi) * max(white_sigma, 1e-9)), 1.0)
         if not self._common.repeat(axis_probability**3, MIN_COMMON_RUN):
             return False

@@ -118,9 +118,11 @@ class SensorComparison:
         step_us = after.time_us - before.time_us
         if not (before.time_us < other.time_us <= after.time_us and step_us <= MAX_INTERVAL_US):
             return
+        # linear interpolation of this sensor at the time of the other one
         fraction = (other.time_us - before.time_us) / step_us
         total = before.total + fraction * (after.total - before.total)
         difference = total - other.total
+        # variance of the difference, were both sigmas right
         expected = after.sigma**2 + other.sigma**2
         disagrees = difference * difference > DISAGREEMENT_SIGMA**2 * expected
         self._excess = difference * difference - expected if disagrees or self.is_wrong else 0.0
@@ -155,6 +157,7 @@ class SensorComparison:
             self.blamed = 0 if first.is_doubtful else 1
             return
         squares = [(one.total - one.reference) ** 2 / (reference_sigma**2 + one.sigma**2) for one in pair]
+        # log ratio of the module, up to the logarithm of the variances
         log_ratio = 0.5 * (squares[0] - squares[1])  # NaN without a position: no decision
         if log_ratio > BLAME_LOG_RATIO:
             self.blamed = 0

@@ -175,6 +175,7 @@ class ConsistencyCheck:
             self._temperature = temperature
         turn, self._course = course - self._course, course
         metres = speed * exp(self._log_roughness / 3.0) * seconds
+        # time update of the crustal field, and of what the filter has absorbed of each error
         F, Q = self._process.transition(metres, seconds, turn if isfinite(turn) else 0.0)
         self._filter.predict(F, Q)
         absorbed = self._test.absorbed
@@ -184,6 +185,7 @@ class ConsistencyCheck:
         self._outliers = self._outliers + 1 if abs(normalised) > MAX_CONSISTENT_SIGMA else 0
         if 0 < self._outliers < AGREEING and not self.is_wrong:
             return
+        # test the innovation before the filter absorbs it
         begins = self._test.begin(1e-6 * time_us, normalised)
         f = self._signatures(1e-6 * time_us, unit, mass_changes, begins)
         systematic = max(sigma * sigma - self._noise2, 0.0) ** 0.5
@@ -203,6 +205,7 @@ class ConsistencyCheck:
 
     def _null(self, systematic: float) -> Any:
         """Return the amplitude (rows,) that the calibration's own uncertainty (nT) allows."""
+        # no drift and no temperature effect belong to the null hypothesis
         units = [OFFSET_NT, np.inf, np.inf, GAIN_NT, *np.maximum(np.nan_to_num(self._scale), DEGENERATE_NT)]
         return np.repeat(np.minimum(systematic / np.array(units), 1.0), len(RESTART_PERIODS))
 
@@ -218,6 +221,7 @@ class ConsistencyCheck:
         part = slice(0, 3 * onsets)
         self._start[part] = np.where(begins[part], regressors, self._start[part])
         since = regressors - self._start[part]
+        # signatures of the module, in the unit of each error
         f[:onsets] = OFFSET_NT * u
         f[onsets : 2 * onsets] = PER_DEGREE_NT * since[onsets : 2 * onsets, None] * u
         f[2 * onsets : 3 * onsets] = DRIFT_NT_PER_H * since[2 * onsets :, None] * u
@@ -244,6 +248,7 @@ class ConsistencyCheck:
         self._variance = 0.0
         if not self.is_wrong:
             return
+        # posterior weights of the errors and onsets that compete
         rows = np.flatnonzero(statistic > largest - COMPETING_LOG_RATIO).tolist()
         shares = [exp(float(statistic[row]) - largest) for row in rows]
         self._variance = self._mixture_variance(rows, shares)
@@ -256,6 +261,7 @@ class ConsistencyCheck:
         variance, total = 0.0, sum(shares)
         for row, share in zip(rows, shares, strict=True):
             f = self._last_signatures[row]
+            # second moment of the error at the present attitude: mean squared and covariance
             error = float(f @ self._test.amplitude[row])
             variance += share / total * (error * error + float(f @ self._test.covariance(row) @ f))
         return variance

@@ -91,12 +91,15 @@ class DirectionCheck:
         known = abs(time_us - self._attitude_us) < MAX_DIRECTION_AGE_US
         if not known or not 0.0 < field < inf or self._inclination != self._inclination:
             return self._variance
+        # level the vector by roll and pitch, without the heading
         cr, sr, cp, sp = cos(self._roll), sin(self._roll), cos(self._pitch), sin(self._pitch)
         down = min(max((-sp * x + sr * cp * y + cr * cp * z) / field, -1.0), 1.0)
         forward, starboard = cp * x + sr * sp * y + cr * sp * z, cr * y - sr * z
+        # differences in inclination and heading from the main field
         inclination = asin(down)
         tilt = inclination - self._inclination
         turn = remainder(self._yaw + atan2(starboard, forward) - self._declination, 2.0 * pi)
+        # horizontal share of the field: near the pole there is no heading
         level = min(cos(inclination), cos(self._inclination))
         self._judge(time_us, tilt, turn if level > MIN_HORIZONTAL_FRACTION else 0.0)
         if (

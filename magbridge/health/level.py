@@ -62,8 +62,10 @@ class LevelCheck:
             self._record(time_us, total, reference, not MIN_FIELD_NT < total < MAX_FIELD_NT)
             return 0.0
         difference = total - reference
+        # normalised square of the difference from the main field
         squared = difference * difference / (reference_sigma * reference_sigma + sigma * sigma)
         self._record(time_us, total, reference, squared > MAX_LEVEL_SIGMA * MAX_LEVEL_SIGMA)
+        # two thresholds: begin at FAR_SIGMA, end at NEAR_SIGMA
         if self._is_far and steady:
             self._is_far = squared > NEAR_SIGMA * NEAR_SIGMA
         self._is_far = self._is_far or squared > FAR_SIGMA * FAR_SIGMA

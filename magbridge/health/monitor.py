@@ -131,6 +131,7 @@ class HealthMonitor:
                 self.flags = IMPLAUSIBLE
             return 0.0
         self._reference_steps.follow(time_us, reference)
+        # the order matters: a wrong field must not become a trend, nor an outlier evidence
         steady = not quality & UNSTEADY
         variance = level.check(time_us, total, sigma, reference, reference_sigma, steady)
         doubtful = stuck or level.is_wrong
@@ -150,6 +151,7 @@ class HealthMonitor:
             self.flags = IMPLAUSIBLE
         consistency = self._consistency
         speed = trend.crossing_speed
+        # consistency: samples at rest that no other check has flagged
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
             anomaly = total - reference + self._reference_steps.total if isfinite(reference) else total
             changes, course = tuple(mass_changes()), self._course.angle

@@ -80,6 +80,7 @@ class MedianDifference:
 
     def update(self, difference: float) -> None:
         """Update the median with a second difference's absolute value, nT."""
+        # stochastic approximation of the median: equal steps up and down in its logarithm
         rising = difference > self.median
         weight = 3 if difference > RARE_RATIO * self.median else 1
         self.run = self.run + weight if rising == self.is_rising else 0
@@ -153,6 +154,7 @@ class Scatter:
         if white < 1.0:
             rho = noise.autocorrelation ** (1e-6 * lag_us / noise.interval)
             slow = 6.0 - 8.0 * rho + 2.0 * rho * rho
+        # V(T) of the module
         variance = self._sigma2 * (SECOND_DIFFERENCE * white + (1.0 - white) * slow)
         return float(max(variance, SECOND_DIFFERENCE * MIN_NOISE_NT**2))
 
@@ -199,6 +201,7 @@ class Scatter:
                 difference = abs(total - 2.0 * self._fields[middle] + self._fields[first])
                 if difference == difference:  # noqa: PLR0124 - faster than a call
                     differences.update(difference)
+            # excess over what a crustal field makes at this lag, relative to the noise model
             if differences.count >= MIN_COUNT:
                 certain = 1.0 + UNCERTAINTY / differences.count
                 crust = (MEDIAN_TO_SIGMA * CRUST_NT * (lag / SCATTER_LAGS[-1]) ** 2) ** 2
@@ -215,6 +218,7 @@ class Scatter:
         """Return the variance (nT²) that more noise than the calibration's adds."""
         if not self._is_known or self._next.count < MIN_COUNT:
             return 0.0
+        # the factor by which the whole noise has grown, with a hysteresis of two
         squared = max(self.variance / self.floor, self._ratio)
         ratio = squared**0.5
         certain = 1.0 + UNCERTAINTY / self._next.count

@@ -168,12 +168,14 @@ class TrendCheck:
         p_level = p_still + sigma * sigma * min(turned, 2.0)
         if self.has_moved:
             p_level += sigma * sigma + self._sigma * self._sigma
+        # variance of the innovation: level, turn or motion, and noise
         S = p_level + noise
         e = total - level
         scatter.follow(time_us, total)
         # the jumps so far stay as they are; _replace would take twice as long
         predicted = TrendState(time_us, level, now.slope, p_level, p_cross, p_slope, *now[6:])
         if e * e <= GATE * S:
+            # accepted only because of a turn or a motion: it may yet be an outlier
             self._before = level if e * e > GATE * (p_still + noise) else nan
             return self._accept(predicted, e, S, sigma, noise)
         if self._accepted < AGREEING:
@@ -197,6 +199,7 @@ class TrendCheck:
         """Update the filter; return what past outliers add, nT²."""
         self._accepted += 1
         self._agreed = 0
+        # Kalman gain and update of level and slope
         k_level, k_slope = predicted.p_level / S, predicted.p_cross / S
         self._now = TrendState(
             predicted.time_us,
@@ -232,6 +235,7 @@ class TrendCheck:
 
     def _agree(self, time_us: int, total: float, sigma: float, S: float, noise: float) -> None:
         """Record an outlier, which may be of another level."""
+        # outliers that agree with each other are a new level
         difference = total - self._candidate
         if self._agreed and difference * difference <= GATE * S:
             self._agreed += 1
@@ -277,6 +281,7 @@ class TrendCheck:
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
+        # jumps at motions come with every motion, so that they are remembered for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
         self._now = now._replace(
@@ -298,6 +303,7 @@ class TrendCheck:
         now = self._now
         if now is None or not now.jumps:
             return 0.0
+        # the sum of the jumps is zero again, up to the noise
         self.is_away = now.jump_sum * now.jump_sum > GATE * self._scatter.variance
         if not self.is_away and time_us >= now.until_us:
             self._now = now._replace(jump_sum=0.0, largest=0.0)

@@ -178,10 +178,12 @@ class ChangeDetector:
         """Return (rows, 3) residual of one unit of each cause, of which some begin now."""
         self._now = signs.time
         now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
+        # each cause adds its regressor times the derivative by the offset of each axis
         regressor = np.repeat(np.nan_to_num(np.array(now)), len(RESTART_PERIODS))
         self._start[begins] = regressor[begins]
         amount = (regressor - self._since_onset * self._start) * self._unit
         f = amount[:, None] * signs.offset
+        # telemetry delay and level act on the total field alone, not on an axis
         f[self._no_vector] = 0.0
         f[self._no_vector, 0] = amount[self._no_vector]
         return np.asarray(f)
@@ -212,9 +214,11 @@ class ChangeDetector:
         fits = self._fitting
         if self._causes[fits[0]].states is None:
             return None
+        # posterior weights of the causes that fit, all equally likely before
         share = np.exp(self.statistic[fits] - self.statistic[fits[0]])
         share /= share.sum()
         by, covariance = np.zeros(self._states), np.zeros((self._states, self._states))
+        # moments of the mixture: mean and covariance about it
         for weight, row in zip(share.tolist(), fits, strict=True):
             if self._causes[row].states is None:  # it moves no coefficient
                 continue
@@ -234,12 +238,14 @@ class ChangeDetector:
         cause, unit, start = self._causes[row], float(self._unit[row]), float(self._start[row])
         G = self._test.absorbed[:, row].copy()
         assert cause.states is not None
+        # a drift has moved the offset since its onset, and goes on with its slope
         if cause.name == "offset_drift":
             G[cause.states, range(3)] += unit / 3600.0
             G[self._offsets, range(3)] += unit * (self._now / 3600.0 - start)
             return np.asarray(G)
         G[cause.states, range(3)] += unit
         if self._since_onset[row]:
+            # the regressor counts from the onset, the coefficient from its origin
             G[self._offsets, range(3)] -= unit * (start - self._origin(cause.channel))
         return np.asarray(G)
 
@@ -310,10 +316,12 @@ class LateTelemetryTest:
             if np.abs(np.subtract(positions, one.positions)).max(initial=0.0) < MOVED:
                 continue
             then, now = (observe(one.field, at, one.reference).e for at in (one.phi, phi))
+            # Page's test: the innovation at the positions reported now, against that of then
             S = one.variance
             more = S + (DELAY_UNCERTAINTY * (now - then)) ** 2
             v = min(one.innovation**2 / S, MAX_HINDSIGHT_SQUARE)
             late = (one.innovation + now - then) ** 2 / more + log(more / S)
+            # a ratio of 0 begins a new onset
             if self._ratio[k] == 0.0:
                 self._square[k], self._count[k], self._since_us[k] = 0.0, 1, one.time_us
             self._ratio[k] = max(0.0, self._ratio[k] + 0.5 * (v - late))
@@ -395,6 +403,7 @@ class AlarmState:
     def raised(self, alarm: LearningAlarm) -> str:
         """Update the state with an alarm of the change detector; return the notification, or ""."""
         before = self.alarm
+        # an alarm after its cause was learned is another one, or a relapse
         anew = before is None or self.tried
         if before is not None and (alarm.mapless or before.mapless):
             if alarm.mapless and before.causes == alarm.causes:
@@ -451,6 +460,7 @@ class AlarmState:
         self._quiet += telling
         self._doubted += telling
         self._explained += telling
+        # largest error that is beyond chance, forgotten over QUIET informative samples
         seen = error * error - SIGNIFICANT_SQUARE * variance
         self._peak = max(self._peak * (1.0 - telling / QUIET), seen)
         if self.relapses and seen > 0.0:
@@ -459,6 +469,7 @@ class AlarmState:
 
     def _cover(self) -> None:
         """Set the variance to that of the likeliest cause, and of the errors once a cause was learned."""
+        # until the cause is published, sigma includes its effect; later the errors that are seen
         learned = self.tried and not self.pending
         size = 0.0 if self.alarm is None or learned or self.mapless else self.alarm.size
         self.variance = max(size * size, self._peak if self.relapses or self.pending else 0.0)
@@ -483,6 +494,7 @@ class AlarmState:
         """True if the evidence suffices to learn the alarm's cause."""
         if self.alarm is None or self.tried or not self.learnable:
             return False
+        # each further candidate needs more growth, so that the attitudes to come separate them
         fit, slower = len(self.alarm.channels), self._slower
         sure = self.alarm.strength > self._sure + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
         if self._mapped and "map_error" in self.alarm.causes:

@@ -97,6 +97,7 @@ class EstimatorBank:
             warm.open(PER_DEGREE**2, slots)
             self._warm = len(self.all)
             self.all.append(warm)
+        # a drift of unknown rate, which is forgotten within hours
         drifting = deepcopy(self.quiet)
         drifting.drift(DRIFT_SIGMA_NT_S, DRIFT_CORRELATION_TIME_S)
         self.all.append(drifting)
@@ -113,10 +114,12 @@ class EstimatorBank:
 
     def judge(self, time: float) -> LearningAlarm | None:
         """Score each estimator's prediction at a time (s); return the map alarm, if there is one."""
+        # log w of the module, with a bounded innovation
         for k, one in enumerate(self.all):
             S = one.variance
             self._weights[k] *= 1.0 - 1.0 / BANK_MEMORY_SAMPLES
             self._weights[k] -= 0.5 * (min(one.residual * one.residual / S, MAX_BANK_SQUARE) + log(S))
+        # the map has its own test below, since its estimator predicts another reference
         with_map = [k for k, one in enumerate(self.all) if one is not self.without_map]
         ahead = max(with_map, key=self._weights.__getitem__)
         if self._weights[ahead] > self._weights[self._best] + (AHEAD if self._best else BEYOND_CHANCE):
@@ -141,6 +144,7 @@ class EstimatorBank:
         warm = self._warm
         if self._weights[warm] - self._weights[0] < max(BEYOND_CHANCE, strength - CLOSE):
             return False
+        # the warm estimator goes on as well, so that it is compared with its copy
         self.all[0], self._weights[0], self._best = deepcopy(self.all[warm]), self._weights[warm], 0
         return True
 
@@ -150,6 +154,7 @@ class EstimatorBank:
         `step` and its log-likelihood ratio `strength` come from the alarm's cause; `strength` is added to the
         baseline's score.
         """
+        # the evidence for the cause is what the baseline would have gained with it
         self.quiet.shift(step, covariance)
         self._weights[0] += strength
         if self._weights[0] > self._weights[self._best] + AHEAD:

@@ -99,6 +99,7 @@ class Publication:
                 by = coefficients - estimator.coefficients
                 covariance = covariance + np.outer(by, by)
             toward = covariance @ estimator.mean  # how coefficients go with the level, which has this sigma
+            # level vector of the file: covariance with the mean field, over its sigma
             sigma = float(np.sqrt(estimator.mean @ toward))
             if sigma:  # no sample, no level
                 level = tuple((toward[: first.coefficients.size] / sigma).tolist())
@@ -232,6 +233,7 @@ class Decision:
         published = self._judge(knowledge, sample, way)
         difference = published.e - now.e
         if knowledge.start is None:
+            # compare and test before learning: a prediction must not know its own sample
             self._compare(knowledge, signs.time, difference)
             alarm, learned = knowledge.learn(signs, frozen=frozen)
             self.raise_alarm(alarm)
@@ -253,9 +255,11 @@ class Decision:
         if judge.is_due(way.metres, way.seconds, direction) and knowledge.start is None:
             publication.propose(knowledge.bank.best.coefficients)
         seen = [observe(nine) for nine in publication.nine(sample.phi)]
+        # a calibration that was replaced goes on with the level of its crustal field
         for which, nine in publication.replaced(sample.phi).items():
             judge.replace(which, seen[which].e - observe(nine).e, seen[which].s)
         first, published, candidate = seen
+        # the judge's filters move on over the same way as the estimators
         F = knowledge.believed.transition(*way)[0]
         judge.judge(F, (first.e, published.e, candidate.e), first.s)
         return published
@@ -295,6 +299,7 @@ class Decision:
             self._unconfirmed = self._refuted = False
             return True
         worse, relapsed = publication.judge.roll_back, self._standing.relapses > 0
+        # first undo what is worse, then publish what is better
         if worse and not publication.learned and self._standing.alarm is None:
             publication.judge.discard()  # the learned calibration may improve yet
         elif worse or (relapsed and publication.judge.improves < -BEYOND_CHANCE):
@@ -306,6 +311,7 @@ class Decision:
             return True
         if frozen or not self._trusted(knowledge):
             return False
+        # the first publication needs the judge; later ones follow the estimator
         pending = self._standing.pending
         if pending or not publication.learned:
             if self._holds(knowledge):
@@ -319,6 +325,7 @@ class Decision:
         publication, best = self._publication, knowledge.bank.best
         if knowledge.start is not None and not publication.learned:  # no calibration is published
             return publication.judge.better > BEYOND_CHANCE
+        # better in the last blocks, and known at all attitudes so far
         change = best.coefficients - publication.coefficients
         expected = self._standing.pending and self._expected
         return publication.judge.adopt(expected=expected) and knowledge.coverage.is_significant(
@@ -358,6 +365,7 @@ class Decision:
             if standing.ripe:
                 self._take_up(knowledge)
             return False
+        # learning that nothing has confirmed restarts from the published calibration
         restart = self._unconfirmed or (standing.relapses > 0 and not standing.tried)
         if not standing.tried:
             self.gone(knowledge)
@@ -383,6 +391,7 @@ class Decision:
             self.gone(knowledge)
             return
         assert alarm is not None
+        # a cause that explains the samples needs less confirmation than a change without an alarm
         self._expected = knowledge.detector.misfit < MAX_MISFIT
         if "temperature_offset" not in alarm.causes or not bank.take_over(strength):
             moved = knowledge.detector.learned()

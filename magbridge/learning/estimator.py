@@ -102,6 +102,7 @@ class Estimator:
     ) -> None:
         self.size = K = len(coefficients)
         self.states = K + EXTRA_STATES
+        # state: coefficients, slope of the offset, states of the nuisance
         P = np.zeros((self.states, self.states))
         P[:K, :K] = covariance
         P[-STATES:, -STATES:] = nuisance.initial
@@ -135,6 +136,7 @@ class Estimator:
         P = self.filter.covariance[: self.size, : self.size]
         kept = self._kept * float(self._mean @ P @ self._mean)  # the part not learned since keep_level
         P = P + np.outer(kept, kept)
+        # rounding leaves small negative eigenvalues, which no calibration file may have
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ root.T)
@@ -156,6 +158,7 @@ class Estimator:
         significant, and the published level is kept where the data allow it.
         """
         K = self.size
+        # conditional mean of the coefficients, given their mean field: c + P m (m^T P m)^-1 (level)
         toward = self.filter.covariance[:K, :K] @ self._mean
         by = float(self._mean @ (published - self.coefficients))
         return np.asarray(self.coefficients + toward * (by / float(self._mean @ toward)))
@@ -168,6 +171,7 @@ class Estimator:
         further samples reduce it; the filter's own covariance does not change.
         """
         K = self.size
+        # the same conditional mean for the whole state; the nuisance takes up what the level loses
         toward = self.filter.covariance[:, :K] @ self._mean
         by, variance = float(self._mean @ (published - self.coefficients)), float(self._mean @ toward[:K])
         if not self._sloping and by * by < CHANGED * CHANGED * variance:
@@ -202,10 +206,12 @@ class Estimator:
         metres, seconds, _ = way
         P = self.filter.covariance
         F, Q = self._nuisance.transition(*way)
+        # mean F x and covariance F P F^T + Q: once by the rows, once by the columns
         self.advance(self.filter.mean, F, seconds)
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)
         P[-STATES:, -STATES:] += Q
+        # a drift's slope is forgotten: its variance grows by exponential forgetting, up to a bound
         if self._sloping:
             known = P[self.slope, self.slope]
             P[self.slope, self.slope] = np.where(
@@ -219,6 +225,7 @@ class Estimator:
         """Compute the innovation from a sample's residual and derivatives (K,) at these coefficients."""
         K = self.size
         h = np.concatenate([by_coefficients, np.zeros(SLOPE_STATES), self._nuisance.row(s)])
+        # the derivative's running mean along the track: a constant one is hidden by the crustal field
         if self._near is None:
             self._near = by_coefficients.copy()
         else:
@@ -226,6 +233,7 @@ class Estimator:
         # e is the residual at the present coefficients, so that they have no part in h^T x
         known = e - float(by_coefficients @ self.coefficients)
         self.filter.innovate(known, h, self._nuisance.white_variance)
+        # share of the variance S that the coefficients explain and the crustal field does not
         varying = by_coefficients - self._near
         self.telling = float(varying @ self.filter.covariance[:K, :K] @ varying) > TELLING * self.variance
 

@@ -107,6 +107,7 @@ class Blocks:
         largest = 0.0
         for count in range(1 if expected else MIN_BLOCKS, len(self._ended) + 1):
             information, confirmed = np.array(list(self._ended)[-count:])[:, crust].T
+            # beta of the module, over the last `count` blocks together
             total = float(information.sum())
             if total <= 0.0:
                 continue
@@ -114,6 +115,7 @@ class Blocks:
             # what a block confirms more or less than the common share
             excess = confirmed - share * information
             by_blocks = float(excess @ excess) / total**2 * count / max(count - 1, 1)
+            # the larger of the model's standard error and the sandwich estimate over the blocks
             sigma = sqrt(max(1.0 / total, by_blocks))
             quantile = SIGNIFICANCE_SIGMA if expected else student_quantile(count - 1)
             significance = (share - 0.5) / (quantile * sigma)
@@ -149,6 +151,7 @@ class Judge:
     def restart(self, nuisance: Nuisance | None = None) -> None:
         """Discard all blocks, for another first calibration, candidate or nuisance."""
         self._nuisance = nuisance or self._nuisance
+        # one filter for each standard deviation of the crustal field: its value and slope are scaled
         scale = np.ones((len(CRUST_FACTORS), STATES))
         scale[:, :2] = CRUST_FACTORS[:, None]
         self._initial = scale[:, :, None] * self._nuisance.initial * scale[:, None, :]
@@ -181,6 +184,7 @@ class Judge:
         if self._direction is None:
             self._direction = direction
             return True
+        # a block may end once the crustal field has decorrelated, a minute after a turn
         self._seconds += seconds
         self._metres += metres
         self._steady += seconds
@@ -213,6 +217,7 @@ class Judge:
         scale : float
             Scale of the first calibration's residual.
         """
+        # the three calibrations share the covariance, because only their residuals differ
         h = self._nuisance.row(scale)
         self._P = self._initial + F @ (self._P - self._initial) @ F.T
         Ph = self._P @ h
@@ -222,6 +227,7 @@ class Judge:
         gain = Ph / S[:, None]
         self._states = states - gain[:, :, None] * v[:, None, :]
         self._P -= gain[:, :, None] * Ph[:, None, :]
+        # innovations of the published calibration under the widest crustal field
         self.last = float(v[0, PUBLISHED]), float(S[0])
         if self._fresh:  # the first sample only determines the level of the crustal field
             self._fresh = False
@@ -229,11 +235,13 @@ class Judge:
         self._judged += 1
         share = 1.0 / min(self._judged, JUDGE_MEMORY_SAMPLES)
         self.mean_square += share * (v[0] * v[0] - self.mean_square)
+        # likelihood of each standard deviation, of innovations that are no outliers
         squares = v * v / S[:, None]
         self._likelihoods *= 1.0 - 1.0 / CRUST_MEMORY_SAMPLES
         self._likelihoods -= 0.5 * (np.minimum(squares, MAX_JUDGE_SQUARE) + np.log(S)[:, None])
         smaller = squares.min(axis=1)
         self._noisier += share * (min(float(smaller[0]), MAX_JUDGE_SQUARE) - self._noisier)
+        # more noise than the model's, and outliers of both calibrations, have less weight
         S = S * np.maximum(max(1.0, self._noisier), smaller / MAX_JUDGE_SQUARE)
         for blocks, which in ((self._to_first, FIRST), (self._to_published, PUBLISHED)):
             blocks.add(v[:, which], v[:, CANDIDATE] - v[:, which], S)
@@ -312,6 +320,7 @@ class Coverage:
         """
         if len(self._directions) < MIN_DIRECTIONS:
             return False
+        # the level is hidden by the reference, so only the variation over the attitudes counts
         rows = self._rows[: self._stored] - self._rows[: self._stored].mean(axis=0)
         by_change = rows @ change
         variance = float(np.einsum("ij,jk,ik->", rows, covariance, rows))

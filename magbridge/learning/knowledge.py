@@ -128,10 +128,12 @@ class Knowledge:
         before, self._before = self._before, sample.phi
         self._reference_steps.follow(sample.time_us, sample.reference)
         quiet = self.bank.quiet
+        # time update of all estimators, and of what the tests have absorbed
         for other in self.bank.all[1:]:
             other.propagate(way)
         seconds = way.seconds
         self.detector.propagate(quiet, quiet.propagate(way), seconds)
+        # relinearise every estimator at its own coefficients
         live = {id(one): self._predict(one, sample) for one in self.bank.all}
         best = live[id(self.bank.best)]
         self.coverage.add(best.s * self._model.derivative(sample.phi, best.by_nine), best.direction)
@@ -165,6 +167,7 @@ class Knowledge:
     def learn(self, signs: Signs, *, frozen: bool) -> tuple[LearningAlarm | None, bool]:
         """Test the prediction, then learn from it; return the alarm, and True if the sample was used."""
         quiet = self.bank.quiet
+        # test the innovation first: the update absorbs a part of every change
         alarm = self.detector.test(quiet, signs)
         for other in self.bank.all[1:]:
             other.update(learn=other.telling and not frozen)
@@ -179,6 +182,7 @@ class Knowledge:
         if not self.start.add(sample.field, sample.phi, sample.reference, way):
             quiet.update(learn=True)
             return False
+        # all samples so far, from the prior: no linearisation of a poor start stays
         fitted = self.start.fit(quiet.coefficients, self.nuisance)
         self.noise = msgspec.structs.replace(self.noise, sensor=fitted.noise)
         self.nuisance = Nuisance(self.noise, self.nuisance.spread, self.nuisance.constant)

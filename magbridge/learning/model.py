@@ -60,6 +60,7 @@ class LearnedTerms:
         self._regressors = [0.0] * len(self._further)
         extended = self._extended(self._further)
         self.size, self._own = extended.coefficients.size, calibration.coefficients.size
+        # the nine coefficients are linear in the coefficients and in the regressors: a tensor (K, m, 9)
         self._tensor, exponents = coefficient_tensor(extended)
         self._flat = self._tensor.reshape(len(self._tensor), -1)
         self._terms = self._tensor.shape[1] - len(self._further)
@@ -105,6 +106,7 @@ class LearnedTerms:
         found = []
         for axis in range(3):
             only = np.zeros(self._tensor.shape[1:])
+            # a coefficient of the offset moves one of the last three of the nine, by one regressor
             only[row, 6 + axis] = 1.0
             same = np.flatnonzero((self._tensor == only).all(axis=(1, 2)))
             if not same.size:

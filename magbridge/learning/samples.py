@@ -51,16 +51,19 @@ def observe(field: Vector, nine: FloatArray, F_0: float, reference: float, kappa
         Noise of the reference over the sensor's.
     """
     axx, ayy, azz, axy, axz, ayz, tx, ty, tz = nine.tolist()
+    # A and b = A (H_r - T), written out: numpy would cost ten times as much
     xx, yy, zz = 1.0 + axx / F_0, 1.0 + ayy / F_0, 1.0 + azz / F_0
     xy, xz, yz = axy / F_0, axz / F_0, ayz / F_0
     dx, dy, dz = field[0] - tx, field[1] - ty, field[2] - tz
     bx, by, bz = xx * dx + xy * dy + xz * dz, xy * dx + yy * dy + yz * dz, xz * dx + yz * dy + zz * dz
     F = sqrt(bx * bx + by * by + bz * bz)
     ux, uy, uz = bx / F, by / F, bz / F
+    # w = A^T u; s^2 = kappa^2 + w^T w, the variance of the residual over the sensor's
     wx, wy, wz = xx * ux + xy * uy + xz * uz, xy * ux + yy * uy + yz * uz, xz * ux + yz * uy + zz * uz
     s2 = kappa * kappa + wx * wx + wy * wy + wz * wz
     s = sqrt(s2)
     e = (F - reference) / s
+    # derivative of s: dA enters by A w
     vx, vy, vz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
     along = ux * vx + uy * vy + uz * vz
     k = e / s2
@@ -70,6 +73,7 @@ def observe(field: Vector, nine: FloatArray, F_0: float, reference: float, kappa
         uy / s - kF * (vy - uy * along),
         uz / s - kF * (vz - uz * along),
     )
+    # first the six of A, diagonal then off-diagonal, then the three of T
     by_nine = np.array(
         (
             (zx * dx - k * wx * ux) / F_0,

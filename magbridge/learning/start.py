@@ -127,6 +127,7 @@ class BatchFit:
         """Fit all samples, beginning at `coefficients` (K,)."""
         c, z = coefficients, np.full(self._root.shape[1], np.inf)
         for _ in range(MAX_GAUSS_NEWTON_STEPS):
+            # Gauss-Newton step in the whitened prior's coordinates z, as in the module
             r, J, nuisances, B, Pb = self._whitened(c, nuisance)
             JL = J @ self._root
             H = np.eye(JL.shape[1]) + JL.T @ JL
@@ -137,6 +138,7 @@ class BatchFit:
                 break
         rms = float(np.sqrt(np.mean(r * r)))
         noise = float(np.sqrt(nuisance.white_variance)) * (rms if len(r) >= MIN_SAMPLES_FOR_NOISE else 1.0)
+        # joint covariance: the nuisance depends on the coefficients by B, and has Pb of its own
         both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
         covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
         covariance[-STATES:, -STATES:] += Pb
@@ -155,6 +157,7 @@ class BatchFit:
             one: Observation = observe(field, phi @ weights, self._field, reference)
             row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
             h = nuisance.row(one.s)
+            # Kalman filter of the residual and of every column of J: innovations are white
             P, states = F @ P @ F.T + Q, F @ states
             Ph = P @ h
             S = float(h @ Ph) + nuisance.white_variance
