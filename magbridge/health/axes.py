@@ -102,6 +102,7 @@ class RepetitionCheck:
         return True
 
     def _repeat(self, number: int, axis: Repetition, value: float) -> bool:
+        # a value at which the axis was stuck before is a limit: no probability is needed
         if abs(value) == axis.limit:
             axis.run += 1
         elif not axis.repeat(0.0, MIN_RUN):

@@ -124,6 +124,7 @@ class SensorComparison:
         difference = total - other.total
         # variance of the difference, were both sigmas right
         expected = after.sigma**2 + other.sigma**2
+        # beyond the sigmas, or during a disagreement: the variance that neither sigma explains
         disagrees = difference * difference > DISAGREEMENT_SIGMA**2 * expected
         self._excess = difference * difference - expected if disagrees or self.is_wrong else 0.0
         self._excess = max(self._excess, 0.0)
@@ -135,6 +136,7 @@ class SensorComparison:
 
     def _count(self, disagrees: bool, time_us: int) -> None:
         """Begin or end a disagreement that lasts."""
+        # a state changes only after several comparisons in a row
         if disagrees == self.is_wrong:
             self._run = 0
             return

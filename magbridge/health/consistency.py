@@ -165,6 +165,7 @@ class ConsistencyCheck:
     def _test_sample(self, sample: TestedSample) -> None:
         time_us, unit, total, sigma, temperature, mass_changes, speed, course = sample
         seconds = 1e-6 * (time_us - self._time_us)
+        # after a gap the crustal field is another one; a clock that goes back restarts all
         if not 0.0 < seconds < MAX_GAP_S:
             if self._time_us == 0 or seconds < 0.0:
                 self.restart()
@@ -196,6 +197,7 @@ class ConsistencyCheck:
 
     def _learn_roughness(self, squared: float, unit: Any) -> None:
         """Update the crustal field's curvature from the innovations while the attitude stays the same."""
+        # straight legs alone: at a turn, an error of the calibration looks like roughness
         turned = float(np.abs(unit - self._last_unit).max())
         self._last_unit = unit
         if turned < STRAIGHT_CHANGE and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:

@@ -105,6 +105,7 @@ class DirectionCheck:
         if (
             self._tilted >= MIN_DIFFERING_CHECKS or self._turned >= MIN_DIFFERING_CHECKS
         ):  # the chord between both directions
+            # chord between two unit vectors, from the differences in inclination and heading
             horizontal = 2.0 * level * sin(0.5 * turn)
             chord = field * field * (4.0 * sin(0.5 * tilt) ** 2 + horizontal * horizontal)
             self._variance, self._until_us = max(self._variance, chord), time_us + LONG_US

@@ -152,6 +152,7 @@ class Scatter:
         white = noise.white if noise.autocorrelation > 0.0 and noise.interval > 0.0 else 1.0
         slow = 0.0
         if white < 1.0:
+            # slow part of V(T): an AR(1) process
             rho = noise.autocorrelation ** (1e-6 * lag_us / noise.interval)
             slow = 6.0 - 8.0 * rho + 2.0 * rho * rho
         # V(T) of the module
@@ -190,6 +191,7 @@ class Scatter:
 
     def _store(self, time_us: int, total: float) -> None:
         """Store a sample, and update the medians with the second differences that end at it."""
+        # ring buffer of samples, eight to the longest lag
         self._place = place = (self._place + 1) % STORED
         self._fields[place], self._times[place] = total, time_us
         self._ratio = 0.0
@@ -197,6 +199,7 @@ class Scatter:
             middle, first = (place - lag) % STORED, (place - 2 * lag) % STORED
             late_us = time_us - self._times[middle]
             early_us = self._times[middle] - self._times[first]
+            # only differences of equal intervals, at lags that the speed allows
             if late_us <= self._max_lag_us and abs(late_us - early_us) * 8 <= late_us:
                 difference = abs(total - 2.0 * self._fields[middle] + self._fields[first])
                 if difference == difference:  # noqa: PLR0124 - faster than a call

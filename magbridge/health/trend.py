@@ -160,6 +160,7 @@ class TrendCheck:
         noise = scatter.variance
         # prediction
         T = 1e-6 * (time_us - now.time_us)
+        # q adapted to the innovations, at least that of the crustal field at this speed
         q = exp(max(self._log_q, self._min_log_q))
         level = now.level + T * now.slope
         p_slope = now.p_slope + q * T
@@ -212,6 +213,7 @@ class TrendCheck:
         )
         self._sigma, self.has_moved = sigma, False
         self._adapt(min(e * e / S, MAX_TREND_SQUARE))
+        # states to return to when a motion is reported late
         checkpoints = self._checkpoints
         if not checkpoints or not 0 <= predicted.time_us - checkpoints[-1].time_us < CHECKPOINT_US:
             checkpoints.append(self._now)
@@ -227,6 +229,7 @@ class TrendCheck:
         """Begin a trend at a level, nT; the jumps so far and the slope stay."""
         if self._now is None:
             self._now = TrendState(time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, 0, 0)
+        # another level: its slope is not known
         p_slope = max(self._now.p_slope, self._slope_variance)
         self._now = self._now._replace(
             time_us=time_us, level=level, p_level=noise, p_cross=0.0, p_slope=p_slope
@@ -276,6 +279,7 @@ class TrendCheck:
         assert now is not None
         largest_zero, by_motion = GATE * noise, self.has_moved
         since_us, until_us = now.since_us, now.until_us
+        # the time since the field left its level decides how long sigma remembers it
         if now.jump_sum * now.jump_sum <= largest_zero:
             since_us = time_us
         elif time_us - since_us > LASTING_US:

@@ -141,6 +141,7 @@ class ChangeDetector:
             AlarmCause("clock_offset", "", None),
             AlarmCause("map_error", "", None),
         ]
+        # each cause has a row for each onset, in the order of the sequential test
         self._causes = [cause for cause in causes for _ in RESTART_PERIODS]
         names = [cause.name for cause in self._causes]
         self._unit = np.array([CAUSE_UNITS[name] for name in names])
@@ -211,6 +212,7 @@ class ChangeDetector:
 
         Return None if no coefficient can represent the likeliest cause.
         """
+        # the likeliest cause decides whether there is anything to learn
         fits = self._fitting
         if self._causes[fits[0]].states is None:
             return None
@@ -243,6 +245,7 @@ class ChangeDetector:
             G[cause.states, range(3)] += unit / 3600.0
             G[self._offsets, range(3)] += unit * (self._now / 3600.0 - start)
             return np.asarray(G)
+        # step or coefficient: what was absorbed (Xi), and the cause itself
         G[cause.states, range(3)] += unit
         if self._since_onset[row]:
             # the regressor counts from the onset, the coefficient from its origin
@@ -318,6 +321,7 @@ class LateTelemetryTest:
             then, now = (observe(one.field, at, one.reference).e for at in (one.phi, phi))
             # Page's test: the innovation at the positions reported now, against that of then
             S = one.variance
+            # the delay is known to a share only, which widens S
             more = S + (DELAY_UNCERTAINTY * (now - then)) ** 2
             v = min(one.innovation**2 / S, MAX_HINDSIGHT_SQUARE)
             late = (one.innovation + now - then) ** 2 / more + log(more / S)
@@ -411,6 +415,7 @@ class AlarmState:
             return ""  # a map error explains every further alarm
         if before is not None and not anew and alarm.strength < before.strength + MIN_ALARM_GROWTH:
             return ""
+        # a relapse: the last learned cause has not explained enough samples
         if anew and self._explained <= QUIET:
             self.relapses += 1
         self._since = self._since if self.relapses else alarm.since
@@ -457,6 +462,7 @@ class AlarmState:
 
         `telling` is True if the sample is informative about the coefficients.
         """
+        # only informative samples count: the others cannot show an effect
         self._quiet += telling
         self._doubted += telling
         self._explained += telling

@@ -127,6 +127,7 @@ class EstimatorBank:
         return None if self.without_map is None else self._doubt_map(time, self.without_map, ahead)
 
     def _doubt_map(self, time: float, mapless: Estimator, best_with: int) -> LearningAlarm | None:
+        # lead in log w of the estimator without the map
         lead = self._weights[-1] - self._weights[best_with]
         if lead <= 0.0:
             self.map_doubted, self._since = False, time

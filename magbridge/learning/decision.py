@@ -210,6 +210,7 @@ class Decision:
         if self._standing.alarm is None:
             return
         self._standing.end()
+        # the evidence so far belongs to the alarm that is over
         knowledge.detector.restart()
         knowledge.late_telemetry.restart()
         self._notify(f"explained again: {how}", False)

@@ -134,6 +134,7 @@ class Estimator:
     def covariance(self) -> FloatArray:
         """Their covariance (K, K), symmetric and positive semidefinite."""
         P = self.filter.covariance[: self.size, : self.size]
+        # rank-one addition: the level that was kept instead of the learned one
         kept = self._kept * float(self._mean @ P @ self._mean)  # the part not learned since keep_level
         P = P + np.outer(kept, kept)
         # rounding leaves small negative eigenvalues, which no calibration file may have
@@ -231,6 +232,7 @@ class Estimator:
         else:
             self._near += (1.0 - self._stay) * (by_coefficients - self._near)
         # e is the residual at the present coefficients, so that they have no part in h^T x
+        # innovation of h^T x, with the nuisance's mean
         known = e - float(by_coefficients @ self.coefficients)
         self.filter.innovate(known, h, self._nuisance.white_variance)
         # share of the variance S that the coefficients explain and the crustal field does not
@@ -249,6 +251,7 @@ class Estimator:
 
     def leave_map(self, nuisance: Nuisance) -> None:
         """Replace the nuisance by `nuisance`, of a reference without a map, in its initial state."""
+        # the nuisance starts again, uncorrelated with the coefficients
         self._nuisance = nuisance
         P, states = self.filter.covariance, slice(-STATES, None)
         self.filter.mean[states] = 0.0

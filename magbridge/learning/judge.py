@@ -188,6 +188,7 @@ class Judge:
         self._seconds += seconds
         self._metres += metres
         self._steady += seconds
+        # another attitude, since the block began or since the last turn
         change = direction - self._direction
         if float(change @ change) > TURN * TURN:
             self._turned, self._direction, self._steady = True, direction, 0.0
@@ -295,6 +296,7 @@ class Coverage:
 
     def add(self, row: FloatArray, direction: FloatArray) -> None:
         """Add a sample's derivatives of the total field (K,), and the field's direction in sensor axes."""
+        # directions closer than TURN to a known one are the same attitude
         nearest = min((float(np.sum((direction - one) ** 2)) for one in self._directions), default=np.inf)
         if nearest > TURN * TURN:
             self._directions.append(direction)

@@ -176,6 +176,7 @@ class Learner:
     def _restart(self, nuisance: Nuisance) -> None:
         """Begin to learn from the published calibration; offsets may have changed at this power-on."""
         published = self.calibration
+        # without the map, the reference is off by the crustal field and its level
         mapless = Nuisance(published.noise, MAPLESS, MAPLESS) if self._grid is not None else None
         self._knowledge = Knowledge(self._model, published, nuisance, mapless, self._turn_on)
 
@@ -231,6 +232,7 @@ class Learner:
         settled : tuple of 3 float or None
             Field of the previous sample, nT, if this sample makes it more exact.
         """
+        # axes sampled in turn: the next reading makes the waiting sample more exact
         self._intake.settle(settled)
         if not self.enabled:
             return
@@ -247,9 +249,11 @@ class Learner:
         if isnan(reference) or not np.isfinite(phi).all():
             self._nothing(time_us)
             return
+        # late telemetry shows only now, in samples that have waited or are kept
         self._decision.raise_alarm(self._knowledge.look_back(time_us, phi, positions))
         if unfit:
             self._intake.drop()
+        # newer telemetry has come without a motion: the waiting samples are at rest
         for before in self._intake.confirmed(time_us, age):
             self._take(before)
         if not fit:

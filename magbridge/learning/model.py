@@ -93,6 +93,7 @@ class LearnedTerms:
         )
         own, more = base.coefficients.size, 3 * len(effects)
         covariance = np.zeros((own + more, own + more))
+        # the further terms have no variance until a hypothesis or an alarm gives them one
         covariance[:own, :own] = base.covariance
         return replace(
             base,
@@ -135,6 +136,7 @@ class LearnedTerms:
         for place, k in enumerate(self._further):
             value = watched[k]
             if not isnan(value):  # while the value is unknown, the last one holds
+                # the first known temperature is the origin, so that the term starts at zero
                 if isnan(self._origins[k]):
                     self._origins[k] = value
                 self._regressors[place] = value - self._origins[k]

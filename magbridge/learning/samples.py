@@ -65,6 +65,7 @@ def observe(field: Vector, nine: FloatArray, F_0: float, reference: float, kappa
     e = (F - reference) / s
     # derivative of s: dA enters by A w
     vx, vy, vz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
+    # the part of v along the field does not turn it, so it is left out of the derivative by the direction
     along = ux * vx + uy * vy + uz * vz
     k = e / s2
     kF = k / F
@@ -150,6 +151,7 @@ class Intake:
         """Return those that waited for a sample now, at which nothing moves, with telemetry `age` (s) old."""
         self._looked_us = time_us
         out = []
+        # a sample is confirmed by telemetry that is newer than it
         while self._held and self._held[0].time_us < time_us - age * 1e6:
             out.append(self._held.popleft())
         return out

@@ -57,6 +57,7 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
+    # mean of the square of a log-normal width: exp(2 mu + 2 sigma^2)
     square = np.exp(2.0 * (family.constant + family.design @ family.centre))
     square *= np.exp(2.0 * ((family.design * family.spread) ** 2).sum(axis=1))
     return Calibration(
@@ -100,6 +101,7 @@ class BatchFit:
     ) -> None:
         self._model, self._prior, self._field = model, coefficients, field
         values, vectors = np.linalg.eigh(covariance)
+        # square root L of a prior that may be singular
         seen = values > values[-1] * 1e-14
         self._root = vectors[:, seen] * np.sqrt(values[seen])
         self._samples: list[tuple[Vector, FloatArray, float, Way]] = []
