@@ -325,27 +325,23 @@ def _covering(
     return replace(calibration, covariance=calibration.covariance + excess * np.outer(s, s))
 
 
-def error_without(
-    problem: Problem, model: Sequence[Candidate], left_out: Sequence[slice], fit: Joint
-) -> FloatArray:
-    """Return the held-out error (n,), nT, of an extension by a model without some of its causes.
-
-    Parameters
-    ----------
-    problem : Problem
-        Comparison, linearised about the calibration as given.
-    model : sequence of Candidate
-        All named causes.
-    left_out : sequence of slice
-        Places of the coefficients of the causes that are left out.
-    fit : Joint
-        Fit of the whole model in this problem.
-    """
-    others = [c for c, place in zip(model, slices(model), strict=True) if place not in left_out]
-    kept = np.delete(np.arange(fit.coefficients.size), np.r_[*left_out])
+def fit_without(
+    problem: Problem, model: Sequence[Candidate], left_out: Sequence[int], fit: Joint
+) -> tuple[list[Candidate], Joint]:
+    """Return a model without the causes at some places, and its fit, about the calibration as given."""
+    others = [candidate for k, candidate in enumerate(model) if k not in left_out]
+    own = slices(model)
+    kept = np.delete(np.arange(fit.coefficients.size), np.r_[*(own[k] for k in left_out)])
     ridge, start = fit.prior[len(fit.z) + kept], np.append(fit.z, fit.coefficients[kept])
     columns, noise = [candidate.columns for candidate in others], fit.noise
-    alone = fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+    return others, fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+
+
+def error_without(
+    problem: Problem, model: Sequence[Candidate], left_out: Sequence[int], fit: Joint
+) -> FloatArray:
+    """Return the held-out error (n,), nT, of an extension by a model without the causes at some places."""
+    others, alone = fit_without(problem, model, left_out, fit)
     settled, blocks, alone = relinearised(problem, others, alone)
     out = held_out(settled, blocks, alone)
     settled.let_go()

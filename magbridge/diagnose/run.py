@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -29,8 +29,15 @@ from magbridge.diagnose.evidence import (
     log_odds,
     shaped_ratio,
 )
-from magbridge.diagnose.improvement import Extension, check_written, corrected, error_without, extension_of
-from magbridge.diagnose.joint import Joint, fit_joint, held_out, paired
+from magbridge.diagnose.improvement import (
+    Extension,
+    check_written,
+    corrected,
+    error_without,
+    extension_of,
+    fit_without,
+)
+from magbridge.diagnose.joint import Improvement, Joint, fit_joint, held_out, paired
 from magbridge.diagnose.leftover import Leftover, leftover, switching, unlisted, varying
 from magbridge.diagnose.noise import autoregressive_order
 from magbridge.diagnose.observed import memory
@@ -52,6 +59,19 @@ ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 MIN_SLOW_FRACTION = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
+
+
+class Names(NamedTuple):
+    """The causes that are asserted, their competing hypotheses, and their joint fit."""
+
+    chosen: tuple[Hypothesis, ...]
+    competing: tuple[tuple[CompetingHypothesis, ...], ...]
+    fit: Joint
+
+    @property
+    def model(self) -> list[Candidate]:
+        """Their candidates."""
+        return [hypothesis.candidate for hypothesis in self.chosen]
 
 
 def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
@@ -259,26 +279,22 @@ def _examine(
     for one in (problem, outcome.problem):
         one.let_go()
     problem = outcome.problem
-    found = outcome.chosen, outcome.competing, outcome.fit
-    named, competing, fit = found if stand else ((), (), outcome.null)
-    off = _wrong_samples(outcome, named, len(causes))
-    if switched := switching(problem, outcome.fit, named, off, ended=outcome.switches):
-        rest, named, competing, fit = switched, (), (), outcome.null
-    model = [h.candidate for h in named]
+    nothing = Names((), (), outcome.null)
+    names = Names(outcome.chosen, outcome.competing, outcome.fit) if stand else nothing
+    off = _wrong_samples(outcome, names.chosen, len(causes))
+    if switched := switching(problem, outcome.fit, names.chosen, off, ended=outcome.switches):
+        rest, names = switched, nothing
     wrong = off if off is not None and off.isolated else None
     counts = counted(problem, wrong)
     progress("refitting the calibration alone")
     refit = extension_of(problem, [], outcome.null, counts)
     refit.problem.let_go()
     progress("extending the calibration")
-    extension = refit
-    if model:
-        extension = extension_of(problem, model, fit, counts, candidates)
-        extension.problem.let_go()
-        if extension.score < refit.score - ODDS:
-            # The held-out dives contradict these names 20:1
-            named, competing, model, extension = (), (), [], refit
-            rest = leftover(problem, [], outcome.null, tone)
+    kept, extension, gains = _extended(problem, names, refit, counts, candidates, causes)
+    if len(kept.chosen) < len(names.chosen):
+        names = kept if kept.chosen else nothing
+        rest = leftover(problem, names.model, names.fit, tone)
+    named, model = names.chosen, names.model
     progress("measuring the improvement")
     fit = extension.fit if model else outcome.null
     before = corrected(problem.survey, calibration).total - problem.survey.reference
@@ -293,7 +309,7 @@ def _examine(
     negligible = bool(named) and wrong is None and beyond.ratio > 1.0 - MIN_RMS_REDUCTION
     return Diagnosis(
         problem=problem, outcome=outcome,
-        findings=_findings(problem, named, competing, extension, refit, counts, outcome, causes),
+        findings=_findings(problem, names, extension, gains, outcome, causes),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()),
         calibration=extension.calibration if stands else calibration, fit=fit,
         refused=extension.refused if model else "",
@@ -367,32 +383,58 @@ def _wrong_samples(outcome: SearchOutcome, named: Sequence[Hypothesis], causes: 
     return off if own else None
 
 
-def _findings(
+def _extended(
     problem: Problem,
-    named: Sequence[Hypothesis],
-    competing: Sequence[tuple[CompetingHypothesis, ...]],
-    extension: Extension,
+    names: Names,
     refit: Extension,
     counts: BoolArray,
+    grid: Sequence[Candidate],
+    causes: Mapping[str, Cause],
+) -> tuple[Names, Extension, dict[int, Improvement]]:
+    """Extend the calibration by the names that the held-out dives support, with each family's improvement."""
+    while names.chosen:
+        extension = extension_of(problem, names.model, names.fit, counts, grid)
+        extension.problem.let_go()
+        if extension.score < refit.score - ODDS:  # the held-out dives contradict these names 20:1
+            break
+        groups = _families(names.chosen, causes)
+        after, gains = extension.error - extension.reference_error, {}
+        for group in groups:
+            without = refit.error
+            if len(group) < len(names.chosen):
+                without = error_without(problem, names.model, group, names.fit)
+            gains[group[0]] = paired(without, after, problem.survey.dive, counts)
+        # A further name that does not improve the held-out corrected field is a remnant without a name
+        strongest = max(gains, key=lambda k: names.chosen[k].signal_to_noise)
+        idle = [
+            k for group in groups if group[0] != strongest and gains[group[0]].ratio >= 1.0 for k in group
+        ]
+        if not idle:
+            return names, extension, gains
+        kept = [k for k in range(len(names.chosen)) if k not in idle]
+        _, fit = fit_without(problem, names.model, idle, names.fit)
+        names = Names(tuple(names.chosen[k] for k in kept), tuple(names.competing[k] for k in kept), fit)
+    return Names((), (), names.fit), refit, {}
+
+
+def _findings(
+    problem: Problem,
+    names: Names,
+    extension: Extension,
+    gains: Mapping[int, Improvement],
     outcome: SearchOutcome,
     causes: Mapping[str, Cause],
 ) -> tuple[Finding, ...]:
-    """Collect the results of each cause; its improvement is that over an extension by the others alone."""
-    found, fit, model = [], extension.fit, [h.candidate for h in named]
-    after, places = extension.error - extension.reference_error, slices(model)
-    for group in _families(named, causes):
-        first, *further = group
-        without = refit.error
-        if len(group) < len(named):
-            without = error_without(problem, model, [places[k] for k in group], outcome.fit)
-        own, hypothesis = places[first], named[first]
-        others = (*(CompetingHypothesis(named[k].candidate, 0.0) for k in further), *competing[first])
+    """Collect the results of each family of causes; the strongest of each has its name."""
+    found, fit, places = [], extension.fit, slices(names.model)
+    for first, *further in _families(names.chosen, causes):
+        own, hypothesis = places[first], names.chosen[first]
+        others = (*(CompetingHypothesis(names.model[k], 0.0) for k in further), *names.competing[first])
         odds = odds_over_random_walk(outcome, hypothesis) if _is_slow(problem, hypothesis) else np.inf
         found.append(
             Finding(
-                hypothesis, others, paired(without, after, problem.survey.dive, counts),
-                fit.coefficients[own],
-                fit.effects_covariance[own, own], odds, tuple(model[k] for k in further),
+                hypothesis, others, gains[first], fit.coefficients[own], fit.effects_covariance[own, own],
+                odds, tuple(names.model[k] for k in further),
             )
         )  # fmt: skip
     return tuple(found)

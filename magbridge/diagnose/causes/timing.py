@@ -56,6 +56,7 @@ class _Rate(Cause):
     """Offsets in proportion to the rate of change of the reading."""
 
     needs = "turns"
+    family = "rate"
     on: ClassVar[Literal["skew", "eddy"]]
     width_s: ClassVar[float]
     """Plausible coefficient, s."""
