@@ -25,7 +25,7 @@ class Curve:
 
     def __init__(self, title: str, name: str, unit: str, *, small: bool = False) -> None:
         self._changes = Changes()
-        height = "h-44" if small else "h-80"
+        height = "h-44" if small else "h-80 md:h-[34rem]"
         with frame(title):
             self._chart = ui.echart(options(name, unit, small=small)).classes(f"w-full {height}")
 

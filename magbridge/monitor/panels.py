@@ -112,25 +112,28 @@ class SensorPanel:
     def __init__(self) -> None:
         self._changes = Changes()
         with ui.element().classes("w-full") as self._box, card("Sensors, nT ± 2σ"):
-            self._table = ui.element().classes(
-                "w-full grid gap-x-6 gap-y-1 text-sm grid-cols-1 sm:grid-cols-[auto_auto_auto_auto_1fr]"
-            )
+            self._table = ui.element().classes(f"{GRID} sm:grid-cols-2 lg:grid-cols-4 gap-x-8")
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show a row for each."""
+        """Show what each measures, and how far it differs from the first."""
         rows = sensor_rows(state, now_s)
         self._box.set_visibility(bool(rows))
         if not self._changes.new("rows", rows, self._table):
             return
         with self._table:
-            for name in ("sensor", "total field", "minus the first", "line", "flags"):
-                ui.label(name).classes(f"{MUTED} max-sm:hidden")
             for row in rows:
-                ui.label(row.name).classes("font-medium max-sm:pt-2")
-                ui.label(row.total).classes("tabular-nums")
-                ui.label(row.difference).classes("tabular-nums").style(f"color: {INK if row.agrees else RED}")
-                ui.label(row.line).style(f"color: {INK if row.is_well else RED}")
-                ui.label(row.flags or "none").classes(MUTED)
+                texts = {
+                    "Total field": (row.total, True),
+                    f"Minus {rows[0].name}": (row.difference, row.agrees),
+                    "Line": (row.line, row.is_well),
+                    "Flags": (row.flags or "none", True),
+                }
+                with ui.column().classes("w-full gap-0"):
+                    ui.label(row.name).classes("font-medium")
+                    for name, (text, well) in texts.items():
+                        label = fact(name)
+                        label.set_text(text)
+                        label.style(f"color: {INK if well else RED}")
 
 
 class NavigationPanel:

@@ -87,7 +87,7 @@ class CompassRose:
         self._changes = Changes()
         with card("Heading ± 2σ") as self.box:
             self._picture = ui.html("", sanitize=False).classes("w-full flex justify-center")
-            self._text = ui.label().classes(f"tabular-nums {MUTED}")
+            self._text = ui.label().classes(f"w-full text-center tabular-nums {MUTED}")
 
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show the heading of the last sample."""

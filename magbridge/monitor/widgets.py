@@ -91,7 +91,7 @@ def nothing(text: str = "None yet") -> ui.label:
 def button(text: str, order: Callable[[], None]) -> ui.button:
     """Make a small button that gives an order."""
     made = ui.button(text, on_click=order).classes("!text-slate-700 dark:!text-slate-200")
-    return made.props("dense no-caps outline size=sm padding='4px 10px'")
+    return made.props("dense no-caps outline size=md padding='3px 10px'")
 
 
 def clock(moment: float) -> str:
