@@ -99,7 +99,9 @@ def _refusal(device: str, error: Exception) -> str:
         users = _users(device)
         return f"busy: {users or 'another program'} has opened it; stop that program, then repeat"
     there = "://" in device or Path(device).exists()
-    return (access(device) if there else "") or f"cannot be opened: {error}"
+    number = getattr(error, "errno", None)
+    reason = os.strerror(number) if number else str(error)  # pyserial repeats the port and the number
+    return (access(device) if there else "") or f"cannot be opened: {reason}"
 
 
 def _users(device: str) -> str:

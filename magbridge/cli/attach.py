@@ -75,11 +75,13 @@ def init(
         hint = "as: battpos [in], ballast [cm3]; none: press Enter"
         names = tuple(name.strip() for name in _ask("5. Which masses move?", hint, "", asks, "").split(","))
         names = tuple(name for name in names if name)
-    options, file = dict(map(_option, option)), _relative(calibration, output)
+    options, file = _options(option, driver), _relative(calibration, output)
     answers = Answers(driver, port, baudrate, link, number, names, options, file)
-    text = bridge_toml(answers, known)
     with atomic_path(output) as path:
-        path.write_text(text, encoding="utf-8")
+        path.write_text(bridge_toml(answers, known), encoding="utf-8")
+        fatal = [one.text for one in findings(path) if one.fatal]
+        if fatal:
+            raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
     found = [one.text for one in findings(output)]
     for text in found:
         complain(text)
@@ -132,6 +134,18 @@ def _ports_listed() -> str:
 
     found = [f"  {one.device}  {one.description}" for one in there()]
     return "\n".join(["ports of this computer:", *found]) if found else "no serial port is there now"
+
+
+def _options(texts: tuple[str, ...], driver: str) -> dict[str, Any]:
+    """Return the driver's options; WrongUse: the driver has no option of that name."""
+    from magbridge.sensors.options import options_of
+    from magbridge.wording import one_of
+
+    given, known = dict(map(_option, texts)), [one.name for one in options_of(driver)]
+    for name in given:
+        if name not in known:
+            raise WrongUse(f"--option {name}: {one_of(name, known)}")
+    return given
 
 
 def _option(text: str) -> tuple[str, Any]:

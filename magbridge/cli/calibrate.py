@@ -13,13 +13,12 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     NO_SCALAR,
     Base,
+    CalibrationOutput,
     Heading,
-    Output,
     Plot,
     ReadingOptions,
     ScalarOptions,
     Whole,
-    check_inputs,
     command,
     complain,
     logs_to_read,
@@ -192,7 +191,7 @@ class _Request:
 @command("calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
 def calibrate(
     *files: Path,
-    output: Output,
+    output: CalibrationOutput,
     model: ModelOptions = PHYSICAL_MODEL,
     truth: ReferenceOptions = MAIN_FIELD,
     scalar: ScalarOptions = NO_SCALAR,
@@ -225,7 +224,6 @@ def calibrate(
     model.check()
     scalar.check(is_reference=truth.reference == "scalar")
     logs_to_read(files, output, model.masses, truth.grid, truth.base)
-    check_inputs((*files, output), plot)
 
     from magbridge.field.read import read_grid
 

@@ -22,9 +22,10 @@ from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
 
 __all__ = [
-    "AS_THEY_SAY", "NO_SCALAR", "Base", "Day", "FailedResult", "Folder", "Grid", "Heading", "Json", "Log",
-    "Output", "Plot", "ReadingOptions", "ScalarOptions", "Whole", "app", "check_inputs", "command",
-    "complain", "file_to_write", "folder_to_write", "logs_to_read", "print_error", "print_result",
+    "AS_THEY_SAY", "NO_SCALAR", "Base", "CalibrationOutput", "Day", "FailedResult", "Folder", "Grid",
+    "Heading", "Json", "Log", "Output", "Plot", "ReadingOptions", "SavedCalibration", "ScalarOptions",
+    "Whole", "app", "check_inputs", "command", "complain", "file_to_write", "folder_to_write",
+    "logs_to_read", "print_error", "print_result",
 ]  # fmt: skip
 
 
@@ -210,6 +211,8 @@ AS_THEY_SAY = ReadingOptions()
 NO_SCALAR = ScalarOptions()
 """No scalar magnetometer."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
+CalibrationOutput = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".json"))]
+SavedCalibration = Annotated[Path | None, Parameter(validator=file_to_write(".json"))]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]

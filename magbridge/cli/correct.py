@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
@@ -14,10 +12,9 @@ from magbridge.cli.common import (
     Log,
     Plot,
     ReadingOptions,
-    check_inputs,
+    SavedCalibration,
     command,
     complain,
-    file_to_write,
     logs_to_read,
     print_result,
 )
@@ -58,7 +55,7 @@ def correct(
     output: Log,
     learn: bool = False,
     config: Path | None = None,
-    save: Annotated[Path | None, Parameter(validator=file_to_write())] = None,
+    save: SavedCalibration = None,
     plot: Plot = None,
     reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
@@ -69,7 +66,6 @@ def correct(
     bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
     each and its age; [align] and every max_age are known as they were when the log began, not as they were
     set later. The bridge itself uses every message about a moving mass, and the channels of a sensor that has
-    no counts are float32 here (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every
     no counts are float32 here (to 0.002 nT of 50,000 nT). In another log, telemetry counts as new in every
     row that has it, and rows that have nothing else are not samples: they are left out of the output. To
     compute the bridge's output bit for bit, put the calibration into a bridge.toml and run:
@@ -98,7 +94,6 @@ def correct(
     """
     source = _source(calibration, config, learn=learn)
     logs_to_read(files, output, source, reading.columns)
-    check_inputs((*files, output), plot)
 
     from magbridge.logs import Writer, read_chunks
 
@@ -160,7 +155,7 @@ def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Pa
         raise WrongUse("--config says how to learn: give --learn, too")
     source = calibration or config
     if source is None:
-        raise WrongUse("--calibration is missing, or --learn with --config bridge.toml")
+        raise WrongUse("expected --calibration cal.json, or --learn with --config bridge.toml")
     return source
 
 

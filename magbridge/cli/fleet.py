@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import App, Parameter, validators
 
 from magbridge.cli.common import (
+    CalibrationOutput,
     Day,
     FailedResult,
     Json,
-    Output,
     Whole,
     app,
     complain,
@@ -255,7 +255,13 @@ def show(
 
 @fleet.command
 def export(
-    vehicle: str, /, *, output: Output, refit: str = "", catalogue: Where = HERE, json: Json = False
+    vehicle: str,
+    /,
+    *,
+    output: CalibrationOutput,
+    refit: str = "",
+    catalogue: Where = HERE,
+    json: Json = False,
 ) -> None:
     """Write the prediction for a vehicle's next deployment as a calibration, before any run is flown.
 

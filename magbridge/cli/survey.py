@@ -18,6 +18,7 @@ from magbridge.cli.common import (
     Output,
     Plot,
     ReadingOptions,
+    SavedCalibration,
     ScalarOptions,
     Whole,
     command,
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.survey.run import Result
     from magbridge.survey.samples import Samples
-
-Written = Annotated[Path | None, Parameter(validator=file_to_write())]
 
 
 @Parameter(name="*")
@@ -67,7 +66,7 @@ class CorrectionOptions:
     parameter: tuple[str, ...] = ()
     order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
     calibration: tuple[Path, ...] = ()
-    save: Written = None
+    save: SavedCalibration = None
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
     base: Base = None
 

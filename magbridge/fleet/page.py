@@ -63,7 +63,9 @@ EXPLANATION = (
 MAX_BAND_RATIO = 6.0
 """Largest width of a band over the range of the estimates at which the whole band is drawn."""
 UNCHANGED = "No coefficient moved farther than by chance."
-FIRST_ONLY = "One deployment: nothing to compare with."
+FIRST_ONLY = (
+    "One deployment: its bands are what the fleet alone predicts; the second one shows what has changed."
+)
 Maps = Mapping[str, tuple[str, Path]]
 """Vehicle -> deployment and file of its last anomaly map."""
 Findings = Mapping[str, Sequence[Mapping[str, Any]]]
@@ -245,10 +247,8 @@ def _panel(history: History, k: int) -> str:
                 ax.axvline(middle, color=REFIT, lw=0.8, ls=":")  # type: ignore[arg-type]
         _limit(ax, history, k, later)
         ax.set_title(f"{history.names[k]}, nT", fontsize=9, loc="left")
-        aside = max(0.08 * (when[-1] - when[0]), timedelta(days=10))  # one deployment alone has no span
-        ax.set_xlim(when[0] - aside, when[-1] + aside)
+        _dates(ax, when.tolist())
         ax.spines[["top", "right"]].set_visible(False)
-        ax.xaxis.set_major_formatter(ConciseDateFormatter(ax.xaxis.get_major_locator()))  # type: ignore[no-untyped-call]
         literal(figure)
         drawn = StringIO()
         figure.savefig(drawn, format="svg", transparent=True, metadata={"Date": None})
@@ -256,6 +256,16 @@ def _panel(history: History, k: int) -> str:
     for stand_in, colour in PAGE_COLOURS.items():
         text = text.replace(stand_in, colour)
     return text[text.index("<svg") :]
+
+
+def _dates(ax: Axes, dates: Sequence[datetime]) -> None:
+    """Set the horizontal axis: a date at each deployment where they are few and apart, else at intervals."""
+    aside = max(0.08 * (dates[-1] - dates[0]), timedelta(days=10))  # one deployment alone has no span
+    ax.set_xlim(dates[0] - aside, dates[-1] + aside)  # type: ignore[arg-type]
+    if len(dates) == 1 or (len(dates) == 2 and dates[1] - dates[0] >= aside):
+        ax.set_xticks(list(dates), [f"{one:%Y-%m-%d}" for one in dates])  # type: ignore[arg-type]
+    else:
+        ax.xaxis.set_major_formatter(ConciseDateFormatter(ax.xaxis.get_major_locator()))  # type: ignore[no-untyped-call]
 
 
 def _limit(ax: Axes, history: History, k: int, later: slice) -> None:
@@ -267,7 +277,7 @@ def _limit(ax: Axes, history: History, k: int, later: slice) -> None:
         return
     ax.set_ylim(low - (high - low), high + (high - low))
     note = f"expected {history.expected[later, k][-1]:,.0f} ± {half:,.0f}"
-    ax.text(0.98, 0.04, note, transform=ax.transAxes, ha="right", fontsize=7, color=INK)
+    ax.set_title(note, fontsize=7, loc="right")  # above the axes, where no band hides it
 
 
 def _day(time: float) -> str:

@@ -24,14 +24,14 @@ def status(catalogue: Catalogue) -> dict[str, Any]:
     new = {job.name for job in new_jobs(catalogue, list(every.values()))}
     counts = {row["vehicle"]: Counter[str]() for row in catalogue.rows("vehicles", ["vehicle"])}
     for job in every.values():
-        counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=job.name in new)
+        counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=int(job.name in new))
     calibrated = set[str]()
     for row in catalogue.rows("calibrations", ["job", "attempt", "vehicle", "supported"]):
         if row["job"] == GIVEN:
             counts[row["vehicle"]].update(given=1)
         elif row["job"] in every and row["attempt"] == last.get(row["job"], 1):
             calibrated.add(row["job"])
-            counts[row["vehicle"]].update(calibrated=1, unsupported=not row["supported"])
+            counts[row["vehicle"]].update(calibrated=1, unsupported=int(not row["supported"]))
     for name in every.keys() - calibrated - new:
         counts[every[name].vehicle["vehicle"]].update(failed=1)
     for what in ("diagnosed", "mapped"):

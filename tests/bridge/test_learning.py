@@ -205,7 +205,7 @@ def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, capsys: pytest
     log, out = tmp_path / "log.csv", tmp_path / "out.nc"
     log.write_text("time,mag_x,mag_y,mag_z\n1,2,3,4\n", encoding="utf-8")
     assert main(["correct", str(log), "-o", str(out)]) == 2
-    assert "--calibration is missing" in capsys.readouterr().err
+    assert "expected --calibration cal.json, or --learn" in capsys.readouterr().err
     assert main(["correct", str(log), "--config", str(tmp_path / "bridge.toml"), "-o", str(out)]) == 2
     assert "--learn" in capsys.readouterr().err
     assert not out.exists()

@@ -30,8 +30,8 @@ def test_what_is_read_is_not_written_over(deployment: Path, command: Command) ->
         (log, ["convert", log, "-o", log]),
         (link, ["convert", log, "-o", link]),
         (log, ["correct", deployment, "--calibration", log, "-o", log]),
-        (log, ["calibrate", deployment, "--grid", log, "-o", log]),
-        (log, ["calibrate", deployment, "--vehicle", log, "-o", link]),
+        (folder, ["calibrate", deployment, "--grid", folder, "-o", folder]),
+        (folder, ["calibrate", deployment, "--vehicle", folder, "-o", folder]),
         (log, ["simulate", "demo", "--trajectory-from", log, "-o", log]),
         (log, ["simulate", log, "-o", log]),
         (log, ["navigate", deployment, "--map", log, "--bound", "-o", log]),
@@ -136,7 +136,6 @@ def test_a_position_in_another_unit_is_refused(
         ("calibrate {d} --order 0 -o x.json", 2, "order"),
         ("calibrate {d} --parameter run --parameter run -o x.json", 1, "'run' is named twice"),
         ("calibrate {d} --site-bias 1e300 -o x.json", 2, "--site-bias. Must be <= 100000"),
-        ("calibrate {d} -o x.png --plot x.png", 2, "x.png: is among the files"),
         ("map none.nc -o x.nc", 1, "none.nc"),
         ("map none.nc -o x.foo", 2, "must end in .nc"),
         ("map none.nc -o x.nc --altitude 1e308", 2, "Must be <= 1000000"),
@@ -265,3 +264,24 @@ def test_a_file_without_a_value_is_named(
         command("simulate", "demo", "-o", "twin.nc", "--map", "grid.nc", "--seed", "5")
     assert command.refuses(*arguments.split()).startswith(words)
     assert not Path("x.nc").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        ("calibrate short.csv -o x.nc", 2, "Its name must end in .json"),
+        ("survey short.csv --save x.csv -o x.nc", 2, "Its name must end in .json"),
+        ("correct short.csv -o x.nc", 2, "expected --calibration cal.json, or --learn with"),
+        ("correct short.csv --calibration cal.json -o x.nc", 1, "column 'mag_z': expected this column"),
+        ("init --driver hmr2300 --link wrong -o x.toml", 2, "x.toml: link.url: expected udpin, udpout"),
+        ("init --driver ascii --option unit=nT --option unid=3 -o x.toml", 2, "did you mean unit?"),
+    ],
+)
+def test_what_would_be_written_wrong_is_refused(
+    arguments: str, code: int, words: str, deployment: Path, here: Path, command: Command
+) -> None:
+    """Also a simulated log that lacks a channel: its true field must not be taken for one."""
+    write(read(deployment).isel(time=slice(0, 60)).drop_vars("mag_z"), "short.csv")
+    save_calibration(identity(), "cal.json")
+    assert words in command.refuses(*arguments.split(), code=code)
+    assert not list(here.glob("x.*"))

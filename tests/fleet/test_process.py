@@ -242,4 +242,5 @@ def test_status_counts(done: Catalogue, capsys: pytest.CaptureFixture[str]) -> N
         2,
         0,
     )
+    assert type(one["new"]) is int
     assert (two["vehicle"], two["deployments"], two["failed"]) == ("two", 1, 0)
