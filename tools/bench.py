@@ -92,14 +92,13 @@ def markdown(results: list[dict[str, Any]]) -> str:
     ]
     for row in (row for result in results for row in result["rows"]):
         floor = f"{row.floor_is}: {row.floor:.3g} {row.unit}" if row.floor is not None else ""
-        target = (
-            f"at most {row.most:g}"
-            if row.most is not None
-            else f"at least {row.least:g}"
-            if row.least
-            else ""
-        )
-        lines.append(f"| {row.what} | {row.value:.3g} {row.unit} | {floor} | {target} |")
+        target = f"at least {row.least:g}" if row.least else ""
+        if row.most is not None:
+            target = f"at most {row.most:g}"
+        value = f"{row.value:.3g} {row.unit}"
+        if row.ratio is not None:
+            value, target = f"{value}, ratio {row.ratio:.2f}", f"ratio {target}"
+        lines.append(f"| {row.what} | {value} | {floor} | {target} |")
     return "\n".join(lines) + "\n"
 
 

@@ -22,6 +22,10 @@ CLOCK_SET_US: Final = 10**15
 """µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
 FIELD_INTERVAL_US: Final = 1_000_000
 """µs after which the bridge computes the main field again."""
+MAX_VECTOR_AGE_US: Final = 3_600_000_000
+MAX_VECTOR_DISTANCE_DEG: Final = 0.01
+"""Time, and difference of latitude or longitude, from which on the bridge computes the main field's vector
+again: over 1 km its direction changes by 0.01 deg."""
 MAX_VEHICLE_SPEED_M_S: Final = 350.0
 """m/s: no vehicle that carries a fluxgate is faster."""
 MAX_JUMP_M: Final = 10_000.0
@@ -54,7 +58,7 @@ class Position:
         self._when_us = self._evaluated_us = 0
         self._field = nan
         self._vector = nan, nan, nan
-        self._vector_us = 0
+        self._vector_us, self._vector_where = 0, (nan, nan)
         self._model: NearbyField | None = None
         self._trusted: tuple[float, float] | None = None
         self._trusted_us = self._jumped_us = 0
@@ -126,16 +130,17 @@ class Position:
         return self._field
 
     def direction(self, time_us: int, utc_us: int) -> tuple[float, float, float]:
-        """Return the IGRF's vector in nT, north-east-down, of the last minute; NaN as :meth:`main_field`."""
+        """Return the IGRF's vector near the position, nT, north-east-down; NaN as :meth:`main_field`."""
         if isnan(self.main_field(time_us, utc_us)):
             return nan, nan, nan
-        if abs(utc_us - self._vector_us) > MAX_POSITION_AGE_US:
+        assert self._where is not None
+        (latitude, longitude), (last_latitude, last_longitude) = self._where, self._vector_where
+        distance_deg = max(abs(latitude - last_latitude), abs(longitude - last_longitude))
+        if not distance_deg < MAX_VECTOR_DISTANCE_DEG or abs(utc_us - self._vector_us) > MAX_VECTOR_AGE_US:
             from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
 
-            assert self._where is not None
-            latitude, longitude = self._where
             north, east, down = igrf(longitude, latitude, self._depth, utc_us * 1e-6)[0].tolist()
-            self._vector, self._vector_us = (north, east, down), utc_us
+            self._vector, self._vector_us, self._vector_where = (north, east, down), utc_us, self._where
         return self._vector
 
     def _evaluate(self, utc_us: int) -> float:

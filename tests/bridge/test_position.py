@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from math import isnan
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small import small_bridge
 
@@ -14,7 +15,7 @@ from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.position import Position
 from magbridge.bridge.states import clock_step
 from magbridge.calibration.model import Parameter
-from magbridge.field.igrf import total_field
+from magbridge.field.igrf import igrf, total_field
 from magbridge.mavlink import Codec
 from magbridge.records import Channel
 
@@ -39,6 +40,17 @@ def test_a_dive_is_nearer_to_the_core() -> None:
     for field, depth in ((surface, 0.0), (deep, 1000.0)):
         assert field == pytest.approx(total_field(-57.9, 49.5, depth, START * 1e-6).item(), abs=0.1)
     assert 15.0 < deep - surface < 35.0
+
+
+def test_the_vector_is_that_of_a_place_at_most_a_kilometre_away() -> None:
+    position = position_at(49.5, -57.9, 0.0)
+    for latitude in (49.5, 49.505, 49.55):
+        (message,) = Codec(0, 0).parse(
+            Codec(1, 1).pack("GLOBAL_POSITION_INT", lat=round(latitude * 1e7), lon=-579_000_000)
+        )
+        position.update(message, START)
+        vector = igrf(-57.9, latitude, 0.0, START * 1e-6)[0]
+        assert np.linalg.norm(vector - position.direction(START, START)) < 10.0
 
 
 def test_an_old_position_or_none_gives_no_field() -> None:
