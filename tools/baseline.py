@@ -89,27 +89,28 @@ def live(change: str, seed: int) -> Figures:
 
 
 def diagnosis(entry: dict[str, Any]) -> Figures:
-    """Hide effects in a deployment and diagnose it."""
-    from study.cases import case  # noqa: PLC0415
+    """Hide effects in a deployment and diagnose it.
+
+    A name counts as alone if all its alternatives are the same cause, on another series or of the same trace.
+    """
+    from study import table  # noqa: PLC0415
+    from study.cases import NAMELESS, case  # noqa: PLC0415
 
     row = case(entry)
-    names, found = set(entry["names"]), row["found"]
-    listed = {name for cause, _, _, alternatives in found for name in (cause, *alternatives)}
-    first = {cause for cause, *_ in found}
-    part = "foreign" if entry["part"] in ("unknown", "seen", "foreign") else "listed"
-    if not names:
-        return {"false alarms": float(row["verdict"] != "nothing_found")}
-    if part == "foreign":
-        return {
-            "foreign: found": float(row["verdict"] != "nothing_found"),
-            "foreign: a name": float(bool(found)),
-        }
-    sure = {cause for cause, _, _, alternatives in found if not alternatives}
-    return {
-        "listed: found": len(names & listed) / len(names),
-        "listed: named alone": len(names & sure) / len(names),
-        "listed: false second name": float(bool(first - names) and bool(names & listed)),
+    found = float(table.found(row))
+    if not entry["names"]:
+        return {"false alarms": found}
+    if entry["part"] in NAMELESS:
+        return {"foreign: found": found, "foreign: a name": float(bool(row["found"]))}
+    figures = {
+        "listed: found": found,
+        "listed: false second name": float(table.has_second(row)),
     }
+    if found:
+        figures["listed: truth among the names"] = float(table.holds(row))
+    if row["theory"] and table.is_nameable(row):
+        figures["listed: named alone, where an ideal detector can"] = float(table.is_right_alone(row))
+    return figures
 
 
 def navigation(rms: float, length: float, seed: int) -> Figures:

@@ -233,6 +233,7 @@ class _Table:
 
         Where one cause stood, neither may be a remnant of the other.
         """
+        # Each cause is tested given the other of the pair
         ratios = []
         for n, other in ((a, b), (b, a)):
             one, alone = self.candidates[n], self.scores[n]
@@ -249,6 +250,7 @@ class _Table:
         """Return True if a rather replaces the second, judged by cause, else by the signal it explains."""
         if len(self.standing) == 1:
             return False
+        # Places by the cause where that decides, else by the signal that each explains
         names = [candidate.cause for candidate in self.standing]
         one, two = self.candidates[a].cause, self.candidates[b].cause
         straight, crossed = (one == names[0]) + (two == names[1]), (one == names[1]) + (two == names[0])
@@ -377,6 +379,7 @@ def _separate(new: list[Candidate], pieces: list[Candidate], replaced: list[int]
 
 def _gathered(state: SearchState, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
     """Join the pieces of each cause into one candidate."""
+    # Pieces of one cause stand next to each other, so that one candidate can hold them
     causes = list(dict.fromkeys(piece.cause for piece in pieces))
     if len(causes) == len(pieces):
         return pieces, base

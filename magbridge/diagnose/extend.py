@@ -230,6 +230,7 @@ def without_effects_at(calibration: Calibration, places: Sequence[int]) -> Calib
     """Return the calibration without the effects at some places; other places may hold equal ones."""
     if not places:
         return calibration
+    # Coefficients stand in the order of terms, then effects
     first = sum(term.size for term in calibration.terms)
     starts = list(accumulate((effect.size for effect in calibration.effects), initial=first))
     own = np.concatenate([np.arange(starts[place], starts[place + 1]) for place in places])
@@ -258,6 +259,7 @@ def with_map_error(
     """
     if not problem.survey.learned.any():
         return extended
+    # Mean square of half of the map's error over the log
     power = 0.0
     for candidate, own in zip(model, slices(model), strict=True):
         if candidate.about == "place":
@@ -348,6 +350,7 @@ def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> 
     places = accumulate(_counts(extended), initial=first)
     for place, rates in zip(list(places)[len(problem.calibration.effects) :], smooth, strict=False):
         if rates is not None:
+            # Central differences of the search replace the live, noisy ones
             central = rates(slice(0, len(problem)))
             samples.phi[:, place : place + len(central)] = central.T
     # Causes that appeared later have no regressors in the logs that were learned from

@@ -159,6 +159,7 @@ def _attempt(
     calibration = _covering(problem, calibration, error, [counts, counts & (out.fold == out.fold.max())])
     if model and not any(isinstance(effect, TimeEffect) for c in model for effect in c.effects):
         # Forward chaining: the second half by a fit of the first, as a later log will be corrected
+        # Sigma must cover what a fit of the first half leaves in the second
         late = np.cumsum(counts) > 0.5 * counts.sum()
         halves = held_out(settled, blocks, fit, groups=late.astype(np.int64))
         forward, _ = _held_out_error(problem, model, fit, halves, dropped)
@@ -208,6 +209,7 @@ def _refusal(
     allowed, moved = _departure(problem, extension)
     if moved > allowed:
         return "outside_prior", (allowed, moved)
+    # Compare with the calibration as given, dive by dive; an error of the reference is not in the output
     before = corrected(problem.survey, problem.calibration).total - problem.survey.reference
     change = paired(before, extension.error, problem.survey.dive, counts)
     if not extension.reference_error.any() and change.interval[1] > MAX_RATIO:
@@ -252,6 +254,7 @@ def _turned(samples: ResidualSamples) -> ResidualSamples:
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         for a in (angle, -angle):
+            # Rotation by the angle in the plane of the other two axes
             R = np.eye(3)
             R[i, i] = R[j, j] = np.cos(a)
             R[i, j], R[j, i] = -np.sin(a), np.sin(a)
@@ -298,6 +301,7 @@ def tightened(problem: Problem, factor: float) -> Problem:
     """
     known = problem.known
     directions, centre = problem.directions.copy(), problem.centre.copy()
+    # L -> factor L; what the prior loses, (1 - factor^2) L L^T, is kept as unseen variance
     D = directions[:, known]
     unseen = problem.unseen + (1.0 - factor**2) * D @ D.T
     directions[:, known] *= factor
@@ -318,6 +322,7 @@ def _covering(
 
     .. math:: C \leftarrow C + \max(0, \overline{e^2} - \overline{\sigma^2})\, s s^T
     """
+    # Largest excess of the mean square error over the stated variance, along equal scales
     sigma, s = corrected(problem.survey, calibration).sigma, isotropic(calibration)
     excess = max(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any())
     if excess <= 0.0 or not s.any():
@@ -341,6 +346,7 @@ def error_without(
     problem: Problem, model: Sequence[Candidate], left_out: Sequence[int], fit: Joint
 ) -> FloatArray:
     """Return the held-out error (n,), nT, of an extension by a model without the causes at some places."""
+    # The same steps as for the whole model: converge, hold folds out, correct them
     others, alone = fit_without(problem, model, left_out, fit)
     settled, blocks, alone = relinearised(problem, others, alone)
     out = held_out(settled, blocks, alone)

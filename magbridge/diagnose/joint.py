@@ -258,6 +258,7 @@ class Joint:
 
     def wald(self, places: slice | IndexArray) -> float:
         """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) at `places`."""
+        # Quadratic form of the estimates with their inverse covariance
         b = self.coefficients[places]
         return float(b @ np.linalg.solve(self.effects_covariance[places][:, places], b))
 
@@ -311,6 +312,7 @@ def fit_joint(
 
     def evaluated(c: FloatArray) -> tuple[FloatArray, ResidualNoise]:
         residual = problem.residual - X.times(c)
+        # The noise is fitted again at every trial, beginning with that of a similar fit
         known = None if like is None else like.noise
         return residual, fit_noise(residual, past, blocks=blocks, like=known, brief=brief)
 

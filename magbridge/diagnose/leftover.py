@@ -186,6 +186,7 @@ def leftover(
     also : sequence of Description
         Further descriptions.
     """
+    # Descriptions that only repeat an excluded cause's own regressors are no alternatives
     listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
@@ -208,6 +209,7 @@ def leftover(
     if p_value >= (FALSE_ALARM_RATE if model else 0.1 * FALSE_ALARM_RATE):
         return None
     every = slice(0, len(problem))
+    # RMS of the fitted description in the total field
     shape = times(likeliest.columns, every, likeliest.fit.coefficients[-len(best.variance) :])
     size = rms(shape / problem.reference_jacobian)
     return Leftover(
@@ -353,6 +355,7 @@ def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover
     Noise of a long memory can describe any slow signal, but such a signal is not noise of the sensor. Noise
     that grows towards low frequencies can, too, unless it may be a remnant of the strongest cause.
     """
+    # Slow noise belongs to what is left: no sensor makes it
     slow = problem.slow_noise(fit.z)
     residual = (fit.residual + slow) / problem.reference_jacobian
     found = memory(problem, residual)

@@ -154,6 +154,7 @@ class ResidualNoise:
     def _weights(self, rows: slice) -> FloatArray:
         """(m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
         past, gaps = self.past, self.near_gaps
+        # Rows of the band matrix: (1, -a), or f (1, -a') after a gap, over the scale
         weights = np.tile(np.append(1.0, -self.ar), (rows.stop - rows.start, 1))
         some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
         weights[past.rows[some] - rows.start] = gaps.weights[past.pattern[some]]
@@ -296,6 +297,7 @@ def fit_noise(
     count = _counts(n)
     # a view of the p samples before each, which takes no memory
     lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
+    # First weights: all equal, or those of the noise that this one will be like
     ar, nu = np.zeros(order), 12.0
     if like is None:
         weight, scale = np.ones(n), np.full(n, robust_scale(residual) + 1e-12)
@@ -397,6 +399,7 @@ def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -
         before, each = power, _each(power, count)
         weighted = square if nu > GAUSSIAN else (nu + 1.0) * each * square / (nu * each + square)
         sums = _sums(weighted, count)
+        # Shrunk towards the level of all blocks, with the weight of ten samples
         whole = float(sums.sum()) / n
         power = (sums + 10.0 * whole) / (count + 10.0) if count.size > 1 else sums / count
         power = power + 1e-24

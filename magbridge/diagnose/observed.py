@@ -134,6 +134,7 @@ def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = No
         return FIELD_AND_AXES[k] if clear else None
 
     found = [(explained(q), name, lag, q) for name, lag, q in _series(problem, part)]
+    # A lag must explain more than its freedom does by chance
     share, name, lag, q = max(found, key=lambda one: one[0] - MIN_LAG_GAIN * (one[2] > 0.0))
     apart = float(own @ fitted(q, EVERY, own)) / (float(own @ own) + 1e-300)
     chance = _by_chance(share, q.shape[1] * len(FIELD_AND_AXES), (y - fitted(q, EVERY))[:, None] * axes)

@@ -145,6 +145,7 @@ def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
 
 def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
     """(2, k) power gain of whitening at frequencies (k,), per sample: away from gaps, and after them."""
+    # |1 - sum a_k e^(-2 pi i f k)|^2 away from gaps, and its mean over the patterns after them
     past, gaps = noise.past, noise.near_gaps
     lags = np.arange(1, past.order + 1)
     whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.ar) ** 2
@@ -177,6 +178,7 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     pairs = np.einsum("ik,jk->ijk", shape, shape).reshape(9, -1)
     best, nearest, scale, look_elsewhere = -np.inf, 0.0, 1.0, 1.0
     for duration in np.geomspace(BRIEFEST / len(t), SLOWEST, DURATIONS) * float(t[-1]):
+        # Sums by quarters, then b and S at every moment by a product with the shapes
         quarters = (4.0 * t / duration).astype(int)
         b, S = (_around(np.bincount(quarters, x)) @ f.T for x, f in ((matched, shape), (power, pairs)))
         ratio = _ratio(S.reshape(-1, 3, 3), b)

@@ -185,6 +185,7 @@ def floor(calibration: Calibration) -> FloatArray:
     The posterior counts only the noise of its samples, and a few thousand samples average that down to a
     hundredth. The filters' lag in the turns of the calibration runs, and the drift between days, are larger.
     """
+    # 20 ppm of the field on each of the nine constants
     spread = np.zeros(calibration.coefficients.size)
     for constants in _constants(calibration):
         spread[constants] = STABLE * calibration.reference.field
@@ -471,6 +472,7 @@ def with_slow_noise(problem: Problem, power: int = 1) -> Problem:
     if problem.waves.size:
         made = replace(problem, waves=waves() ** power)
     else:
+        # Zero columns of L: slow noise moves no coefficient of the calibration
         place, more = problem.known.stop, np.zeros(waves().size)
         made = replace(
             problem,

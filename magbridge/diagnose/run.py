@@ -393,6 +393,7 @@ def _extended(
 ) -> tuple[Names, Extension, dict[int, Improvement]]:
     """Extend the calibration by the names that the held-out dives support, with each family's improvement."""
     while names.chosen:
+        # Extend by all names, then measure each family against an extension by the others
         extension = extension_of(problem, names.model, names.fit, counts, grid)
         extension.problem.let_go()
         if extension.score < refit.score - ODDS:  # the held-out dives contradict these names 20:1

@@ -155,6 +155,7 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
     In both cases each neighbour has as its p-value its rank among those of all samples, whatever the noise's
     tails; Fisher's method combines them, and each sample counts as the kind that has the better neighbours.
     """
+    # Whitening filter h, and b: the filter's transpose applied to the innovations
     noise, p = fit.noise, len(fit.noise.ar)
     h = np.concatenate([[1.0], -noise.ar, np.zeros(2)])
     b, v = (
@@ -184,6 +185,7 @@ def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
     # Expectation maximisation over scale, share and width of the wide component
     for _ in range(25):
         x = v / s
+        # Membership of the wide component, then scale, share and width by weighted moments
         log_t = at_zero - np.log(s) - 0.5 * (nu + 1.0) * np.log1p(x * x / nu)
         inside = np.exp(log_t) * (1.0 - eps)
         outside = eps * np.exp(-0.5 * (v / wide) ** 2) / (wide * np.sqrt(2 * np.pi))
@@ -360,6 +362,7 @@ def _backward_elimination(
     Then drop the remnants of a Gaussian process, and further causes that the held-out dives contradict or
     that a free description predicts better.
     """
+    # Each cause in turn against the model without it; a drop starts the pass again
     chosen: list[Hypothesis] = []
     k = 0
     while k < len(model):
@@ -418,6 +421,7 @@ def _surplus(
 
 def _like_another(state: SearchState, model: Sequence[Candidate], base: Joint, k: int) -> bool:
     """Return True if in this log the k-th cause is strongly correlated with another of the model."""
+    # The most visible candidate of each group stands for its grid
     info = state.conditional_on(model, base)
     every = {state.candidates[n].group: n for n in most_visible(state.candidates, info, state.at)}
     own, *others = (every[candidate.group] for candidate in (model[k], *model[:k], *model[k + 1 :]))

@@ -170,6 +170,7 @@ class SearchState:
         pool = [best.place for best in top.values()]
         index = np.r_[*(self.at[k] for k in pool)]
         taken = np.linalg.solve(info.matrix[np.ix_(index, index)] + np.eye(len(index)), info.score[index])
+        # Start from the solution of that system under the present noise
         every = [*model, *(self.candidates[k] for k in pool)]
         everything = fit_joint(
             self.problem,
@@ -264,6 +265,7 @@ def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, 
         if improvement > 0.0:
             ratio, evidence = best.ratio + improvement, best.evidence + 0.5 * improvement
             best = replace(best, candidate=candidate, fit=fit, ratio=ratio, evidence=evidence)
+    # Cells of the grid, in which the uncertainty of these parameters is expressed later
     brackets = [_bracket(state, best.candidate, name) for name in best.candidate.point.shape]
     cells = tuple(0.5 * (high - low) for low, high in brackets)
     point = replace(best.candidate.point, narrow=narrow, cells=cells)

@@ -66,8 +66,12 @@ def holds(row: Row) -> bool:
 
 
 def has_second(row: Row) -> bool:
-    """Return True if more causes are named than are hidden."""
-    return len(asserted(row)) > max(len(hidden(row)), 1)
+    """Return True if more causes are named than are hidden.
+
+    The offset of a vehicle whose reference is a map has changed since its calibration: its name is right.
+    """
+    changed = {"offset_step"} if row["part"] == "charted" else set()
+    return len(asserted(row) - changed) > max(len(hidden(row)), 1)
 
 
 def is_nameable(row: Row) -> bool:

@@ -78,6 +78,7 @@ class ActuatorOrder(Cause):
             return []
         # What the calibration's polynomials lack, up to one order more
         present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
+        # Legendre terms that are missing, then whole masses again, then sources near each path
         order = max(sum(e) for e in present) + 1
         missing = [e for e in full_order(len(calibration.parameters), order) if e not in present]
         moved = [p for p in calibration.parameters if np.ptp(problem.survey.channels[p.name].extent) > 0.0]
