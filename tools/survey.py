@@ -24,7 +24,7 @@ from study_worlds import MASSES, NOISES, GaussianRock, SurveyBound, drifted, fly
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.field_nodes import nodes_for
+from magbridge.calibration.fitting.field_search import nodes_for
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observe import observations

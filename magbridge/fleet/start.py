@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from magbridge.calibration.fitting.fit import Fit
-from magbridge.calibration.fitting.known import DEPARTURE, Known
+from magbridge.calibration.fitting.pose import DEPARTURE, Known
 from magbridge.fleet.catalogue import open_catalogue
 from magbridge.fleet.memory import fleet_of, owner
 from magbridge.wording import counted

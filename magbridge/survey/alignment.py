@@ -22,8 +22,17 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.figure_of_merit import figure_of_merit, merit_text
-from magbridge.calibration.fitting.field_nodes import SMOOTH, about_the_middle, ladder, nodes_for
-from magbridge.calibration.fitting.field_search import BENDS, Choice, Weighed, choose, climb
+from magbridge.calibration.fitting.field_search import (
+    BENDS,
+    SMOOTH,
+    Choice,
+    Weighed,
+    about_the_middle,
+    choose,
+    climb,
+    ladder,
+    nodes_for,
+)
 from magbridge.errors import CalibrationError
 from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
 from magbridge.estimation.elimination import eliminate_field

@@ -17,13 +17,16 @@ from dataclasses import replace
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.field_doubt import plausible
-from magbridge.calibration.fitting.field_nodes import about_the_middle, fine_enough, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
+    about_the_middle,
     choose,
     climb,
+    fine_enough,
+    ladder,
+    nodes_for,
+    plausible,
 )
 from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, slow_functions, with_blocks
 from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field

@@ -10,8 +10,8 @@ from gliders import Gliders
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.known import Known, rescaling
 from magbridge.calibration.fitting.observations import monomials
+from magbridge.calibration.fitting.pose import Known, rescaling
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from magbridge.calibration.fitting.field_nodes import nodes_for
+from magbridge.calibration.fitting.field_search import nodes_for
 from magbridge.estimation.elimination import LinearisedRows, eliminate_field, sum_rows
 from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.estimation.nodes import nodes_near

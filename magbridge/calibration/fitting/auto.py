@@ -16,26 +16,126 @@ predicts those better, it is taken.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.fitting.climb import Climbed, climb, thinned
-from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.left_out import carried_forward, leave_out, refitted
+from magbridge.calibration.fitting.left_out import error_between, error_forward, leave_out, thinned
 from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, nominal, nominal_samples, starts
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.pose import Vehicle, pose
+from magbridge.calibration.fitting.pose import Known, Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.errors import CalibrationError, NoSolutionError
-from magbridge.estimation.hyperparameters import is_maximum
-from magbridge.estimation.information import covariance_of
-from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, fit_slow_and_white
-from magbridge.estimation.priors import PriorFamily
-from magbridge.estimation.residual import ResidualSamples, residuals_of, robust_scale
+from magbridge.estimation.hyperparameters import Hyperparameters, is_maximum, maximise_evidence
+from magbridge.estimation.information import GaussianInformation, covariance_of
+from magbridge.estimation.noise import (
+    OUTLIER_SIGMA,
+    NoiseModel,
+    Whitening,
+    estimate_noise,
+    fit_slow_and_white,
+)  # fmt: skip
+from magbridge.estimation.optimise import Solution, gauss_newton
+from magbridge.estimation.priors import Prior, PriorFamily
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
-__all__ = ["fit_auto", "flown"]
+__all__ = ["Climbed", "climb", "fit_auto", "flown"]
+
+# ---- One start ----
+
+MAX_START_ITERATIONS = 16
+"""Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Climbed:
+    """Result of a climb."""
+
+    solution: Solution
+    widths: Hyperparameters
+    noise: NoiseModel
+    family: PriorFamily
+    quadratic: GaussianInformation
+    score: float
+
+
+def climb(
+    samples: ResidualSamples,
+    family: PriorFamily,
+    z: FloatArray,
+    eta: FloatArray,
+    noise: NoiseModel | None = None,
+    *,
+    shaped: bool = False,
+) -> Climbed:
+    """Alternate coefficients, widths and noise until the evidence converges; give `noise` if z is near that.
+
+    `z` (q,) and `eta` (h,) are where it begins. `shaped`: the memory of `noise` is kept.
+    """
+    score, white = -np.inf, noise is None
+    shape = noise.shape if noise is not None and shaped else None
+    if noise is None:
+        z, noise = _approach(samples, family.prior(eta), z)
+    for step in range(MAX_START_ITERATIONS):
+        if family.renew is not None and step:
+            family = family.renew(z)
+        # the first widths are a guess, and not worth settling at
+        solution = gauss_newton(samples, family.prior(eta), noise, z, steps=50 if step else 3)
+        kept = len(samples.field) - noise.rejected
+        quadratic = GaussianInformation.from_derivatives(solution.z, *solution.normal, kept)
+        widths = maximise_evidence(quadratic, family, eta, noise.sigma)
+        eta, z = widths.eta, solution.z
+        last, score = score, _score(widths, noise, samples)
+        noise = replace(noise, sigma=widths.sigma)
+        still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
+        if still and not white:
+            break
+        # residuals of a wrong model look correlated for long, so the autocorrelation waits for convergence
+        white = white and not still and step < MAX_START_ITERATIONS // 2
+        # at last the noise's autocorrelation and outliers are kept, so that the rest converges
+        if step < MAX_START_ITERATIONS - 4:
+            prior = family.prior(eta)
+            e = residuals_of(samples, prior.coefficients(z))
+            doubt = (0.0, 0.0) if white or shape else _doubt(samples, prior, solution, noise)
+            steps = np.where(white, np.inf, samples.steps)
+            found = estimate_noise(e, steps, widths.determined, doubt, shape)
+            noise = replace(found, sigma=widths.sigma)
+    return Climbed(solution, widths, noise, family, quadratic, score)
+
+
+def _doubt(
+    samples: ResidualSamples, prior: Prior, solution: Solution, noise: NoiseModel
+) -> tuple[float, float]:
+    """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
+    few = thinned(samples)
+    _, g = residuals(few, prior.coefficients(solution.z))
+    J = jacobian(few.phi, g)
+    P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
+    JP = J @ (prior.E @ P @ prior.E.T)
+    next_one = few.steps[1:] == 1
+    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
+
+
+def _approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
+    """Approach the solution: after each Gauss-Newton step, set the noise to the bulk of the residuals."""
+    apart = np.full(len(samples.field), np.inf)
+    noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
+    for _ in range(MAX_START_ITERATIONS):
+        z = gauss_newton(samples, prior, noise, z, steps=1, tolerance=0.1).z
+        last, noise = noise, estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
+        if noise.sigma > 0.8 * last.sigma:
+            break
+    return z, noise
+
+
+def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
+    """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
+    outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
+    variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
+    whitening = 0.5 * np.log(variance).sum()
+    return float(widths.log_evidence - noise.rejected * outlier - whitening)
+
 
 # ---- The ends of a log that are not its flight ----
 
@@ -131,7 +231,7 @@ def fit_auto(
     if known is not None:
         return found
     # always: the choice of parameters compares this error of fits with and without one
-    found.details["forward_nT"] = carried_forward(samples, prior, best.solution.z, best.noise)
+    found.details["forward_nT"] = error_forward(samples, prior, best.solution.z, best.noise)
     if left.ratio <= 1.0 and data.names:
         return found
     return _simpler(data, found, best) or found
@@ -151,12 +251,12 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
         return None
     samples, white = nominal_samples(data), one.weighted
     prior, z, noise = best.family.prior(best.widths.eta), best.solution.z, best.noise
-    forward = carried_forward(samples, one.prior, one.z, white) / found.details["forward_nT"]
+    forward = error_forward(samples, one.prior, one.z, white) / found.details["forward_nT"]
     simpler.details["forward_nT"] = forward * found.details["forward_nT"]
     if data.names:  # to first order is enough to compare fits that differ by their parameters
         among = simpler.details["left_out_nT"] / found.details["left_out_nT"]
         return simpler if among * forward < 1.0 else None
-    among = refitted(samples, one.prior, one.z, white, data.runs) / refitted(
+    among = error_between(samples, one.prior, one.z, white, data.runs) / error_between(
         found.samples, prior, z, noise, data.runs
     )
     return simpler if among * forward < 1.0 and _shrinks(simpler) <= max(_shrinks(found), SHRUNK) else None

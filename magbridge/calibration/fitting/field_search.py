@@ -1,24 +1,110 @@
-"""Amplitude, length and smoothness of a field, and the noise's autocorrelation, by the evidence."""
+r"""The field in place: nodes, lengths to try, the search for the likeliest one, and what that leaves open.
+
+Amplitude, length and smoothness of a field, and the noise's autocorrelation, are chosen by the evidence. A
+few anomalies hardly determine amplitude and length: a solution at the likeliest values alone would be
+overconfident away from the track. The evidence is therefore summed over points about its maximum,
+
+.. math:: p(f) \approx \sum_k w_k\, p(f \mid \theta_k), \quad \theta_k = \hat\theta + V S g_k,
+
+of a Gauss-Hermite rule (3 x 3) along the axes V of its curvature with the spreads S, each weighed with its
+own evidence (Rue, Martino & Chopin 2009, section 6.5).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
-from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.field_nodes import MAX_FIELD_NODES, SMOOTH, fine_enough, ladder, nodes_for
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
 from magbridge.estimation.gaussian_field import BURIED_FACTORS, SMOOTHNESS_POWERS, GaussianField
 from magbridge.estimation.hyperparameters import log_evidence
+from magbridge.estimation.nodes import Nodes, nodes_near
 from magbridge.estimation.priors import PriorFamily
 
 __all__ = [
-    "BENDS", "DECISIVE_LOG_RATIO", "Choice", "Weighed", "choose", "climb", "first_guess", "refined",
-    "same_noise",
+    "BENDS", "DECISIVE_LOG_RATIO", "MAX_FIELD_NODES", "MAX_UNCERTAIN_NODES", "SMOOTH", "Choice",
+    "Weighed", "about_the_middle", "choose", "climb", "fine_enough", "first_guess", "ladder", "nodes_for",
+    "plausible", "refined", "same_noise",
 ]  # fmt: skip
+
+# ---- Lengths and nodes ----
+
+RUNGS = 7
+"""Lengths that are tried first."""
+NODES_PER_LENGTH = {2: 8.0, 3: 8.0, 4: 5.0}
+SMOOTH, ENOUGH = 6, 3.0
+"""Nodes a length by the power alpha, and from SMOOTH on: of a field 40 times the noise they leave out less
+than that noise (rough ones on coarser nodes gave maps with errors of 5 to 8 sigmas)."""
+PAD_LENGTHS = 1.0
+"""Lengths around the track that have nodes."""
+MAX_FIELD_NODES = 4_000
+"""Nodes at most, unless more are asked for."""
+SIDE = 1_500
+"""Nodes along a side of the area's box at most, where it is a square."""
+MIN_LENGTH_M = 60.0
+"""Shortest correlation length, m; a twentieth of an area smaller than that."""
+
+
+def fine_enough(nodes: Nodes, length: float, alpha: int, finer: float = 1.0) -> bool:
+    """Return True if nodes are fine enough for a field of a `length`, m, and power alpha."""
+    return 0.7 <= length / nodes.spacing / _nodes_per_length(alpha, finer) <= 1.5
+
+
+def _nodes_per_length(alpha: int, finer: float) -> float:
+    return max(NODES_PER_LENGTH.get(alpha, ENOUGH), finer * ENOUGH)
+
+
+def nodes_for(
+    place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES, finer: float = 1.0
+) -> Nodes:
+    """Return the nodes of a field around places (n, 2), m; coarser if they are too many.
+
+    Parameters
+    ----------
+    place : (n, 2) array
+        m.
+    length : float
+        m, of the field.
+    alpha : int
+        Its smoothness: a rough one takes finer nodes.
+    most : int
+        Nodes at most, about.
+    finer : float
+        Factor of the nodes per length of a smooth field; the error of its splines falls as the fourth power.
+    """
+    box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
+    spacing = max(length / _nodes_per_length(alpha, finer), float(np.sqrt(box.prod())) / SIDE)
+    while (nodes := nodes_near(place, spacing, PAD_LENGTHS * length)).size > 1.05 * most:
+        spacing *= (nodes.size / most) ** 0.5
+    return nodes
+
+
+def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolArray:
+    """Return which of places (n, 2), m, are the `number` nearest to the middle one, or within `wide` m: (n,).
+
+    They lie in a square, so that whole stretches of lines are among them.
+    """
+    if len(place) <= number:
+        return np.ones(len(place), bool)
+    from_middle = np.abs(place - np.nanmedian(place, axis=0)).max(axis=1)
+    return np.asarray(from_middle <= max(np.partition(from_middle, number)[number], wide))
+
+
+def ladder(place: FloatArray) -> FloatArray:
+    """Return seven lengths to try, m: from the resolution of samples at places (n, 2), m, to the area."""
+    known = place[np.isfinite(place).all(axis=1)]
+    extent = float(np.hypot(*np.ptp(known, axis=0)))
+    step = np.linalg.norm(np.diff(known, axis=0), axis=1)
+    shortest = max(4.0 * float(np.median(step)), extent / 60.0, min(MIN_LENGTH_M, extent / 20.0))
+    return np.asarray(np.geomspace(shortest, max(extent / 2.5, 1.5 * shortest), RUNGS))
+
+
+# ---- The search ----
 
 RESOLVED = 2.0
 """Nodes a length at least: a shorter one is not tried on so large an area."""
@@ -256,3 +342,66 @@ def same_noise(sums: SampleSums, choice: Choice, weighed: Weighed) -> Choice:
     found = minimize_scalar(downhill, bounds=(-5.0, 5.0), method="bounded", options={"maxiter": 12})
     rho = float(MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-found.x)))
     return replace(choice, rho=rho if rho > WHITE_AUTOCORRELATION else 0.0)
+
+
+# ---- What the search leaves open ----
+
+MAX_UNCERTAIN_NODES = 2_500
+"""Nodes from which on size and length are known well enough."""
+LOG_STEP = 0.3
+"""Step in the logarithms of amplitude and length with which the evidence's curvature is computed."""
+WIDEST = 0.7
+"""Largest spread of these logarithms: beyond, the evidence is not a parabola."""
+RULE = ((0.0, 2.0 / 3.0), (3.0**0.5, 1.0 / 6.0), (-(3.0**0.5), 1.0 / 6.0))
+"""Nodes and weights for a standard normal distribution."""
+MIN_WEIGHT = 0.01
+"""Weight below which a point is not worth its cost."""
+
+
+def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[float, Choice]]:
+    """Return choices about the best one with their weights, which add up to 1; the best one first.
+
+    Parameters
+    ----------
+    score : callable
+        The log evidence of a choice; may raise LinAlgError where there is none.
+    best : Choice
+        About where that is largest.
+    """
+    if best.field.nodes.size > MAX_UNCERTAIN_NODES:
+        return [(1.0, best)]
+
+    def choice_at(x: FloatArray) -> Choice:
+        field = replace(best.field, length=best.field.length * float(np.exp(x[1])))
+        return replace(best, field=field, ratio=best.ratio * float(np.exp(x[0])))
+
+    def value(x: FloatArray) -> float:
+        try:
+            return score(choice_at(x))
+        except np.linalg.LinAlgError:
+            return -np.inf
+
+    top = value(np.zeros(2))
+    spreads, axes = _spread(value, top)
+    points: list[tuple[float, Choice]] = []
+    for (g, p), (h, q) in product(RULE, RULE):
+        x = axes @ (spreads * np.array([g, h]))
+        gained = (value(x) if x.any() else top) - top + 0.5 * (g * g + h * h)
+        points.append((p * q * float(np.exp(min(gained, 5.0))), choice_at(x)))
+    total = sum(weight for weight, _ in points)
+    kept = [(weight, one) for weight, one in points if weight > MIN_WEIGHT * total]
+    total = sum(weight for weight, _ in kept)
+    return [(weight / total, one) for weight, one in kept]
+
+
+def _spread(value: Callable[[FloatArray], float], top: float) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations (2,) along the axes, columns (2, 2), of the evidence's curvature."""
+    a, b = LOG_STEP * np.eye(2)
+    second = np.array([value(x) + value(-x) - 2.0 * top for x in (a, b, a + b)]) / LOG_STEP**2
+    if not np.isfinite(second).all():
+        return np.full(2, 0.1), np.eye(2)
+    # second differences along both axes and their diagonal give the Hessian
+    bend = np.diag(second[:2])
+    bend[0, 1] = bend[1, 0] = 0.5 * (second[2] - second[:2].sum())
+    values, axes = np.linalg.eigh(-bend)
+    return np.maximum(values, WIDEST**-2.0) ** -0.5, axes

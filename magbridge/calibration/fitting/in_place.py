@@ -28,14 +28,13 @@ from typing import Any
 import numpy as np
 
 from magbridge.calibration.fitting.crossings import left_open
-from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder
-from magbridge.calibration.fitting.known import Known
+from magbridge.calibration.fitting.field_search import about_the_middle, ladder
 from magbridge.calibration.fitting.left_out import leave_out
 from magbridge.calibration.fitting.level import contradicts, with_level
 from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
-from magbridge.calibration.fitting.pose import Vehicle, pose
+from magbridge.calibration.fitting.pose import Known, Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.rounds import FIRST_SAMPLES, SEARCHED, WIDE, Answer, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples

@@ -14,7 +14,7 @@ square is Birge's ratio R (Birge 1932, Phys. Rev. 40:207): where it is larger th
 lacks something of that size, and all sigmas are too small by R.
 
 This check needs the normal equations only. To first order two different fits can agree, so to prefer one to
-another each is fitted again without the part (:func:`refitted`).
+another each is fitted again without the part (:func:`error_between`).
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.climb import thinned_rows
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, effective_fraction
 from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
 from magbridge.estimation.priors import Prior
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
-__all__ = ["LeftOut", "carried_forward", "leave_out", "refitted"]
+__all__ = ["LeftOut", "error_between", "error_forward", "leave_out", "thinned", "thinned_rows"]
 
+ENOUGH, BLOCK = 6000, 50
+"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
 PARTS, BLOCKS = 10, 4
 """Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three, or one
 that is most of the log."""
@@ -150,7 +151,7 @@ def _left_out(
     return replace(_judged(np.concatenate(e), np.concatenate(s2), count), rms=among.rms)
 
 
-def refitted(
+def error_between(
     samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel, runs: NDArray[np.generic]
 ) -> float:
     """Return the RMS error of the parts left out, nT, each predicted by a fit without it.
@@ -158,40 +159,61 @@ def refitted(
     Of n `samples`, the fit z (q,), the labels `runs` (n,): as :func:`leave_out` takes them. Prior and noise
     stay those of the fit to all. An outlier counts as five robust sigmas.
     """
-    weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
-    e = np.empty(len(weight))
-    for rows in _parts(runs):
-        others = np.delete(np.arange(len(weight)), rows)
-        kept = samples.part(others)
-        # neighbours across the gap are not successive
-        kept.steps[1:][np.diff(others) > 1] = np.inf
-        found = gauss_newton(kept, prior, replace(noise, weight=weight[others]), z, steps=REFIT_STEPS)
-        e[rows] = residuals_of(samples.part(rows), prior.coefficients(found.z))
-    limit = OUTLIER_SIGMA * robust_scale(e)
-    return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
+    rows = np.arange(len(samples.field))
+    splits = [(np.delete(rows, part), part) for part in _parts(runs)]
+    return _refitted_error(samples, prior, z, noise, splits)
 
 
-def carried_forward(samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel) -> float:
+def error_forward(samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel) -> float:
     """Return the RMS error, nT, of parts of a log that a fit to the earlier parts alone is carried to.
 
     Forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
     :data:`FORWARD_PARTS` parts predict the next one. Coefficients that the beginning of a log does not
     determine count here, and so do later changes; neither counts where parts between others are held out.
-    Arguments as for :func:`refitted`.
+    Arguments as for :func:`error_between`.
     """
-    rows = thinned_rows(len(samples.field))
+    parts = np.array_split(thinned_rows(len(samples.field)), FORWARD_PARTS)
+    splits = [(np.concatenate(parts[:k]), parts[k]) for k in range(1, FORWARD_PARTS)]
+    return _refitted_error(samples, prior, z, noise, splits)
+
+
+def _refitted_error(
+    samples: ResidualSamples,
+    prior: Prior,
+    z: FloatArray,
+    noise: NoiseModel,
+    splits: list[tuple[IndexArray, IndexArray]],
+) -> float:
+    """Return the RMS error, nT, of the second rows of each split, predicted by a fit to the first ones."""
     weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
-    parts = np.array_split(rows, FORWARD_PARTS)
     errors = []
-    for k in range(1, FORWARD_PARTS):
-        earlier = np.concatenate(parts[:k])
-        kept = samples.part(earlier)
-        kept.steps[1:][np.diff(earlier) > 1] = np.inf
-        found = gauss_newton(kept, prior, replace(noise, weight=weight[earlier]), z, steps=REFIT_STEPS)
-        errors.append(residuals_of(samples.part(parts[k]), prior.coefficients(found.z)))
+    for fitted, tested in splits:
+        kept = samples.part(fitted)
+        # neighbours across the gap are not successive
+        kept.steps[1:][np.diff(fitted) > 1] = np.inf
+        found = gauss_newton(kept, prior, replace(noise, weight=weight[fitted]), z, steps=REFIT_STEPS)
+        errors.append(residuals_of(samples.part(tested), prior.coefficients(found.z)))
     e = np.concatenate(errors)
     limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
+
+
+def thinned_rows(n: int) -> IndexArray:
+    """Return the rows (k,) of blocks of neighbours, spread evenly over n samples; all rows if n is small."""
+    if n <= ENOUGH:
+        return np.arange(n)
+    first = np.linspace(0, n // BLOCK - 1, ENOUGH // BLOCK).astype(int) * BLOCK
+    return (first[:, None] + np.arange(BLOCK)).ravel()
+
+
+def thinned(samples: ResidualSamples) -> ResidualSamples:
+    """Return blocks of neighbours, spread evenly over all samples, to choose a start."""
+    n = len(samples.field)
+    if n <= ENOUGH:
+        return samples
+    part = samples.part(thinned_rows(n))
+    part.steps[::BLOCK] = np.inf
+    return part
 
 
 def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:

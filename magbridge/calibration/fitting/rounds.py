@@ -7,14 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.field_doubt import plausible
-from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     DECISIVE_LOG_RATIO,
     Choice,
     Weighed,
+    about_the_middle,
     choose,
     first_guess,
+    ladder,
+    nodes_for,
+    plausible,
     refined,
     same_noise,
 )

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
-from magbridge.calibration.fitting.field_nodes import nodes_for
+from magbridge.calibration.fitting.field_search import nodes_for
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
