@@ -53,6 +53,7 @@ def compass_of(calibration: Calibration) -> Compass:
     """Return the part of a calibration that an autopilot's compass model can represent."""
     kernel = calibration.kernel
     currents = [k for k, one in enumerate(calibration.parameters) if usual(one.unit) == "A"][:1]
+    # expand about the middle of each range, and about no current: T(I) = T + I dT/dI
     middle = np.array([0.5 * (one.low + one.high) for one in calibration.parameters])
     middle[currents] = 0.0
     matrix, offset = matrix_and_offset(calibration, middle)
@@ -62,6 +63,7 @@ def compass_of(calibration: Calibration) -> Compass:
         step[currents] = 1.0
         current = matrix_and_offset(calibration, middle + step)[1] - offset
     lost = []
+    # the error of that expansion is largest at the corners of the ranges
     corners = product(*((one.low, one.high) for one in calibration.parameters))
     field = kernel.field * np.eye(3)
     worst = 0.0
@@ -93,6 +95,7 @@ def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
     """Return the text of a ``.param`` file for compass `number` (from 0), and warnings."""
     mG = NT_PER_UNIT["mG"]
     n = "" if number == 0 else str(number + 1)
+    # ArduPilot: corrected = ODI (raw + OFS) + MOT I, in mG
     offset = -compass.offset / mG
     values = {f"COMPASS_OFS{n}_{axis}": offset[k] for k, axis in enumerate(AUTOPILOT_AXES)}
     values |= {f"COMPASS_DIA{n}_{axis}": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
@@ -101,6 +104,7 @@ def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
     }
     values[f"COMPASS_SCALE{n}"] = 1.0
     if compass.current is not None:
+        # the current is compensated after the matrix
         motor = -(compass.matrix @ compass.current) / mG
         values |= {"COMPASS_MOTCT": 2.0} | {
             f"COMPASS_MOT{n}_{axis}": motor[k] for k, axis in enumerate(AUTOPILOT_AXES)
@@ -116,6 +120,7 @@ def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
 def px4(compass: Compass, number: int = 0) -> str:
     """Return the text of a QGroundControl parameter file for PX4's compass `number` (from 0)."""
     G = NT_PER_UNIT["G"]
+    # PX4: corrected = SCALE (raw - OFF), in G; the current in kA
     values = {f"CAL_MAG{number}_{axis}OFF": compass.offset[k] / G for k, axis in enumerate(AUTOPILOT_AXES)}
     values |= {f"CAL_MAG{number}_{axis}SCALE": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
     values |= {

@@ -159,11 +159,14 @@ def c_source(calibration: Calibration) -> str:
     if calibration.effects:
         names = ", ".join(sorted({type(one).__name__ for one in calibration.effects}))
         raise CalibrationError(f"{names}: effects that follow telemetry in time are not written as C")
+    # the tables of the compiled kernel, so that C and Python do the same sums in the same order
     kernel = calibration.kernel
     omega = calibration.boresight.covariance if calibration.boresight else ((0.0,) * 3,) * 3
     place = [[0] * 3 for _ in range(3)]
+    # place of entry (i, j) among the six of a symmetric matrix
     for k, (i, j) in enumerate(PAIRS):
         place[i][j] = place[j][i] = k
+    # C has no empty arrays: one row of zeros where there is no parameter
     some = calibration.parameters or ()
     tables = [
         _reals("centre[]", kernel.centre or (0.0,)),

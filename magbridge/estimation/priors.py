@@ -109,6 +109,7 @@ def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F
     F_0 : float
         nT, as in :class:`~magbridge.estimation.residual.ResidualSamples`.
     """
+    # widths of the constant terms, then three for each mass, then those of the cross terms
     labels = ["gain", "soft iron", "hard iron"]
     widths = (np.sqrt(3.0) * GAIN_SIGMA * F_0, SOFT_IRON_SIGMA * F_0, HARD_IRON_SIGMA_NT)
     centre = [float(np.log(width)) for width in widths]
@@ -124,6 +125,7 @@ def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F
     for m, powers in enumerate(exponents):
         _log_widths(powers, constant[m], design[m])
     E = np.eye(9 * len(exponents))
+    # the common gain has a width of its own: rotate the three diagonal entries
     E[:3, :3] = gain_rotation()
     return PriorFamily(
         E=E,

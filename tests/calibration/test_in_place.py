@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.fitting import in_place
+from magbridge.calibration.fitting.auto import fit_auto
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit, fit
 from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
@@ -63,6 +66,19 @@ def test_crustal_field_is_not_taken_for_noise(survey: Survey) -> None:
     assert 20.0 < rock["size_nT"] < 100.0
     assert 300.0 < rock["length_m"] < 2000.0
     assert survey[2].calibration.noise.sensor == pytest.approx(NOISE, rel=0.1)
+
+
+def test_a_field_larger_than_any_crust_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compass's own error can be put into places, at thousands of nT: the fit is then one without them."""
+
+    def too_large(data: Observations, order: int = 3, **_: Any) -> Fit:
+        found = fit_auto(data, order)
+        return replace(found, details={**found.details, "rock": {"rms_nT": 15_000.0}})
+
+    monkeypatch.setattr(in_place, "fit_in_place", too_large)
+    found = fit(flown()[0])
+    assert found.calibration.method == "auto"
+    assert "rock" not in found.details
 
 
 def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) -> None:

@@ -294,6 +294,7 @@ def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterato
 
 def _contradicted_prior(found: Fit) -> Iterator[str]:
     """Report scales that the prior of an ellipsoid does not expect, and attitudes that do not prove them."""
+    # both must hold: where the data overrule the prior, an unusual gain is the sensor's
     unlikely = found.details.get("prior_chi_squared", 0.0) > MAX_PRIOR_CHI_SQUARED
     if unlikely and found.details["scale_sigma_ratio"] > MAX_SCALE_SIGMA_RATIO:
         low, high = found.scales

@@ -77,6 +77,7 @@ def nodes_for(
     finer : float
         Factor of the nodes per length of a smooth field; the error of its splines falls as the fourth power.
     """
+    # finest spacing that the length needs, coarser until there are few enough nodes
     box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
     spacing = max(length / _nodes_per_length(alpha, finer), float(np.sqrt(box.prod())) / SIDE)
     while (nodes := nodes_near(place, spacing, PAD_LENGTHS * length)).size > 1.05 * most:
@@ -97,6 +98,7 @@ def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolA
 
 def ladder(place: FloatArray) -> FloatArray:
     """Return seven lengths to try, m: from the resolution of samples at places (n, 2), m, to the area."""
+    # shortest: four steps between samples; longest: a fraction of the area
     known = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(known, axis=0)))
     step = np.linalg.norm(np.diff(known, axis=0), axis=1)
@@ -386,6 +388,7 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
     points: list[tuple[float, Choice]] = []
     for (g, p), (h, q) in product(RULE, RULE):
         x = axes @ (spreads * np.array([g, h]))
+        # weight: the evidence over that of a parabola, which the rule assumes
         gained = (value(x) if x.any() else top) - top + 0.5 * (g * g + h * h)
         points.append((p * q * float(np.exp(min(gained, 5.0))), choice_at(x)))
     total = sum(weight for weight, _ in points)

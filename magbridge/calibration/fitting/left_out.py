@@ -122,7 +122,7 @@ def _left_out(
     # Normal equations are sums over samples. Those without a part are the whole minus the part's, and one
     # Newton step from the common fit gives the coefficients without it: no fit is repeated.
     normals = [_normal(samples, c, weighted, rows).reduced(prior.E) for rows in parts]
-    # at the minimum the whole gradient balances the prior, so the part's own gradient is what is lacking
+    # at the minimum the whole gradient balances the prior, so the part's own gradient is missing
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
     every = max(len(samples.field) // TESTED, 1)
     counted = np.ones(len(samples.field), bool)

@@ -45,11 +45,13 @@ def with_level(
     """
     part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
     own = calibration.coefficients[: 9 * part.phi.shape[1]]
+    # j: mean slope of the corrected field by the coefficients (the residual is over its size)
     _, g = residuals(part, own)
     j = np.zeros(len(calibration.coefficients))
     j[: len(own)] = (jacobian(part.phi, g) * sizes(part, own)[:, None]).mean(axis=0)
     Pj = calibration.covariance @ j
     sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
+    # w: how the coefficients move together when the mean moves by its sigma
     w, covariance = Pj / max(sigma, 1e-300), calibration.covariance
     coefficients = calibration.coefficients
     if sigma and contradicts(bias, bias_sigma):

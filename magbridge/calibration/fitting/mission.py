@@ -38,6 +38,7 @@ class Mission:
 
         CalibrationError: attitude or place is missing.
         """
+        # the true field in body axes needs attitude and direction
         known, attitude, reference_ned = data.directed()
         if not known.any():
             raise CalibrationError(
@@ -57,11 +58,13 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
     k = len(calibration.parameters)
     positions = data.parameters[rows, :k]
     b = correct(calibration, data.field[rows], positions, data.time[rows]).vector
+    # roll a little further each way
     met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-ROLL, 0.0, ROLL)]
     places = [positions] * len(met)
     if data.attitude is not None:
         known = np.isfinite(data.attitude[rows]).all(axis=1)
         attitude = Rotation.from_euler("ZYX", data.attitude[rows[known], ::-1])
+        # and turn about the vertical, by attitude
         down = attitude.apply([0.0, 0.0, 1.0], inverse=True)
         met += [
             Rotation.from_rotvec(np.radians(angle) * down).apply(b[known]) for angle in range(60, 360, 60)
@@ -77,6 +80,7 @@ def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
     -------
     (n,) array
     """
+    # forward to the reading and back: the sigma of the way back is that of the position terms
     model = replace(calibration.without_effects(), noise=Noise(0.0), boresight=None)
     truth = mission.field_body
     if calibration.boresight is not None:

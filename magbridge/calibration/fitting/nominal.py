@@ -223,7 +223,7 @@ def _weighted(
     e, g = residuals(samples, prior.coefficients(found.z))
     noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
     limit = CLIP_SIGMA * noise.sigma
-    # scale the gradient by the posterior's root, so that all nine coefficients count alike
+    # scale the gradient by the posterior's root, so that all nine coefficients have equal weight
     root = np.linalg.cholesky(covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision))
     pulls = np.clip(e, -limit, limit)[:, None] * (g @ (prior.E @ root))
     repeats = samples_per_independent(pulls, samples.steps)

@@ -206,6 +206,7 @@ def best_parameters(
         if {"forward_nT"} <= found.details.keys() & further.details.keys():
             forward = further.details["forward_nT"] / found.details["forward_nT"]
             worth_it = worth_it and forward < MAX_HELD_OUT_ERROR_RATIO
+        # a parameter that moves with the attitude absorbs it, and bends the scales instead
         worth_it = worth_it and _departure(further) <= max(_departure(found), USUAL_DEPARTURE)
         offers.append(Offer(name, without, left, worth_it))
         if worth_it:

@@ -212,7 +212,7 @@ class Rounds:
             self.choice,
             eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho),
         )
-        # 2. widths of the priors, and sigma, by the evidence of what is left
+        # 2. widths of the priors, and sigma, by the evidence of the eliminated problem
         widths = maximise_evidence(reduced.quadratic, self.family, self.eta, self.sigma)
         self.eta, self.sigma = widths.eta, widths.sigma
         # 3. the Gauss-Newton step of z, then the field's coefficients w given z
@@ -301,7 +301,7 @@ class Rounds:
             e = self._residuals(z, here + part * change)[survey.kept]
             return float(e @ e) / self.sigma**2 + float(z @ precision @ z)
 
-        # halve the step until the objective stays within OVERSHOT of what it was
+        # halve the step until the objective stays within OVERSHOT of the previous one
         before, part = objective(0.0), 1.0
         while part > MIN_ITERATION_STEP and not objective(part) < OVERSHOT * before:
             part *= 0.5

@@ -21,6 +21,7 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
     got = correct(calibration, data.field, data.channels(calibration), data.time)
     A, T = calibration.matrices(data.parameters[:, : len(calibration.parameters)])
     b = np.matmul(A, (data.field - T)[:, :, None])
+    # |A^T u|: nT of the corrected field for one of the sensor
     size = np.linalg.norm(np.matmul(A, b)[:, :, 0], axis=1) / got.total
     error = got.total - data.reference
     return error / size, error / got.sigma

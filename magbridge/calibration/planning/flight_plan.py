@@ -47,6 +47,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     data = _to_be_flown(mission, names)
     if data.reference_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
+    # runs at trims that the vehicle can fly: those that the mission shows
     flown = settled(data, calibration.parameters) if names else None
     limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
     return plan(
@@ -76,6 +77,7 @@ def survey_plan(
         require_units(mission, calibration.units)
         parameters = tuple(calibration.units)
     data = _to_be_flown(mission.drop_vars("reference_field", errors="ignore"), parameters)
+    # an unknown vehicle has the expected calibration, with the uncertainty of its prior
     if calibration is None:
         calibration = expected_calibration(data.ranges(), float(np.median(data.reference)))
     return propose(calibration, data, hours=hours, roll=roll)
