@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import hypot, inf
 
-from magbridge.bridge.frame import Frame
+from magbridge.bridge.motion import Frame
 from magbridge.field.geodesy import separation
 from magbridge.link.component import Component
 from magbridge.link.fixes import Fix, Kind, widened

@@ -8,8 +8,7 @@ from functools import partial
 import numpy as np
 
 from magbridge.bridge.fixing import FIX_3D, Fixing
-from magbridge.bridge.frame import Frame
-from magbridge.bridge.motion import Motion, MotionSource
+from magbridge.bridge.motion import Frame, Motion, MotionSource
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.config import Navigation as Wanted

@@ -27,8 +27,7 @@ from magbridge.link.message_rates import check_publish
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.reports import Condition
 from magbridge.link.requests import needed_rates
-from magbridge.link.telemetry import TelemetryMap
-from magbridge.link.validity import is_possible
+from magbridge.link.telemetry import TelemetryMap, is_possible
 from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
