@@ -74,7 +74,7 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
             else:
                 ours = any("column" in variable.ncattrs() for variable in file.variables.values())
                 for part, numbers in trajectory.chunks(path, file, rows):
-                    yield part if ours else known(path, part), numbers
+                    yield (part, numbers) if ours else known(path, part, numbers)
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None

@@ -75,7 +75,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
             columns[name] = on_side(name, columns[name], batch.column(k).to_pandas())
         numbers = range(row, row + batch.num_rows)
         piece = deployment(path, time, columns, layout.column_units, {**attrs, **layout.attrs}, meanings)
-        yield known(path, piece) if layout.foreign else piece, numbers
+        yield known(path, piece, numbers) if layout.foreign else (piece, numbers)
         row = numbers.stop
 
 

@@ -19,7 +19,7 @@ from magbridge.logs.clocks import CountState, TimeFormat, clock_of, date_order, 
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.logs.stamps import DAY
-from magbridge.logs.validity import EXPECTED_VALUE, unknown
+from magbridge.logs.validity import EXPECTED_VALUE, Validity, invalid, unknown
 from magbridge.records import Quality
 from magbridge.wording import counted
 
@@ -136,41 +136,31 @@ class TextTable:
             value = float(columns[name][int(codes.argmax())])
             self._note(name, codes, kept, f"{EXPECTED_VALUE}{value!r}", wrong=False)
             columns[name][codes] = np.nan
+        rules = []
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:
-                self._drop(name, columns, columns[source.valid] == 0.0, kept, source.valid)
-        return self._valid(times, columns, kept)
+                rules.append(Validity(source.valid, (name,), frozenset({0.0})))
+        return self._valid(times, columns, kept, [*rules, *self._layout.validity])
 
     def _valid(
-        self, times: FloatArray, columns: dict[str, FloatArray], numbers: list[int]
+        self,
+        times: FloatArray,
+        columns: dict[str, FloatArray],
+        numbers: list[int],
+        rules: Sequence[Validity],
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
         """Return times, columns and numbers without values that a column of the file marks as invalid."""
-        for rule in self._layout.validity:
-            bad = np.isin(columns[rule.column], list(rule.bad))
-            for name in rule.targets:
-                if name in columns:
-                    self._drop(name, columns, bad, numbers, rule.column)
-            if bad.any() and not rule.targets:
-                self._note("", bad, numbers, f"not valid by {rule.column!r}", wrong=False)
-                good = ~bad
-                times = times[good]
-                columns = {name: values[good] for name, values in columns.items()}
-                numbers = [number for number, is_good in zip(numbers, good.tolist(), strict=True) if is_good]
-        return times, columns, numbers
-
-    def _drop(
-        self,
-        name: str,
-        columns: dict[str, FloatArray],
-        bad: BoolArray,
-        numbers: list[int],
-        validity_column: str,
-    ) -> None:
-        """Remove the values of a column that another one states not to be valid, and count them."""
-        there = bad & np.isfinite(columns[name])
-        if there.any():
-            self._note(name, there, numbers, f"not valid by {validity_column!r}", wrong=False)
-            columns[name][there] = np.nan
+        keep = np.ones(len(times), bool)
+        for name, bad, column in invalid(rules, columns):
+            self._note(name, bad, numbers, f"not valid by {column!r}", wrong=False)
+            if name:
+                columns[name][bad] = np.nan
+            else:
+                keep &= ~bad
+        if keep.all():
+            return times, columns, numbers
+        kept = [number for number, is_valid in zip(numbers, keep.tolist(), strict=True) if is_valid]
+        return times[keep], {name: values[keep] for name, values in columns.items()}, kept
 
     def _complete_lines(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
         """Return the lines that have as many fields as there are headings, and their numbers."""

@@ -14,7 +14,7 @@ Argo Quality Control Manual, reference table 2, https://doi.org/10.13155/33951
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from magbridge.errors import FormatError
 from magbridge.logs.deployment import with_losses
 from magbridge.logs.headings import bare
 
-__all__ = ["EXPECTED_VALUE", "Validity", "known", "states_validity", "unknown", "validity_of"]
+__all__ = ["EXPECTED_VALUE", "Validity", "invalid", "known", "states_validity", "unknown", "validity_of"]
 
 VALID = re.compile("(is|data|row|sample)?valid(ity)?")
 MAG_VALID = re.compile("(mag|field|tmi)(is)?valid(ity)?")
@@ -86,12 +86,25 @@ def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Val
         elif FLAG.fullmatch(word):
             cells = [row[k] for row in rows if k < len(row) and row[k]]
             marked = sum(cell in {"1", "1.0"} for cell in cells)
-            binary = all(cell in {"0", "0.0", "1", "1.0"} for cell in cells)
+            binary = bool(cells) and all(cell in {"0", "0.0", "1", "1.0"} for cell in cells)
             if binary and marked <= MAX_FLAGGED * len(cells):
                 found.append(Validity(name, (), frozenset({1.0})))
             elif binary and len(cells) - marked <= MAX_FLAGGED * len(cells):
                 found.append(Validity(name, (), frozenset({0.0})))
     return found
+
+
+def invalid(
+    rules: Sequence[Validity], columns: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, BoolArray, str]]:
+    """Yield what rules mark as not valid: column ("" for whole rows), values (n,), and the rule's column."""
+    for rule in rules:
+        bad = np.isin(columns[rule.column], list(rule.bad))
+        if bad.any() and not rule.targets:
+            yield "", bad, rule.column
+        for name in rule.targets:
+            if name in columns and (there := bad & np.isfinite(columns[name])).any():
+                yield name, there, rule.column
 
 
 def _column(name: str, names: Sequence[str]) -> str:
@@ -140,12 +153,30 @@ def _is_code(values: FloatArray) -> BoolArray:
     return wrong
 
 
-def known(path: Path, dataset: xr.Dataset) -> xr.Dataset:
-    """Return a deployment of another program without missing-value codes; they are counted and named."""
-    codes = unknown({str(name): column.to_numpy() for name, column in dataset.data_vars.items()})
-    lines = []
-    for name, wrong in codes.items():
-        values = dataset[name].to_numpy()
-        lines.append(str(FormatError(path, f"{EXPECTED_VALUE}{float(values[wrong][0])!r}", column=name)))
-        dataset = dataset.assign({name: dataset[name].copy(data=np.where(wrong, np.nan, values))})
-    return with_losses(dataset, {"values_dropped": sum(int(wrong.sum()) for wrong in codes.values())}, lines)
+def known(path: Path, dataset: xr.Dataset, numbers: Sequence[int]) -> tuple[xr.Dataset, Sequence[int]]:
+    """Return a deployment of another program and the numbers of its rows without what is not valid.
+
+    Missing-value codes, and what a column such as ``Valid`` marks, are counted and named.
+    """
+    columns = {str(name): column.to_numpy().copy() for name, column in dataset.data_vars.items()}
+    lines, values_dropped, keep = [], 0, np.ones(dataset.sizes["time"], bool)
+    for name, codes in unknown(columns).items():
+        expected = f"{EXPECTED_VALUE}{float(columns[name][codes][0])!r}"
+        lines.append(str(FormatError(path, expected, column=name)))
+        values_dropped += int(codes.sum())
+        columns[name][codes] = np.nan
+    for name, bad, column in invalid(validity_of([*columns], ()), columns):
+        row = numbers[int(bad.argmax())]
+        lines.append(str(FormatError(path, f"not valid by {column!r}", row=row, column=name or None)))
+        if name:
+            values_dropped += int(bad.sum())
+            columns[name][bad] = np.nan
+        else:
+            keep &= ~bad
+    if lines:
+        dataset = dataset.assign({name: dataset[name].copy(data=columns[name]) for name in columns})
+    if not keep.all():
+        dataset = dataset.isel(time=keep)
+        numbers = [number for number, is_valid in zip(numbers, keep.tolist(), strict=True) if is_valid]
+    counts = {"values_dropped": values_dropped, "rows_dropped": int((~keep).sum())}
+    return with_losses(dataset, counts, lines), numbers

@@ -16,6 +16,7 @@ import xarray as xr
 from magbridge import logs
 from magbridge.errors import FormatError
 from magbridge.logs import Options
+from magbridge.logs.deployment import passed_over
 
 NOON = 1_651_665_600.0  # 2022-05-04T12:00:00Z
 GPS = NOON - 315_964_800 + 18
@@ -193,6 +194,21 @@ def test_codes_in_the_netcdf_and_parquet_of_other_programs(tmp_path: Path) -> No
         log = logs.read(tmp_path / name)
         assert np.isnan(log["mag_z"].values).tolist() == [False, True, False]
         assert "column 'mag_z': expected a value, or nothing where it is not known" in log.attrs["losses"]
+
+
+def test_validity_columns_of_netcdf_and_parquet(tmp_path: Path) -> None:
+    columns = {"TMI": 50_000.0 + np.arange(6), "MagValid": [1, 1, 0, 1, 1, 1], "Valid": [1, 1, 1, 1, 0, 1]}
+    time = xr.DataArray(NOON + np.arange(6), dims="time", attrs={"units": "seconds since 1970-01-01"})
+    theirs = xr.Dataset({name: ("time", np.asarray(values, float)) for name, values in columns.items()})
+    theirs = theirs.rename(TMI="total_field").assign_coords(time=time)
+    theirs.to_netcdf(tmp_path / "a.nc")
+    theirs.to_dataframe().reset_index().to_parquet(tmp_path / "a.parquet")
+    for name in ("a.nc", "a.parquet"):
+        log = logs.read(tmp_path / name)
+        assert (log["time"].values - NOON).tolist() == [0, 1, 2, 3, 5]
+        assert np.isnan(log["total_field"].values).tolist() == [False, False, True, False, False]
+        assert passed_over(log.attrs) == {"rows_dropped": 1, "values_dropped": 1}
+        assert "row 5: not valid by 'valid'" in log.attrs["losses"].lower()
 
 
 def test_a_field_of_nothing_is_none_and_one_axis_at_0_is(tmp_path: Path) -> None:
