@@ -12,7 +12,7 @@ magnetometer sample; every other column holds the values known at that time:
 :mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.reading` and
 :mod:`.writing` are for all formats; :mod:`.options` is what a user can say about a log. The formats are
 :mod:`.text` (CSV), :mod:`.netcdf` (with :mod:`.seaglider` and :mod:`.cf`), :mod:`.parquet`, :mod:`.telemetry`
-(with its ``telemetry_*``), :mod:`.ardupilot`, :mod:`.px4` and :mod:`.slocum`. They share :mod:`.resample`
+(with its ``telemetry_*``), :mod:`.ardupilot`, :mod:`.px4` and :mod:`.slocum`. They share :mod:`.fields`
 (telemetry brought to the rows; :mod:`.autopilot` does so for both autopilots), :mod:`.deployment` (what they
 return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one stream of several. :mod:`.tlog`
 is separate: it writes the bridge's log.

@@ -19,7 +19,7 @@ from magbridge.arrays import FloatArray
 from magbridge.logs.checks import in_order
 from magbridge.logs.compasses import LogCompass, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
-from magbridge.logs.resample import latest
+from magbridge.logs.fields import latest
 
 __all__ = ["BootRun", "Magnetometer", "Series", "pieces"]
 

@@ -40,8 +40,7 @@ from magbridge.field.igrf import total_field
 from magbridge.field.reference import sphere_radius
 from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, sliced, with_losses
-from magbridge.logs.fields import FieldMap, Track, fields_of, interpolated
-from magbridge.logs.resample import degrees, linear
+from magbridge.logs.fields import FieldMap, Track, degrees, fields_of, interpolated, linear
 
 __all__ = ["DIMENSION", "chunks", "dive", "read_netcdf"]
 

@@ -25,7 +25,7 @@ from magbridge.columns import CHANNEL_TIMES, CHANNELS, COLUMNS, counts_from_boot
 from magbridge.errors import FormatError, WrongUse
 from magbridge.logs.compasses import COMPASSES_ATTRIBUTE, further
 from magbridge.logs.deployment import NOTES, join, join_attrs, noted, uncounted, with_losses
-from magbridge.logs.resample import CIRCLES, latest, linear
+from magbridge.logs.fields import CIRCLES, latest, linear
 
 __all__ = ["VehicleTelemetry", "combine", "refuse_offset", "sensor_logs", "with_note"]
 

@@ -29,9 +29,8 @@ import xarray as xr
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.deployment import deployment, sliced
-from magbridge.logs.fields import DEG_PER_RAD, FieldMap, Track, interpolated
+from magbridge.logs.fields import DEG_PER_RAD, FieldMap, Track, degrees, interpolated
 from magbridge.logs.registry import FLIGHT
-from magbridge.logs.resample import degrees
 
 __all__ = ["check_header", "chunks"]
 

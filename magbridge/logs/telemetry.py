@@ -3,7 +3,7 @@
 A row is a magnetometer message of the best kind that the log holds
 (:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the component that sent most of them; every other
 column is the last value from this vehicle before it (NaN once older than
-:data:`~magbridge.logs.resample.MAX_AGE`).
+:data:`~magbridge.logs.fields.MAX_AGE`).
 
 - ``MAG_RAW`` (ours): nT computed from the counts as by the driver, where the log declares the nT per count,
   else float32 (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The
@@ -36,7 +36,7 @@ from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
 from magbridge.logs.compasses import LogCompass, by_columns, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted
-from magbridge.logs.resample import MAX_AGE
+from magbridge.logs.fields import MAX_AGE
 from magbridge.logs.telemetry_fields import TELEMETRY, DeclaredField, are_of_main_sensor, source_columns
 from magbridge.logs.telemetry_survey import AUTOPILOT, LogContents, survey
 from magbridge.logs.telemetry_writer import FileWriter

@@ -16,14 +16,14 @@ from flash import Log
 from ulogs import Output, ulog_of
 
 from magbridge import logs
-from magbridge.logs.resample import MAX_AGE
+from magbridge.logs.fields import MAX_AGE
 
 Series = tuple[list[float], list[float]]
 """Times, s, and values."""
 
 
 def carried(at: np.ndarray, series: Series) -> list[float]:
-    """Return, one by one, the last value at or before each time: what :func:`.resample.latest` is to do."""
+    """Return, one by one, the last value at or before each time: what :func:`.fields.latest` is to do."""
     found = []
     for now in at.tolist():
         known = [(t, v) for t, v in zip(*series, strict=True) if t <= now and np.isfinite(v)]
