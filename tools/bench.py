@@ -33,9 +33,9 @@ __all__ = ["BENCHMARKS"]
 BENCHMARKS: dict[str, tuple[str, int]] = {
     "processor": ("benchmarks.processor:processor", 15),
     "latency": ("benchmarks.latency:latency", 5),
-    "start": ("benchmarks.start:start", 5),
-    "learning": ("benchmarks.learning:learning", 5),
-    "commands": ("benchmarks.commands:commands", 7),
+    "start": ("benchmarks.latency:start", 5),
+    "learning": ("benchmarks.processor:learning", 5),
+    "commands": ("benchmarks.latency:commands", 7),
     "fitting": ("benchmarks.calibration:fitting", 3),
     "correcting": ("benchmarks.calibration:correcting", 5),
     "diagnosing": ("benchmarks.diagnose:diagnosing", 1),

@@ -1,4 +1,6 @@
-"""From the last byte of a frame into the pty to the datagram out, of the real ``magbridge run``.
+"""The real programs as processes: latency and start of ``magbridge run``, processor time of commands.
+
+Latency is the time from the last byte of a frame into the pty to the datagram out.
 
 One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then polls
 the socket until the next frame is due, so that the bridge is measured and not the wake-up of this process.
@@ -25,10 +27,13 @@ import numpy as np
 from benchmarks.row import Row
 from benchmarks.workload import OPTIONS, TELEMETRY_HZ, Feed, write_config
 
+from magbridge.logs import write
 from magbridge.mavlink import Codec, spec
 from magbridge.sensors import open_driver
+from sitl.scenario import load
+from sitl.twin import simulate
 
-__all__ = ["SECONDS", "Sent", "bridge_command", "latency", "play", "sequences_of_messages", "started"]
+__all__ = ["commands", "latency", "start"]
 
 ECHO = Path(__file__).with_name("echo.py")
 RATES = (100, 1000)
@@ -40,6 +45,14 @@ WARM_UP = 0.5
 """s at the beginning that are not measured: caches fill, the IGRF is computed first."""
 RAW, FIELD = spec("MAG_RAW").id, spec("MAG_FIELD").id
 BIN = Path(sys.executable).parent
+START_FLOOR = "import numpy, msgspec, serial"
+"""The imports that any bridge needs; cyclopts (the command line) and our own modules come on top."""
+SETTLE_S = 3.0
+"""Time with readings and telemetry before the memory is read, s."""
+START_HZ = 100
+ROWS = 2250
+LIBRARIES = "import numpy, cyclopts, pandas, xarray, scipy.linalg, scipy.optimize"
+"""What reads the file, fits and understands the command line."""
 
 
 class Sent(NamedTuple):
@@ -94,11 +107,11 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Running]:
         os.close(slave)
 
 
-def bridge_command(folder: Path, more: str = "") -> Callable[[str, int], list[str]]:
-    """Return the command that starts the bridge of the workload, with `more` tables in its configuration."""
+def bridge_command(folder: Path) -> Callable[[str, int], list[str]]:
+    """Return the command that starts the bridge of the workload."""
 
     def command(device: str, port: int) -> list[str]:
-        config = write_config(folder, device, f"udpout:127.0.0.1:{port}", more)
+        config = write_config(folder, device, f"udpout:127.0.0.1:{port}")
         return [str(BIN / "magbridge"), "run", "--config", str(config)]
 
     return command
@@ -212,3 +225,66 @@ def resident(pid: int) -> dict[str, float]:
     return {
         name: int(kilobytes) / 1024.0 for name, kilobytes in re.findall(r"(VmRSS|VmHWM):\s+(\d+) kB", text)
     }
+
+
+def start(folder: Path, repetitions: int) -> list[Row]:
+    """Start the bridge repeatedly, and an interpreter with the necessary imports."""
+    bridge, bare, used = [], [], []
+    memory: dict[str, float] = {}
+    for _ in range(repetitions):
+        with started(bridge_command(folder)) as live:
+            names = [message.name for message in Codec(255, 190).parse(live.first)]
+            if "HEARTBEAT" not in names:
+                raise RuntimeError(f"the first datagram was {names}")
+            bridge.append(live.seconds)
+            used.append(processor_time(live.process.pid))
+            feed = Feed()
+            for _ in range(round(SETTLE_S * START_HZ)):
+                live.link.sendto(feed.message(time.time_ns() // 1000), live.peer)
+                live.write(feed.reading(START_HZ))
+                time.sleep(1.0 / START_HZ)
+            memory = resident(live.process.pid)
+        begun = time.perf_counter()
+        subprocess.run([sys.executable, "-c", START_FLOOR], check=True)
+        bare.append(time.perf_counter() - begun)
+    return [
+        Row("magbridge run to the first heartbeat", median(bridge), "s", median(bare), START_FLOOR, most=0.3),
+        Row("processor time of that", median(used), "s"),
+        Row("resident, calibrating, logging and with a position", memory["VmRSS"], "MB", most=65.0),
+        Row("resident, at most", memory["VmHWM"], "MB", most=65.0),
+    ]  # fmt: skip
+
+
+def commands(folder: Path, repetitions: int) -> list[Row]:
+    """Time commands and an interpreter that only imports the libraries they stand on."""
+    write(simulate(load("demo"), 1).isel(time=slice(ROWS)), folder / "runs.csv")
+    asked = ("--parameter", "battpos", "--parameter", "ballast", "-o", str(folder / "cal.json"))
+    measured: dict[str, tuple[list[str], str, float]] = {
+        "processor time: magbridge --help": (
+            [str(BIN / "magbridge"), "--help"], "import cyclopts, rich.console", 0.3
+        ),
+        "processor time: calibrate, a file that is not there": (
+            [str(BIN / "magbridge"), "calibrate", "missing.csv", *asked], "import cyclopts", 0.3
+        ),
+        f"processor time: calibrate, a CSV of {ROWS} rows": (
+            [str(BIN / "magbridge"), "calibrate", str(folder / "runs.csv"), *asked], LIBRARIES, 1.5
+        ),
+    }  # fmt: skip
+    rows = []
+    for what, (command, floor, most) in measured.items():
+        times, bare = [], []
+        for _ in range(repetitions + 1):  # the first fills the caches
+            times.append(_spent(command))
+            bare.append(_spent([sys.executable, "-c", floor]))
+        rows.append(
+            Row(what, median(times[1:]), "s", median(bare[1:]), floor, most=most)
+        )  # fmt: skip
+    return rows
+
+
+def _spent(command: list[str]) -> float:
+    """Return the processor time, s, of a command from its start to its end."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, _, used = os.wait4(process.pid, 0)
+    process.returncode = 0
+    return used.ru_utime + used.ru_stime

@@ -1,4 +1,4 @@
-"""Processor time of the whole live path for one sample, compared with pymavlink's codec alone.
+"""Processor time of the whole live path for one sample, compared with pymavlink's codec alone; of learning.
 
 The floor decodes the received frames, encodes the sent ones, and encodes the message in which the log keeps
 the sensor's bytes.
@@ -19,17 +19,21 @@ from benchmarks.workload import BEGIN_US, Feed, write_config
 
 from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.pipeline import Pipeline
 from magbridge.config import load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
 
-__all__ = ["processor"]
+__all__ = ["learning", "processor"]
 
 HERTZ = 100
 SECONDS = 10
 """Simulated, in one repetition."""
 MAX_RATIO = 2.5
 """Largest ratio to pymavlink's classes on the messages of link and log."""
+LEARNING_S = 20
+"""Simulated time of one repetition, s."""
+LEARNING = "[learning]\nenabled = true\n"
 
 
 class Edge:
@@ -104,3 +108,43 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[fl
     log.close()
     gc.unfreeze()
     return times
+
+
+def learning(folder: Path, repetitions: int) -> list[Row]:
+    """Measure a bridge that learns and one that does not."""
+    pipelines = {}
+    for more in ("", LEARNING):
+        path = write_config(folder, more=more)
+        pipelines[more] = set_up(load(path), StartEvent(BEGIN_US))
+    feed, times = Feed(), {more: list[float]() for more in pipelines}
+    longest: list[float] = []
+    gc.collect()
+    gc.freeze()
+    for repetition in range(repetitions + 1):
+        events = list(feed.events(LEARNING_S, HERTZ, BEGIN_US + repetition * LEARNING_S * 1_000_000))
+        for more, pipeline in pipelines.items():
+            slow = longest if more and repetition else []
+            seconds = processor_time(partial(_drive, pipeline, Edge(events), slow))
+            if repetition:  # the first one warms up
+                times[more].append(1e6 * seconds / (LEARNING_S * HERTZ))
+    gc.unfreeze()
+    added = [a - b for a, b in zip(times[LEARNING], times[""], strict=True)]
+    return [
+        Row("learning, processor time more a sample", median(added), "us", median(times[""]),
+            "without learning", ratio=median(added), most=60.0),
+        Row("the longest event of a second", median(longest), "ms"),
+    ]  # fmt: skip
+
+
+def _drive(pipeline: Pipeline, edge: Edge, longest: list[float]) -> None:
+    """Feed a bridge; append the ms that the longest event of each second took."""
+    worst, second = 0.0, 0
+    for event in edge.events(lambda: 0):
+        begun = time.perf_counter()
+        pipeline.feed(event)
+        pipeline.recorder.drain()
+        worst = max(worst, 1e3 * (time.perf_counter() - begun))
+        if event.time_us // 1_000_000 != second:
+            if second:
+                longest.append(worst)
+            worst, second = 0.0, event.time_us // 1_000_000
