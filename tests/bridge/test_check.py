@@ -10,6 +10,7 @@ from threading import Thread
 
 import pytest
 from rig import Rig
+from small import bridge_text
 
 from magbridge.bridge import live_check
 from magbridge.bridge.check import findings
@@ -22,22 +23,7 @@ from magbridge.config import load
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT
 
-GOOD = """
-[sensor]
-driver = "hmr2300"
-port = "/dev/null"
-[link]
-url = "udpout:127.0.0.1:14550"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
-unit = "in"
-[calibration]
-file = "cal.json"
-[log]
-directory = "logs"
-"""
+GOOD = bridge_text("hmr2300", "", masses={"battpos": "in"})
 
 
 def of(*names: str) -> Calibration:
@@ -66,9 +52,8 @@ def test_nothing_is_wrong_with_a_good_one(config: Path) -> None:
 
 
 def test_all_findings_come_at_once(config: Path) -> None:
-    text = GOOD.replace(
-        '"/dev/null"', '"/dev/no_such_device"\nbaudrat = 1\n[sensor.options]\nrate = 21\nspeed = 3'
-    )
+    text = GOOD.replace('"/dev/null"', '"/dev/no_such_device"\nbaudrat = 1')
+    text = text.replace("options = {}", "options = {rate = 21, speed = 3}")
     text = text.replace("udpout:127.0.0.1:14550", "udp:127.0.0.1:1").replace(
         "NAMED_VALUE_FLOAT", "NAMED_VALUE"
     )

@@ -16,17 +16,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from small import bridge_text
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import identity
 
-CONFIG = """
-[sensor]
-driver = "hmr2300"
-port = "/dev/ttyNo"
-[link]
-url = "udpout:127.0.0.1:9"
-"""
+CONFIG = bridge_text(
+    "hmr2300", "", port="/dev/ttyNo", url="udpout:127.0.0.1:9", masses={}, calibration=False, log=False
+)
 
 
 WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such file or directory: /dev/ttyNo")

@@ -240,12 +240,6 @@ def test_a_field_is_rough_given_the_distance_of_tracks_or_at_the_shortest_length
     assert not list(too_rough(lines[:200], 10.0))
 
 
-def test_an_hour_is_fitted_with_a_consistent_sigma() -> None:
-    data, true = flown(legs=8)
-    error, sigma = error_of(fit(data, "survey"), data, true)
-    assert 0.5 < error / sigma < 1.25
-
-
 def test_a_track_that_drifts_is_bent_to_where_the_crustal_field_repeats() -> None:
     """Positions that are slowly off by 150 m: as exact ones, where the fit knows that they may be."""
     data, true = flown()

@@ -10,18 +10,14 @@ from typing import Any
 import pytest
 from commands import Command
 from cyclopts import App
+from small import bridge_text
 
 from magbridge.cli.common import app
 from magbridge.logs import read, write
 
 HAVE_NO_RESULT = {"monitor"}
 """Commands that run until they are interrupted."""
-BRIDGE = """[sensor]
-driver = "hmr2300"
-port = "loop://"
-[link]
-url = "udpout:127.0.0.1:14550"
-"""
+BRIDGE = bridge_text("hmr2300", "", port="loop://", masses={}, calibration=False, log=False)
 
 
 def names(group: App = app, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

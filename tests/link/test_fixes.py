@@ -41,16 +41,6 @@ def test_odometry_is_what_ardupilot_takes() -> None:
     assert isnan(got["velocity_covariance"][0])
 
 
-def test_what_receivers_ask_of_their_source() -> None:
-    """ArduPilot takes a sigma above 10 m for 10 m, and a source below 4 Hz for dead."""
-    odometry = FIX_MESSAGES["ODOMETRY"]
-    assert (odometry.trusted_to, odometry.least, odometry.rate) == (10.0, 4.0, 5.0)
-    assert odometry.rate > odometry.least
-    assert all(kind.trusted_to == float("inf") for name, kind in FIX_MESSAGES.items() if name != "ODOMETRY")
-    first = Fix(NOW, 49.5, -57.9, 400.0, 120.0, 100.0, pose=POSE)
-    assert decoded("ODOMETRY", first)["reset_counter"] == 0
-
-
 def test_the_sensor_is_what_px4_takes() -> None:
     got = decoded("GLOBAL_POSITION_SENSOR")
     assert (got["target_system"], got["target_component"], got["id"], got["source"]) == (3, 4, 1, 5)
