@@ -118,8 +118,6 @@ class Diagnosis:
     refusal_values: tuple[float, float]
     """Allowed and found value behind a refusal, nT."""
     isolability: Isolability
-    beyond: Improvement
-    """Held-out improvement by all findings together over a refit of the calibration's own coefficients."""
     verdict: str
     """Verdict of ``findings.json``: ``explained`` only if held-out parts show a gain."""
     negligible: bool

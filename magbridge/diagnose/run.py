@@ -318,7 +318,7 @@ def _examine(
         improvement=paired(before, extension.error if stands else before, dive, counts),
         over_refit=paired(refit.error, extension.error if stands else before, dive, counts),
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
-        beyond=beyond, verdict=verdict_of(named, wrong, rest, total), causes=causes,
+        verdict=verdict_of(named, wrong, rest, total), causes=causes,
         negligible=negligible and small(problem, refit.error * problem.reference_jacobian, rest),
     )  # fmt: skip
 
