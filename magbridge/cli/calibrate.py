@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.observations import Observations
     from magbridge.calibration.model import Calibration
     from magbridge.field.grid import AnomalyGrid
-    from magbridge.fleet.start import FleetPrediction
+    from magbridge.fleet.calibrations import FleetPrediction
 
 MAX_LISTED_CONTRIBUTIONS = 5
 """Contributions to a scalar's reading that the summary lists."""
@@ -296,7 +296,8 @@ def _fit(
         if model.position_sigma:
             if not (data.lacks_rock and model.method in ("auto", "survey")):
                 raise WrongUse(
-                    "--position-sigma: positions matter only where the field is mapped (method survey)"
+                    "--position-sigma: positions matter only where the crustal field is estimated (method "
+                    "survey); leave the option out"
                 )
             options["position_sigma"] = model.position_sigma
         if start:
@@ -343,7 +344,7 @@ def _from_fleet(
 ) -> tuple[Fit, list[str], dict[str, Any]]:
     """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
     from magbridge.calibration.fitting.fit import fit
-    from magbridge.fleet.start import gained
+    from magbridge.fleet.calibrations import gained
 
     found = fit(data, order=order, known=start.known, **options)
     try:
@@ -356,7 +357,7 @@ def _from_fleet(
 
 def _fleet_start(model: ModelOptions, files: tuple[Path, ...]) -> FleetPrediction:
     """Return a fleet's prior for these logs."""
-    from magbridge.fleet.start import start
+    from magbridge.fleet.calibrations import start
 
     with waiting("learning"):
         return start(model.fleet, model.vehicle, model.refit, {digest(file) for file in files})
@@ -426,7 +427,7 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
     source = deployment.attrs["source"]
     placed = {"latitude", "longitude"} <= set(deployment.data_vars) and not counts_from_boot(deployment)
     if placed or "reference_field" in deployment:
-        raise WrongUse(f"--reference mean: {source} tells what the field was")
+        raise WrongUse(f"--reference mean: {source} tells what the field was; leave the option out")
     deployment = about_mean(deployment)
     mean = float(deployment["reference_field"][0])
     complain(

@@ -67,7 +67,6 @@ def export(
             "expected --c DIR, --ardupilot F.param, --px4 F.params, --seaglider F.cal or --table F.csv"
         )
 
-    from magbridge.calibration import export_autopilot
     from magbridge.calibration.export_c import c_header, c_source
     from magbridge.calibration.export_seaglider import position_table
     from magbridge.calibration.file import load
@@ -89,21 +88,32 @@ def export(
             texts[table] = position_table(known, parameter or first)
     except CalibrationError as error:
         raise DataError(f"{calibration}: {error}") from error
-    if ardupilot is not None or px4 is not None:
-        compass = export_autopilot.compass_of(known)
-        for lost in compass.lost:
-            complain(f"{calibration}: the autopilot's model cannot hold {lost}")
-        if ardupilot is not None:
-            texts[ardupilot], warnings = export_autopilot.ardupilot(compass, number)
-            for warning in warnings:
-                complain(warning)
-        if px4 is not None:
-            texts[px4] = export_autopilot.px4(compass, number)
+    texts |= _autopilot(calibration, known, ardupilot, px4, number)
     for file, text in texts.items():
         with new_folder(file.parent), atomic_path(file) as path:
             path.write_text(text, encoding="utf-8")
     files = [str(file) for file in texts]
     print_result({"files": files}, "\n".join(f"{file}: written" for file in files), json)
+
+
+def _autopilot(
+    file: Path, known: Calibration, ardupilot: Path | None, px4: Path | None, number: int
+) -> dict[Path, str]:
+    """Return the autopilots' parameter files that are asked for; report what these cannot hold."""
+    from magbridge.calibration import export_autopilot
+
+    if ardupilot is None and px4 is None:
+        return {}
+    compass, texts = export_autopilot.compass_of(known), dict[Path, str]()
+    for lost in compass.lost:
+        complain(f"{file}: the autopilot's model cannot hold {lost}")
+    if ardupilot is not None:
+        texts[ardupilot], warnings = export_autopilot.ardupilot(compass, number)
+        for warning in warnings:
+            complain(warning)
+    if px4 is not None:
+        texts[px4] = export_autopilot.px4(compass, number)
+    return texts
 
 
 def _filter_lag(known: Calibration, file: Path) -> list[str]:

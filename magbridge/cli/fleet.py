@@ -73,8 +73,8 @@ def add(
     date
         When the deployment of a calibration began (YYYY-MM-DD).
     """
+    from magbridge.fleet.calibrations import add_calibration
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.given import add_calibration
     from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, logs_of, read_fleet
 
     if not files and not (vehicle and parameter):
@@ -126,7 +126,7 @@ def _calibrations(files: Sequence[Path], date: dt.date | None) -> list[tuple[flo
     from magbridge.calibration.file import load
 
     if files and date is None:
-        raise WrongUse(f"{files[0]}: a calibration says no date: when did its deployment begin (--date)?")
+        raise WrongUse(f"{files[0]}: expected --date YYYY-MM-DD, the day on which its deployment began")
     start = dt.datetime.combine(date, dt.time(), dt.UTC).timestamp() if date else 0.0
     return [(start, load(file)) for file in files]
 
@@ -200,7 +200,7 @@ def process(
 def status(*, catalogue: Where = HERE, json: Json = False) -> None:
     """Print the catalogued logs, the finished work, and the failures."""
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.status import status as of
+    from magbridge.fleet.job import status as of
 
     there = open_catalogue(catalogue)
     found = of(there)
@@ -243,7 +243,7 @@ def show(
             else:
                 found[name] = history(learnt, name)
     if not found:
-        raise DataError(f"{there.name}: nothing to show: no deployment has been calibrated")
+        raise DataError(f"{there.name}: no deployment has been calibrated; run magbridge fleet process")
     if html:
         from magbridge.fleet.page import write_page, write_pages
 
@@ -275,9 +275,9 @@ def export(
         The refit it will fly with; by default a new one.
     """
     from magbridge.calibration.file import save
+    from magbridge.fleet.calibrations import unflown
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.memory import fleet_of
-    from magbridge.fleet.unflown import unflown
 
     with waiting("learning"):
         learnt = fleet_of(open_catalogue(catalogue), vehicle)

@@ -95,19 +95,13 @@ def navigate(
 
     from magbridge.field.read import read_grid
     from magbridge.logs import write
-    from magbridge.navigate import NavigationOptions
     from magbridge.navigate.batch import navigate as find_way
-    from magbridge.navigate.options import informed, with_level
 
     if known is None or calibration is None:
         deployment = _scalar(files, heading_reference, reading)
-        level = float(deployment["level_sigma"].median()) if "level_sigma" in deployment else 0.0
-        options = options or with_level(NavigationOptions(), level)
     else:
         deployment = _corrected(files, known, calibration, heading_reference, reading)
-        options = options or informed(
-            NavigationOptions(), known, float(deployment["total_field_sigma"].median())
-        )
+    options = options or _options_for(deployment, known)
     if map is None:
         from magbridge.navigate.own_survey import localise
 
@@ -124,6 +118,17 @@ def navigate(
         complain(finding)
     facts, summary = _judged(track)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+
+
+def _options_for(deployment: xr.Dataset, known: Calibration | None) -> NavigationOptions:
+    """Return the filter's options as the calibration, or else the log's own level, gives them."""
+    from magbridge.navigate import NavigationOptions
+    from magbridge.navigate.options import informed, with_level
+
+    if known is not None:
+        return informed(NavigationOptions(), known, float(deployment["total_field_sigma"].median()))
+    level = float(deployment["level_sigma"].median()) if "level_sigma" in deployment else 0.0
+    return with_level(NavigationOptions(), level)
 
 
 def _scalar(files: tuple[Path, ...], heading_reference: Heading, reading: ReadingOptions) -> xr.Dataset:

@@ -98,7 +98,7 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
     if AUTO not in named:
         return tuple(named)
     if len(named) > 1:
-        raise WrongUse(f"--parameter {AUTO}: chooses them all, and goes with no other")
+        raise WrongUse(f"--parameter {AUTO}: chooses all parameters; name no other")
     offered = [*movers(deployment), *conditions(deployment)]
     taken, offers = best_parameters(deployment, offered, **options)
     for line in lines(offers) or [
@@ -113,7 +113,8 @@ def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
     for name in calibration.channels:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
-            complain(f"{lacking}: every sample is flagged, with a sigma to match")
+            remedy = f"name the log's own column with --column {name}=THEIRS"
+            complain(f"{lacking}: every sample is flagged, with a wider sigma; {remedy}")
 
 
 def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:

@@ -141,7 +141,7 @@ def survey(
     if products.predict is None and output.suffix.lower() != ".nc":
         raise WrongUse(f"{output}: a map's name must end in .nc")
     if (correction.calibration or scalar.scalar) and correction.save:
-        raise WrongUse("--save: with --calibration or --scalar none is found")
+        raise WrongUse("--save: with --calibration or --scalar no calibration is found; leave --save out")
     scalar.check()
     with waiting("surveying"):
         if scalar.scalar:
@@ -178,7 +178,10 @@ def _scalar_survey(
     known = [load(path) for path in correction.calibration]
     for path, found in zip(correction.calibration, known, strict=True):
         if all(sensor.column != column for sensor in found.sensors):
-            complain(f"{path}: has no scalar sensor {column!r}: it is not compensated")
+            complain(
+                f"{path}: has no scalar sensor {column!r}, which is not compensated; fit it with "
+                f"magbridge calibrate --scalar {column}"
+            )
     names = [name for name in correction.parameter if name != "auto"]
     if "auto" in correction.parameter:
         names = sorted({name for log in logs for name in telemetry_columns(log, column)})

@@ -143,7 +143,7 @@ def test_a_field_that_the_earth_does_not_have_is_reported(
     for name, iron in (("own.nc", 0.0), ("other.nc", 50_000.0)):
         write(own.assign(mag_z=own["mag_z"] + iron), name)
         output = command("correct", name, "--calibration", calibration, "-o", "out.nc")
-        doubt = "another vehicle's? 100 of 100 corrected total fields are none of the Earth's"
+        doubt = "100 of 100 corrected total fields are outside the Earth's range, 20,000 to 70,000 nT"
         assert (doubt in output.err) == bool(iron)
 
 
@@ -279,7 +279,9 @@ def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, comma
     # no further from where it is than a run may be
     assert all(run["ballast"] >= 200.0 - 0.35 * known.parameters[1].scale for run in runs)
     write(log.assign(pitch=log["pitch"] * np.nan), "flat.nc")
-    assert command.refuses(*asked, "flat.nc").startswith("the mission has no sample with all of roll, pitch")
+    assert command.refuses(*asked, "flat.nc").startswith(
+        "flat.nc (deployment.csv): the mission has no sample with all of roll, pitch"
+    )
 
 
 def test_plan_of_a_survey_needs_no_calibration(deployment: Path, command: Command) -> None:

@@ -11,10 +11,9 @@ from fleets import fly
 from magbridge.calibration.file import load
 from magbridge.cli import main
 from magbridge.fleet.folder import FolderCatalogue
-from magbridge.fleet.job import jobs
+from magbridge.fleet.job import jobs, status
 from magbridge.fleet.memory import fleet_of, lessons
 from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
-from magbridge.fleet.status import status
 from magbridge.fleet.work import work
 
 
@@ -73,7 +72,7 @@ def test_what_does_not_fit_is_a_line(
         return capsys.readouterr().err
 
     when = "--date", "2026-05-01"
-    assert "a calibration says no date: when did its deployment begin (--date)?" in output()
+    assert "expected --date YYYY-MM-DD, the day on which its deployment began" in output()
     reported = output(*when, "--sensor", "HMR 9")
     assert "a calibration of sensor 'HMR 1', but comet may carries 'HMR 9'" in reported
     add_vehicle(catalogue, "other", Vehicle(parameters=("ballast",)))
