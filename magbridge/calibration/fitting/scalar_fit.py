@@ -10,7 +10,9 @@ Williams 2006, section 5.4):
 
 1. For given noise, the steady-state Kalman filter of the slow processes whitens reading and columns. For a
    stationary process it is a linear filter with the zeros ``eig(A)`` and the poles ``eig(A - K C)``, applied
-   as second-order sections, so that the cost is linear in the samples.
+   as second-order sections, so that the cost is linear in the samples. The filter begins with the steady
+   state's covariance P, the processes with their stationary covariance: the remainder of the initial state is
+   a random vector whose effect on the stretch is whitened as well.
 2. With the normal equations of the whitened columns, the evidence and its gradient by the log widths are
    algebra of the columns' number alone.
 
@@ -26,7 +28,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_discrete_are
+from scipy.linalg import block_diag, cho_factor, cho_solve, solve_discrete_are
 from scipy.optimize import minimize
 from scipy.signal import sosfilt, zpk2sos
 from threadpoolctl import threadpool_limits
@@ -275,22 +277,33 @@ class _ScalarProblem:
         )  # fmt: skip
 
     def whiten(self, log_noise: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Return the whitened target and design, and the log of the noise's determinant."""
-        sections, variance = _whitening_filter(log_noise, self.interval)
-        both = np.column_stack([self.target, self.design])
-        for segment in self.segments:
-            both[segment] = sosfilt(sections, both[segment], axis=0)
-        both /= np.sqrt(variance)
-        return both[:, 0], both[:, 1:], len(both) * float(np.log(variance))
+        """Return the whitened target and design, and the log of the noise's determinant.
 
-    def level_sigma(self, log_noise: FloatArray) -> float:
-        """Return the prior's 1-sigma of a level, nT: the slow processes begin at zero in the filter."""
-        return float(np.hypot(CYCLE_LEVEL_SIGMA_NT, np.sqrt(_slow_variances(log_noise).sum())))
+        Notes
+        -----
+        With B (n, q) the filtered effect of the initial state's remainder in units of its 1-sigma, what the
+        filter leaves of the noise has the covariance ``1 + B B^T``. Its inverse square root is ``1 - B V f(s)
+        V^T B^T``, with ``B^T B = V s V^T`` and ``f(s) = (1 - (1 + s)^-1/2) / s``.
+        """
+        slow = _SlowNoise.build(log_noise, self.interval)
+        both = np.column_stack([self.target, self.design])
+        log_det = len(both) * float(np.log(slow.variance))
+        for segment in self.segments:
+            initial = slow.initial_effect(self.time[segment] - self.time[segment.start])
+            filtered = sosfilt(slow.sections, np.column_stack([both[segment], initial]), axis=0)
+            filtered /= np.sqrt(slow.variance)
+            rows, B = filtered[:, : both.shape[1]], filtered[:, both.shape[1] :]
+            s, V = np.linalg.eigh(B.T @ B)
+            s = np.maximum(s, 1e-12)
+            BV = B @ V
+            both[segment] = rows - BV @ (((1.0 - 1.0 / np.sqrt(1.0 + s)) / s)[:, None] * (BV.T @ rows))
+            log_det += float(np.log1p(s).sum())
+        return both[:, 0], both[:, 1:], log_det
 
     def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> tuple[_State, FloatArray]:
         """Return the posterior given the hyperparameters, and the optimal log widths."""
         y, X, log_det = self.whiten(log_noise)
-        chosen = _choose_widths(X.T @ X, X.T @ y, self.blocks, self.level_sigma(log_noise), log_widths)
+        chosen = _choose_widths(X.T @ X, X.T @ y, self.blocks, log_widths)
         value = chosen.value + 0.5 * (float(y @ y) + log_det) - _log_noise_prior(log_noise)
         return _State(log_noise, chosen.sigma, chosen.mean, chosen.covariance, value), chosen.log_widths
 
@@ -353,7 +366,7 @@ class _Widths:
 
 
 def _choose_widths(
-    gram: FloatArray, moment: FloatArray, blocks: tuple[_Block, ...], level: float, log_widths: FloatArray
+    gram: FloatArray, moment: FloatArray, blocks: tuple[_Block, ...], log_widths: FloatArray
 ) -> _Widths:
     """Maximise the evidence over the widths, given the normal equations of whitened columns.
 
@@ -369,7 +382,7 @@ def _choose_widths(
     size = len(moment)
 
     def evaluate(logs: FloatArray) -> tuple[float, FloatArray, _Widths]:
-        sigma = _prior_sigma(blocks, np.exp(logs), level, size)
+        sigma = _prior_sigma(blocks, np.exp(logs), size)
         factor = cho_factor(np.eye(size) + sigma[:, None] * gram * sigma, lower=True)
         mean = sigma * cho_solve(factor, sigma * moment)
         covariance = sigma[:, None] * cho_solve(factor, np.eye(size)) * sigma
@@ -422,7 +435,7 @@ def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
     information = (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor
     blocks = _blocks(tuple(wider), len(sensor.power_cycles), fixed_lag=prior[PLATFORM_TERMS - 1] < 1e-6)
     start = np.log([prior[block.columns][0] for block in blocks if block.spread > 0.0])
-    chosen = _choose_widths(information, moment * factor, blocks, float(prior[-1]), start)
+    chosen = _choose_widths(information, moment * factor, blocks, start)
     return msgspec.structs.replace(
         sensor,
         channels=tuple(wider),
@@ -468,12 +481,11 @@ def _blocks(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool
     return tuple(blocks)
 
 
-def _prior_sigma(blocks: tuple[_Block, ...], widths: FloatArray, level: float, size: int) -> FloatArray:
+def _prior_sigma(blocks: tuple[_Block, ...], widths: FloatArray, size: int) -> FloatArray:
     """Return the prior's 1-sigma of every coefficient, (m,)."""
     sigma, free = np.empty(size), iter(widths.tolist())
     for block in blocks:
         sigma[block.columns] = next(free) if block.spread > 0.0 else block.centre
-    sigma[blocks[-1].columns] = level
     return sigma
 
 
@@ -490,8 +502,9 @@ def _slow_variances(log_noise: FloatArray) -> FloatArray:
     return np.asarray(np.exp(2.0 * log_noise[1 : 2 + many]))
 
 
-def _whitening_filter(log_noise: FloatArray, interval: float) -> tuple[FloatArray, float]:
-    """Return the second-order sections that whiten the noise, and the innovations' variance, nT^2.
+@dataclass(frozen=True, eq=False)
+class _SlowNoise:
+    """Whitening filter of white noise and slow processes.
 
     Notes
     -----
@@ -499,25 +512,49 @@ def _whitening_filter(log_noise: FloatArray, interval: float) -> tuple[FloatArra
     gives the steady prediction covariance P, ``S = C P C^T + sigma^2``, ``K = A P C^T / S``. The
     innovations are the output of a filter with the zeros eig(A) and the poles eig(A - K C).
     """
-    variances = _slow_variances(log_noise)
-    decay = np.exp(-interval / np.array(TIME_CONSTANTS_S))
-    A, Q = np.diag(decay), np.diag(variances[: len(decay)] * (1.0 - decay**2))
-    C = np.ones(len(decay))
-    if len(log_noise) > 1 + len(TIME_CONSTANTS_S):
-        A_m, Q_m = _matern_transition(float(np.exp(log_noise[-1])), float(variances[-1]), interval)
-        A = np.block([[A, np.zeros((len(A), 3))], [np.zeros((3, len(A))), A_m]])
-        Q = np.block([[Q, np.zeros((len(Q), 3))], [np.zeros((3, len(Q))), Q_m]])
-        C = np.append(C, [1.0, 0.0, 0.0])
-    white = float(np.exp(2.0 * log_noise[0]))
-    P = solve_discrete_are(A.T, C[:, None], Q + 1e-12 * np.eye(len(Q)), np.array([[white]]))
-    variance = float(C @ P @ C) + white
-    K = A @ P @ C / variance
-    sections = zpk2sos(np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(K, C)), 1.0)
-    return np.asarray(sections), variance
+
+    sections: FloatArray
+    """Second-order sections of the filter."""
+    variance: float
+    """nT^2, of the innovations."""
+    remainder: FloatArray
+    """(q, q), square root of the initial state's covariance beyond P."""
+    crust_length: float | None
+    """s, time scale of the crustal process; None without one."""
+
+    @staticmethod
+    def build(log_noise: FloatArray, interval: float) -> _SlowNoise:
+        """Return the filter for the logs of the noise's amplitudes, nT."""
+        variances = _slow_variances(log_noise)
+        decay = np.exp(-interval / np.array(TIME_CONSTANTS_S))
+        stationary = np.diag(variances[: len(decay)])
+        A, Q = np.diag(decay), stationary * (1.0 - decay**2)
+        C, length = np.ones(len(decay)), None
+        if len(log_noise) > 1 + len(TIME_CONSTANTS_S):
+            length = float(np.exp(log_noise[-1]))
+            A_m, Q_m, P_m = _matern_transition(length, float(variances[-1]), interval)
+            A, Q, stationary = block_diag(A, A_m), block_diag(Q, Q_m), block_diag(stationary, P_m)
+            C = np.append(C, [1.0, 0.0, 0.0])
+        white = float(np.exp(2.0 * log_noise[0]))
+        P = solve_discrete_are(A.T, C[:, None], Q + 1e-12 * np.eye(len(Q)), np.array([[white]]))
+        variance = float(C @ P @ C) + white
+        K = A @ P @ C / variance
+        sections = zpk2sos(np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(K, C)), 1.0)
+        size, axes = np.linalg.eigh(stationary - P)
+        return _SlowNoise(np.asarray(sections), variance, axes * np.sqrt(np.maximum(size, 0.0)), length)
+
+    def initial_effect(self, elapsed: FloatArray) -> FloatArray:
+        """Return the effect (n, q) of the initial state's remainder, nT, `elapsed` (n,) s after it: C A^t."""
+        effect = np.exp(-elapsed[:, None] / np.array(TIME_CONSTANTS_S))
+        if self.crust_length is not None:
+            x = np.sqrt(5.0) / self.crust_length * elapsed
+            row = np.exp(-x)[:, None] * np.stack([1.0 + x + 0.5 * x * x, x + x * x, 0.5 * x * x], axis=1)
+            effect = np.hstack([effect, row])
+        return np.asarray(effect @ self.remainder)
 
 
-def _matern_transition(length: float, variance: float, interval: float) -> tuple[FloatArray, FloatArray]:
-    """Return transition and process noise of a Matern process of smoothness 5/2.
+def _matern_transition(length: float, variance: float, interval: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return transition, process noise and stationary covariance of a Matern process of smoothness 5/2.
 
     Notes
     -----
@@ -530,7 +567,7 @@ def _matern_transition(length: float, variance: float, interval: float) -> tuple
     A = np.exp(-x) * (np.eye(3) + x * N + 0.5 * x * x * N @ N)
     P = variance * np.array([[1.0, 0.0, -1.0 / 3.0], [0.0, 1.0 / 3.0, 0.0], [-1.0 / 3.0, 0.0, 1.0]])
     Q = P - A @ P @ A.T + ROUNDING * variance * np.eye(3)
-    return A, 0.5 * (Q + Q.T)
+    return A, 0.5 * (Q + Q.T), P
 
 
 def _result(
