@@ -65,10 +65,13 @@ MIN_SCALAR_SAMPLES = 100
 EVIDENCE_ITERATIONS = 15
 LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
 """Log of nT: centre and 1-sigma of white noise and fastest process, 1-sigma of the change to the next."""
-LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 30.0])), 1.5
-"""Log of the crustal field's amplitude (nT) and time scale (s) along the track, where no map is known."""
-LOG_LONGEST_CRUST, REFUSED_COST = float(np.log(1000.0)), 1e9
-"""Log of s, longest time scale of the crustal field; cost of noise whose whitening filter is unstable."""
+LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 15.0, 30.0])), 1.5
+"""Log of the amplitudes of the crustal field's two parts (nT) and of the time scale of the first (s), where no
+map is known."""
+CRUST_SCALE_RATIO = 8.0
+"""Time scale of the crustal field's second part in units of that of the first: one scale is too few."""
+LOG_LONGEST_CRUST, REFUSED_COST = float(np.log(500.0)), 1e9
+"""Log of s, longest time scale of the first part; cost of noise whose whitening filter is unstable."""
 WITNESS_SIGMA, WITNESS_PASSES = 8.0, 12
 """Distance from the vector sensor, in robust standard deviations, beyond which a sample is not fitted."""
 LOG_WIDTH_LIMITS = -15.0, 15.0
@@ -314,7 +317,7 @@ class _ScalarProblem:
 
         # A time scale beyond these limits is white noise or part of the level; its filter would be unstable.
         limits = [(-9.0, 9.0)] * (1 + len(TIME_CONSTANTS_S))
-        limits += [(-3.0, 7.0), (float(np.log(2.0 * self.interval)), LOG_LONGEST_CRUST)]
+        limits += [(-3.0, 7.0), (-3.0, 7.0), (float(np.log(2.0 * self.interval)), LOG_LONGEST_CRUST)]
 
         def cost(log_noise: FloatArray) -> float:
             nonlocal warm, best
@@ -497,9 +500,10 @@ def _segments(time: FloatArray, interval: float) -> tuple[slice, ...]:
 
 
 def _slow_variances(log_noise: FloatArray) -> FloatArray:
-    """Return the variance of every slow process, nT^2; the crustal one last where there is one."""
+    """Return the variance of every slow process, nT^2; the crustal ones last where there are any."""
     many = len(TIME_CONSTANTS_S)
-    return np.asarray(np.exp(2.0 * log_noise[1 : 2 + many]))
+    crust = log_noise[1 + many : -1] if len(log_noise) > 1 + many else log_noise[:0]
+    return np.asarray(np.exp(2.0 * np.concatenate([log_noise[1 : 1 + many], crust])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -519,8 +523,8 @@ class _SlowNoise:
     """nT^2, of the innovations."""
     remainder: FloatArray
     """(q, q), square root of the initial state's covariance beyond P."""
-    crust_length: float | None
-    """s, time scale of the crustal process; None without one."""
+    crust_lengths: tuple[float, ...]
+    """s, time scales of the crustal processes."""
 
     @staticmethod
     def build(log_noise: FloatArray, interval: float) -> _SlowNoise:
@@ -528,32 +532,38 @@ class _SlowNoise:
         variances = _slow_variances(log_noise)
         decay = np.exp(-interval / np.array(TIME_CONSTANTS_S))
         stationary = np.diag(variances[: len(decay)])
-        A, Q = np.diag(decay), stationary * (1.0 - decay**2)
-        C, length = np.ones(len(decay)), None
-        if len(log_noise) > 1 + len(TIME_CONSTANTS_S):
-            length = float(np.exp(log_noise[-1]))
-            A_m, Q_m, P_m = _matern_transition(length, float(variances[-1]), interval)
+        A, Q, zeros, C = np.diag(decay), stationary * (1.0 - decay**2), decay, np.ones(len(decay))
+        lengths: list[float] = []
+        for variance_m in variances[len(decay) :].tolist():
+            lengths.append(float(np.exp(log_noise[-1])) * CRUST_SCALE_RATIO ** len(lengths))
+            A_m, Q_m, P_m = _matern_transition(lengths[-1], variance_m, interval)
             A, Q, stationary = block_diag(A, A_m), block_diag(Q, Q_m), block_diag(stationary, P_m)
+            # The triple eigenvalue of A_m is known; computed, it would lose two thirds of its digits.
+            zeros = np.append(zeros, np.full(3, np.exp(-np.sqrt(5.0) / lengths[-1] * interval)))
             C = np.append(C, [1.0, 0.0, 0.0])
         white = float(np.exp(2.0 * log_noise[0]))
         P = solve_discrete_are(A.T, C[:, None], Q + 1e-12 * np.eye(len(Q)), np.array([[white]]))
         variance = float(C @ P @ C) + white
         K = A @ P @ C / variance
-        sections = zpk2sos(np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(K, C)), 1.0)
+        sections = zpk2sos(zeros, np.linalg.eigvals(A - np.outer(K, C)), 1.0)
         size, axes = np.linalg.eigh(stationary - P)
-        return _SlowNoise(np.asarray(sections), variance, axes * np.sqrt(np.maximum(size, 0.0)), length)
+        return _SlowNoise(
+            np.asarray(sections), variance, axes * np.sqrt(np.maximum(size, 0.0)), tuple(lengths)
+        )
 
     def initial_effect(self, elapsed: FloatArray) -> FloatArray:
         """Return the effect (n, q) of the initial state's remainder, nT, `elapsed` (n,) s after it: C A^t."""
         effect = np.exp(-elapsed[:, None] / np.array(TIME_CONSTANTS_S))
-        if self.crust_length is not None:
-            x = np.sqrt(5.0) / self.crust_length * elapsed
+        for length in self.crust_lengths:
+            x = np.sqrt(5.0) / length * elapsed
             row = np.exp(-x)[:, None] * np.stack([1.0 + x + 0.5 * x * x, x + x * x, 0.5 * x * x], axis=1)
             effect = np.hstack([effect, row])
         return np.asarray(effect @ self.remainder)
 
 
-def _matern_transition(length: float, variance: float, interval: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _matern_transition(
+    length: float, variance: float, interval: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return transition, process noise and stationary covariance of a Matern process of smoothness 5/2.
 
     Notes
