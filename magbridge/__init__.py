@@ -17,10 +17,11 @@ What there is:
 - ``read_grid``: an anomaly grid, of any format
 - ``reference_field``: what the total field should be at the places of a log
 - ``observations``: what a fit needs of a log, and which of its columns move masses
+- ``calibrate``: a calibration of a log, with its scalar magnetometer
 - ``fit``: a calibration of these observations, with its covariance, warnings and residual
 - ``Calibration``: what a fit found: the model, its coefficients and how sure they are
 - ``save``, ``load``: a calibration to and from ``cal.json``
-- ``correct``: the field of one reading, or of arrays of them
+- ``correct``: the field of one reading, of arrays of them, or of a log with its scalar magnetometer
 - ``Corrector``: the same for many readings, one by one
 - ``Correction``: readings and telemetry, aligned and corrected as the bridge does it
 - ``correct_rows``: a log, corrected: total field, vector, anomaly, sigmas and flags
@@ -43,6 +44,7 @@ TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge import plot
     from magbridge.api import (
+        calibrate,
         correct,
         correct_rows,
         diagnose,
@@ -66,9 +68,9 @@ if TYPE_CHECKING:
     from magbridge.version import __version__
 
 __all__ = [
-    "Calibration", "Correction", "Corrector", "MagbridgeError", "__version__", "correct", "correct_rows",
-    "diagnose", "fit", "from_frame", "heading", "load", "navigate", "observations", "plan", "plot", "read",
-    "read_grid", "reference_field", "save", "survey", "to_frame", "write",
+    "Calibration", "Correction", "Corrector", "MagbridgeError", "__version__", "calibrate", "correct",
+    "correct_rows", "diagnose", "fit", "from_frame", "heading", "load", "navigate", "observations", "plan",
+    "plot", "read", "read_grid", "reference_field", "save", "survey", "to_frame", "write",
 ]  # fmt: skip
 
 _HOMES = {
@@ -77,6 +79,7 @@ _HOMES = {
     "Corrector": "calibration.corrector",
     "MagbridgeError": "errors",
     "__version__": "version",
+    "calibrate": "api",
     "correct": "api",
     "correct_rows": "api",
     "diagnose": "api",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
     from magbridge.survey.run import Result
 
 __all__ = [
-    "correct", "correct_rows", "diagnose", "navigate", "observations", "plan", "reference_field", "survey",
-    "write",
+    "calibrate", "correct", "correct_rows", "diagnose", "navigate", "observations", "plan",
+    "reference_field", "survey", "write",
 ]  # fmt: skip
 
 
@@ -62,17 +63,87 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> 
     return reference.reference_field(in_seconds(deployment), grid)
 
 
+def calibrate(
+    deployment: xr.Dataset,
+    parameters: str | Sequence[str] = (),
+    *,
+    scalar: str = "",
+    channels: Sequence[str] | None = None,
+    grid: AnomalyGrid | None = None,
+    lag: float | None = None,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **options: Any,
+) -> Calibration:
+    """Fit the calibration of a log's vector magnetometer, and of its scalar magnetometer if one is named.
+
+    Parameters
+    ----------
+    deployment : Dataset
+        On ``time``, with ``mag_x mag_y mag_z`` (nT), and ``reference_field`` or positions.
+    parameters : str or sequence of str
+        Columns that move masses, for the vector magnetometer.
+    scalar : str
+        Column of a scalar magnetometer's reading, nT; its compensation is in ``sensors`` of the result.
+    channels : sequence of str, optional
+        Telemetry channels that disturb the scalar; by default all telemetry of the log.
+    grid : AnomalyGrid, optional
+        Crustal field to add to the main field. Without it and without ``reference_field``, the crustal
+        field along the track is estimated together with the scalar's compensation.
+    lag : float, optional
+        Time by which the scalar is late, s; estimated if not given.
+    lever : tuple of 3 float
+        Position of the scalar relative to the logged positions, m forward, starboard and down.
+    **options
+        Of :func:`magbridge.fit`: ``method``, ``order``.
+
+    Returns
+    -------
+    Calibration
+        Of the vector magnetometer, with the scalar's compensation.
+
+    Raises
+    ------
+    FormatError
+        A column is missing.
+    DataError
+        The scalar's reading is not in nT.
+    CalibrationError
+        The samples do not suffice.
+    """
+    from magbridge.calibration.fitting.fit import fit  # noqa: PLC0415 - scipy only where it is used
+    from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns  # noqa: PLC0415
+
+    log = in_seconds(deployment)
+    found = fit(observations(log, parameters, grid=grid), **options).calibration
+    if not scalar:
+        return found
+    names = telemetry_columns(log, scalar) if channels is None else channels
+    map_known = grid is not None or "reference_field" in log
+    known = calibrate_scalar(log, found, scalar, names, grid=grid, map_known=map_known, lag=lag, lever=lever)
+    return replace(found, sensors=(known.sensor,))
+
+
+@overload
+def correct(calibration: Calibration, field: xr.Dataset) -> xr.Dataset: ...
+@overload
 def correct(
     calibration: Calibration, field: ArrayLike, channels: ArrayLike = (), time: ArrayLike = 0.0
-) -> Corrected | CorrectedArrays:
-    """Correct one reading, or arrays of readings.
+) -> Corrected | CorrectedArrays: ...
+def correct(
+    calibration: Calibration,
+    field: ArrayLike | xr.Dataset,
+    channels: ArrayLike = (),
+    time: ArrayLike = 0.0,
+) -> Corrected | CorrectedArrays | xr.Dataset:
+    """Correct one reading, arrays of readings, or a log.
 
     Parameters
     ----------
     calibration : Calibration
         Of the sensor that took the samples.
-    field : (3,) or (n, 3) array
-        nT, raw, sensor axes.
+    field : (3,) or (n, 3) array, or Dataset
+        nT, raw, sensor axes. A log is corrected as the bridge does it, with its scalar magnetometer where the
+        calibration has one.
     channels : (k,) or (n, k) array
         ``calibration.channels``, in that order; NaN where unknown.
     time : float or (n,) array
@@ -80,14 +151,19 @@ def correct(
 
     Returns
     -------
-    Corrected or CorrectedArrays
-        Of one reading, or of the n.
+    Corrected, CorrectedArrays or Dataset
+        Of one reading, of the n, or of a log: the columns of :func:`magbridge.correct_rows`, and with a
+        scalar magnetometer ``scalar_field``, its sigma and flags.
 
     Raises
     ------
     CalibrationError
         Another shape, or another number of channels than the calibration's.
+    FormatError
+        A log lacks a column.
     """
+    if hasattr(field, "data_vars"):
+        return _corrected_log(calibration, cast("xr.Dataset", field))
     readings = np.asarray(field, float)
     if readings.shape[-1:] != (3,) or readings.ndim > 2:
         raise CalibrationError(f"field: expected shape (3,) or (n, 3), got {readings.shape}")
@@ -100,6 +176,16 @@ def correct(
         return Corrector(calibration).step(round(float(moments) * 1e6), (x, y, z), values)
     moments = np.broadcast_to(moments.astype(float), len(readings))
     return correct_arrays(calibration, readings, np.asarray(channels, float), moments)
+
+
+def _corrected_log(calibration: Calibration, deployment: xr.Dataset) -> xr.Dataset:
+    """Return a corrected log, with its scalar magnetometer."""
+    from magbridge.calibration.fitting.scalar_log import with_scalar  # noqa: PLC0415 - scipy only where it is used
+    from magbridge.correction import Correction  # noqa: PLC0415 - as the other imports of this function
+
+    log = in_seconds(deployment)
+    corrected = with_scalar(correct_rows_in_seconds(Correction(calibration), log), log, calibration.sensors)
+    return corrected.assign_coords(time=deployment["time"])
 
 
 def plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:

@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
+import magbridge as mb
 from magbridge import logs
 from magbridge.arrays import FloatArray
 from magbridge.calibration.file import decode_calibration, encode_calibration, load
@@ -22,7 +23,7 @@ from magbridge.calibration.scalar import (
     compare_sensors,
 )
 from magbridge.cli import main
-from magbridge.errors import CalibrationError
+from magbridge.errors import CalibrationError, FormatError
 
 RATE, MINUTES = 4.0, 24
 CHANNELS = "motor_current", "relay", "rudder"
@@ -122,6 +123,24 @@ def test_commands_calibrate_and_correct_a_scalar(tmp_path: Path, capsys: pytest.
     wrong = ["calibrate", str(tmp_path / "a.nc"), "--scalar", SCALAR, "--lever", "1,2", "-o", str(cal)]
     assert main(wrong) == 2
     assert "F,R,D" in capsys.readouterr().err
+
+
+def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:
+    series = flown(7)
+    write(half(series, False), tmp_path / "a.nc")
+    write(half(series, True), tmp_path / "b.nc")
+    runs, later = logs.read(tmp_path / "a.nc"), logs.read(tmp_path / "b.nc")
+    found = mb.calibrate(runs, scalar=SCALAR, channels=CHANNELS[:2])
+    assert [channel.name for channel in found.sensors[0].channels] == ["motor_current", "relay"]
+    assert mb.calibrate(runs).sensors == ()
+    found = mb.calibrate(runs, scalar=SCALAR)
+    corrected = mb.correct(found, later)
+    assert (corrected["time"] == later["time"]).all()
+    error = corrected["scalar_field"].to_numpy() - half(series, True).reference
+    assert np.sqrt(np.mean(error**2)) < 2.0
+    assert 0.4 < np.sqrt(np.mean((error / corrected["scalar_field_sigma"].to_numpy()) ** 2)) < 1.6
+    with pytest.raises(FormatError, match="mag_tail"):
+        mb.calibrate(runs, scalar="mag_tail")
 
 
 def test_the_vector_is_calibrated_by_the_scalar(tmp_path: Path) -> None:

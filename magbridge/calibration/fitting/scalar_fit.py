@@ -66,8 +66,7 @@ EVIDENCE_ITERATIONS = 15
 LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
 """Log of nT: centre and 1-sigma of white noise and fastest process, 1-sigma of the change to the next."""
 LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 15.0, 30.0])), 1.5
-"""Log of the amplitudes of the crustal field's two parts (nT) and of the time scale of the first (s), where no
-map is known."""
+"""Log of the amplitudes of the two parts of the crustal field (nT) and of the time scale of the first (s)."""
 CRUST_SCALE_RATIO = 8.0
 """Time scale of the crustal field's second part in units of that of the first: one scale is too few."""
 LOG_LONGEST_CRUST, REFUSED_COST = float(np.log(500.0)), 1e9
