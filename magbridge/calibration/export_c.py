@@ -16,7 +16,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
 
-__all__ = ["c_header", "c_source"]
+__all__ = ["c_header", "c_source", "hexadecimal", "reals", "rows"]
 
 C_HEADER = Template("""/* Made by magbridge export from calibration $id: do not edit.
  *
@@ -169,19 +169,23 @@ def c_source(calibration: Calibration) -> str:
     # C has no empty arrays: one row of zeros where there is no parameter
     some = calibration.parameters or ()
     tables = [
-        _reals("centre[]", kernel.centre or (0.0,)),
-        _reals("scale[]", kernel.scale or (1.0,)),
-        _rows("real", "range[][2]", [[_hex(one.low), _hex(one.high)] for one in some] or [["0", "0"]]),
-        _rows("int", "parent[][2]", [[str(n) for n in one] for one in kernel.parents] or [["0", "0"]]),
-        _rows("int", "pair[][2]", [[str(i), str(j)] for i, j in kernel.pairs]),
-        _rows("int", "place[3][3]", [[str(n) for n in one] for one in place]),
-        _rows("real", "omega[3][3]", [[_hex(float(n)) for n in one] for one in omega]),
+        reals("centre[]", kernel.centre or (0.0,)),
+        reals("scale[]", kernel.scale or (1.0,)),
+        rows(
+            "real",
+            "range[][2]",
+            [[hexadecimal(one.low), hexadecimal(one.high)] for one in some] or [["0", "0"]],
+        ),
+        rows("int", "parent[][2]", [[str(n) for n in one] for one in kernel.parents] or [["0", "0"]]),
+        rows("int", "pair[][2]", [[str(i), str(j)] for i, j in kernel.pairs]),
+        rows("int", "place[3][3]", [[str(n) for n in one] for one in place]),
+        rows("real", "omega[3][3]", [[hexadecimal(float(n)) for n in one] for one in omega]),
         f"static const int row[6] = {{{', '.join(str(i) for i, _ in PAIRS)}}};",
         f"static const int column[6] = {{{', '.join(str(j) for _, j in PAIRS)}}};",
-        _rows(
+        rows(
             "real",
             f"table[PRODUCTS][{TABLE_SUMS}]",
-            [[_hex(float(n)) for n in one] for one in kernel.table.T],
+            [[hexadecimal(float(n)) for n in one] for one in kernel.table.T],
         ),
     ]
     return SOURCE.substitute(
@@ -193,15 +197,17 @@ def c_source(calibration: Calibration) -> str:
     )
 
 
-def _hex(number: float) -> str:
+def hexadecimal(number: float) -> str:
     """Return a C99 constant that is the number to the last bit."""
     return f"(real){number.hex()}"
 
 
-def _reals(name: str, numbers: Sequence[float]) -> str:
-    return f"static const real {name} = {{{', '.join(map(_hex, numbers))}}};"
+def reals(name: str, numbers: Sequence[float]) -> str:
+    """Return the C constant `name`, an array of the numbers."""
+    return f"static const real {name} = {{{', '.join(map(hexadecimal, numbers))}}};"
 
 
-def _rows(kind: str, name: str, rows: Sequence[Sequence[str]]) -> str:
-    lines = ",\n".join(f"    {{{', '.join(row)}}}" for row in rows)
+def rows(kind: str, name: str, table: Sequence[Sequence[str]]) -> str:
+    """Return the C constant `name`, a table of numbers of a `kind`, which are written already."""
+    lines = ",\n".join(f"    {{{', '.join(row)}}}" for row in table)
     return f"static const {kind} {name} = {{\n{lines}\n}};"

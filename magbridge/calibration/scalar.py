@@ -28,9 +28,9 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "CorrectedScalar", "ScalarChannel",
-    "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "Witness", "compare_sensors",
-    "correct_scalar", "scalar_design", "term_columns",
+    "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "RANGE_MARGIN", "CorrectedScalar",
+    "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "Witness",
+    "compare_sensors", "correct_scalar", "scalar_design", "term_columns",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19

@@ -44,7 +44,8 @@ def export(
     calibration
         The calibration (cal.json).
     c
-        A folder for magbridge_calibration.h and .c: C99 without allocation, float or double.
+        A folder for magbridge_calibration.h and .c: C99 without allocation, float or double. A scalar
+        magnetometer of the calibration is in magbridge_scalar.h and .c.
     ardupilot
         A .param file: offsets, diagonals, off-diagonals and the motors' current of a compass.
     px4
@@ -67,7 +68,6 @@ def export(
             "expected --c DIR, --ardupilot F.param, --px4 F.params, --seaglider F.cal or --table F.csv"
         )
 
-    from magbridge.calibration.export_c import c_header, c_source
     from magbridge.calibration.export_seaglider import position_table
     from magbridge.calibration.file import load
     from magbridge.errors import CalibrationError
@@ -79,8 +79,7 @@ def export(
     texts: dict[Path, str] = {}
     try:
         if c is not None:
-            header, source = c_header(known), c_source(known)
-            texts |= {c / "magbridge_calibration.h": header, c / "magbridge_calibration.c": source}
+            texts |= _in_c(known, c)
         if seaglider is not None:
             texts[seaglider] = _seaglider(calibration, known, nt_per_count, dip)
         if table is not None:
@@ -113,6 +112,21 @@ def _autopilot(
             complain(warning)
     if px4 is not None:
         texts[px4] = export_autopilot.px4(compass, number)
+    return texts
+
+
+def _in_c(known: Calibration, folder: Path) -> dict[Path, str]:
+    """Return the C files of a calibration, with those of its first scalar magnetometer."""
+    from magbridge.calibration.export_c import c_header, c_source
+    from magbridge.calibration.export_scalar import scalar_header, scalar_source
+
+    texts = {
+        folder / "magbridge_calibration.h": c_header(known),
+        folder / "magbridge_calibration.c": c_source(known),
+    }
+    for sensor in known.sensors[:1]:
+        texts[folder / "magbridge_scalar.h"] = scalar_header(sensor)
+        texts[folder / "magbridge_scalar.c"] = scalar_source(sensor)
     return texts
 
 

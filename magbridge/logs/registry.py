@@ -116,9 +116,10 @@ FORMATS: dict[str, Format] = {
     ),
     "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002", packed=True),
     "seaglider": Format("magbridge.logs.seaglider", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
+    "geosoft": Format("magbridge.logs.geosoft", (".xyz",), writes=True, maps_columns=True, packed=True),
     "text": Format(
         "magbridge.logs.text",
-        (".txt", ".tsv", ".dat", ".asc", ".xyz", ".m77t", ".jsonl", ".ndjson"),
+        (".txt", ".tsv", ".dat", ".asc", ".m77t", ".jsonl", ".ndjson"),
         maps_columns=True,
         packed=True,
     ),

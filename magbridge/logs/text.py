@@ -20,10 +20,11 @@ from __future__ import annotations
 import codecs
 import csv
 import io
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import TextIO
 
@@ -31,6 +32,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
@@ -53,6 +55,8 @@ MAX_LINE_CHARACTERS = 1 << 20
 """Characters of the longest line that is read whole."""
 MAX_QUOTED_CHARACTERS = 1000
 """Characters that are kept of a longer one: a row that is dropped, and counted."""
+FIRST_NAMED_LINE = 1e6
+"""Number of the first survey line whose label is no number."""
 LOOKED_AT, LINE = 1 << 16, 256
 """Bytes by which the encoding is found, and of the first line, which holds no zero in a text."""
 
@@ -123,10 +127,13 @@ def _chunks(
             GUESSED_ATTRIBUTE: note,
             HISTORY_ATTRIBUTE: "\n".join([*before, f"{path.name} was read with: {note}"]),
         }
+    marks = _LineMarks(header[: layout.first])
     numbered = enumerate(chain(header[layout.first :], further, lines), layout.first + 1 - added)
-    wanted = ((row, line) for row, line in numbered if line.strip() and not is_remark(line))
+    wanted = ((row, line) for row, line in numbered if line.strip() and not marks.passes(row, line))
     while block := list(islice(wanted, rows)):
         time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])
+        if marks.rows and "line" not in columns:
+            columns["line"] = marks.labels(numbers)
         piece = deployment(path, time, columns, layout.column_units, attrs)
         yield with_losses(piece, *table.faults.since_last()), numbers
     table.faults.finish()
@@ -164,6 +171,42 @@ def _lines(file: TextIO) -> Iterator[str]:
         yield line if line.endswith("\n") else f"{line}\n"
 
 
+class _LineMarks:
+    """Lines such as ``LINE 100`` and ``TIE 9000``, which Geosoft writes before the rows of a survey line.
+
+    Attributes
+    ----------
+    rows : list of int
+        Number of each mark's row.
+    """
+
+    def __init__(self, preamble: Sequence[str]) -> None:
+        self.rows: list[int] = []
+        self._labels: list[float] = []
+        self._known: dict[str, float] = {}
+        for line in preamble:
+            self.passes(0, line)
+
+    def passes(self, row: int, line: str) -> bool:
+        """Return True if a line is no row of the table; keep the mark of a survey line."""
+        if not is_remark(line):
+            return False
+        if line[0] not in "#%/":
+            text = " ".join(line.upper().split())
+            number = re.sub(r"^(LINE|TIE)[\s:]*L?", "", text)
+            label = float(number) if re.fullmatch(r"\d+(\.\d*)?|NAN", number) else nan
+            taken = (isnan(label) and number != "NAN") or label in self._known.values()
+            # A label that is no number, or that is another line's as well, is counted from a million.
+            self._known.setdefault(text, FIRST_NAMED_LINE + len(self._known) if taken else label)
+            self.rows.append(row)
+            self._labels.append(self._known[text])
+        return True
+
+    def labels(self, rows: Sequence[int]) -> FloatArray:
+        """Return the label (n,) of the survey line of each row; NaN before the first mark."""
+        return np.append(nan, self._labels)[np.searchsorted(self.rows, rows)]
+
+
 class FileWriter:
     """Write successive deployments with the columns of the first one.
 
@@ -184,9 +227,13 @@ class FileWriter:
             headings = ["time", *(_heading(dataset, str(name)) for name in dataset.data_vars)]
             self.metadata = _metadata(dataset, headings)
             self._csv.writerow(headings)
+        self._csv.writerows(self.texts(dataset))
+
+    def texts(self, dataset: xr.Dataset) -> list[tuple[str, ...]]:
+        """Return the cells of the rows."""
         columns = [_texts("time", dataset["time"].values)]
         columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]
-        self._csv.writerows(zip(*columns, strict=True))
+        return list(zip(*columns, strict=True))
 
     def close(self) -> None:
         """Write everything to the file and close it."""

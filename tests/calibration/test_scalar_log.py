@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +17,14 @@ from scipy.spatial.transform import Rotation
 import magbridge as mb
 from magbridge import logs
 from magbridge.arrays import FloatArray
-from magbridge.calibration.file import decode_calibration, encode_calibration, load
+from magbridge.calibration.file import decode_calibration, encode_calibration, load, save
 from magbridge.calibration.fitting.scalar_fit import fit_scalar
 from magbridge.calibration.model import identity
 from magbridge.calibration.scalar import (
     ScalarQuality,
     ScalarSeries,
     compare_sensors,
+    correct_scalar,
 )
 from magbridge.cli import main
 from magbridge.errors import CalibrationError, FormatError
@@ -141,6 +145,41 @@ def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:
     assert 0.4 < np.sqrt(np.mean((error / corrected["scalar_field_sigma"].to_numpy()) ** 2)) < 1.6
     with pytest.raises(FormatError, match="mag_tail"):
         mb.calibrate(runs, scalar="mag_tail")
+
+
+def test_compiled_c_gives_the_field_of_python(tmp_path: Path) -> None:
+    gcc = shutil.which("gcc") or shutil.which("cc")
+    if gcc is None:
+        pytest.skip("no C compiler is installed")
+    series = half(flown(4), False)
+    sensor = fit_scalar(series, CHANNELS, column=SCALAR, map_known=True).sensor
+    save(replace(identity(), sensors=(sensor,)), tmp_path / "cal.json")
+    assert main(["export", str(tmp_path / "cal.json"), "--c", str(tmp_path)]) == 0
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-shared", "-fPIC"]
+    library = tmp_path / "scalar.so"
+    subprocess.run([gcc, *strict, str(tmp_path / "magbridge_scalar.c"), "-o", library, "-lm"], check=True)
+
+    class Corrected(ctypes.Structure):
+        _fields_ = [(name, ctypes.c_double) for name in ("field", "sigma", "level_sigma")] + [
+            ("extrapolated", ctypes.c_int)
+        ]
+
+    correct_in_c = ctypes.CDLL(str(library)).magbridge_correct_scalar
+    three = ctypes.c_double * 3
+    series = series._replace(reference=np.full(len(series.time), np.nan))
+    expected = correct_scalar(sensor, series)
+    u = series.vector / np.linalg.norm(series.vector, axis=1)[:, None]
+    turn, rate = np.gradient(u, series.time, axis=0), np.gradient(series.scalar, series.time)
+    out = Corrected()
+    for k in range(0, len(series.time), 97):
+        reading = ctypes.c_double(series.scalar[k]), three(*series.vector[k]), three(*turn[k])
+        correct_in_c(*reading, ctypes.c_double(rate[k]), three(*series.channels[k]), 1, ctypes.byref(out))
+        assert out.field == pytest.approx(expected.field[k], abs=1e-6)
+        assert out.sigma == pytest.approx(expected.sigma[k], rel=1e-6)
+        assert bool(out.extrapolated) == expected.extrapolated[k]
+    correct_in_c(*reading, ctypes.c_double(0.0), three(1e3, 0.0, 0.0), 0, ctypes.byref(out))
+    assert out.extrapolated
+    assert out.level_sigma == 30.0
 
 
 def test_the_vector_is_calibrated_by_the_scalar(tmp_path: Path) -> None:

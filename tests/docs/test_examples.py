@@ -128,7 +128,11 @@ def test_the_page_of_a_calibration_has_its_keys(survey_and_runs: Path) -> None:
     assert set(keys) - set(written) <= {"doubts", "level", "sensors"}
 
 
-@pytest.mark.parametrize("block", blocks("python"), ids=str)
+RUN_ELSEWHERE = "docs/scalar.md"
+"""Its commands and code are run in order, on a drone's files, by tests/survey/test_scalar_survey.py."""
+
+
+@pytest.mark.parametrize("block", [b for b in blocks("python") if b.page != RUN_ELSEWHERE], ids=str)
 def test_a_block_of_python_runs(block: Block, survey_and_runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(survey_and_runs)
     exec(compile(block.text, str(block), "exec"), {"__name__": "example"})

@@ -195,3 +195,27 @@ def test_a_count_that_is_none_fits_a_telemetry_log(tmp_path: Path) -> None:
     logs.write(deployment("made", np.arange(4.0), columns), tmp_path / "log.tlog")
     counted = logs.read(tmp_path / "log.tlog")["power_cycle"].to_numpy()
     np.testing.assert_array_equal(counted, [3.0, np.nan, np.nan, np.nan])
+
+
+def test_geosoft_xyz_keeps_its_lines(tmp_path: Path) -> None:
+    row = "-122.0 37.9 2021/03/04 10:00:0{}.00 4850{} {}\n"
+    path, again = tmp_path / "lines.xyz", tmp_path / "again.xyz"
+    path.write_text(
+        "/ LONGITUDE LATITUDE DATE TIME MAG ALT\n/====\nLine 100\n"
+        + "".join(row.format(k, k, 100.0) for k in range(3))
+        + "Tie L9000\n"
+        + "".join(row.format(k, k, "*") for k in range(3, 6))
+        + "LINE A1\n"
+        + row.format(6, 6, 1.0)
+    )
+    log = logs.read(path)
+    assert log["line"].to_numpy().tolist() == [100.0] * 3 + [9000.0] * 3 + [1_000_002.0]
+    assert np.isnan(log["ALT"].to_numpy()).tolist() == [False] * 3 + [True] * 3 + [False]
+    logs.write(log.assign(quality=("time", [1.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0])), again)
+    assert again.read_text().splitlines()[:2] == [
+        "/ time,longitude,latitude,total_field,ALT,quality", "LINE 100"
+    ]  # fmt: skip
+    back = logs.read(again)
+    for name in log.variables:
+        assert np.array_equal(log[name].to_numpy(), back[name].to_numpy(), equal_nan=True), name
+    assert back["quality"].to_numpy().tolist()[:3] == [1.0, 3.0, 0.0]
