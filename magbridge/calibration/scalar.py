@@ -52,6 +52,8 @@ DISAGREEMENT_SIGMA = 4.0
 """Difference of two sensors, in its standard deviations, from which on it is flagged."""
 REFERENCE_SIGMA_NT = 145.0
 """nT, 1-sigma of the main-field model where no map is known (error model of the WMM 2020)."""
+MIN_AGREEING_SAMPLES = 10
+"""Samples at which two sensors agree, from which on these show the crustal field."""
 BLAME_RATIO = 2.0
 """Ratio of two sensors' standardised distances from the reference, beyond which the farther one is blamed."""
 
@@ -174,17 +176,25 @@ def scalar_design(
     """Return the columns (n, 19 + 3k) of the model, without levels; `reference_field` is F_0, nT."""
     length = np.sqrt(np.einsum("ni,ni->n", series.vector, series.vector))
     u = series.vector / length[:, None]
-    turn = np.gradient(u, series.time, axis=0)  # du/dt, 1/s
+    turn = _rate(u, series.time)  # du/dt, 1/s
     ratio = length / reference_field
     columns = [*u.T]
     columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in INDUCED_PAIRS]
     columns += [u[:, i] * turn[:, j] for i in range(3) for j in range(3)]
     smooth = np.where(np.isfinite(series.reference), series.reference, series.scalar)
-    columns.append(np.gradient(smooth, series.time))
+    columns.append(_rate(smooth, series.time))
     for channel, values in zip(channels, series.channels.T, strict=True):
         z = (values - channel.centre) / channel.scale
         columns += [z * u[:, i] for i in range(3)]
     return np.stack(columns, axis=1)
+
+
+def _rate(values: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the derivative by time, (n,) or (n, 3); samples of one time have one derivative."""
+    moments, first, same = np.unique(time, return_index=True, return_inverse=True)
+    if len(moments) < 2:
+        return np.zeros_like(values)
+    return np.asarray(np.gradient(values[first], moments, axis=0)[same])
 
 
 def term_columns(channels: tuple[ScalarChannel, ...]) -> dict[str, slice]:
@@ -292,25 +302,45 @@ def compare_sensors(
     Notes
     -----
     With ``w`` the difference, ``max(0, w^2 - s1^2 - s2^2)`` is its variance that neither sigma explains. It
-    is added to the sensor that is the farther from the reference, in standard deviations that include the
-    reference's own; to both where that does not distinguish them.
+    is added to the sensor that is the farther from the expected field, in standard deviations that include
+    the expectation's own; to both where that does not distinguish them. The expected field is the reference
+    plus what both sensors read of the crust before and after, where they agree: a disturbance that cancels a
+    crustal anomaly is thus not taken for the truth.
     """
     with np.errstate(invalid="ignore"):
         difference = scalar - total
         expected = scalar_sigma**2 + total_sigma**2
         excess = np.nan_to_num(np.maximum(difference**2 - expected, 0.0), posinf=0.0)
-        off_scalar = np.abs(scalar - reference) / np.hypot(scalar_sigma, REFERENCE_SIGMA_NT)
-        off_total = np.abs(total - reference) / np.hypot(total_sigma, REFERENCE_SIGMA_NT)
-        # Both comparisons are False where the reference is unknown.
+        disagrees = difference**2 > DISAGREEMENT_SIGMA**2 * expected
+        field, sigma = _expected_field(0.5 * (scalar + total), reference, disagrees)
+        off_scalar = np.abs(scalar - field) / np.hypot(scalar_sigma, sigma)
+        off_total = np.abs(total - field) / np.hypot(total_sigma, sigma)
+        # Both comparisons are False where the expected field is unknown.
         spares_scalar = off_total > BLAME_RATIO * off_scalar
         spares_vector = off_scalar > BLAME_RATIO * off_total
-        disagrees = difference**2 > DISAGREEMENT_SIGMA**2 * expected
     return Witness(
         np.where(spares_scalar, 0.0, excess),
         np.where(spares_vector, 0.0, excess),
         np.asarray(disagrees),
         _jumps(scalar) & ~_jumps(total),
     )
+
+
+def _expected_field(
+    mean: FloatArray, reference: FloatArray, disagrees: BoolArray
+) -> tuple[FloatArray, float]:
+    """Return what both sensors should read (n,), nT, and its 1-sigma, nT.
+
+    `mean` (n,) is that of both sensors; where they agree, it minus the reference is the crustal field.
+    """
+    rows = np.flatnonzero(np.isfinite(mean) & ~disagrees)
+    base = reference if np.isfinite(reference).any() else np.zeros(len(mean))
+    rows = rows[np.isfinite(base[rows])]
+    if len(rows) < MIN_AGREEING_SAMPLES:
+        return reference, REFERENCE_SIGMA_NT
+    crust = (mean - base)[rows]
+    sigma = 1.4826 * float(np.median(np.abs(crust - np.median(crust))))
+    return base + np.interp(np.arange(len(mean)), rows, crust), min(sigma, REFERENCE_SIGMA_NT)
 
 
 def _jumps(values: FloatArray) -> BoolArray:

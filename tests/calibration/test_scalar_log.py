@@ -82,7 +82,41 @@ def test_a_disturbance_that_no_channel_shows_is_seen_by_the_vector() -> None:
     assert seen.jump[100]
     assert seen.jump[160]
     unknown = compare_sensors(scalar, np.full(n, 0.5), total, np.full(n, 5.0), np.full(n, np.nan))
-    assert (unknown.vector_variance[100:160] > 0.0).all()
+    assert (unknown.vector_variance[100:160] == 0.0).all()  # so do the samples before and after
+    first = slice(100, 160)
+    alone = compare_sensors(
+        scalar[first], np.full(60, 0.5), total[first], np.full(60, 5.0), np.full(60, np.nan)
+    )
+    assert (alone.vector_variance > 0.0).all()
+    assert (alone.scalar_variance > 0.0).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_disturbance_that_cancels_the_crust_is_not_taken_for_the_truth() -> None:
+    """Over an anomaly of 300 nT the disturbed sensor reads the main field, the other one does not."""
+    n = 400
+    random = np.random.default_rng(5)
+    crust = 300.0 + 20.0 * np.sin(np.arange(n) / 30.0)
+    scalar = 53_000.0 + crust + random.normal(0, 0.5, n)
+    total = 53_000.0 + crust + random.normal(0, 5.0, n)
+    main, one, five = np.full(n, 53_000.0), np.full(n, 0.5), np.full(n, 5.0)
+    disturbed = np.where((np.arange(n) >= 100) & (np.arange(n) < 160), -300.0, 0.0)
+    seen = compare_sensors(scalar + disturbed, one, total, five, main)
+    assert (seen.vector_variance[100:160] == 0.0).all()
+    assert (seen.scalar_variance[100:160] > 0.0).all()
+    seen = compare_sensors(scalar, one, total + disturbed, five, main)
+    assert (seen.scalar_variance[100:160] == 0.0).all()
+    assert (seen.vector_variance[100:160] > 0.0).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_samples_of_one_time_are_fitted_and_corrected() -> None:
+    series = half(flown(8), False)
+    pairs = np.repeat(np.arange(len(series.time)), 1 + (np.arange(len(series.time)) % 7 == 0))
+    twice = ScalarSeries(*(column[pairs] for column in series))
+    found = fit_scalar(twice, CHANNELS, map_known=True)
+    error = correct_scalar(found.sensor, twice).field - twice.reference
+    assert np.sqrt(np.mean(error**2)) < 1.0
 
 
 def test_the_file_holds_the_sensor_and_refuses_numbers_that_do_not_belong_together() -> None:

@@ -246,7 +246,8 @@ class _ScalarProblem:
         lag: float | None,
     ) -> _ScalarProblem:
         """Average to the fit's interval and form the columns."""
-        step = float(np.median(np.diff(series.time)))
+        gaps = np.diff(series.time)
+        step = float(np.median(gaps[gaps > 0.0])) if (gaps > 0.0).any() else FIT_INTERVAL_S
         many = max(1, int(FIT_INTERVAL_S / step + 1e-6))
         design = scalar_design(series, channels, reference_field)
         target = series.scalar - series.reference
