@@ -12,7 +12,7 @@ from magbridge.calibration.scalar import CYCLE_LEVEL_SIGMA_NT, RANGE_MARGIN, Sca
 
 __all__ = ["scalar_header", "scalar_source"]
 
-HEADER = Template("""/* Made by magbridge export: compensation of the scalar magnetometer $column.
+SCALAR_HEADER = Template("""/* Made by magbridge export: compensation of the scalar magnetometer $column.
  * Do not edit.
  *
  * Compile with -DMAGBRIDGE_FLOAT for float; otherwise double. No allocation, no state.
@@ -44,7 +44,7 @@ void magbridge_correct_scalar(magbridge_scalar_real reading, const magbridge_sca
 #endif
 """)
 
-SOURCE = Template("""/* Made by magbridge export: do not edit. */
+SCALAR_SOURCE = Template("""/* Made by magbridge export: do not edit. */
 #include "magbridge_scalar.h"
 
 #include <math.h>
@@ -109,7 +109,7 @@ def scalar_header(sensor: ScalarSensor) -> str:
         for k, one in enumerate(sensor.channels)
     ]
     column = sensor.column.replace("*/", "")
-    return HEADER.substitute(column=column, count=len(sensor.channels), names="\n".join(lines))
+    return SCALAR_HEADER.substitute(column=column, count=len(sensor.channels), names="\n".join(lines))
 
 
 def scalar_source(sensor: ScalarSensor) -> str:
@@ -130,7 +130,7 @@ def scalar_source(sensor: ScalarSensor) -> str:
         rows("real", "channel[][4]", channel),
         rows("real", "covariance[TERMS + 1][TERMS + 1]", covariance),
     ]
-    return SOURCE.substitute(
+    return SCALAR_SOURCE.substitute(
         terms=size,
         tables="\n".join(tables),
         noise=hexadecimal(sensor.noise.white**2 + sensor.slow_variance),

@@ -116,7 +116,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     directions_from: str
     """Vector sensor whose corrected field gives the directions u."""
     reference_field: float
-    """nT, F_0."""
+    """Field F_0 that scales the induced terms, nT."""
     channels: tuple[ScalarChannel, ...]
     coefficients: tuple[float, ...]
     """Permanent (nT), induced xx yy zz xy xz yz (nT), eddy (nT s, row by row), lag (s), three for each

@@ -56,7 +56,7 @@ MAX_LINE_CHARACTERS = 1 << 20
 MAX_QUOTED_CHARACTERS = 1000
 """Characters that are kept of a longer one: a row that is dropped, and counted."""
 FIRST_NAMED_LINE = 1e6
-"""Number of the first survey line whose label is no number."""
+"""Number of the first survey line with a label that is not a number."""
 LOOKED_AT, LINE = 1 << 16, 256
 """Bytes by which the encoding is found, and of the first line, which holds no zero in a text."""
 
@@ -188,7 +188,7 @@ class _LineMarks:
             self.passes(0, line)
 
     def passes(self, row: int, line: str) -> bool:
-        """Return True if a line is no row of the table; keep the mark of a survey line."""
+        """Return True if a line is not a row of the table; keep the mark of a survey line."""
         if not is_remark(line):
             return False
         if line[0] not in "#%/":
@@ -196,7 +196,7 @@ class _LineMarks:
             number = re.sub(r"^(LINE|TIE)[\s:]*L?", "", text)
             label = float(number) if re.fullmatch(r"\d+(\.\d*)?|NAN", number) else nan
             taken = (isnan(label) and number != "NAN") or label in self._known.values()
-            # A label that is no number, or that is another line's as well, is counted from a million.
+            # A label that is not a number, or that another line has, is counted from a million.
             self._known.setdefault(text, FIRST_NAMED_LINE + len(self._known) if taken else label)
             self.rows.append(row)
             self._labels.append(self._known[text])

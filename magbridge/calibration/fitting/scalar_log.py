@@ -137,7 +137,7 @@ def calibrate_scalar(
 
 
 def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
-    """Return a scalar magnetometer's reading (n,), nT; DataError: the column is no total field in nT."""
+    """Return a scalar magnetometer's reading (n,), nT; DataError: the column is not a total field in nT."""
     reading = ds[column].to_numpy().astype(float)
     usual = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
     if not 1e4 < usual < 1e5:
