@@ -111,7 +111,7 @@ class TrendCheck:
         self._sigma = 0.0
         self._log_q = log(MIN_INTENSITY)
         self._min_log_q = log(MIN_INTENSITY)
-        self._has_speed = False
+        self._has_speed = self._is_start_unsure = False
         self._slope_variance = SLOPE_NT_PER_S**2
         self._before = nan  # level before a sample that only time or a motion made acceptable
         self._accepted = 0
@@ -259,8 +259,8 @@ class TrendCheck:
             self._checkpoints.pop()
         if self._checkpoints and self._now is not None and self._now.time_us > since_us:
             self._now = self._checkpoints[-1]
-        elif self._now is not None and self._accepted < AGREEING and not self._now.jumps:
-            self._now = None  # the motion had begun before the first sample: it tells no level
+        elif self._now is not None and self._accepted < AGREEING and since_us < self._now.time_us:
+            self._is_start_unsure = True
         self._agreed, self._unrest, self._quiet = 0, 0.0, BURST_SAMPLES
         self.has_moved = True
 
@@ -285,6 +285,10 @@ class TrendCheck:
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
+        if self._is_start_unsure:
+            # either the mass is wrong, or its motion spoiled the first sample: sigma remembers it for an hour
+            self._is_start_unsure, total = False, 0.0
+            until_us = time_us + MAX_HOLD_US
         # jumps at motions come with every motion, so that they are remembered for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
