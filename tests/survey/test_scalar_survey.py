@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
+from pages import blocks, commands
+from scipy.spatial.transform import Rotation
 
 import magbridge as mb
 from magbridge import logs
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.field.geodesy import offset
 from magbridge.field.igrf import igrf, magnitude
+from magbridge.field.read import read_grid
+from magbridge.field.reference import main_field
 from magbridge.survey.run import Result
 
 ORIGIN = 49.5, -57.9
@@ -40,25 +44,25 @@ def rock(random: np.random.Generator, depth: float) -> tuple[FloatArray, FloatAr
     return np.stack([wave * np.cos(angle), wave * np.sin(angle)], axis=1), random.uniform(0, 2 * np.pi, 400)
 
 
-def grid(seed: int = 1, depth: float = 150.0) -> Grid:
+def grid(seed: int = 1, depth: float = 150.0, side: float = SIDE_M) -> Grid:
     """Return lines 100 m and ties 500 m from each other, flown to and fro, with a level for each line."""
     random = np.random.default_rng(seed)
     waves, phases = rock(random, depth)
-    along = np.arange(0.0, SIDE_M, SPEED_M_S / RATE_HZ)
+    along = np.arange(0.0, side, SPEED_M_S / RATE_HZ)
     place, heading, line, time = [], [], [], []
-    starts = [(across, 0.0) for across in np.arange(0.0, SIDE_M + 1, 100.0)]
-    starts += [(across, 90.0) for across in np.arange(0.0, SIDE_M + 1, 500.0)]
+    starts = [(across, 0.0) for across in np.arange(0.0, side + 1, 100.0)]
+    starts += [(across, 90.0) for across in np.arange(0.0, side + 1, 500.0)]
     clock = 1.6e9
     for number, (across, course) in enumerate(starts):
         back = number % 2 == 1
-        way = (SIDE_M - along) if back else along
+        way = (side - along) if back else along
         aside = across + 3.0 * np.sin(along / 200.0 + number)
         place.append(np.stack([way, aside] if course == 0.0 else [aside, way], axis=1))
         crab = 4.0 * np.sin(1.7 * number)
         heading.append(np.full(len(along), course + 180.0 * back + crab))
         line.append(np.full(len(along), number))
         time.append(clock + along / SPEED_M_S)
-        clock += SIDE_M / SPEED_M_S + 30.0
+        clock += side / SPEED_M_S + 30.0
     psi = np.radians(np.concatenate(heading))
     velocity = np.concatenate([np.gradient(part, axis=0) * RATE_HZ for part in place])
     position, label = np.concatenate(place), np.concatenate(line)
@@ -123,3 +127,76 @@ def test_command_with_a_known_shift(flown: Grid, tmp_path: Path, command: Comman
     assert "no_such" in command.refuses("survey", log, "--scalar", "no_such", "-o", out)
     assert "--save" in command.refuses(*given, "--save", tmp_path / "cal.json", code=2)
     assert "--scalar COLUMN" in command.refuses("survey", log, "--lag", "0.3", "-o", out, code=2)
+
+
+def with_fluxgate(log: xr.Dataset, seed: int) -> xr.Dataset:
+    """Return a log with roll, pitch, fluxgate and motor current, whose iron the scalar reads."""
+    random = np.random.default_rng(seed)
+    n, time = log.sizes["time"], log["time"].to_numpy()
+    if "roll" not in log:
+        log = log.assign(roll=("time", 3.0 * np.sin(time / 3.1)), pitch=("time", 2.0 * np.sin(time / 4.3)))
+    angles = np.stack([log[name].to_numpy() for name in ("heading", "pitch", "roll")], axis=1)
+    north_east_down = main_field(log)
+    turned = Rotation.from_euler("ZYX", angles, degrees=True).inv().apply(north_east_down)
+    total = magnitude(north_east_down)
+    u = turned / total[:, None]
+    current = 5.0 + 3.0 * np.sin(time / 11.0) + random.normal(0.0, 0.3, n)
+    iron = u @ np.array([20.0, -12.0, 30.0]) + (current - 5.0) * (u @ np.array([2.0, -1.0, 1.5]))
+    vector = turned + random.normal(0.0, 1.0, (n, 3))
+    columns = {f"mag_{axis}": ("time", vector[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")}
+    columns["motor_current"] = ("time", current, {"units": "A"})
+    return log.assign(columns | {SENSOR: log[SENSOR] + iron})
+
+
+def box(start: float, minutes: float = 16.0) -> xr.Dataset:
+    """Return rolls, pitches and yaws on four headings, high above the rock: the main field alone."""
+    time = start + np.arange(0.0, 60.0 * minutes, 1.0 / RATE_HZ)
+    leg, swing = (time - start) % 60.0, np.sin(2.0 * np.pi * (time - start) / 5.0)
+    heading = 90.0 * ((time - start) // 60.0)
+    heading += np.where((leg > 40) & (leg < 55), 5.0 * swing, 0.0)
+    zero = np.zeros(len(time))
+    columns = {
+        "latitude": (zero + ORIGIN[0] - 0.003, "deg"),
+        "longitude": (zero + ORIGIN[1], "deg"),
+        "depth": (zero - 500.0, "m"),
+        "heading": (heading % 360.0, "deg"),
+        "roll": (np.where((leg > 5) & (leg < 20), 10.0 * swing, 0.3 * swing), "deg"),
+        "pitch": (np.where((leg > 22) & (leg < 37), 5.0 * swing, 0.0), "deg"),
+        "line": (zero + 900.0, "1"),
+    }
+    log = xr.Dataset(
+        {name: ("time", values, {"units": units}) for name, (values, units) in columns.items()},
+        coords={"time": time},
+        attrs={"source": "box", "heading_reference": "true"},
+    )
+    noise = np.random.default_rng(int(start) % 1000).normal(0.0, NOISE_NT, len(time))
+    return log.assign({SENSOR: ("time", magnitude(main_field(log)) + noise, {"units": "nT"})})
+
+
+def test_the_page_runs_from_the_files_to_the_map(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The survey has a box, a fluxgate, telemetry, and a calibration with this sensor."""
+    flown = grid(seed=4, side=500.0)
+    monkeypatch.chdir(tmp_path)
+    logs.write(with_fluxgate(box(1.6e9 - 5_000.0), 1), Path("box.csv"))
+    second = with_fluxgate(box(1.6e9 - 2_000.0, 8.0), 2)
+    lines = with_fluxgate(flown.log, 3)
+    logs.write(xr.concat([second, lines], "time", join="outer"), Path("survey.csv"))
+    for block in blocks("sh"):
+        for words in commands(block) if block.page == "docs/scalar.md" else ():
+            command(*words[1:])
+    assert len(Path("crossings.csv").read_text().splitlines()) > 6
+    page = [block for block in blocks("python") if block.page == "docs/scalar.md"]
+    scope: dict[str, Any] = {"__name__": "example"}
+    for block in page:
+        exec(compile(block.text, str(block), "exec"), scope)
+    found: Result = scope["found"]
+    assert found.scalar is not None
+    assert {"permanent", "motor_current"} <= set(found.scalar.facts()["contribution_nT"])
+    merit = found.scalar.facts()["figure_of_merit"]
+    assert merit["after_nT"] < 0.5 * merit["before_nT"]
+    lines_only = found.samples.time >= flown.log["time"].to_numpy()[0]
+    error = (found.samples.value - found.gridded.levels)[lines_only] - flown.truth
+    assert np.std(error) < 0.3
+    assert np.isfinite(read_grid(Path("map.nc")).anomaly).any()
