@@ -199,6 +199,7 @@ class _JointFit:
         self.directions = np.stack([-rows.velocity, forward, starboard])
         self.chosen = _fitted_rows(rows.samples, FITTED_SAMPLES)
         few = _fitted_rows(rows.samples, SCANNED_SAMPLES)
+        # The likelihood has several maxima along the shift: a field first, then a scan, then Gauss-Newton.
         choice = self._search(few)
         choice = self._scan(few, choice)
         nodes = nodes_for(
@@ -255,6 +256,7 @@ class _JointFit:
         component = int(self.free[0])  # lag, else forward lever arm
         reach = SCANNED_LAG_S if component == 0 else SCANNED_LEVER_M
         metres = reach * (self.speed if component == 0 else 1.0)
+        # A step is a fraction of the crustal length: the likelihood changes within it.
         steps = int(
             np.clip(2.0 * metres / (SCAN_STEP_LENGTHS * choice.field.length), MIN_SCAN_STEPS, MAX_SCAN_STEPS)
         )
@@ -282,6 +284,7 @@ class _JointFit:
             length = field.length * ((field.alpha - 1) / (SMOOTH - 1)) ** BENDS
             field = replace(field, alpha=SMOOTH, length=length)
         nodes = nodes_for(problem.samples.place, field.length, field.alpha, FITTED_NODES, FINER_NODES)
+        # Finer nodes resolve what the scan left to the noise.
         field = replace(field, nodes=nodes)
         weighed, sums = self._weighed(blocks, field.length), problem.sums(field, every)
         start = replace(choice, field=field)
@@ -298,6 +301,7 @@ class _JointFit:
         effects = sum(len(block.shape) for block in blocks if _is_effect(block))
         slopes: FloatArray | None = None
         for _ in range(GAUSS_NEWTON_STEPS + 1):
+            # Linearise about the shift so far: y = levels + heading error + terms + field + slopes * step.
             joint = blocks
             if slopes is not None and len(self.free):
                 joint = (*blocks, ParameterBlock("shift", slopes, self.prior_sigma, 1.0))
@@ -317,6 +321,7 @@ class _JointFit:
             z = np.asarray(
                 np.linalg.solve(precision, reduced.quadratic.vector / widths.sigma**2 + prior @ mean), float
             )
+            # Back-substitution: the field given the dense unknowns.
             w = reduced.field(z)
             if moved:
                 self.shift[self.free] += z[-moved:]

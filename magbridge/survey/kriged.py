@@ -87,12 +87,14 @@ class Kriged:
         wide, own, k = float(self.value.var()), self.share[lines] ** 2, np.arange(neighbours.shape[1])
         among = self._covariance(x[:, :, None] - x[:, None]) * there[:, :, None] * there[:, None]
         among = among * (1.0 + own[:, :, None] * (lines[:, :, None] == lines[:, None])) + wide
+        # C + s^2 1 among the neighbours, c from them to the place: value c^T (C + s^2 1)^-1 y.
         among[:, k, k] += self.noise**2
         to = self._covariance(place[:, None] - x) * here[:, None] * there
         variance = (self.size * here) ** 2
         if line is not None:
             to = to * (1.0 + own * (line[:, None] == lines))
             variance = variance * (1.0 + self.share[line] ** 2)
+        # Simple kriging about the neighbours' mean, with its variance `wide` added to every covariance.
         mean = self.value[neighbours].mean(axis=1)
         off = self.value[neighbours] - mean[:, None]
         solved = np.linalg.solve(among, np.stack([off, to + wide], axis=2))
@@ -135,6 +137,7 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
     rng = np.random.default_rng(0)
     rank, some = rng.permutation(len(start.value)), rng.choice(len(start.value), CHOOSING)
     near = start.tree.query(start.place[some], AMONG)[1]
+    # Vecchia: each sample given the nearest of those before it in a random order.
     near, whole = _first(near, rank[near] < rank[some, None])
     some = some[whole]
     first = np.log([start.below, start.size, start.noise])
@@ -148,6 +151,7 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
         mean, variance = one.given(one.place[some], near, one.line[some]).T
         return -_likelihood(one.value[some] - mean, variance + one.noise**2)
 
+    # Nelder-Mead over the logs of depth, size and noise.
     simplex = first + 0.5 * np.vstack([np.zeros(3), np.eye(3)])
     found = minimize(
         downhill,

@@ -172,6 +172,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     many = sum(one.modes.shape[1] for one in parts)
     modes = np.zeros((sum(len(one.value) for one in parts), many))
     row = column = 0
+    # Block diagonal: the uncertain combinations of one log do not touch another log.
     for one in parts:
         n, r = one.modes.shape
         modes[row : row + n, column : column + r] = one.modes
@@ -226,6 +227,7 @@ def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, ti
         shifted = replace(calibration, coefficients=calibration.coefficients + step)
         return np.nan_to_num(total(shifted, rows) - unmoved)
 
+    # Directions of the coefficients' covariance, scaled to 1-sigma; the largest effects are kept by SVD.
     values, vectors = np.linalg.eigh(calibration.covariance)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))
     few = slice(None, None, max(len(field) // THINNED, 1))

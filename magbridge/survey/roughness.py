@@ -49,6 +49,7 @@ class Roughness:
         place = samples.place
         low, extent = place.min(axis=0), np.ptp(place, axis=0)
         cell = max(float(extent.max()) / MAX_CELLS_PER_SIDE, REACH * length / 4.0)
+        # Second differences are free of levels and slow changes; their mean square follows the roughness.
         bent = _bends(samples, LAG * length)
         known = np.isfinite(bent)
         if known.sum() < 50:
@@ -61,6 +62,7 @@ class Roughness:
         power, count = (
             gaussian_filter(one, REACH * length / cell, mode="constant") for one in (power, count)
         )
+        # Shrink cells with few samples to the typical power.
         typical2 = float(np.median((power / np.maximum(count, 1e-12))[count > PRIOR * count.mean()]))
         few = PRIOR * count.mean()
         scale = np.sqrt((power + few * typical2) / ((count + few) * max(typical2, 1e-12)))
@@ -73,6 +75,7 @@ class Roughness:
         u = (place - self.low) / self.cell - 0.5
         i = np.clip(np.floor(u).astype(int), 0, np.array(self.scale.shape) - 2)
         t = np.clip(u - i, 0.0, 1.0)
+        # Bilinear interpolation between the centres of the cells.
         a = self.scale[i[:, 0], i[:, 1]] * (1 - t[:, 1]) + self.scale[i[:, 0], i[:, 1] + 1] * t[:, 1]
         b = self.scale[i[:, 0] + 1, i[:, 1]] * (1 - t[:, 1]) + self.scale[i[:, 0] + 1, i[:, 1] + 1] * t[:, 1]
         return np.asarray(a * (1 - t[:, 0]) + b * t[:, 0])

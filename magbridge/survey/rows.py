@@ -55,6 +55,7 @@ class Rows:
         follows = np.zeros(len(rows), bool)
         follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
         for start in range(0, len(rows), BLOCK_ROWS):
+            # One row of overlap: the noise is correlated with that of the row before.
             first = max(start - 1, 0)
             mine = rows[first : start + BLOCK_ROWS]
             weight = -1.0 / s.weight[mine]

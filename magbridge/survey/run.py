@@ -195,6 +195,7 @@ def _gridded(samples: Samples, start: Choice | None) -> Gridded:
     at = at[samples.line[at] == samples.line[at + 1]]
     if not len(at):
         return gridded(samples, start=start)
+    # Each stretch between jumps is a line of its own, without a time.
     first = np.diff(samples.line, prepend=samples.line[0]) != 0
     first[at + 1] = True
     apart = replace(samples, time=np.full(len(samples.time), np.nan), line=np.cumsum(first))
@@ -212,6 +213,7 @@ def _misplaced(samples: Samples, line_ends: IndexArray, found: Gridded) -> Float
     stretch, steps = samples.line, samples.place[line_ends + 1] - samples.place[line_ends]
     here, drawn = field.basis(samples.place), []
     for w in found.posteriors[0].draw(rng, DRAWN_TRACKS).T:
+        # Draw which side of each jump is wrong, and by how much, and evaluate the field there.
         off = np.zeros((stretch[-1] + 1, 2))
         for side in (line_ends, line_ends + 1):
             np.add.at(off, stretch[side], rng.normal(size=(len(line_ends), 1)) * steps / 2.0**0.5)

@@ -156,6 +156,7 @@ def _log_rows(
         require(log, CHANNELS)
         corrected = correct_rows(Correction(calibration), log)
         log = log.sel(time=corrected["time"]) if log.sizes["time"] != corrected.sizes["time"] else log
+        # The calibration removes the platform; its uncertain combinations are fitted with the survey.
         found = compensate(corrected, log, sensor)
         value, compensated = found.field, found.contribution
         terms: tuple[AlignmentTerm, ...] = (AlignmentTerm(COMPENSATION, found.modes),)
@@ -165,6 +166,7 @@ def _log_rows(
     expected = magnitude(main_field(log))
     if "daily_variation" in log:
         expected = expected + log["daily_variation"].to_numpy()
+    # Anomalies: minus the main field and the daily variation.
     raw, value = scalar_reading(log, column) - expected, value - expected
     place, depth, origin = _places(log)
     known = np.isfinite(value) & np.isfinite(place).all(axis=1) & placed(log)
@@ -180,6 +182,7 @@ def _log_rows(
         own = np.radians(log["heading"].to_numpy().astype(float))
         heading = np.where(np.isfinite(own), own, heading)
     boxes = _boxes(log, time, heading, raw, value, terms)
+    # A box flight tests the compensation, so that it is not fitted.
     for box_rows in boxes:
         known &= ~box_rows.box.rows(len(known))
     line, tie = _lines(log)
@@ -199,6 +202,7 @@ def _velocity(time: FloatArray, place: FloatArray) -> FloatArray:
     """Return the velocity north and east (n, 2), m/s, over some seconds, never across a gap of the log."""
     interval = max(float(np.median(np.diff(time))), 1e-3)
     half = max(1, round(0.5 * SPEED_SMOOTHING_S / interval))
+    # Central difference over the smoothing time, cut at the ends of a stretch without gaps.
     stretch = np.cumsum(np.diff(time, prepend=time[0]) > MAX_SPEED_GAP_INTERVALS * interval)
     first, last = np.searchsorted(stretch, stretch), np.searchsorted(stretch, stretch, "right") - 1
     rows = np.arange(len(time))
@@ -246,6 +250,7 @@ def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[AlignmentTerm
             raise FormatError(log.attrs.get("source", "the log"), "expected numbers, got none", column=name)
         low, middle, high = np.nanquantile(values, [0.02, 0.5, 0.98]).tolist()
         z = (values - middle) / max(high - low, 1e-12)
+        # A channel's field turns with the vehicle: its value, and times cosine and sine of the heading.
         columns = [z]
         if "heading" in log:
             angle = np.radians(log["heading"].to_numpy().astype(float))
