@@ -5,12 +5,14 @@
 Each reader has a process of its own, its start and its imports included; Slocum's segments are read together.
 Printed are processor seconds (of all processes; the least of several runs), their ratio, and the largest
 memory. A peer reads the same as far as its options allow: pymavlink and rosbags are asked for the messages
-that magbridge reads, pyulog for its topics, dbdreader for its sensors; xarray loads all.
+that magbridge reads, pyulog for its topics, dbdreader for its sensors; xarray loads all. A peer's process
+does not import magbridge: this one gives it the names.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import resource
 import subprocess
@@ -18,24 +20,22 @@ import sys
 from collections.abc import Callable
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.table import Table
-
-from magbridge.logs.registry import FORMATS, Format, format_of
+if TYPE_CHECKING:
+    from magbridge.logs.registry import Format
 
 OURS = "magbridge"
 
 
-def ours(paths: list[Path]) -> None:
+def ours(paths: list[Path], wanted: Any) -> None:  # noqa: ARG001 - it knows what it reads
     """Read as ``magbridge convert`` does."""
     from magbridge.logs import read_each  # noqa: PLC0415 - its imports are part of what is measured
 
     read_each(paths)
 
 
-def by_xarray(paths: list[Path]) -> None:
+def by_xarray(paths: list[Path], wanted: Any) -> None:  # noqa: ARG001 - it has no such option
     """Load every variable."""
     import xarray as xr  # noqa: PLC0415
 
@@ -43,58 +43,59 @@ def by_xarray(paths: list[Path]) -> None:
         xr.open_dataset(path, decode_times=False).load()
 
 
-def by_pymavlink(paths: list[Path]) -> None:
+def by_pymavlink(paths: list[Path], wanted: Any) -> None:
     """Read the kinds of messages that magbridge reads."""
     from pymavlink import mavutil  # noqa: PLC0415
 
-    from magbridge.logs.ardupilot import WANTED  # noqa: PLC0415
-    from magbridge.logs.telemetry_fields import MAVLINK_FIELDS  # noqa: PLC0415
-
     for path in paths:
         connection: Any = mavutil.mavlink_connection(str(path))
-        kinds = (
-            [*WANTED] if format_of(path) is FORMATS["ardupilot"] else [*MAVLINK_FIELDS, "NAMED_VALUE_FLOAT"]
-        )
-        while connection.recv_match(type=kinds) is not None:
+        while connection.recv_match(type=wanted) is not None:
             pass
 
 
-def by_pyulog(paths: list[Path]) -> None:
+def by_pyulog(paths: list[Path], wanted: Any) -> None:
     """Read the topics that magbridge reads."""
     from pyulog import ULog  # noqa: PLC0415
 
-    from magbridge.logs.px4 import NEEDED_FIELDS, PX4_FIELDS  # noqa: PLC0415
-
     for path in paths:
-        ULog(str(path), [*PX4_FIELDS, *NEEDED_FIELDS])
+        ULog(str(path), wanted)
 
 
-def by_rosbags(paths: list[Path]) -> None:
+def by_rosbags(paths: list[Path], wanted: Any) -> None:
     """Read and decode the types of messages that magbridge reads."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415
 
-    from magbridge.logs.rosbag import MESSAGE_KINDS  # noqa: PLC0415
-
     for path in paths:
         with AnyReader([path]) as bag:
-            wanted = [one for one in bag.connections if one.msgtype.replace("/msg/", "/") in MESSAGE_KINDS]
-            for connection, _, data in bag.messages(connections=wanted):
+            chosen = [one for one in bag.connections if one.msgtype.replace("/msg/", "/") in wanted]
+            for connection, _, data in bag.messages(connections=chosen):
                 bag.deserialize(data, connection.msgtype)
 
 
-def by_dbdreader(paths: list[Path]) -> None:
+def by_dbdreader(paths: list[Path], wanted: Any) -> None:
     """Read the sensors that magbridge reads, of flight and science files."""
     import dbdreader  # noqa: PLC0415
 
-    from magbridge.logs.slocum import SCIENCE, SENSORS  # noqa: PLC0415
-
-    partners = [path.with_suffix(SCIENCE[path.suffix]) for path in paths if path.suffix in SCIENCE]
+    partners = [path.with_suffix(wanted[0][path.suffix]) for path in paths if path.suffix in wanted[0]]
     for path in [*paths, *partners]:
         file = dbdreader.DBD(str(path), cacheDir=str(path.parent))
-        file.get(file.timeVariable, *(name for name in SENSORS if name in file.parameterNames))
+        file.get(file.timeVariable, *(name for name in wanted[1] if name in file.parameterNames))
 
 
-PEERS: dict[str, Callable[[list[Path]], None]] = {
+def wanted_by(name: str) -> Any:
+    """Return what magbridge reads of a format, in the terms of the peer."""
+    from magbridge.logs import ardupilot, px4, rosbag, slocum, telemetry_fields  # noqa: PLC0415
+
+    return {
+        "ardupilot": [*ardupilot.WANTED],
+        "telemetry": [*telemetry_fields.MAVLINK_FIELDS, "NAMED_VALUE_FLOAT"],
+        "px4": [*px4.PX4_FIELDS, *px4.NEEDED_FIELDS],
+        "ros": [*rosbag.MESSAGE_KINDS],
+        "slocum": [slocum.SCIENCE, [*slocum.SENSORS]],
+    }.get(name)
+
+
+PEERS: dict[str, Callable[[list[Path], Any], None]] = {
     "netcdf": by_xarray,
     "ardupilot": by_pymavlink,
     "telemetry": by_pymavlink,
@@ -109,12 +110,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--times", type=int, default=3)
     parser.add_argument("--reader", default="", help=argparse.SUPPRESS)
+    parser.add_argument("--wanted", default="null", help=argparse.SUPPRESS)
     parser.add_argument("logs", nargs="+", type=Path)
     chosen = parser.parse_args()
     if chosen.reader:
-        ({OURS: ours} | PEERS)[chosen.reader](chosen.logs)
+        ({OURS: ours} | PEERS)[chosen.reader](chosen.logs, json.loads(chosen.wanted))
         print(*_used())
         return
+    from rich.console import Console  # noqa: PLC0415 - not in the processes that are timed
+    from rich.table import Table  # noqa: PLC0415
+
     table = Table("log", "MB", "magbridge, s", "peer, s", "", "ratio", "memory, MB")
     for name, paths in _groups(chosen.logs):
         size = sum(one.stat().st_size for path in paths for one in _files(path))
@@ -128,6 +133,8 @@ def main() -> None:
 
 def _groups(logs: list[Path]) -> list[tuple[str, list[Path]]]:
     """Return the logs by format: each alone, but segments together."""
+    from magbridge.logs.registry import FORMATS, format_of  # noqa: PLC0415
+
     names = {id(form): name for name, form in FORMATS.items()}
 
     def of(form: Format) -> str:
@@ -144,7 +151,8 @@ def _files(path: Path) -> list[Path]:
 
 def _timed(reader: str, paths: list[Path], times: int) -> tuple[float, float]:
     """Return the least processor time (s) and the memory (MB) of several runs."""
-    command = [sys.executable, __file__, "--reader", reader, *map(str, paths)]
+    wanted = "null" if reader == OURS else json.dumps(wanted_by(reader))
+    command = [sys.executable, __file__, "--reader", reader, "--wanted", wanted, *map(str, paths)]
     found = []
     for _ in range(times):
         done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
