@@ -133,7 +133,7 @@ class Telemetry(Table, frozen=True):
     unit: str = ""
     """Unit of the parameter, as in the calibration."""
     max_age: Positive = 30.0
-    """s; an older value is stale."""
+    """Age from which on a value is stale, s."""
     delay: float = 0.0
     """Time by which the telemetry is late, s: a value stamped t was true at t - delay."""
     component: SystemId | None = None
@@ -170,9 +170,9 @@ class Align(Table, frozen=True):
     stale_growth: NotNegative = 1.0
     """nT/s by which the sigma grows with the age of stale telemetry."""
     turn_on_sigma: NotNegative = 20.0
-    """nT, 1-sigma, by which the sensor's offset changes at every power-on."""
+    """1-sigma, by which the sensor's offset changes at every power-on, nT."""
     reference_sigma: Positive = 145.0
-    """nT, 1-sigma of the Earth's total field about the main field: a corrected field beyond five of them is
+    """1-sigma of the Earth's total field about the main field, nT: a corrected field beyond five of them is
     ``implausible``."""
 
 
@@ -188,7 +188,7 @@ class Navigation(Table, frozen=True):
     """Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for ``ODOMETRY``, else
     0."""
     depth: NotNegative = 0.0
-    """m, of the deepest dives; a map whose altitude is known is continued to half this depth."""
+    """Depth of the deepest dives, m; a map whose altitude is known is continued to half this depth."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     """Prior uncertainties and settings of the position filter: the fields of
     :class:`magbridge.navigate.NavigationOptions`."""
@@ -203,7 +203,7 @@ class HeadingOutput(Table, frozen=True):
     rate: NotNegative = 10.0
     """Hz of that message; 0 is with every sample. ArduPilot needs 4 Hz at least, PX4 10 Hz."""
     tilt_sigma: Positive = 0.3
-    """deg, 1-sigma of the autopilot's roll and pitch."""
+    """1-sigma of the autopilot's roll and pitch, deg."""
     nmea: Name | None = None
     """Port for the NMEA 0183 sentences HDG, HDT and PASHR: ``udp:HOST:PORT`` or a serial device."""
     nmea_baudrate: Baudrate = 4800
@@ -229,7 +229,7 @@ class Learning(Table, frozen=True):
     """Without both: the parameters of moving masses, each with the least and the greatest value. The prior is
     then that of any vehicle."""
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
-    """Hz: samples that are learned from, at most."""
+    """Largest rate of the samples that are learned from, Hz."""
     directory: Name | None = None
     """Folder for the calibrations that were learned; by default that of the calibration's file."""
 

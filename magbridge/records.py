@@ -18,7 +18,7 @@ Vector = tuple[float, float, float]
 MAX_MEASURED_NT: Final = 1e9
 """nT (1 T): a field or a sigma above it is not a measurement, but garbage that happens to be a number."""
 MAX_DEVICE_TIME_S: Final = 1e11
-"""s: no instrument counts more than 3,000 years; such a time is an error of transmission."""
+"""Largest time of an instrument, s: one beyond 3,000 years is an error of transmission."""
 
 
 class Quality(IntFlag):
@@ -102,7 +102,7 @@ class Corrected(msgspec.Struct, frozen=True, gc=False):
     total_field_sigma: float
     """`total_field`, `total_field_sigma`: nT, magnitude and its 1-sigma."""
     field: Vector
-    """nT, body axes (sensor axes while ``no_boresight`` is set)."""
+    """Corrected field in body axes, nT (sensor axes while ``no_boresight`` is set)."""
     field_sigma: Vector
     """1-sigma of each component, nT."""
     quality: int

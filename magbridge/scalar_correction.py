@@ -46,7 +46,7 @@ class PendingReading(NamedTuple):
 
     sample: Sample
     main_field: float
-    """nT, the main field's total; NaN where unknown."""
+    """Main field's total, nT; NaN where unknown."""
     where: tuple[float, float] | None
     """Position of the vehicle: latitude and longitude, deg; None where unknown."""
 
@@ -57,9 +57,9 @@ class CorrectedReading(NamedTuple):
     sample: Sample
     corrected: Corrected
     main_field: float
-    """nT, the main field's total; NaN where unknown."""
+    """Main field's total, nT; NaN where unknown."""
     stated_sigma: float
-    """nT, 1-sigma of the total field without what the plausibility checks added."""
+    """1-sigma of the total field without what the plausibility checks added, nT."""
 
 
 class ScalarCorrection:

@@ -43,7 +43,7 @@ class Instrument(Table, frozen=True):
     start_temperature: float | None = None
     """degC of the fluxgate at the start; None: the temperature of the water."""
     thermal_lag: NotNegative = 3600.0
-    """s, time constant with which the fluxgate's temperature follows the water's."""
+    """Time constant with which the fluxgate's temperature follows the water's, s."""
     corner: NotNegative = 0.33
     """Hz of the RC anti-alias filter; 0 leaves it out."""
     channel_delay: Vector = (0.0, 0.0, 0.0)

@@ -54,7 +54,7 @@ class Leg(Table, frozen=True):
     roll: Annotated[float, Meta(ge=-80, le=80)] = 0.0
     """`pitch`, `roll`: deg."""
     turn: float = 0.0
-    """deg/s, clockwise seen from above."""
+    """Turn rate, deg/s, clockwise seen from above."""
     heading: float | None = None
     """deg at its start; None keeps the heading at which the last leg ended."""
     parameters: dict[str, float] = msgspec.field(default_factory=dict)
@@ -86,7 +86,7 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
     turns: float = 4.0
     """Full turns in a descent or ascent."""
     roll: tuple[float, NotNegative] = (6.0, 1.0)
-    """deg, mean and spread of the bank."""
+    """Mean and spread of the bank, deg."""
     segment: str = "calibration"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
@@ -123,7 +123,7 @@ class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
     duration: Positive = 900.0
     """s of one descent or ascent."""
     battery_spread: NotNegative = 0.02
-    """in, spread of the battery's position about Table 1's at this pitch."""
+    """Spread of the battery's position about Table 1's at this pitch, in."""
     segment: str = "survey"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:

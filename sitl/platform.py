@@ -48,13 +48,13 @@ MOUNTINGS: dict[str, Mounting] = {
 
 
 HARD_IRON, SOFT_IRON = 1500.0, 0.01
-"""nT, and nT a nT: 1-sigma an axis of a drawn vehicle's fixed iron."""
+"""1-sigma on each axis of a drawn vehicle's fixed iron: nT, and nT per nT."""
 MOMENT = 3.0
 """A m², 1-sigma an axis of a drawn mass."""
 VOLUME, VOLUME_SPREAD = (2e-3, 1e-3, 1e-3), 0.3
 """m³, apparent susceptibility times volume along each axis, and the spread of its logarithm."""
 PLACE_SPREAD = (0.06, 0.03, 0.03)
-"""m, 1-sigma of where a drawn mass stands about :data:`MOUNTINGS`."""
+"""1-sigma of where a drawn mass stands about :data:`MOUNTINGS`, m."""
 
 
 class Mass(Table, frozen=True):

@@ -29,13 +29,13 @@ class Motion(Table, frozen=True):
     settle: NotNegative = 15.0
     """s of the first-order approach to a commanded attitude."""
     wander: tuple[float, float, float] = (0.3, 0.6, 5.0)
-    """deg, standard deviation of roll, pitch and heading about the command; as a Slocum's log shows them."""
+    """Standard deviation of roll, pitch and heading about the command, deg; as a Slocum's log shows them."""
     wander_memory: Positive = 20.0
     """s over which the wander's correlation falls."""
     current: tuple[float, float] = (0.0, 0.0)
     """m/s north, east of the water."""
     max_depth: Positive = 200.0
-    """m, where the vehicle stays until it climbs."""
+    """Depth at which the vehicle stays until it climbs, m."""
 
 
 STEADY = Motion()

@@ -51,7 +51,7 @@ class Geology(Table, frozen=True):
     sources: int = 600
     """How many magnetised bodies; 0 leaves the Earth's main field alone."""
     extent: float = 12_000.0
-    """m, half the side of the square that holds them, about the first position."""
+    """Half the side of the square that holds them, about the first position, m."""
     top: float = 350.0
     bottom: float = 3_000.0
     """`top`, `bottom`: m below the surface, where the bodies lie: as many in each octave of depth. The

@@ -29,7 +29,7 @@ ANSWER_PAUSE_US = 20_000_000
 UNUSED_US = 45_000_000
 """µs for which the autopilot's position must differ from the fixes until that is reported."""
 MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
-"""m, and 1-sigmas of the fix: a smaller difference from the autopilot's position is none."""
+"""Differences from the autopilot's position that count as none: m, and 1-sigmas of the fix."""
 PX4_KEEPS_CLAIM = 1, 16
 """Version of PX4 up to which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's own uncertainty; a later one
 fuses it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""

@@ -31,7 +31,7 @@ COVARIANCE_INTERVAL_US: Final = 200_000
 MAX_PITCH_RAD: Final = radians(89.0)
 """Largest pitch at which roll and heading are distinguished, rad."""
 MAX_SENT_SIGMA_DEG: Final = 30.0
-"""deg: a heading that is known less well is not sent to the autopilot."""
+"""Largest sigma of a heading that is sent to the autopilot, deg."""
 MAX_WAITING: Final = 8
 """Sentences that wait at most."""
 NO_HEADING_FLAGS: Final = int(

@@ -46,7 +46,7 @@ ARDUPILOT_GROUPS: Final = {
 MAX_CLOCK_DIFFERENCE_S = 2.0
 """s between the host's clock and SYSTEM_TIME above which the difference is reported."""
 YEAR_2001_US = 10**15
-"""µs; a lower SYSTEM_TIME is not a date: the autopilot does not know the time yet."""
+"""Lowest SYSTEM_TIME that is a date, µs; before, the autopilot does not know the time."""
 NO_READING = {
     MAG_PORT_STATE.LOST: "the port is not open; the bridge would wait for it",
     MAG_PORT_STATE.SILENT: "check power, cable, sensor.baudrate and sensor.options",

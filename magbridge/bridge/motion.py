@@ -25,7 +25,7 @@ from magbridge.navigate.deadreckoning import GLIDE
 __all__ = ["Frame", "Motion", "MotionSource"]
 
 MAX_STATE_AGE_US = 10_000_000
-"""µs, for which a height or an attitude is the present one."""
+"""Time for which a height or an attitude is the present one, µs."""
 UNSET = (0, 0)
 """GPS_GLOBAL_ORIGIN's latitude and longitude of an autopilot without an origin."""
 
@@ -114,7 +114,7 @@ MIN_EQUAL = 5
 VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
 """Flags of EKF_STATUS_REPORT, and of ESTIMATOR_STATUS: the velocity holds; the position is only held."""
 JUMP = 10.0
-"""m: a step in a position that its own velocity does not explain by more than that is a reset."""
+"""Step of a position beyond its own velocity that is a reset, m."""
 
 
 class MotionSource(IntEnum):

@@ -17,7 +17,8 @@ __all__ = ["CLOCK_SET_US", "Position"]
 
 POSITION = spec("GLOBAL_POSITION_INT")
 MAX_POSITION_AGE_US: Final = 60_000_000
-"""µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
+"""Age of a position, µs: a glider makes 20 m in a minute, over which the main field changes by less than
+0.1 nT."""
 CLOCK_SET_US: Final = 10**15
 """µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
 FIELD_INTERVAL_US: Final = 1_000_000
@@ -27,7 +28,7 @@ MAX_VECTOR_DISTANCE_DEG: Final = 0.01
 """Time, and difference of latitude or longitude, from which on the bridge computes the main field's vector
 again: over 1 km its direction changes by 0.01 deg."""
 MAX_VEHICLE_SPEED_M_S: Final = 350.0
-"""m/s: no vehicle that carries a fluxgate is faster."""
+"""Speed that no vehicle with a fluxgate exceeds, m/s."""
 MAX_JUMP_M: Final = 10_000.0
 """m beyond what MAX_SPEED_M_S allows: the main field changes by 50 nT at most over that, so that a correction
 of a long dead reckoning is not a jump."""
@@ -36,7 +37,7 @@ SUSPECT_US: Final = 900_000_000
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """Largest magnitudes of GLOBAL_POSITION_INT's lat and lon, 1e-7 deg."""
 ALTITUDE_M: Final = -15_000.0, 100_000.0
-"""m: heights at which the main-field model is defined for vehicles."""
+"""Heights at which the main-field model is defined for vehicles, m."""
 
 
 class Position:

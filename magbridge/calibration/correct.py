@@ -140,7 +140,7 @@ def _regressors(
 def regressors(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """(m, n) regressors of every sample, from a fresh state, in the effects' array form.
+    """Return (m, n) regressors of every sample, from a fresh state, in the effects' array form.
 
     Arguments as for :func:`correct`, which steps through the effects as the bridge does.
     """

@@ -38,7 +38,7 @@ SERIES_ORDER = 8
 
 
 def dipole_tensor(r: FloatArray) -> FloatArray:
-    """``G(r)`` of dipoles at `r` from the sensor.
+    """Return ``G(r)`` of dipoles at `r` from the sensor.
 
     Parameters
     ----------
@@ -123,11 +123,11 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
     parameter: str
     """Which parameter moves it."""
     at: Vector
-    """m, body frame from the sensor, where the mass is when the parameter is 0."""
+    """Position of the mass where the parameter is 0, in the body frame from the sensor, m."""
     travel: Vector
     """m per unit of the parameter."""
     at_sigma: float = 0.0
-    """m, 1-sigma of `at`: the prior of the displacement."""
+    """1-sigma of `at`, m: the prior of the displacement."""
     moment: Vector = (0.0, 0.0, 0.0)
     """nT at the sensor: where the displacement's columns were linearised."""
     induced: Vector = (0.0, 0.0, 0.0)

@@ -32,7 +32,7 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_INTERVAL = 60_000_000
-"""µs; over a longer gap no rate of change is computed."""
+"""Longest gap over which a rate of change is computed, µs."""
 Factors = list[tuple[int, float, float, list[float]]]
 """Of each: place of the position, its centre and scale, coefficients of its polynomial, the highest first."""
 
@@ -61,7 +61,7 @@ def held(values: FloatArray, first: float) -> FloatArray:
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
-    """(n,) y that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
+    """Return (n,) y that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) ->
 
 
 def _filtered(values: FloatArray, share: float) -> FloatArray:
-    """(n,) ``y_t = y_(t-1) + s (x_t - y_(t-1))``."""
+    """Return (n,) ``y_t = y_(t-1) + s (x_t - y_(t-1))``."""
     from scipy.signal import lfilter  # noqa: PLC0415  (the live path starts without scipy)
 
     return np.asarray(lfilter([share], [1.0, share - 1.0], values, zi=[(1.0 - share) * values[0]])[0])
@@ -134,7 +134,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
     diagonal of ``a``, nT at F_0 per unit."""
 
     def columns(self, field: float) -> FloatArray:
-        """One regressor, one slot for each axis."""
+        """Return one regressor, one slot for each axis."""
         columns = np.zeros((3, 1, 9))
         # Slots 6 to 8 are T (offset), slots 0 to 2 the diagonal of a (scale).
         columns[:, 0, 6:9] = np.eye(3) * (self.on == "offset")
@@ -164,7 +164,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(1, n) regressors; 0 before the first value."""
+        """Return (1, n) regressors; 0 before the first value."""
         values = series.values[self.channel]
         known = np.flatnonzero(~np.isnan(values))
         out = np.full(len(values), np.nan)
@@ -206,7 +206,7 @@ class PathEffect(MassEffect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(r, n) regressors."""
+        """Return (r, n) regressors."""
         return np.stack(self.regressors(held((series.values[self.channel] - self.centre) / self.scale, 0.0)))
 
 
@@ -301,7 +301,7 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(1, n) regressors."""
+        """Return (1, n) regressors."""
         values = list(series.values.values())
         return np.reshape(_product(self._factors(series.kernel), values), (1, -1))
 
@@ -379,7 +379,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(r, n) regressors; 0 before the first value."""
+        """Return (r, n) regressors; 0 before the first value."""
         values = series.values[self.channel]
         known = ~np.isnan(values)
         out = np.full((max(self.order, 1), len(values)), np.nan)
@@ -393,7 +393,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
 
 def play(values: FloatArray, width: float) -> FloatArray:
-    """(n,) play operator of values, from the middle of the play (:class:`PlayEffect`).
+    """Return (n,) play operator of values, from the middle of the play (:class:`PlayEffect`).
 
     Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
     by doubling: over 2, 4, 8 ... rows.
@@ -425,7 +425,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         return 1
 
     def columns(self, field: float) -> FloatArray:
-        """One coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
+        """Return one coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
         return self.sign * np.eye(9)[None]
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
@@ -448,7 +448,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(9, n) regressors."""
+        """Return (9, n) regressors."""
         # The same backward difference for a log; across a gap or at a repeated time the rate is zero.
         monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
         apart = 1e-6 * np.diff(series.time_us)

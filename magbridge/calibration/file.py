@@ -178,7 +178,7 @@ def save(calibration: Calibration, path: str | Path) -> None:
 
 
 def calibration_id(calibration: Calibration) -> int:
-    """32 bits that name this calibration on the link: CRC-32 of its file."""
+    """Return 32 bits that name this calibration on the link: CRC-32 of its file."""
     return crc32(encode_calibration(calibration))
 
 

@@ -44,14 +44,14 @@ __all__ = [
 ]
 
 DEFAULT_TILT_SIGMA_DEG = 0.3
-"""deg, 1-sigma of roll and of pitch where the log does not state one."""
+"""1-sigma of roll and of pitch where the log does not state one, deg."""
 MODEL_DECLINATION_SIGMA_DEG = 0.26
-"""deg, 1-sigma of a main-field model's declination where the horizontal field is large; error model of the
+"""1-sigma of a main-field model's declination where the horizontal field is large, deg; error model of the
 World Magnetic Model 2020 (Chulliat et al. 2020, section 3.4): ``sqrt(0.26^2 + (5417 nT / H)^2)``."""
 MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
 """deg nT, the part of the same error model that falls with the horizontal field."""
 UNIFORM_SIGMA_DEG = 180.0 / sqrt(3.0)
-"""deg, standard deviation of an angle of which nothing is known."""
+"""Standard deviation of an angle of which nothing is known, deg."""
 MAX_ADDED_VARIANCE = 1e12
 """nT^2, largest variance that the published one adds to that of the calibration."""
 

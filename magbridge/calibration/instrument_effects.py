@@ -62,7 +62,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(r, n) regressors."""
+        """Return (r, n) regressors."""
         after = series.time_us - round(self.start * 1e6)
         if self.shape == "step":
             return (after >= 0.0)[None].astype(float)
@@ -92,7 +92,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         return {"skew": 3, "eddy": 6}[self.on]
 
     def columns(self, field: float) -> FloatArray:
-        """Three regressors, the rates of the three channels (nT/s)."""
+        """Return three regressors, the rates of the three channels (nT/s)."""
         columns = np.zeros((self.size, 3, 9))
         if self.on == "skew":
             for k in range(3):
@@ -128,7 +128,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(3, n) the same backward difference: a centred one correlates less with its own sample's noise."""
+        """Return the same backward difference (3, n): a centred one shares less noise with its sample."""
         # Rates over the finite samples only, as the stepper skips the others.
         known = np.flatnonzero(np.isfinite(series.reading).all(axis=1))
         apart = 1e-6 * np.diff(series.time_us[known])
@@ -184,7 +184,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(r, n) regressors."""
+        """Return (r, n) regressors."""
         if self.power:
             return np.asarray(powers(series.reading.T / self.unit, self.power)[-1])
         sign = 1.0 if self.knee >= 0.0 else -1.0

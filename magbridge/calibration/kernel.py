@@ -125,7 +125,7 @@ class Kernel:
         return phi
 
     def monomials_of(self, positions: FloatArray) -> FloatArray:
-        """(m, n) monomials of (n, k) positions."""
+        """Return (m, n) monomials of (n, k) positions."""
         return np.stack(self.monomials(list(positions.T), np.ones(len(positions))))
 
 

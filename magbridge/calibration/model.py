@@ -230,7 +230,7 @@ class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
     def matrix(self) -> FloatArray:
-        """(3, 3) rotation matrix: Rodrigues' formula."""
+        """Return (3, 3) rotation matrix: Rodrigues' formula."""
         # R = I + sinc(a) K + (1 - cos a)/a^2 K^2; 1 - cos a = 2 sin^2(a/2), so that both factors stay
         # finite at a = 0
         x, y, z = self.rotation

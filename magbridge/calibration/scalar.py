@@ -39,9 +39,9 @@ PLATFORM_COLUMNS = {
     "permanent": slice(0, 3), "induced": slice(3, 9), "eddy": slice(9, 18), "lag": slice(18, 19)
 }  # fmt: skip
 CYCLE_LEVEL_SIGMA_NT = 30.0
-"""nT, 1-sigma of the level of a power cycle."""
+"""1-sigma of the level of a power cycle, nT."""
 SAME_POWER_CYCLE_S = 12 * 3600.0
-"""s, within which a log without a power cycle's number is taken to be of the fitted cycle."""
+"""Time within which a log without a power cycle's number is taken to be of the fitted cycle, s."""
 RANGE_MARGIN = 0.02
 """Fraction of a channel's range by which telemetry may exceed it without a flag."""
 INDUCED_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -51,7 +51,7 @@ JUMP_SIGMA = 8.0
 DISAGREEMENT_SIGMA = 4.0
 """Difference of two sensors, in its standard deviations, from which on it is flagged."""
 REFERENCE_SIGMA_NT = 145.0
-"""nT, 1-sigma of the main-field model where no map is known (error model of the WMM 2020)."""
+"""1-sigma of the main-field model where no map is known (error model of the WMM 2020), nT."""
 MIN_AGREEING_SAMPLES = 10
 """Samples at which two sensors agree, from which on these show the crustal field."""
 BLAME_RATIO = 2.0
@@ -97,11 +97,11 @@ class ScalarNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Noise of the compensated scalar: white, and a sum of Ornstein-Uhlenbeck processes (flicker)."""
 
     white: float
-    """nT, 1-sigma of the white part of one sample."""
+    """1-sigma of the white part of one sample, nT."""
     interval: float
-    """s, between the samples to which `white` refers."""
+    """Interval of the samples to which `white` refers, s."""
     time_constants: tuple[float, ...] = ()
-    """s, of the Ornstein-Uhlenbeck processes."""
+    """Correlation times of the Ornstein-Uhlenbeck processes, s."""
     process_sigma: tuple[float, ...] = ()
     """1-sigma of each process, nT."""
 
@@ -133,7 +133,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     fitted_until: float = 0.0
     """s since 1970 UTC, last sample of the fit."""
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """m, forward, starboard and down from the positions' origin to the scalar sensor."""
+    """Forward, starboard and down from the positions' origin to the scalar sensor, m."""
     slow_variance: float = 0.0
     """nT^2, variance of the slow noise over the fitted log: the sigma of the corrected field counts it."""
 

@@ -198,12 +198,12 @@ class Effect(Term, frozen=True, kw_only=True):
     cause: str = ""
 
     def channels(self) -> tuple[str, ...]:
-        """Names of the telemetry channels that it needs: parameters or other columns of a deployment."""
+        """Return the names of the channels that it needs: parameters or other columns of a log."""
         return ()
 
     @abstractmethod
     def columns(self, field: float) -> FloatArray:
-        """(K, r, 9): what regressor r adds to each slot per unit of coefficient k; `field` is F_0, nT."""
+        """Return what regressor r adds to each slot per unit of coefficient k, (K, r, 9); `field`: F_0, nT."""
 
     @abstractmethod
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
@@ -218,7 +218,7 @@ class Effect(Term, frozen=True, kw_only=True):
         """
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """(r, n) regressors of a whole log, from a fresh state: by default those of :meth:`begin`."""
+        """Return (r, n) regressors of a whole log, from a fresh state: by default those of :meth:`begin`."""
         # The stepper is the definition; effects with a faster array form override this method.
         step = self.begin(tuple(series.values), series.kernel)
         values = np.reshape([*series.values.values()], (-1, len(series.time))).T.tolist()
@@ -228,7 +228,7 @@ class Effect(Term, frozen=True, kw_only=True):
 
 
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
-    """All monomials of total degree up to `order`, cross terms included, the constant first."""
+    """Return all monomials of total degree up to `order`, cross terms included, the constant first."""
     return tuple(
         # each choice of `degree` parameters, with repetition, is one monomial
         tuple(picks.count(k) for k in range(parameters))

@@ -44,7 +44,7 @@ MAX_LISTED_CONTRIBUTIONS = 5
 ALL_COMPASSES = "all"
 """``--compass all``: a calibration for each compass."""
 SCALAR_REFERENCE_SIGMA_NT = 1.0
-"""nT, 1-sigma of a scalar magnetometer's reading that serves as the reference."""
+"""1-sigma of a scalar magnetometer's reading that serves as the reference, nT."""
 
 
 @Parameter(name="*")

@@ -35,7 +35,7 @@ class Mixture:
     """X_i and M_i."""
 
     def __call__(self, rows: slice) -> FloatArray:
-        """(m, k) these rows."""
+        """Return (m, k) these rows."""
         return np.asarray(sum(M.T @ X(rows).T for X, M in self.parts)).T
 
     def times(self, widths: FloatArray) -> Mixture:
@@ -53,7 +53,7 @@ class Interpolated:
     """(c, k) V, the columns at the nodes."""
 
     def __call__(self, rows: slice) -> FloatArray:
-        """(m, k) these rows."""
+        """Return (m, k) these rows."""
         return np.asarray(self.weights[rows] @ self.values)
 
 
@@ -65,7 +65,7 @@ class Since:
     fresh: BoolArray = field(compare=False)
 
     def __call__(self, rows: slice) -> FloatArray:
-        """(m, k) these rows."""
+        """Return (m, k) these rows."""
         return (self.columns(rows).T * self.fresh[rows]).T
 
 
@@ -87,7 +87,7 @@ def places(sizes: Iterable[int], first: int = 0) -> list[slice]:
 
 
 def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
-    """(m,) product of the columns' rows and coefficients c (k,), without building all columns if possible."""
+    """Return the product (m,) of rows and coefficients c (k,), without all columns where possible."""
     if isinstance(columns, Mixture):
         return np.asarray(sum(times(X, rows, M @ c) for X, M in columns.parts))
     if isinstance(columns, Interpolated):
@@ -118,7 +118,7 @@ class Products:
     """For each column, the place of its function and the slot of its slope."""
 
     def __call__(self, rows: slice) -> FloatArray:
-        """(m, pairs) these rows."""
+        """Return (m, pairs) these rows."""
         functions, slots = zip(*self.pairs, strict=True)
         jacobian = self.problem.jacobian.T[_run(slots), rows]
         if self.phi is None:

@@ -38,11 +38,11 @@ BEND = 32
 PLAYS = (0.3, 0.8)
 """Widths of the play operators that describe a channel's past, in half ranges."""
 HULL_LAGS_S = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
-"""s, lags with which the inside of a hull follows: heat, water that seeps, stress that relaxes."""
+"""Lags with which the inside of a hull follows, s: heat, water that seeps, stress that relaxes."""
 SWAYS = (0.0, 10.0, 30.0)
-"""s, lags with which something loose, or on a line, follows a turn."""
+"""Lags with which something loose, or on a line, follows a turn, s."""
 SKIN = (5.0, 20.0)
-"""m, depths over which light, warmth and waves fade."""
+"""Depths over which light, warmth and waves fade, m."""
 REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
 ZERO = (500.0, 1000.0, 2000.0)
@@ -54,7 +54,7 @@ BODY, EARTH = 24, 48
 
 
 def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
-    """Prior widths of half waves for an exponential correlation (relaxation, switching), by kind.
+    """Return prior widths of half waves for an exponential correlation (relaxation, switching), by kind.
 
     The k-th has ``1 / sqrt(1 + (k / k_0)^2)``, k_0 the corner of the kind.
     """
@@ -64,7 +64,7 @@ def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
 
 
 def direction(body: Columns) -> Columns:
-    """Functions up to quartic of the field's direction in the body, that of `body` (m, 3)."""
+    """Return functions up to quartic of the field's direction in the body, that of `body` (m, 3)."""
     exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
 
     def columns(rows: slice) -> FloatArray:
@@ -77,7 +77,7 @@ def direction(body: Columns) -> Columns:
 
 
 def response(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Each axis' error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
+    """Return each axis' error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
 
     `jacobian` (m, 3) are what one nT in each axis adds to the residual.
     """
@@ -93,7 +93,7 @@ def response(reading: FloatArray, jacobian: Columns) -> Columns:
 
 
 def bends() -> tuple[tuple[str, FloatArray], ...]:
-    """Prior widths (3 BEND,) of a response's polynomials: of one with steps, with a corner, or smooth."""
+    """Return prior widths (3 BEND,) of a response's polynomials: with steps, with a corner, or smooth."""
     k = np.arange(1.0, BEND + 1.0)
     return tuple(
         ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
@@ -101,7 +101,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 
 
 def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Each axis' error where it passes zero (Hermite's functions); arguments as of :func:`response`.
+    """Return each axis' error where it passes zero (Hermite's functions); arguments as of :func:`response`.
 
     There the feedback current changes sign, or a converter's first bit flips.
     """
@@ -115,13 +115,13 @@ def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
 
 
 def curve(values: FloatArray) -> Columns:
-    """Powers of a channel (n,)."""
+    """Return powers of a channel (n,)."""
     y = _scaled(values)
     return _centred(lambda rows: np.stack(powers(y(rows), 4)).T, len(values))
 
 
 def hysteresis(values: FloatArray) -> Columns:
-    """Functions of a channel's past (n,): curved branches of hysteresis, narrow and wide; its direction."""
+    """Return functions of a channel's past (n,): branches of hysteresis, narrow and wide; its direction."""
     scaled = _scaled(values)
     y = scaled(slice(None))
     # Branches v^k - x^k of the play operator at two widths, and the direction of motion
@@ -157,7 +157,7 @@ def near_surface(time: FloatArray, depth: FloatArray) -> Columns:
 
 
 def repeated(problem: Problem) -> Columns:
-    """Half waves in the course of a dive, the same in all."""
+    """Return half waves in the course of a dive, the same in all."""
     dive, time = problem.survey.dive, problem.survey.time
     # Phase in the dive, 0 to 1, of the usual duration
     start = np.flatnonzero(np.diff(dive, prepend=dive[0] - 1))
@@ -182,7 +182,7 @@ def lower_end(tilt: FloatArray) -> Columns:
 
 
 def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Columns:
-    """Each of `values` (k, n) with each lag; in single precision, since of a month they fill the memory."""
+    """Return each of `values` (k, n) with each lag, in single precision to save memory."""
     followed = np.stack([lagged(time, y, lag).astype(np.float32) for y in values for lag in lags])
     return lambda rows: followed[:, rows].T.astype(float)
 
@@ -193,7 +193,7 @@ def _centred(columns: Columns, n: int) -> Columns:
 
 
 def _scaled(values: FloatArray) -> Columns:
-    """Values (n,) moved to the range -1 to 1, (m,) of m rows."""
+    """Return values (n,) moved to the range -1 to 1, (m,) of m rows."""
     low, span = values.min(), max(float(np.ptp(values)), 1e-12)
     return lambda rows: np.asarray(2.0 * (values[rows] - low) / span - 1.0)
 
@@ -283,7 +283,7 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
 
 
 def _in_time(problem: Problem, fit: Joint) -> list[Description]:
-    """Slow curves in body axes and along the field, a constant, a passing source."""
+    """Return slow curves in body axes and along the field, a constant, a passing source."""
     time = problem.survey.time
     whole = max(float(time[-1] - time[0]), 1.0)
     constant = problem.reference_jacobian * ~problem.survey.learned
@@ -308,7 +308,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
 
 
 def _of_reading(problem: Problem) -> list[Description]:
-    """Functions of the field's direction, its rates of change, each axis' reading; one common delay."""
+    """Return functions of the field's direction, its rates and each axis' reading; one common delay."""
     rates = field_rates(problem)
 
     def body(rows: slice) -> FloatArray:
@@ -360,7 +360,7 @@ def _of_channels(problem: Problem) -> list[Description]:
 
 
 def _of_attitude(problem: Problem) -> list[Description]:
-    """Functions of pitch, roll and turns: what hangs in the hull, slides to its lower end, swings out."""
+    """Return functions of pitch, roll and turns: of what hangs, slides or swings in the hull."""
     if problem.survey.attitude is None:
         return []
     listed = []
@@ -399,7 +399,7 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
 
 
 def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
-    """Each function of `basis` along each axis of the body; with `scales`, times that axis' reading."""
+    """Return each function of `basis` along each body axis; with `scales`, times that axis' reading."""
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)

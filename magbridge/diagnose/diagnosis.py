@@ -26,7 +26,7 @@ MIN_RMS_REDUCTION = 0.01
 
 
 def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
-    """(n,) samples by which a gain is measured: new to the calibration, and not wrong."""
+    """Return (n,) samples by which a gain is measured: new to the calibration, and not wrong."""
     # Where every sample was learned from, all of them count
     counts = ~problem.survey.learned
     if wrong is not None:

@@ -299,7 +299,7 @@ def log_odds(
 
 
 def certainty(residual: FloatArray, noise: ResidualNoise, columns: Sequence[Columns]) -> list[float]:
-    r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
+    r"""Return the degrees of freedom of the noise's level at the frequencies of each of `columns`.
 
     `residual` (n,) is what the noise was fitted to, nT.
 
@@ -379,7 +379,7 @@ class Best(NamedTuple):
 
 
 def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: bool = False) -> float:
-    """Likelihood ratio of a model's causes of fixed shape, given its causes of flexible shape.
+    """Return likelihood ratio of a model's causes of fixed shape, given its causes of flexible shape.
 
     `ratio` is the likelihood ratio of the whole model, with `slow` noise if there is any.
     """
@@ -388,7 +388,7 @@ def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: 
 
 
 def wald_ratio(fit: Joint, candidate: Candidate) -> float:
-    """Likelihood ratio of the last candidate's coefficients under the noise that is left."""
+    """Return likelihood ratio of the last candidate's coefficients under the noise that is left."""
     own = slice(-candidate.size, None)
     spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
     return fit.wald(own) - 2.0 * spread
@@ -471,7 +471,7 @@ def _plausible(size: float) -> float:
 
 
 def likeness(info: Information, first: Candidate, a: slice, second: Candidate, b: slice) -> float:
-    """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
+    """Return the correlation of two signatures: root of the mean fraction that one imitates of the other."""
     # Share of A's power that B imitates, C B^-1 C^T, and the reverse
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (first, second))

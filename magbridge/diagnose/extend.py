@@ -77,7 +77,7 @@ def loosened(
 def _own_cell(
     problem: Problem, pieces: Sequence[Candidate], columns: Sequence[Columns], fit: Joint
 ) -> FloatArray:
-    """(q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
+    """Return (q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
     jacobian = [
         slope
         for piece, at in zip(pieces, slices(pieces), strict=True)
@@ -112,7 +112,7 @@ def _other_cells(
     fit: Joint,
     grid: Sequence[Candidate],
 ) -> FloatArray:
-    """(q + k, q + k) covariance added by all other cells."""
+    """Return (q + k, q + k) covariance added by all other cells."""
     more = np.zeros_like(fit.covariance)
     points = [
         [c for c in grid if piece.point.rebuild and (c.group, c.names) == (piece.group, piece.names)]
@@ -130,7 +130,7 @@ def _other_cells(
 
 
 def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequence[Placed]) -> FloatArray:
-    """(q + k, q + k) covariance added by the other points of one piece's grid."""
+    """Return (q + k, q + k) covariance added by the other points of one piece's grid."""
     piece, own = placed_piece
     q, first = len(fit.z), len(info.score) - fit.coefficients.size
     here = slice(own.start - first, own.stop - first)

@@ -99,11 +99,11 @@ class JointDesign:
         self.at, self.effects = places(sizes, self.q), sum(sizes)
 
     def rows(self, rows: slice) -> FloatArray:
-        """(m, q + k) rows of all columns."""
+        """Return (m, q + k) rows of all columns."""
         return side_by_side([self.problem.calibration_rows(rows), *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
-        """(n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
+        """Return (n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
         asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
 
         def piece(rows: slice) -> FloatArray:
@@ -202,7 +202,7 @@ class Statistic:
         self.freedom = np.asarray(1)
 
     def ratio(self, b: FloatArray) -> FloatArray:
-        """(..., m) likelihood ratios of scores b (..., k, m)."""
+        """Return (..., m) likelihood ratios of scores b (..., k, m)."""
         if self.spectra is None:
             y = np.swapaxes(self.vectors, -1, -2) @ b
             return np.asarray(np.sum(y**2 / self.values[..., None], axis=-2))
@@ -211,7 +211,7 @@ class Statistic:
         )
 
     def _evidences(self, k: int, b: FloatArray) -> FloatArray:
-        """(sizes, m) log evidence with the k-th spectrum."""
+        """Return (sizes, m) log evidence with the k-th spectrum."""
         y2, grown = (self.vectors[k].T @ b) ** 2, PRIOR_SIZES[:, None] * self.values[k]
         return np.asarray(
             0.5 * ((PRIOR_SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])
@@ -257,7 +257,7 @@ class Joint:
         return self.covariance[len(self.z) :, len(self.z) :]
 
     def wald(self, places: slice | IndexArray) -> float:
-        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) at `places`."""
+        """Return Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) at `places`."""
         # Quadratic form of the estimates with their inverse covariance
         b = self.coefficients[places]
         return float(b @ np.linalg.solve(self.effects_covariance[places][:, places], b))
@@ -361,7 +361,7 @@ def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
 
 
 def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, place: slice, spectra: FloatArray) -> FloatArray:
-    """Prior precision of the coefficients at `place`, by their likeliest common size and spectrum."""
+    """Return prior precision of the coefficients at `place`, by their likeliest common size and spectrum."""
     # Schur complement: information and score of the block, all other coefficients projected out
     others = np.delete(np.arange(len(h)), place)
     K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, place])

@@ -284,7 +284,7 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
 
 
 def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
-    """(m, k) columns along one direction of (m, 3 k) along each axis."""
+    """Return (m, k) columns along one direction of (m, 3 k) along each axis."""
     return np.asarray(part.reshape(len(part), -1, 3) @ direction)
 
 

@@ -63,7 +63,7 @@ TIMES = 20.0
 """Time constants of the noise that a log holds at least. Slower noise would swallow slow effects, and so few
 repetitions cannot show its level."""
 BRIEFEST, SLOWEST = 20.0, 2000.0
-"""Samples, the least and the most of the longest time constant, in short and in long logs."""
+"""Limits of the longest time constant in short and in long logs, in samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class ResidualNoise:
         return Predictors(self.past, self.ar)
 
     def whitened(self, columns: Columns, rows: slice) -> FloatArray:
-        """(m, k) these rows of whitened columns, stored column by column."""
+        """Return (m, k) these rows of whitened columns, stored column by column."""
         first = max(rows.start - len(self.ar), 0)
         return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 
@@ -152,7 +152,7 @@ class ResidualNoise:
         return out[:, :own].T
 
     def _weights(self, rows: slice) -> FloatArray:
-        """(m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
+        """Return (m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
         past, gaps = self.past, self.near_gaps
         # Rows of the band matrix: (1, -a), or f (1, -a') after a gap, over the scale
         weights = np.tile(np.append(1.0, -self.ar), (rows.stop - rows.start, 1))
@@ -162,11 +162,11 @@ class ResidualNoise:
         return weights
 
     def whiten(self, y: FloatArray) -> FloatArray:
-        """(n,) whitened y (n,): :meth:`filter` of a single whole column."""
+        """Return (n,) whitened y (n,): :meth:`filter` of a single whole column."""
         return np.asarray(np.sqrt(self.kappa) * self.near_gaps.innovations(y) / self.scale)
 
     def filter_back(self, y: FloatArray) -> FloatArray:
-        """(n,) y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
+        """Return y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
         y = np.sqrt(self.kappa) * y / self.scale
         # Transposed filter: samples after a gap have weights of their own
         early, gaps = self.past.rows, self.near_gaps
@@ -180,7 +180,7 @@ class ResidualNoise:
         return out
 
     def response(self, residual: FloatArray) -> FloatArray:
-        """(n,) y of the module's notes; the weights of psi are those of the residual that was fitted."""
+        """Return y (n,) of the module's notes; the weights of psi are those of the fitted residual."""
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
         return np.asarray(weight * self.whiten(residual) / self.kappa)
 
@@ -211,7 +211,7 @@ class Predictors:
         self.weights = self.f[:, None] * np.hstack([np.ones((len(lags), 1)), -self.a])
 
     def innovations(self, residual: FloatArray) -> FloatArray:
-        """(n,) innovations v of a residual (n,)."""
+        """Return (n,) innovations v of a residual (n,)."""
         past, p = self.past, len(self.ar)
         # a view of the p samples before each, which takes no memory
         lags = sliding_window_view(np.append(np.zeros(p), residual), p)[:-1, ::-1]
@@ -223,7 +223,7 @@ class Predictors:
 
 
 def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
-    """(reach + 1,) C of an autoregression whose innovations have variance 1.
+    """Return (reach + 1,) C of an autoregression whose innovations have variance 1.
 
     Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis
     1991, sec. 5.2).
@@ -323,7 +323,7 @@ def fit_noise(
 
 
 def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
-    """(p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
+    """Return (p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
     p = lags.shape[1]
     P, b = np.zeros((p, p)), np.zeros(p)
     for start in range(0, len(r), DERIVATIVE_ROWS):
@@ -336,7 +336,7 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
 
 
 def _counts(n: int) -> IntArray:
-    """(blocks,) samples in each block."""
+    """Return (blocks,) samples in each block."""
     count = np.full(max(n // NOISE_BLOCK_SAMPLES, 1), NOISE_BLOCK_SAMPLES)
     count[-1] += n - count.sum()
     return count
@@ -366,7 +366,7 @@ def _uneven(v: FloatArray, count: IntArray) -> bool:
 
 
 def _sums(values: FloatArray, count: IntArray) -> FloatArray:
-    """(blocks,) sum of each block."""
+    """Return (blocks,) sum of each block."""
     return np.asarray(np.add.reduceat(values, np.cumsum(count) - count))
 
 
@@ -415,12 +415,12 @@ def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -
 
 
 def _spread(levels: FloatArray, count: IntArray) -> FloatArray:
-    """(n,) level of each sample; of a single block it takes no memory."""
+    """Return (n,) level of each sample; of a single block it takes no memory."""
     if count.size == 1:
         return np.broadcast_to(levels, int(count.sum()))
     return np.repeat(levels, count)
 
 
 def _each(values: FloatArray, count: IntArray) -> FloatArray | float:
-    """(n,) a block's value for each of its samples; a number where there is one block."""
+    """Return (n,) a block's value for each of its samples; a number where there is one block."""
     return np.repeat(values, count) if count.size > 1 else float(values[0])

@@ -86,7 +86,7 @@ class Memory(NamedTuple):
     white: float
     """`rms`, `white`: RMS; and what of it changes from one sample to the next."""
     correlation_time: float
-    """s, after which its autocorrelation has fallen to 1/e."""
+    """Time after which its autocorrelation has fallen to 1/e, s."""
     slow: float
     """Share of its power that is left in means over :attr:`samples` samples."""
     samples: int
@@ -166,7 +166,7 @@ def _remembered(e: FloatArray) -> int:
 
 
 def _waves(time: FloatArray) -> FloatArray:
-    """(n, k) cosines of 1 to :data:`WAVES` half waves over the log."""
+    """Return (n, k) cosines of 1 to :data:`WAVES` half waves over the log."""
     phase = np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1e-300)
     return np.asarray(np.cos(phase[:, None] * np.arange(1, WAVES + 1)))
 
@@ -214,7 +214,7 @@ class Returns(NamedTuple):
     share: float
     """Fraction of the samples that lie where the track passes again."""
     longest: float
-    """s, the longest time between two passes of one place."""
+    """Longest time between two passes of one place, s."""
     separable: float
     """Least share of the power of a slow change with time that no function of the place imitates."""
 

@@ -104,7 +104,7 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
 def _columns(
     problem: Problem, length: FloatArray, frequency: FloatArray, moment: FloatArray, rows: slice
 ) -> FloatArray:
-    """(m, 2 k) cosines and sines of k packets."""
+    """Return (m, 2 k) cosines and sines of k packets."""
     since = (problem.survey.slots[rows, None] - moment) / length
     turns = 2.0 * np.pi * length * frequency * since
     # divided by the root of the length, so that in white noise all packets have about one norm
@@ -114,7 +114,7 @@ def _columns(
 
 
 def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
-    """(5, m) length, frequency, moment, ratio and log prior of places above :data:`LEAST_RATIO`.
+    """Return (5, m) length, frequency, moment, ratio and log prior of places above :data:`LEAST_RATIO`.
 
     Times are in intervals; the prior is one among the places of this length.
     """
@@ -144,7 +144,7 @@ def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
 
 
 def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
-    """(2, k) power gain of whitening at frequencies (k,), per sample: away from gaps, and after them."""
+    """Return the power gain of whitening at frequencies (k,), away from gaps and after them, (2, k)."""
     # |1 - sum a_k e^(-2 pi i f k)|^2 away from gaps, and its mean over the patterns after them
     past, gaps = noise.past, noise.near_gaps
     lags = np.arange(1, past.order + 1)
@@ -193,7 +193,7 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
 
 
 def _passing(s: FloatArray) -> FloatArray:
-    """(3, n) functions of Anderson."""
+    """Return (3, n) functions of Anderson."""
     return np.stack([np.ones_like(s), s, s * s]) / (1.0 + s * s) ** 2.5
 
 
@@ -203,7 +203,7 @@ def _around(values: NDArray[Any]) -> FloatArray:
 
 
 def _ratio(S: FloatArray, b: FloatArray) -> FloatArray:
-    """(m,) likelihood ratios of scores b (m, k), information S (m, k, k)."""
+    """Return (m,) likelihood ratios of scores b (m, k), information S (m, k, k)."""
     size = np.trace(S, axis1=1, axis2=2)[:, None, None] + 1e-300
     S = S + 1e-6 * size * np.eye(b.shape[1])
     return np.asarray(np.einsum("mi,mi->m", b, np.linalg.solve(S, b[:, :, None])[:, :, 0]))

@@ -80,7 +80,7 @@ STABLE = 2e-5
 than 20 ppm."""
 T = TypeVar("T")
 AXIS_DELAY_SIGMA_S = 0.3
-"""s, a plausible size of an axis' delay after its row."""
+"""Plausible size of an axis' delay after its row, s."""
 DELAYS = slice(-3, None)
 """Places of the axes' delays in z."""
 MIN_INFORMATION = 0.01
@@ -88,12 +88,12 @@ MIN_INFORMATION = 0.01
 
 
 def waves() -> FloatArray:
-    """(k,) k of each coefficient: each axis in turn, then along the field."""
+    """Return (k,) k of each coefficient: each axis in turn, then along the field."""
     return np.append(np.repeat(np.arange(1.0, EACH + 1.0), 3), np.arange(EACH + 1.0, LAST + 1.0))
 
 
 def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
-    """(m, k) what a nanotesla of each coefficient adds to some rows of a residual of `slopes` (n, 3)."""
+    """Return what 1 nT of each coefficient adds to some rows of a residual of `slopes` (n, 3), (m, k)."""
     # cos(pi k t / T) at the middle of each sample's interval
     n, part = len(slopes), slopes.T[:, rows]
     phase = np.pi * (np.arange(n)[rows] + 0.5) / n
@@ -103,7 +103,7 @@ def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
 
 
 def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
-    r"""(k, n) first or second derivative of H (k, n): of the cubic spline through each leg; zero at its ends.
+    r"""Return the first or second derivative (k, n) of H (k, n), of a cubic spline through each leg.
 
     A leg is a run of samples in which no gap is longer than :data:`MAX_MISSING_SAMPLES` samples.
 
@@ -128,7 +128,7 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
 
 
 def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(3, n) error of axes H (3, n) sampled late and interpolated to their row, nT per s of delay.
+    r"""Return (3, n) error of axes H (3, n) sampled late and interpolated to their row, nT per s of delay.
 
     Linear interpolation is in error when the vehicle sways from sample to sample. `H` must be free of the
     readings' noise: the difference is one-sided and would correlate with it.
@@ -155,7 +155,7 @@ def row_blocks(n: int) -> list[slice]:
 
 
 def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
-    """(m, k) blocks of columns side by side, stored column by column."""
+    """Return (m, k) blocks of columns side by side, stored column by column."""
     out = np.empty((sum(block.shape[1] for block in blocks), len(blocks[0])))
     return np.concatenate([block.T for block in blocks], out=out).T
 
@@ -163,7 +163,7 @@ def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
 def derivatives(
     calibration: Calibration, samples: ResidualSamples, g: FloatArray, L: FloatArray, dtype: type = float
 ) -> FloatArray:
-    """(n, q): derivatives of the residual by all coefficients, times L (K, q), in bounded memory."""
+    """Return (n, q) derivatives of the residual by all coefficients, times L (K, q), in bounded memory."""
     # Sum over r, s of phi_r C_krs g_s, by one product of matrices for each block of rows
     tensor, _ = coefficient_tensor(calibration)  # C_krs of :mod:`.problem`
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], tensor[0].size).T
@@ -180,7 +180,7 @@ def noise_sigma(calibration: Calibration, e: FloatArray) -> float:
 
 
 def floor(calibration: Calibration) -> FloatArray:
-    """(K, K) covariance, nT², of how much the nine constants may have changed since the calibration.
+    """Return (K, K) covariance, nT², of how much the nine constants may have changed since the calibration.
 
     The posterior counts only the noise of its samples, and a few thousand samples average that down to a
     hundredth. The filters' lag in the turns of the calibration runs, and the drift between days, are larger.
@@ -193,7 +193,7 @@ def floor(calibration: Calibration) -> FloatArray:
 
 
 def isotropic(calibration: Calibration) -> FloatArray:
-    """(K,) change of the coefficients that raises the total field by 1 nT at any attitude: equal scales."""
+    """Return the change of coefficients (K,) that raises the total field by 1 nT at any attitude."""
     scale = np.zeros(calibration.coefficients.size)
     for constants in _constants(calibration)[:1]:
         scale[constants.start : constants.start + 3] = 1.0
@@ -212,7 +212,7 @@ def _constants(calibration: Calibration) -> list[slice]:
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
-    """L with ``L L^T`` the covariance, of as many columns as it has rank."""
+    """Return L with ``L L^T`` the covariance, of as many columns as it has rank."""
     # Of the correlations: coefficients have units that differ by orders of magnitude
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -266,7 +266,7 @@ def _without_repeats(
 
 
 def _physical(calibration: Calibration) -> FloatArray:
-    """(K,) nT, plausible size (1-sigma) of each coefficient on any vehicle; infinite where none is known.
+    """Return the plausible 1-sigma (K,), nT, of each coefficient on any vehicle; infinite if unknown.
 
     Soft iron is percents of the field, hard iron thousands of nanotesla, and both fall with the order. The
     bound is needed because, at a glider's few attitudes, scale and offset can cancel each other: without it
@@ -330,7 +330,7 @@ class Problem:
         return slice(self.known.stop, len(self.centre) - 3)
 
     def slow_noise(self, z: FloatArray) -> FloatArray:
-        """(n,) what slow noise of z (q,) adds to the residual."""
+        """Return (n,) what slow noise of z (q,) adds to the residual."""
         if not self.waves.size:
             return np.zeros(len(self))
         slopes = self.jacobian[:, 6:]
@@ -354,7 +354,7 @@ class Problem:
         return derivatives(self.calibration, samples, self.jacobian, L, np.float32)
 
     def calibration_rows(self, rows: slice) -> FloatArray:
-        """(m, q) rows of ``-de/dz``: the calibration's coefficients, slow noise (nT), the axes' delays.
+        """Return rows (m, q) of ``-de/dz``: coefficients, slow noise (nT), delays of the axes.
 
         Slow noise is computed where it is needed: for a month its columns would fill 500 MB.
         """
@@ -374,7 +374,7 @@ class Problem:
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J, dtype=float))
 
     def straight(self, z: FloatArray) -> FloatArray:
-        """(n,) residual without what the axes' delays in z (q,) add to it."""
+        """Return (n,) residual without what the axes' delays in z (q,) add to it."""
         return np.asarray(self.residual - self.delay_jacobian @ z[DELAYS])
 
 

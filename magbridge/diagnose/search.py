@@ -141,7 +141,7 @@ def _lasting(fit: Joint, rows: IndexArray) -> bool:
 
 
 def _neighbours(fit: Joint, rows: IndexArray) -> float:
-    r"""Chance that the samples before and after `rows` (k,) are good: 1 where gaps leave none to ask.
+    r"""Return chance that the samples before and after `rows` (k,) are good: 1 where gaps leave none to ask.
 
     Notes
     -----

@@ -103,7 +103,7 @@ class SearchState:
         )  # fmt: skip
 
     def ratio(self, fit: Joint, null: Joint | None = None) -> float:
-        """Twice the gain in log likelihood over the fit without any cause, or over another `null`."""
+        """Return twice the gain in log likelihood over the fit without any cause, or over another `null`."""
         return 2.0 * (fit.log_likelihood - (null or self.null).log_likelihood)
 
     def value(self, model: Sequence[Candidate], fit: Joint, null: Joint | None = None) -> float:
@@ -124,7 +124,7 @@ class SearchState:
         )
 
     def best(self, info: Information) -> dict[Group, Best]:
-        """Best member of each group."""
+        """Return best member of each group."""
         found = {}
         for group, members in self.groups.items():
             scores = [score(info, self.at[k], self.candidates[k]) for k in members]
@@ -153,7 +153,7 @@ class SearchState:
         return sorted(found, key=lambda h: -h.evidence)
 
     def conditional_on(self, model: Sequence[Candidate], base: Joint) -> Information:
-        """Information of all candidates, then of `model`, under its noise, the calibration projected out."""
+        """Return the information of all candidates, then of `model`, with the calibration projected out."""
         known, info = self.last
         if known is not base:
             info = self._information_under(base.noise, model, base)
@@ -162,7 +162,7 @@ class SearchState:
         return info
 
     def _cleared(self, model: list[Candidate], base: Joint, info: Information) -> Information:
-        """Information under the noise that remains when the best candidate of every cause is fitted."""
+        """Return the information under the noise that the best candidate of every cause leaves."""
         # The best candidate of each cause, all in one model with the prior of plausible sizes
         top: dict[str, Best] = {}
         for (cause, _), best in self.best(info).items():
@@ -193,7 +193,7 @@ class SearchState:
     def _information_under(
         self, noise: ResidualNoise, model: Sequence[Candidate], base: Joint, stride: int = 1
     ) -> Information:
-        """Information of all candidates and of `model` under a noise, in every `stride`-th piece."""
+        """Return information of all candidates and of `model` under a noise, in every `stride`-th piece."""
         columns = [*self.columns, *(candidate.columns for candidate in model)]
         return information(self.problem, noise, base, columns, stride=stride)
 
@@ -223,7 +223,7 @@ class SearchState:
         return max(found, key=lambda h: h.evidence)
 
     def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
-        """P-value of a likelihood ratio, times the hypotheses behind its cause, times the causes.
+        """Return P-value of a likelihood ratio, times the hypotheses behind its cause, times the causes.
 
         The noise's level is estimated, too, so the distribution is Fisher's F.
         """
@@ -242,7 +242,7 @@ def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:
-    """(k,) prior precision that a fit begins from: nature's sizes are known, a fault's hardly."""
+    """Return (k,) prior precision that a fit begins from: nature's sizes are known, a fault's hardly."""
     natural = [not c.effects or c.spectra is not None for c in model]
     return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
 

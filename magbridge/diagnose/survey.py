@@ -110,7 +110,7 @@ def _is_among(part: str, words: str) -> bool:
 
 
 def dives_of(table: Table) -> IntArray:
-    """(n,) number of each sample's dive: as the log counts, else from surface to surface, else eighths.
+    """Return the dive number (n,) of each sample: the log's, else from surface to surface, else eighths.
 
     Of two logs, that which was learned from and that which is diagnosed, one may count its dives alone.
     """
@@ -165,7 +165,7 @@ def held(values: FloatArray) -> FloatArray:
 
 
 def eighths(n: int) -> IntArray:
-    """(n,) number of the eighth of a log that each sample is in."""
+    """Return (n,) number of the eighth of a log that each sample is in."""
     return np.arange(n) * 8 // n
 
 
@@ -268,7 +268,7 @@ class Survey:
         return np.asarray(np.cumsum(self.steps) - self.steps[0])
 
     def follows(self, lost: int = 0) -> BoolArray:
-        """(n,) the sample follows the previous one at the median interval, with at most `lost` missing."""
+        """Return which samples (n,) follow at the median interval, with at most `lost` missing."""
         apart = np.diff(self.time, prepend=np.inf)
         return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < MAX_LAG))
 
@@ -288,7 +288,7 @@ class Survey:
         return {}
 
     def values(self, names: Sequence[str]) -> FloatArray:
-        """(n, k) channels, in this order; DataError: one is missing."""
+        """Return (n, k) channels, in this order; DataError: one is missing."""
         missing = [name for name in names if name not in self.channels]
         if missing:
             raise DataError(
@@ -365,7 +365,7 @@ def _channels(
 
 
 def _place(table: dict[str, FloatArray]) -> FloatArray | None:
-    """(n, 3) m north and east of the middle, and below the surface; None without positions."""
+    """Return (n, 3) m north and east of the middle, and below the surface; None without positions."""
     if not {"latitude", "longitude"} <= set(table):
         return None
     latitude, longitude = table["latitude"], table["longitude"]
@@ -511,7 +511,7 @@ def _columns(
 
 
 def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray:
-    """(n,) samples next to which a mass moves, by the bridge's own criterion.
+    """Return (n,) samples next to which a mass moves, by the bridge's own criterion.
 
     There the axes, sampled in turn, saw the mass at different places and form no vector. With
     simultaneous sampling such samples are kept: only they reveal an offset of the clocks.

@@ -24,7 +24,7 @@ __all__ = [
 MAX_PAUSE_S = 3.0 * 3600.0
 """Time without a sample after which slow changes restart, s."""
 SHORTEST_CHANGE_HALF_PERIOD_S = 1.5 * 3600.0
-"""s, half the period of the fastest slow change."""
+"""Half the period of the fastest slow change, s."""
 MAX_SLOW_FUNCTIONS = 60
 """Slow functions of one stretch of a log, at most."""
 BLOCK_ROWS = 16_384

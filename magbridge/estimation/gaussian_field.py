@@ -62,7 +62,7 @@ class GaussianField:
 
     nodes: Nodes
     length: float
-    """m, over which the correlation falls (Matern's)."""
+    """Correlation length (Matern's), m."""
     alpha: int
     """One of :data:`SMOOTHNESS_POWERS`."""
     harmonic: bool = False

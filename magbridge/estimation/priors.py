@@ -42,7 +42,7 @@ WIDE_HARD_IRON_SIGMA = 0.6
 FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05
 """nT in T and in a over half the range seen, of a mass; its travel over its distance."""
 CROSS_T, CROSS_A = 0.1, 0.1
-"""nT, in T and in a, of cross terms: masses hardly magnetise each other."""
+"""Prior sigma of cross terms, in T and in a, nT: masses hardly magnetise each other."""
 FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)
 """1-sigma of the logarithms of the widths: of fixed iron, of a mass, of travel over distance."""
 
@@ -56,7 +56,7 @@ class Prior:
     offset: FloatArray | float = 0.0
 
     def coefficients(self, z: FloatArray) -> FloatArray:
-        """(K,) ``c = E z + offset`` of z (q,)."""
+        """Return (K,) ``c = E z + offset`` of z (q,)."""
         return np.asarray(self.E @ z + self.offset)
 
 
@@ -80,7 +80,7 @@ class PriorFamily:
     """``z -> PriorFamily``: the family linearised at another z."""
 
     def widths(self, eta: FloatArray) -> FloatArray:
-        """(q,) prior 1-sigma of z at `eta` (h,)."""
+        """Return (q,) prior 1-sigma of z at `eta` (h,)."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
 
     def nearest_latent(self, start: FloatArray) -> FloatArray:

@@ -49,7 +49,7 @@ class ResidualSamples:
     steps: FloatArray
     """(n,): Sampling intervals since the previous sample; infinite where that belongs to another run."""
     F_0: float
-    """nT, the total field that the coefficients of A refer to: ``A = I + a / F_0``."""
+    """Total field that the coefficients of A refer to, nT: ``A = I + a / F_0``."""
     kappa: float = 0.0
     """Noise of the reference divided by the sensor's."""
 
@@ -98,12 +98,12 @@ def residuals(samples: ResidualSamples, coefficients: FloatArray) -> tuple[Float
 
 
 def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
-    """(n, 9 m) derivatives by all coefficients, ``phi (x) g``, of monomials (n, m) and those by the nine."""
+    """Return the derivatives (n, 9 m) by all coefficients: ``phi (x) g`` of phi (n, m) and g (n, 9)."""
     return np.asarray(phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
 
 
 def residuals_of(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
-    """Residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
+    """Return residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
     # Chunks bound the memory of the Jacobian's intermediate arrays.
     pieces = [
         residuals(samples.part(slice(start, start + CHUNK_ROWS)), coefficients)[0]
@@ -113,24 +113,24 @@ def residuals_of(samples: ResidualSamples, coefficients: FloatArray) -> FloatArr
 
 
 def rms(values: FloatArray) -> float:
-    """Root mean square of the values (n,)."""
+    """Return root mean square of the values (n,)."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def robust_scale(values: FloatArray) -> float:
-    """1-sigma of the bulk of values (n,) about zero, outliers or not: 1.48 times their median magnitude."""
+    """Return the 1-sigma of most values (n,) about zero: 1.48 times their median magnitude."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
 def scales_and_offsets(samples: ResidualSamples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
+    """Return eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
     theta = samples.phi @ coefficients.reshape(-1, 9)
     A = np.eye(3) + symmetric(theta) / samples.F_0
     return np.asarray(np.linalg.eigvalsh(A)), np.asarray(np.linalg.norm(theta[:, 6:], axis=1))
 
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:
-    """(n, 3, 3) times (n, 3)."""
+    """Return (n, 3, 3) times (n, 3)."""
     return np.asarray(np.matmul(A, x[:, :, None])[:, :, 0])
 
 

@@ -28,7 +28,7 @@ from magbridge.arrays import FloatArray, IndexArray
 __all__ = ["InverseBlocks", "SparseFactor", "inverse_blocks"]
 
 SMALL, FULL = 1_500, 0.02
-"""Rows, and share of a matrix that is not zero, to which and from which on LAPACK is faster than SuperLU."""
+"""Largest number of rows, and smallest fraction of non-zeros, with which LAPACK is faster than SuperLU."""
 
 
 class SparseFactor:

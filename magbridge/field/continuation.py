@@ -40,9 +40,9 @@ class Continued(NamedTuple):
 
     grid: AnomalyGrid
     sigma: float
-    """nT, 1-sigma of what the continuation leaves out; 0 upward to one level."""
+    """1-sigma of what the continuation leaves out, nT; 0 upward to one level."""
     length: float
-    """m, correlation length of that error: at short distances its correlation falls as exp(-r²/2 length²)."""
+    """Correlation length of that error, m: at short distances its correlation falls as exp(-r²/2 length²)."""
 
 
 def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:

@@ -26,11 +26,11 @@ __all__ = ["HOLE", "AnomalyGrid", "Local", "T", "curvature"]
 EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""
 HOLE = 9.9e4
-"""nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole."""
+"""Value beyond any anomaly, nT; 99999 and 1.7e38 are how formats without NaN write a hole."""
 PLANE_TOLERANCE_NT = 1e-6
-"""nT: what rounding leaves of a plane."""
+"""Remainder of a plane after rounding, nT."""
 NOT_AN_ANOMALY = 15_000.0
-"""nT: a median this large is the total field, not an anomaly."""
+"""Median from which on a grid holds the total field, not an anomaly, nT."""
 
 FEWEST, MIDDLE = 20, 400
 """Nodes along an axis, with fewer of which the error between them is not asked for; and at most asked for."""
@@ -240,7 +240,7 @@ class AnomalyGrid:
 
     @cached_property
     def rms(self) -> float:
-        """nT, RMS of the map about its best-fitting plane."""
+        """RMS of the map about its best-fitting plane, nT."""
         plane = np.stack(np.meshgrid(self.longitude, self.latitude), axis=-1)[~np.isnan(self.anomaly)]
         design = np.column_stack([plane - plane.mean(axis=0), np.ones(len(plane))])
         values = self.anomaly[~np.isnan(self.anomaly)]
@@ -249,13 +249,13 @@ class AnomalyGrid:
 
     @property
     def spacing(self) -> float:
-        """m, the larger of the distances between nodes, in the map's middle."""
+        """Larger of the distances between nodes, in the map's middle, m."""
         per_latitude, per_longitude = metres_per_degree(float(np.mean(self.latitude)))
         return max(self._dy * per_latitude, self._dx * per_longitude)
 
     @cached_property
     def correlation_length(self) -> float:
-        """m, distance over which the anomaly changes by its own RMS; infinite for a map without slopes.
+        """Distance over which the anomaly changes by its own RMS, m; infinite for a map without slopes.
 
         Notes
         -----
@@ -270,7 +270,7 @@ class AnomalyGrid:
 
     @cached_property
     def interpolation_sigma(self) -> float:
-        """nT, RMS error of the spline between nodes, as far as the nodes tell; 0 on a small map.
+        """RMS error of the spline between nodes, as far as the nodes tell, nT; 0 on a small map.
 
         Notes
         -----

@@ -27,7 +27,7 @@ __all__ = ["coverage", "igrf", "magnitude", "total_field"]
 REFERENCE_RADIUS = 6_371_200.0
 """Radius of the model's sphere, m."""
 IGRF_BLOCK_SAMPLES = 2048
-"""Samples; the working arrays of a block stay in the cache."""
+"""Number of samples in a block, so that its working arrays stay in the cache."""
 
 
 class Model(NamedTuple):

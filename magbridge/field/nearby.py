@@ -19,7 +19,7 @@ __all__ = ["HeldField", "NearbyField"]
 BOX_HALF_WIDTH_M = 20_000.0
 """m from the middle of the box to its edge."""
 DEEP = 2_000.0
-"""m, depth up to which it is fitted."""
+"""Depth up to which it is fitted, m."""
 FITTED_TIME_S = 20 * 86_400.0
 """s before and after the time that it is fitted at."""
 

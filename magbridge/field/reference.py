@@ -23,7 +23,7 @@ __all__ = [
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
-"""nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
+"""Range of the total field, nT: 22,000 to 67,000 at the surface (IGRF), and thousands of the crust."""
 SPHERE_TOLERANCE = 0.3
 """Relative difference of the radius of the sphere through the readings from the field, at most: soft iron and
 noise cause less, and another unit causes a factor of 10 or more."""

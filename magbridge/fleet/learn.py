@@ -32,7 +32,7 @@ REST = 0.01
 """Share of the physical widths that a refit of a mounted mass moves besides what a dipole does."""
 NOWHERE: Mapping[str, Mapping[str, Mounting]] = {}
 REFERENCE_FIELD_NT = 50_000.0
-"""nT, the F_0 that a fleet's coefficients refer to."""
+"""F_0 that a fleet's coefficients refer to, nT."""
 
 
 class Lesson(NamedTuple):

@@ -83,9 +83,9 @@ class Signs(NamedTuple):
     positions: tuple[float, ...]
     """Parameters, scaled to their range."""
     watched: tuple[float, ...]
-    """degC and A: temperature and currents; NaN where unknown."""
+    """Temperature, degC, and currents, A; NaN where unknown."""
     clock: float
-    """nT/s: how the residual changes with the telemetry's time."""
+    """Change of the residual with the telemetry's time, nT/s."""
     level: float
     """By the reference's level."""
 
@@ -236,7 +236,7 @@ class ChangeDetector:
         return self._test.misfit(self._fitting[0])
 
     def _moves(self, row: int) -> FloatArray:
-        """(n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
+        """Return (n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
         cause, unit, start = self._causes[row], float(self._unit[row]), float(self._start[row])
         G = self._test.absorbed[:, row].copy()
         assert cause.states is not None
@@ -254,7 +254,7 @@ class ChangeDetector:
 
 
 LATE_US: Final = (8_000_000, 16_000_000, 32_000_000)
-"""µs, d: shorter ones are those of telemetry that comes seldom."""
+"""D, µs: shorter ones are those of telemetry that comes seldom."""
 MAX_DELAY_ERROR: Final = 0.25
 """By how much of d a later report may be off."""
 DELAY_UNCERTAINTY: Final = 0.4

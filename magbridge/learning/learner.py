@@ -51,7 +51,7 @@ MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 """Samples that nothing is learned from."""
 MAPLESS: Final = 145.0
-"""nT, 1-sigma of the field about the main field alone."""
+"""1-sigma of the field about the main field alone, nT."""
 
 
 class Learner:
@@ -133,7 +133,7 @@ class Learner:
 
     @property
     def variance(self) -> float:
-        """nT², to add to that of the total field while the data are not explained."""
+        """Variance to add to that of the total field while the data are not explained, nT²."""
         return self._standing.variance
 
     @property

@@ -143,15 +143,15 @@ class LearnedTerms:
         return np.array([*calibrated[: self._terms], *self._regressors])
 
     def weights(self, coefficients: FloatArray) -> FloatArray:
-        """(m, 9) what each regressor adds to the nine coefficients, nT."""
+        """Return (m, 9) what each regressor adds to the nine coefficients, nT."""
         return np.asarray((coefficients @ self._flat).reshape(self._tensor.shape[1:]))
 
     def derivative(self, phi: FloatArray, by_nine: FloatArray) -> FloatArray:
-        """(K,) derivative by the coefficients of what changes with the nine by `by_nine` (9,)."""
+        """Return (K,) derivative by the coefficients of what changes with the nine by `by_nine` (9,)."""
         return np.asarray(self._flat @ np.outer(phi, by_nine).ravel())
 
     def _index(self, used: Sequence[int]) -> IndexArray:
-        """Which of the K coefficients a calibration has that carries the further terms `used`."""
+        """Return which of the K coefficients a calibration has that carries the further terms `used`."""
         places = [self._further.index(k) for k in used]
         further = [self._own + 3 * place + axis for place in places for axis in range(3)]
         return np.array([*range(self._own), *further])

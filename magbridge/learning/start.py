@@ -33,7 +33,7 @@ MAX_GAUSS_NEWTON_STEPS: Final = 12
 MIN_STEP_SIGMA: Final = 0.01
 """Prior sigmas: a step this small is the last."""
 NOISE: Final = 2.0
-"""nT, 1-sigma of a channel's noise, until the samples say more."""
+"""1-sigma of a channel's noise, until the samples say more, nT."""
 MIN_SAMPLES_FOR_NOISE: Final = 256
 """Samples from which on they do."""
 

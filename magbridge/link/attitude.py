@@ -18,7 +18,8 @@ from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_ESTIMATOR_TYPE, MAV_FRAME
 __all__ = ["HEADING_SENDERS", "NO_ATTITUDE", "Attitude", "nmea_sentences", "quaternion", "send_attitude"]
 
 IGNORED_VARIANCE: Final = 1e4
-"""m², rad²: of position, roll and pitch in a message of which the autopilot shall only use the yaw."""
+"""Variance of position, m², and of roll and pitch, rad², in a message of which the autopilot shall only use
+the yaw."""
 FULL_QUALITY: Final = 100
 """ODOMETRY.quality, %."""
 

@@ -10,7 +10,7 @@ __all__ = ["VehicleClock"]
 CLOCK_EXCHANGES = 32
 """Latest exchanges that are used."""
 JITTER_US = 200.0
-"""µs, the uncertainty of even the fastest exchange."""
+"""Uncertainty of even the fastest exchange, µs."""
 STEP_US, DRIFT = 20_000, 500e-6
 """µs, µs/µs: a clock was set if the offsets of two exchanges differ by more than half of both round trips,
 plus this step, plus this drift over the time between them."""

@@ -25,7 +25,7 @@ LATITUDE_LONGITUDE_ONLY = 0
 GOOD = 100
 """ODOMETRY.quality, in %: only valid positions are sent."""
 OTHERS_VARIANCE = 1.0
-"""m², rad²: of the height and attitude in an ODOMETRY, which are the autopilot's own."""
+"""Variances of height (m²) and attitude (rad²) in an ODOMETRY; both are the autopilot's own."""
 WALK = 1e-3
 """(m/s)²/s: how fast the wind, or the velocity error, of an autopilot's filter is taken to walk."""
 
@@ -190,7 +190,7 @@ class Kind(NamedTuple):
     local: bool = False
     """It holds a :class:`Pose`."""
     trusted_to: float = inf
-    """m: ArduPilot takes a larger sigma for this one."""
+    """Sigma that ArduPilot uses instead of any larger one, m."""
     least: float = 0.0
     """Hz below which the receiver takes the source for dead."""
 

@@ -24,7 +24,7 @@ LIMITS = {
 """The messages whose rate (Hz) can be set, and within which limits."""
 DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 LONGEST_US = 0x7FFFFFFF
-"""µs, 36 min: the longest interval that a MESSAGE_INTERVAL holds."""
+"""Longest interval that a MESSAGE_INTERVAL holds, µs (36 min)."""
 
 
 def check_publish(publish: Mapping[str, float], path: Path) -> None:

@@ -15,9 +15,9 @@ from magbridge.mavlink.enums import MAV_SEVERITY
 __all__ = ["FOREVER", "Announcer", "Outbox", "Rate", "Timers", "period_us"]
 
 FOREVER = 1 << 62
-"""µs: the deadline where no timer is set."""
+"""Deadline where no timer is set, µs."""
 MAX_PERIOD_US = 1e15
-"""µs, 31 years: a lower rate has this period."""
+"""Longest period, µs (31 years): a lower rate has this one."""
 STATUSTEXT_LENGTH = 50
 """Characters in one STATUSTEXT (definition of the message, common.xml)."""
 TEXTS_KEPT = 32

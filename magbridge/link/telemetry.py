@@ -19,7 +19,7 @@ __all__ = ["TelemetryMap", "is_possible", "own_time", "sent_us"]
 Value = tuple[str, float, int]
 ReadTime = Callable[[bytes], tuple[int, int]]
 YEAR_2001_US = 10**15
-"""µs; a 64-bit time beyond it counts from 1970 and not from the boot."""
+"""64-bit time beyond which it counts from 1970 and not from the boot, µs."""
 
 
 class Extractor:
@@ -171,7 +171,7 @@ def own_time(layout: Spec) -> ReadTime | None:
 
 MAX_ANGLE_RAD: Final = 2.0 * pi + 0.1
 MAX_DISTANCE_M: Final = 4e7
-"""m: the Earth's circumference."""
+"""The Earth's circumference, m."""
 MAX_VALID_SPEED_M_S: Final = 1e4
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """1e-7 deg."""

@@ -42,7 +42,7 @@ MIN_VALUE = {
 """Lowest temperatures and pressures, also of a pressure relative to the surface's: -9999 is a code for
 "not known"."""
 REFERENCE_FIELD_RANGE_NT = 1e3, 1e6
-"""nT, between which every reference field lies: 5e-05 is in tesla, and -9999 a code for "not known"."""
+"""Range of every reference field, nT: 5e-05 is in tesla, and -9999 a code for "not known"."""
 MAX_CHANNEL_DELAY_S = 60.0
 """s by which a channel's sampling time may differ from its row's time."""
 MIN_GROUP_ROWS, MAX_ISOLATION_S = 3, 30 * 86_400.0

@@ -22,7 +22,7 @@ __all__ = [
 
 DEG_PER_RAD = 180.0 / np.pi
 MAX_AGE = 30.0
-"""s; a value that was received longer ago is not carried to a row."""
+"""Age from which on a value is not carried to a row, s."""
 CIRCLES = {
     "heading": (360.0, 0.0),
     "roll": (360.0, -180.0),

@@ -25,7 +25,7 @@ from magbridge.logs.registry import opened
 __all__ = ["chunks"]
 
 MIN_CODE_NT = 88_888.0
-"""nT; this, and 99,999, stand for values that were not recorded, or not observed."""
+"""Code for values that were not recorded, as 99,999 for those not observed, nT."""
 TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
 """Elements whose length is the total field, the surest first."""
 

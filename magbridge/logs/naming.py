@@ -294,7 +294,7 @@ def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
 
 
 READING_RANGE_NT = 15_000.0, 90_000.0
-"""nT, within which the Earth's field lies, with a vehicle's own."""
+"""Range of the Earth's field with a vehicle's own, nT."""
 TOTAL_NAME = re.compile(
     "f|nt|mag|tm[fi]|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?(field|intensity)|magneticfield"
     "|reading1|scalar.*|magnitude"

@@ -29,7 +29,7 @@ __all__ = ["read", "read_chunks", "read_each", "without_companions"]
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
-"""Rows: more than any file has."""
+"""Number of rows that no file reaches."""
 MAX_SHARED_BYTES = 4_000_000
 """Bytes of a file below which one child process reads several."""
 DEFAULTS = Options()

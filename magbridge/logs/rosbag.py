@@ -58,7 +58,7 @@ ROS_STAMP = np.dtype([("", "V4"), ("s", "<i4"), ("ns", "<u4")])
 """Where both ROS 1 (after the sequence number) and ROS 2 (after the encapsulation) have a header's stamp."""
 LITTLE = b"\x00\x01"
 MIN_REAL_TIME_S = 315_532_800.0
-"""s: earlier stamps are those of a simulation, which begins at 0."""
+"""Earliest stamp of a real recording, s: a simulation begins at 0."""
 EARTH = 15e3, 150e3
 """nT: a median length within is the Earth's field with a vehicle's; a factor of ten, so one unit fits."""
 TESLA = 1e-6, 1e-2

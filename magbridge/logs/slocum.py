@@ -50,7 +50,7 @@ ASCII_HEADER = re.compile(rb"\w+:.*")
 """A line of the header of what ``dbd2asc`` wrote; below it are names, units, sizes, and a cycle a line."""
 CLOCK_SENSORS = b"m_present_time", b"sci_m_present_time"
 FILL = 69_696_969.0
-"""deg and min, of a position that was never known."""
+"""Code of a position that was never known, deg and min."""
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
 SLOCUM_FIELDS = (
     FieldMap("", "m_roll", "roll", "deg", DEG_PER_RAD),

@@ -27,7 +27,7 @@ V1: Final = PROTOCOL_MARKER_V1
 V2: Final = PROTOCOL_MARKER_V2
 SIGNED: Final = MAVLINK_IFLAG_SIGNED
 SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
-"""bytes: link id, 6 of time stamp, 6 of hash."""
+"""Length of a signature, bytes: link id, 6 of time stamp, 6 of hash."""
 NOT_A_FRAME: Final = 0
 NEEDS_MORE: Final = -1
 MAX_MESSAGE_ID: Final = 0xFFFF

@@ -25,7 +25,7 @@ __all__ = ["LogReader", "RecordBlock", "TlogRecord", "blocks", "pack_record", "p
 
 TLOG_STAMP: Final = Struct(">Q")
 LATEST: Final = 1 << 52
-"""µs; a stamp beyond the year 2112 is damage."""
+"""Stamp of the year 2112, µs; a later one is damage."""
 BLOCK_BYTES: Final = 1 << 22
 """Bytes read at a time."""
 MAX_RECORD_BYTES = 8 + 10 + 255 + 2 + SIGNATURE + 9

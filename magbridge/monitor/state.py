@@ -26,7 +26,7 @@ MAX_SENSORS = 8
 MIN_COMPARISON_TIME_S = 1.0
 """Samples of two sensors are compared where they are no further from each other, s, or than two intervals."""
 SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
-"""Samples, parameters, and series of telemetry that are kept at most."""
+"""Largest numbers of samples, parameters and series of telemetry that are kept."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
 """States of the position filter in which it says where the vehicle is."""
 COMMAND_PARAMETERS = {"MB_LEARN_CMD"}

@@ -38,7 +38,7 @@ class Background:
     """An anomaly grid as a picture."""
 
     box: tuple[float, float, float, float]
-    """deg: west, south, east, north."""
+    """West, south, east and north edge, deg."""
     picture: str
     """A PNG as a ``data:`` address; north is up."""
     span: float

@@ -141,7 +141,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     time_unit: Literal["s", "ms", "us"] = "s"
     """Unit of the column ``time``."""
     time_modulo: NotNegative = 0.0
-    """s, at which the device's time wraps; 0: never."""
+    """Time at which the device's clock wraps, s; 0: never."""
     sequence_modulo: Annotated[int, Meta(ge=0)] = 0
     """Where the column ``sequence`` wraps; 0: never."""
     rate: NotNegative = 0.0

@@ -33,9 +33,9 @@ since a busy computer may delay all points for a second."""
 TOLERANCE: Final = 20_000.0
 """µs by which an arrival may contradict the line."""
 INITIAL_DELAY_US: Final = 5_000.0
-"""µs, the mean delay before anything is known."""
+"""Mean delay before anything is known, µs."""
 STALL: Final = 100_000.0
-"""µs; longer delays enter the mean delay as this, because they say nothing about the usual ones."""
+"""Largest delay that enters the mean delay, µs; longer ones say nothing about the usual delay."""
 WANDER: Final = 0.05
 """Fraction of the prior sigma below which the slope's sigma never falls: rates change with temperature."""
 BOUND: Final = 5.0

@@ -67,9 +67,9 @@ class Gridded:
     rho: float
     """The noise's autocorrelation."""
     middle: float
-    """m, depth at which the map holds."""
+    """Depth at which the map holds, m."""
     mean: float
-    """nT, of all samples, and of the map over them."""
+    """Range of all samples, and of the map over them, nT."""
     kept: BoolArray
     """(n,): True for samples that are not outliers."""
     widths: Hyperparameters

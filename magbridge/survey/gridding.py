@@ -54,7 +54,7 @@ likely as a crustal anomaly: with a free width, slow changes absorbed up to 6 nT
 SEARCHED, SEARCHED_NODES = 4_000, 12_000
 """Samples about the middle with which the field is searched, and nodes at most."""
 VARIATION_BOX_M = 5_000.0
-"""m, north and east of it: where there are more samples within, every second or tenth of these."""
+"""North and east of it, m: where there are more samples within, every second or tenth of these."""
 GRID_OUTLIER_SIGMA = 6.0
 """Sigmas beyond which a sample is left out."""
 FINER_NODES = 2.5

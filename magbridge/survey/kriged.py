@@ -57,7 +57,7 @@ class Kriged:
     roughness: Roughness
     tree: cKDTree
     below: float
-    """m, of the sources below the samples."""
+    """Depth of the sources below the samples, m."""
     size: float
     noise: float
     """`size`, `noise`: nT, standard deviation of the field where the roughness is 1, and of the noise."""

@@ -36,7 +36,7 @@ class Samples:
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     """(n, r), nT, what 1-sigma of each of the calibration's uncertain combinations does to every sample."""
     level_sigma: float = 0.0
-    """nT, 1-sigma of what all samples are off by, the reference's level."""
+    """1-sigma of what all samples are off by, the reference's level, nT."""
 
     def __post_init__(self) -> None:
         n = len(self.value)

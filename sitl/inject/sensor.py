@@ -8,7 +8,7 @@ import numpy as np
 from sitl.inject.scene import Array, Generator, Scene, direction, soaked
 
 CALIBRATED_AT = 4.5
-"""degC, the instrument's temperature during the calibration, to about half a degree."""
+"""Instrument's temperature during the calibration, to about half a degree, degC."""
 
 
 def _warmer(scene: Scene, rng: Generator) -> Array:

@@ -8,7 +8,7 @@ __all__ = ["summary"]
 
 Result = dict[str, Any]
 UNKNOWN = 50_000.0
-"""nT, about the total field: a larger sigma means that nothing is known."""
+"""Sigma of the total field from which on nothing is known, nT."""
 
 
 def summary(result: Result) -> str:

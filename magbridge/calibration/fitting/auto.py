@@ -107,7 +107,7 @@ def climb(
 def _doubt(
     samples: ResidualSamples, prior: Prior, solution: Solution, noise: NoiseModel
 ) -> tuple[float, float]:
-    """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
+    """Return variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
     few = thinned(samples)
     _, g = residuals(few, prior.coefficients(solution.z))
     J = jacobian(few.phi, g)
@@ -140,7 +140,7 @@ def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples)
 # ---- The ends of a log that are not its flight ----
 
 MIN_END_SAMPLES = 20
-"""Samples: fewer outliers at an end are outliers as any others."""
+"""Number of samples: fewer outliers at an end are outliers as any others."""
 MIN_OUTLIER_FRACTION = 0.7
 """Share of an end's samples that are outliers."""
 
@@ -263,7 +263,7 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
 
 
 def _shrinks(found: Fit) -> float:
-    """Departure of the middle scale from 1."""
+    """Return departure of the middle scale from 1."""
     return abs(0.5 * sum(found.scales) - 1.0)
 
 

@@ -50,17 +50,17 @@ __all__ = [
 # ---- From roll and pitch alone ----
 
 INCLINATION_SIGMA_DEG = 0.2
-"""deg, 1-sigma of a main-field model's inclination (Chulliat et al. 2020, table 14)."""
+"""1-sigma of a main-field model's inclination (Chulliat et al, deg. 2020, table 14)."""
 RUN_TILT_SIGMA_DEG = 0.2
-"""deg, 1-sigma of the offset of roll and of pitch in one run."""
+"""1-sigma of the offset of roll and of pitch in one run, deg."""
 MIN_TILT_SIGMA_DEG = 0.02
-"""deg, smallest 1-sigma of the tilt's noise that is believed."""
+"""Smallest 1-sigma of the tilt's noise that is believed, deg."""
 MAX_ITERATIONS = 50
 CONVERGED_RAD = 1e-8
 MIN_SAMPLES = 30
 SEARCH_SAMPLES = 400
 MAX_STEP_RAD = 0.5
-"""rad, longest step: the residual is linear in the rotation over that at most."""
+"""Longest step, rad: the residual is linear in the rotation over that at most."""
 LEAST_INFORMATION = 3.0 / np.pi**2
 """1/rad^2, of an angle of which nothing is known: it is uniform over a full turn."""
 DAMPING = 1e-9
@@ -78,9 +78,9 @@ class TiltBoresight:
     covariance: FloatArray
     """(3, 3), rad^2, of a small rotation about the body axes."""
     inclination_shift: float
-    """deg, by which the field dips more steeply than the reference."""
+    """Difference of the field's inclination from the reference's, deg; positive: steeper."""
     tilt_sigma: float
-    """deg, standard deviation of the tilt that explains the residual."""
+    """Standard deviation of the tilt that explains the residual, deg."""
 
     @property
     def open_angle(self) -> tuple[str, float]:
@@ -221,15 +221,15 @@ def _gauss_newton(problem: _Problem, rotation: Rotation) -> tuple[Rotation, floa
 # ---- With headings, and the choice ----
 
 MAX_OPEN_ANGLE_DEG = 2.0
-"""deg, 1-sigma of the angle that roll and pitch determine least, above which headings are used."""
+"""1-sigma of the angle that roll and pitch determine least, above which headings are used, deg."""
 MIN_BORESIGHT_SAMPLES = 30
 """Samples with attitude and direction that a boresight takes."""
 MISMATCH = 10.0
-"""deg, median angle that no rotation removes: masses leave less, a reversed channel or angle more."""
+"""Median angle that no rotation removes, deg: masses leave less, a reversed channel or angle more."""
 NEAR, LEAST = 2.0, 0.5
-"""deg, within which angles are the same; and the least mismatch, of a compass, that one is compared with."""
+"""Largest difference of equal angles, and smallest mismatch of a compass to compare with, deg."""
 COMPASS_SIGMA = np.radians(0.5)
-"""rad, compass error common to all runs, which their scatter does not show."""
+"""Compass error common to all runs, which their scatter does not show, rad."""
 
 
 def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:

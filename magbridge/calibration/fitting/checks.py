@@ -38,11 +38,11 @@ SWEPT = 0.3
 MAX_CORRELATION = 0.9
 """Correlation of two positions above which their effects cannot be distinguished."""
 BANKED = 10.0
-"""deg, range of roll that shows the vertical offset."""
+"""Range of roll that shows the vertical offset, deg."""
 DIVE_PITCH_DEG = 5.0
-"""deg, pitch from which on a run is a dive or a climb."""
+"""Pitch from which on a run is a dive or a climb, deg."""
 OPEN = 60.0
-"""deg, gap in the headings that is remarked on."""
+"""Gap in the headings that is remarked on, deg."""
 RANK_TOLERANCE = 1e-9
 """Share of the largest singular value, below which one counts as zero."""
 
@@ -86,7 +86,7 @@ def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: floa
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
-    """RMS error expected near the runs, at any heading and 10 deg more roll, divided by a sample's noise."""
+    """Return the RMS error near the runs (any heading, 10 deg more roll) over a sample's noise."""
     error = expected_error(calibration, nearby_mission(calibration, data))
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
@@ -163,7 +163,7 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
 
 
 def heading_gap(data: Observations) -> float:
-    """Width (deg) of the widest part of the compass without a heading; 0 without attitude telemetry."""
+    """Return the width (deg) of the widest gap between headings; 0 without attitude telemetry."""
     if data.attitude is None:
         return 0.0
     heading = np.degrees(data.attitude[:, 2])
@@ -219,7 +219,7 @@ sixteenth of its departure. A gain of 0.8 came out as 0.84 to 0.98 at ratios of 
 MAX_NOISE_AUTOCORRELATION = 0.98
 """Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
 MAX_HEADING_GAP_DEG = 270.0
-"""deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
+"""Gap in the headings, deg: less than a quarter of the compass does not determine the rest."""
 
 
 def judged(found: Fit, data: Observations) -> Fit:

@@ -21,7 +21,7 @@ __all__ = [
 MIN_CROSSING_DEG = 30.0
 """deg between two courses that cross."""
 REVERSED_COURSE_DEG = 150.0
-"""deg, from which on the second course is the first one's reverse."""
+"""Difference of two courses from which on the second is the reverse of the first, deg."""
 FEW = 3
 """Crossed places below which a survey says nothing about itself."""
 PLACE_LENGTH_FRACTION = 0.25

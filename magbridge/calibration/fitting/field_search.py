@@ -144,7 +144,7 @@ class Weighed:
     eta: FloatArray
     sigma: float
     middle: float
-    """m, the length that is expected."""
+    """Length that is expected, m."""
 
     def score(self, reduced: FieldEliminated, field: GaussianField, ratio: float) -> float:
         """Return the log evidence, the noise's size being the likeliest one."""

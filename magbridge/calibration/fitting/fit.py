@@ -34,7 +34,7 @@ METHODS: dict[str, str] = {
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 
 ONE_ATTITUDE = 5.0
-"""deg: all samples within that of their mean direction are one attitude."""
+"""Largest angle from the mean direction within which all samples are one attitude, deg."""
 NO_FIELD_IN_PLACE = "the crustal field was not found with the calibration: its part stays in the errors"
 ONE_ELLIPSOID = (
     "method auto has no solution, so that one ellipsoid was fitted (method nominal), without parameters"
@@ -43,7 +43,7 @@ WITHOUT_PARAMETERS = "method nominal has no solution: used was method auto, with
 UNKNOWN_LENGTH = 500.0
 """Length assumed for the crustal field without a field in place, m."""
 MAIN_FIELD_SIGMA_NT = 145.0
-"""nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
+"""1-sigma by which the total field at a site differs from a main-field model's, nT: what its degrees do not
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 MAX_FIT_SAMPLES = 250_000
 """Samples at most that are fitted: more only cost time, because the model's error does not average out."""

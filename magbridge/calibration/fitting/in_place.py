@@ -51,7 +51,7 @@ REFERENCE_ERROR_LENGTH_M = 25_000.0
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
 DRIFTING = 2700.0
-"""s, half the period of the fastest drift of a position."""
+"""Half the period of the fastest drift of a position, s."""
 
 
 def fit_in_place(

@@ -60,12 +60,12 @@ class LeftOut:
     """Errors of the parts left out, each predicted from the others."""
 
     rms: float
-    """nT, in the sensor's own units; single samples count as five sigmas at most."""
+    """RMS error in the sensor's own units, nT; single samples count as five sigmas at most."""
     ratio: float
     """Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
     The larger one, where groups of like attitude are left out, too."""
     carried: float
-    """nT, the RMS with later parts of the log predicted from the earlier ones among the parts."""
+    """RMS with later parts of the log predicted from the earlier ones among the parts, nT."""
 
 
 def leave_out(

@@ -49,7 +49,7 @@ class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[mass.NAME]``: where the mass that parameter NAME moves sits, seen from the sensor."""
 
     at: Vector
-    """m, body frame, where the parameter is 0."""
+    """Position in the body frame where the parameter is 0, m."""
     travel: Vector
     """m per unit of the parameter."""
     at_sigma: Annotated[float, Meta(gt=0)] = 0.05

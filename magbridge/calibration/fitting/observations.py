@@ -67,9 +67,9 @@ class Observations:
     depth: FloatArray | None = None
     """(n,), m; NaN where it is not known."""
     map_sigma: float | None = None
-    """nT, 1-sigma of the map in the reference; None without a map."""
+    """1-sigma of the map in the reference, nT; None without a map."""
     origin: tuple[float, float] = (0.0, 0.0)
-    """deg, latitude and longitude of the origin of `place`."""
+    """Latitude and longitude of the origin of `place`, deg."""
     sensor: str = ""
     filter_cutoff: float = 0.0
     """Cutoff frequency of the anti-alias filter that is undone in `field`, Hz; 0: none."""

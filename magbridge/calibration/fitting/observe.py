@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["at_one_time", "observations"]
 
 MAP_ERROR = 20.0
-"""nT, 1-sigma of a map that does not state its own."""
+"""1-sigma of a map that does not state its own, nT."""
 MIN_GAP_INTERVALS = 10.0
 """Intervals without a sample, after which a sample is independent of the previous one."""
 FOLLOWED = (TEMPERATURE, "depth")

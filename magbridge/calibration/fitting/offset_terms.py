@@ -24,11 +24,12 @@ from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, slow_functi
 __all__ = ["Creep", "in_words", "offered", "with_creep", "with_temperature"]
 
 TEMPERATURE_LAGS_S = (0.0, 600.0, 2400.0)
-"""s, by which the offset may follow the temperature: a sensor by itself, in its housing, in a hull."""
+"""Time constants with which the offset may follow the temperature, s: a bare sensor, in its housing, in a
+hull."""
 SHORTEST_DRIFT_HALF_PERIOD_S = 1200.0
-"""s, half the period of the fastest creep: of a random walk of 20 nT in 6 h all but 1 nT, and a step."""
+"""Half the period of the fastest creep, s: it follows a random walk of 20 nT in 6 h to 1 nT, and a step."""
 VARIES = 0.5
-"""degC, standard deviation of a temperature, from which on it can tell anything."""
+"""Standard deviation of a temperature, from which on it can tell anything, degC."""
 PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 """nT/degC and nT along an axis (fluxgates' data sheets: 0.1 to 3 nT/degC), 1-sigma of their logarithms."""
 

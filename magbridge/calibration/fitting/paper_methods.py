@@ -48,7 +48,7 @@ __all__ = ["ANYTHING", "fit_cubic", "fit_horizontal", "fit_per_run"]
 PLAIN = 1e4
 """kappa at which all noise counts as the reference's: the residual is the paper's ``|A(H_r - T)| - H_e``."""
 ANYTHING = 1e4
-"""nT, prior 1-sigma of every coefficient: so wide that it only keeps steps finite."""
+"""Prior 1-sigma of every coefficient, nT: so wide that it only keeps steps finite."""
 
 
 def fit_cubic(data: Observations, order: int = 3) -> Fit:

@@ -53,7 +53,7 @@ class Known:
     exponents: tuple[Exponents, ...]
     """The m monomials, all of them up to a degree."""
     field: float
-    """nT, the F_0 that the coefficients refer to."""
+    """F_0 that the coefficients refer to, nT."""
     mean: FloatArray
     """(9 m,), nT."""
     covariance: FloatArray

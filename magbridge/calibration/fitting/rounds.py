@@ -52,7 +52,7 @@ class Answer:
     lacking: FloatArray
     score: float
     middle: float
-    """m, the length that was expected."""
+    """Length that was expected, m."""
 
     def covariance(self) -> FloatArray:
         """Return that of z (q, q), with what the data leave open of the field's size and length."""

@@ -54,11 +54,11 @@ LOG_WIDTH_SIGMA = 1.0
 CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA = 10.0, 1.5
 """nT a swing and its log's 1-sigma: centre of a channel's width."""
 LAG_SIGMA_S = 0.5
-"""s, 1-sigma of the lag between scalar and vector."""
+"""1-sigma of the lag between scalar and vector, s."""
 TIME_CONSTANTS_S = (1.5, 5.0, 15.0, 50.0, 150.0, 500.0, 1500.0, 5000.0)
-"""s, of the Ornstein-Uhlenbeck processes."""
+"""Correlation times of the Ornstein-Uhlenbeck processes, s."""
 FIT_INTERVAL_S = 0.5
-"""s, shortest interval of the samples that are fitted; faster logs are averaged to it."""
+"""Shortest interval of the samples that are fitted, s; faster logs are averaged to it."""
 FILTER_GAP_INTERVALS = 3.0
 """Intervals without a sample after which the whitening filter begins again."""
 MIN_SCALAR_SAMPLES = 100
@@ -87,11 +87,11 @@ class ScalarFit:
 
     sensor: ScalarSensor
     rms_before: float
-    """nT, RMS of reading minus reference about its mean."""
+    """RMS of reading minus reference about its mean, nT."""
     rms_after: float
-    """nT, RMS of compensated minus reference about its mean, on the fitted samples."""
+    """RMS of compensated minus reference about its mean, on the fitted samples, nT."""
     contribution: dict[str, float]
-    """nT, standard deviation of what each block adds to the fitted samples."""
+    """Standard deviation of what each block adds to the fitted samples, nT."""
     left_out: int
     """Samples that were left out as outliers."""
     log_evidence: float
@@ -524,7 +524,7 @@ class _SlowNoise:
     remainder: FloatArray
     """(q, q), square root of the initial state's covariance beyond P."""
     crust_lengths: tuple[float, ...]
-    """s, time scales of the crustal processes."""
+    """Time scales of the crustal processes, s."""
 
     @staticmethod
     def build(log_noise: FloatArray, interval: float) -> _SlowNoise:

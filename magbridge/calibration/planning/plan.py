@@ -39,7 +39,7 @@ __all__ = [
 ]  # fmt: skip
 
 SLACK = 3.0
-"""deg, by which another trim of the vehicle changes the pitch at the same positions."""
+"""Change of the pitch by another trim of the vehicle, at the same positions, deg."""
 MAX_REST_FRACTION = 0.01
 """Share of half a position's range, from one sample to the next: a mass at rest."""
 MAX_POSITION_DIFFERENCE = 0.35
@@ -67,7 +67,7 @@ class Limits:
     """What the vehicle can do."""
 
     roll: tuple[float, float] = (-10.0, 10.0)
-    """deg, banks that it can hold in a spiral."""
+    """Banks that it can hold in a spiral, deg."""
     pitch: tuple[float, float] = (14.0, 30.0)
     """Smallest and largest pitch of dives and climbs, deg."""
     parameters: tuple[tuple[float, float], ...] = ()

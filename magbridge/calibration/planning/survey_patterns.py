@@ -34,7 +34,7 @@ __all__ = ["Proposal", "facts", "propose", "summary"]
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
 """Amplitude (nT), length (m) and power of the expected crustal field, as the place is unmapped."""
 LEVEL_SIGMA_NT = 145.0
-"""nT, 1-sigma of the main field's level."""
+"""1-sigma of the main field's level, nT."""
 PATTERN_SAMPLES = 1_500
 """Largest number of samples of a pattern: more are averaged."""
 SPIRAL = 1_800.0

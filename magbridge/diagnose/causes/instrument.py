@@ -19,7 +19,7 @@ ONSETS = 40
 TONES = 5
 """Peaks of the spectrum that are tried."""
 MAX_BEND_NT = 50.0
-"""nT, the most that a response may plausibly bend (RMS of its coefficients): a thousandth of the field, as
+"""Most that a response may plausibly bend (RMS of its coefficients), nT: a thousandth of the field, as
 magnetoresistive sensors do. Fluxgates are ten times better."""
 
 

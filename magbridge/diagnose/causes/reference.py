@@ -27,7 +27,7 @@ mean error is still found."""
 FAINT = 1e-6
 """Share of a map's mean square error below which one of the functions that describe it is left out."""
 ERROR = 20.0
-"""nT, a plausible error of a map (1-sigma)."""
+"""Plausible error of a map (1-sigma), nT."""
 
 
 class MapError(Cause):
@@ -127,7 +127,7 @@ def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
 
 
 def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
-    """(n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
+    """Return (n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
     low = np.floor(place / side)
     high = place / side - low
     # Trilinear weights of the corners of each sample's cell
@@ -151,7 +151,7 @@ def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
 
 
 def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
-    """(n, m) correlation between positions, whatever their depths, Matern's of order 3/2."""
+    """Return (n, m) correlation between positions, whatever their depths, Matern's of order 3/2."""
     r = np.sqrt(3.0) / length * cdist(a[:, :2], b[:, :2])
     found: FloatArray = (1.0 + r) * np.exp(-r)
     return found

@@ -16,7 +16,7 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import Problem, cached_per_problem
 
 TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
-"""s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""
+"""Spaced so closely that any lag between two of them is matched to within a fifth (RMS), s."""
 STAGES = 2
 """Equal lags in series, because conducted heat passes the hull before it reaches the core. One lag misses 10
 to 30 % of the temperature in the centre of a slab, two in series miss 4 to 9 %."""

@@ -24,13 +24,13 @@ CENTRAL_STEP_S = 0.01
 
 @cached_per_problem
 def field_rates(problem: Problem) -> FloatArray:
-    """(3, n) dH_r/dt, nT/s (:func:`~magbridge.diagnose.problem.rates`)."""
+    """Return (3, n) dH_r/dt, nT/s (:func:`~magbridge.diagnose.problem.rates`)."""
     return rates(problem.survey, problem.survey.field.T)
 
 
 @cached_per_problem
 def mass_rates(problem: Problem) -> FloatArray:
-    """(9, n) rates of change, per s, of the nine coefficients while masses move.
+    """Return (9, n) rates of change, per s, of the nine coefficients while masses move.
 
     A drive starts and stops between samples and runs evenly meanwhile. So a mass is in motion at a sample if
     it moves the same way in the intervals before and after it, and its speed is the larger of the two: that
@@ -95,7 +95,7 @@ class ChannelSkew(_Rate):
 
 @cached_per_problem
 def _legs(problem: Problem) -> tuple[FloatArray, IntArray]:
-    """(n, k) positions of the masses, (n,) number of the leg: every shift of the telemetry shares them."""
+    """Return positions of the masses (n, k) and the leg's number (n,), which all shifts share."""
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
     return p, np.cumsum(~survey.follows(MAX_MISSING_SAMPLES))

@@ -50,7 +50,7 @@ PERIOD_LABELS = {
     43200.0: "12 h",
     864e3: "10 days",
 }
-"""s, periods that the spectrum names."""
+"""Periods that the spectrum names, s."""
 
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, Any]:

@@ -79,7 +79,7 @@ def _alternatives(competing: Sequence[CompetingHypothesis]) -> list[dict[str, An
 
 
 def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
-    """Value, sigma and unit of every coefficient, and of the nonlinear parameters.
+    """Return value, sigma and unit of every coefficient, and of the nonlinear parameters.
 
     Where one channel acts with several lags, or an offset jumps more than once, the sum is given and its
     parts next to it. Coefficients with one common size are summed up as the RMS of their effect over the
@@ -107,7 +107,7 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
 
 
 def _rms(finding: Finding, samples: int) -> dict[str, Any]:
-    """RMS over the log of ``X b``, nT, and its sigma.
+    """Return RMS over the log of ``X b``, nT, and its sigma.
 
     ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``.
     """
