@@ -55,6 +55,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
     start = start[line[start] == line[start + step]]
     a, way = place[start], place[start + step] - place[start]
     i, j = _nearby_pairs(a, way, line[start])
+    # Segments a + s w and b + t v meet where s = (b - a) x v / (w x v) and t = (b - a) x w / (w x v).
     cross = way[i, 0] * way[j, 1] - way[i, 1] * way[j, 0]
     off = a[j] - a[i]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -68,6 +69,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
 def _nearby_pairs(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
     """Return pairs of segments, from `a` (m, 2) along `way` (m, 2), in a cell, not adjacent on a line."""
     cell = max(float(np.quantile(np.abs(way).max(axis=1, initial=0.0), 0.99)), 1.0) if len(a) else 1.0
+    # Hash the segments into cells of about their length; only those in one cell are compared.
     keys: list[IndexArray] = []
     of: list[IndexArray] = []
     for share in (0.0, 0.5, 1.0):  # the cells that a segment touches

@@ -50,6 +50,7 @@ class Posterior:
 
     def draw(self, rng: np.random.Generator, number: int) -> FloatArray:
         """Return so many coefficients (nodes, number) that the data leave open, equally likely."""
+        # Random field by its precision, and the other uncertainties by their modes.
         off = self.sigma * SparseFactor(self.precision).draw(rng.normal(size=(len(self.w), number)))
         return np.asarray(
             self.w[:, None] + off + self.follow @ rng.normal(size=(self.follow.shape[1], number))
@@ -69,7 +70,7 @@ class Gridded:
     middle: float
     """Depth at which the map holds, m."""
     mean: float
-    """Range of all samples, and of the map over them, nT."""
+    """Mean of all samples, and of the map over them, nT."""
     kept: BoolArray
     """(n,): True for samples that are not outliers."""
     widths: Hyperparameters
@@ -106,12 +107,14 @@ class Gridded:
         """
         if self.kriged is not None:
             return self._beside_samples(place)
+        # Mixture over the plausible sizes and lengths: mean, and second moment for the variance.
         deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
         scale = self.roughness.evaluate(place)
         outside = ~self.field.nodes.covers(place)
         mean, square = np.zeros(len(place)), np.zeros(len(place))
         for one in self.posteriors:
             here, variance = one.evaluate(csr_array(diags_array(scale) @ one.field.basis(place, deeper)))
+            # Beyond the nodes the prior is all that is known.
             variance[outside] = (one.size * scale[outside]) ** 2
             here = here - one.mean
             mean += one.weight * here
@@ -121,6 +124,7 @@ class Gridded:
     def _beside_samples(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the same from the nearest samples; what levels and calibration do to it is the nodes'."""
         assert self.kriged is not None
+        # Kriging gives field and noise; levels and calibration enter by the coarse nodes.
         mean, variance = self.kriged.evaluate(place)
         B = csr_array(diags_array(self.roughness.evaluate(place)) @ self.field.basis(place))
         return mean, np.sqrt(variance + ((B @ self.posteriors[0].follow) ** 2).sum(axis=1))
@@ -135,6 +139,7 @@ class Gridded:
 
     def at_samples(self, samples: Samples) -> FloatArray:
         """Return the anomaly (n,), nT, at the samples' own places and depths."""
+        # Chunks bound the memory of the splines.
         deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.evaluate(samples.place)
 
         def evaluate_rows(rows: slice) -> FloatArray:

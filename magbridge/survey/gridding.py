@@ -79,17 +79,21 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
     start : Choice, optional
         Field and noise, where a joint fit has found them; searched if not given.
     """
+    # 1. Field and noise by a part of the samples, or as a joint fit has found them.
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1) if start is None else FINE_NOISE_NT
     choice, roughness = _searched(samples, sigma, local=local, start=start)
     finer = 1.0 if start is None else FINER_NODES
+    # 2. Nodes for the whole area at that length.
     nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MAX_GRID_NODES, finer)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
     every = np.arange(len(samples.value))
+    # 3. Sums over all samples; keep slow changes only if the evidence wants them.
     problem = Rows(samples, level_blocks(samples), roughness)
     sums = problem.sums(choice.field, every)
     groups = _needed(problem.groups, sums, choice, sigma)
     family = with_blocks(NO_COEFFICIENTS, groups)
     weighed = Weighed(family, family.centre, sigma, choice.field.length)
+    # 4. Fit, leave out the outliers, and fit again.
     for turn in range(2):
         reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
         widths = maximise_evidence(reduced.quadratic, family, weighed.eta, sigma)
@@ -102,10 +106,12 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
         problem.kept = ~far
         sums = problem.sums(choice.field, every)
         weighed = replace(weighed, eta=widths.eta, sigma=widths.sigma)
+    # 5. The calibration's uncertainty is considered, not estimated (Schmidt 1966).
     shaken = np.empty((nodes.size, 0))
     if samples.modes.shape[1]:
         shaken = _considered(problem, choice, reduced, widths, family, every)
 
+    # 6. One posterior for each plausible size and length.
     posteriors = [
         _posterior(weight, one, sums, problem, family, widths, shaken)
         for weight, one in _left_open(choice, sums, replace(weighed, eta=widths.eta))
@@ -114,6 +120,7 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
         tuple(posteriors), roughness, choice.rho, problem.middle,
         float(samples.value[problem.kept].mean()), problem.kept, widths,
     )  # fmt: skip
+    # 7. Krige from the nearest samples where the nodes are coarser than the field.
     if fine_enough(nodes, choice.field.length, choice.field.alpha, finer):
         return found
     levelled, kept = samples.value - found.levels, problem.kept
@@ -142,6 +149,7 @@ def _posterior(
     """Return the field given its size and length; `shaken` (nodes, r): what the calibration does to it."""
     reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
     z, covariance = _solved(reduced, widths, family)
+    # Shift of the nodes with 1-sigma of each other unknown: dw/dz times a root of its covariance.
     follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
     w, mean = reduced.field(z), problem.mean_over_samples(choice.field)
     levels = problem.D @ z
@@ -154,6 +162,7 @@ def _posterior(
 
 def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
     """Return the levels, one a line (or log), and what changes slowly within a log."""
+    # One column for each line: 1 at its samples.
     of = np.unique(samples.line, return_inverse=True)[1].ravel()
     levels = np.zeros((len(of), int(of.max()) + 1))
     levels[np.arange(len(of)), of] = 1.0
@@ -188,6 +197,7 @@ def _searched(
     samples: Samples, sigma: float, *, local: bool, start: Choice | None = None
 ) -> tuple[Choice, Roughness]:
     """Return the field that a part of the samples, with noise of about `sigma` nT, is select_blocks with."""
+    # The densest part, thinned to so many samples.
     part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, VARIATION_BOX_M))
     step = max(len(part) // SEARCHED, 1)
     few = samples.part(part[::step])
@@ -196,6 +206,7 @@ def _searched(
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
     even = Roughness.uniform()
     problem = Rows(few, groups, even)
+    # Scatter of the samples, as the first guess of the field's size.
     size = max(robust_scale(few.value - problem.mean), 5.0)
     uniform = not local or _few_lengths(samples, start)
     if start is not None and uniform:
@@ -213,6 +224,7 @@ def _searched(
         rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho
     if uniform or _few_lengths(samples, best):
         return replace(best, rho=rho), even
+    # Compare a field of one size with one whose size follows the roughness.
     uneven = Roughness.from_samples(samples, best.field.length)
     problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
@@ -222,6 +234,7 @@ def _searched(
 
 def _few_lengths(samples: Samples, choice: Choice | None) -> bool:
     """Return whether a survey is too small for a field whose size varies; False without a field."""
+    # Number of independent cells: area over length squared.
     area = float(np.prod(np.ptp(samples.place, axis=0)))
     return choice is not None and area < LARGE * choice.field.length**2
 
@@ -230,6 +243,7 @@ def _solved(
     reduced: FieldEliminated, widths: Hyperparameters, family: PriorFamily
 ) -> tuple[FloatArray, FloatArray]:
     """Return z (q,) and its covariance (q, q)."""
+    # Posterior of z with the field eliminated.
     precision = reduced.quadratic.precision / widths.sigma**2 + family.prior(widths.eta).precision
     z = np.linalg.solve(precision, reduced.quadratic.vector / widths.sigma**2)
     return np.asarray(z, float), covariance_of(precision)
@@ -246,6 +260,7 @@ def _considered(
     """Return how the field's coefficients follow the calibration's modes: (nodes, r), 1-sigma each."""
     q = len(problem.D)
     sums = problem.sums(choice.field, rows, modes=True)
+    # Eliminate the field with the modes as further unknowns; then let levels follow the modes.
     all_in = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
     H = all_in.quadratic.precision / widths.sigma**2
     own = np.linalg.solve(H[:q, :q] + family.prior(widths.eta).precision, H[:q, q:])

@@ -112,6 +112,7 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
         The samples cannot be gridded.
     """
     warnings: list[str] = []
+    # 1. Leave out samples far from all others. 2. Grid. 3. Compare lines at their crossings before and after.
     far = far_off(samples.place)
     if count := int(far.sum()):
         warnings.append(f"{counted(count, 'sample')} far from all others (a jump in position): left out")
@@ -191,6 +192,7 @@ def _gridded(samples: Samples, start: Choice | None) -> Gridded:
     Where stretches that are out of place cross, they contradict each other: each has a level of its own, and
     the rest is not a change with time.
     """
+    # A jump of the track cuts a line: places before and after it are wrong by different amounts.
     at = jumps(samples.place, samples.time)
     at = at[samples.line[at] == samples.line[at + 1]]
     if not len(at):
@@ -209,6 +211,7 @@ def _misplaced(samples: Samples, line_ends: IndexArray, found: Gridded) -> Float
     After a jump by d, either the stretch before or the one after is wrong by d: each has an error of
     N(0, d²/2). Places and fields are drawn; their mean square is the variance.
     """
+    # Monte Carlo: draw fields and errors of place, and take the difference of the field as the error.
     rng, field = np.random.default_rng(0), found.posteriors[0].field
     stretch, steps = samples.line, samples.place[line_ends + 1] - samples.place[line_ends]
     here, drawn = field.basis(samples.place), []
