@@ -65,12 +65,15 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
 
     used = np.asarray(depth, float)
     level = float(used.mean())
+    # Continue to the mean depth, and keep the vertical slope for depths about it.
     height = grid.altitude + level  # downward
     if not isfinite(height):
         return Continued(grid, 0.0, float("inf"))
+    # Laplace: a component of wave number k grows as exp(k h) downward.
     k = _wavenumber(grid)
     surveyed = dctn(filled(grid.anomaly), norm="ortho")
     gain = _growth(k, height, SURE)
+    # Spectrum of the error: what the truncated series and the linear term leave, over quantiles of depth.
     error2 = np.zeros_like(k)
     for below in np.quantile(used, DEPTH_QUANTILES) - level:
         linear = gain * (1 + k * below)
@@ -78,6 +81,7 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     hole = np.isnan(grid.anomaly)
     anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
     there = grid.replaced(anomaly=anomaly, altitude=-level, vertical=filled(vertical))
+    # Parseval: mean square of the error and of its slope.
     sigma2, steepness2 = float(error2.mean()), float((k * k * error2).mean())
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
 
@@ -114,6 +118,7 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
     hole = np.isnan(grid.anomaly)
     anomaly = np.where(hole, np.nan, idctn(dctn(filled(grid.anomaly), norm="ortho") * gain, norm="ortho"))
+    # What was removed is an error of the smoothed map, correlated over a part of the wavelength.
     removed = np.sqrt(np.nanmean((grid.anomaly - anomaly) ** 2))
     sigma = np.hypot(np.nan_to_num(grid.sigma), removed)
     length = max(grid.sigma_length, SIGN_WAVELENGTH_FRACTION * wavelength)
@@ -124,6 +129,7 @@ def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:
     """Return exp(k height), downward the first `terms` of its series."""
     if height <= 0:
         return np.asarray(np.exp(k * height))
+    # exp(k h) = 1 / (1 - p) = 1 + p + p^2 + ...: the first terms amplify noise least.
     p = -np.expm1(-k * height)
     return np.asarray((1 - p**terms) / (1 - p))
 
@@ -132,6 +138,7 @@ def _wavenumber(grid: AnomalyGrid) -> FloatArray:
     """Return |k| (ny, nx), rad/m, of the cosine transform's terms."""
     per_latitude, per_longitude = metres_per_degree(float(np.mean(grid.latitude)))
     ny, nx = grid.anomaly.shape
+    # The cosine transform mirrors the grid: half waves over its sides.
     height = ny * per_latitude * (grid.latitude[1] - grid.latitude[0])
     width = nx * per_longitude * (grid.longitude[1] - grid.longitude[0])
     return np.asarray(np.hypot(np.pi / height * np.arange(ny)[:, None], np.pi / width * np.arange(nx)))

@@ -99,6 +99,7 @@ class AnomalyGrid:
                 name, f"expected {y.size} rows of {x.size} values, found {' x '.join(map(str, values.shape))}"
             )
         scatter = np.broadcast_to(np.asarray(sigma, float), values.shape)
+        # Ascending axes; values beyond HOLE are holes.
         order = (slice(None, None, -1 if flip_y else 1), slice(None, None, -1 if flip_x else 1))
         values, scatter = values[order], scatter[order].copy()
         values[~(np.abs(values) < HOLE)] = nan
@@ -115,6 +116,7 @@ class AnomalyGrid:
         self.vertical = None if vertical is None else np.asarray(vertical, float)[order]
         self._x0, self._dx = float(x[0]), float(x[-1] - x[0]) / (x.size - 1)
         self._y0, self._dy = float(y[0]), float(y[-1] - y[0]) / (y.size - 1)
+        # A cell can be used if all four of its corners are known.
         self._whole = ~(hole[1:, 1:] | hole[1:, :-1] | hole[:-1, 1:] | hole[:-1, :-1])
         self._variance = np.nan_to_num(scatter**2)
         self._even_sigma = bool(np.ptp(self._variance) == 0.0)
@@ -158,9 +160,11 @@ class AnomalyGrid:
         if not self._whole[i, j]:
             return OFF_THE_MAP
         s, t = u - j, v - i
+        # Cubic B-spline of the 4 x 4 coefficients: weights of value, slope and second derivative.
         across = (WEIGHTS @ (1.0, s, s * s, s * s * s)).reshape(3, 4)
         along = (WEIGHTS @ (1.0, t, t * t, t * t * t)).reshape(3, 4)
         patch = self._coefficients[i : i + 4, j : j + 4]
+        # Depth by the vertical slope; NaN stands for the map's own height.
         if self._vertical is not None and (below := depth + self.altitude) == below:
             patch = patch + below * self._vertical[i : i + 4, j : j + 4]
         (f, fx, fxx), (fy, fxy, _), (fyy, _, _) = (along @ patch @ across.T).tolist()
@@ -169,6 +173,7 @@ class AnomalyGrid:
         if self._even_sigma:
             variance = float(self._variance[0, 0])
         else:
+            # Bilinear interpolation of the variance.
             a, b = self._variance[i, j : j + 2].tolist()
             c, d = self._variance[i + 1, j : j + 2].tolist()
             variance = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
@@ -204,6 +209,7 @@ class AnomalyGrid:
         s, t = u - j, v - i
         across, along = weights(s), weights(t)
         wide = self._coefficients.shape[1]
+        # Index of the 4 x 4 coefficients of every place in the flat array.
         window = (wide * i + j) + (wide * np.arange(4)[:, None] + np.arange(4))[..., None]
         patch = self._coefficients.ravel()[window]
         if self._vertical is not None:
@@ -218,6 +224,7 @@ class AnomalyGrid:
             )
         per_degree = metres_per_degree(np.where(inside, lat, 0.0))
         north, east = 1.0 / (per_degree[0] * self._dy), 1.0 / (per_degree[1] * self._dx)
+        # Value, two slopes and three second derivatives in one product.
         parts = (along[DOWN] * lines[ACROSS]).sum(axis=1)  # (6, n), in the order of Local
         parts[1] *= north
         parts[2] *= east
@@ -241,6 +248,7 @@ class AnomalyGrid:
     @cached_property
     def rms(self) -> float:
         """RMS of the map about its best-fitting plane, nT."""
+        # Residual of the least-squares plane over all known nodes.
         plane = np.stack(np.meshgrid(self.longitude, self.latitude), axis=-1)[~np.isnan(self.anomaly)]
         design = np.column_stack([plane - plane.mean(axis=0), np.ones(len(plane))])
         values = self.anomaly[~np.isnan(self.anomaly)]
@@ -264,6 +272,7 @@ class AnomalyGrid:
         middle = float(np.mean(self.latitude))
         per_latitude, per_longitude = metres_per_degree(middle)
         north, east = np.gradient(self.anomaly, self._dy * per_latitude, self._dx * per_longitude)
+        # Slopes about their mean: a regional trend is no anomaly.
         flat = north - np.nanmean(north), east - np.nanmean(east)
         slope = sqrt(float(np.nanmean(flat[0] ** 2 + flat[1] ** 2)))
         return sqrt(2.0) * self.rms / slope if self.rms > PLANE_TOLERANCE_NT else inf
@@ -285,6 +294,7 @@ class AnomalyGrid:
         known = ~np.isnan(self.anomaly)[rows, columns]
         if min(values.shape) < FEWEST or known.sum() < known.size / 2:
             return 0.0
+        # e(2h) and e(4h), extrapolated to e(h) by log e ~ 1/h.
         finer, coarser = (_left_out(values, known, step) for step in (2, 4))
         at_middle = finer * min(finer / coarser, 1.0) ** 2 if coarser > PLANE_TOLERANCE_NT else 0.0
         return at_middle * sqrt(0.5)
@@ -310,6 +320,7 @@ def _left_out(values: FloatArray, known: NDArray[np.bool_], step: int) -> float:
     """Return the RMS error (nT) of a spline through every `step`-th node, halfway between them."""
     from scipy.interpolate import RectBivariateSpline  # noqa: PLC0415  the live path runs without scipy
 
+    # Spline through every `step`-th node; its error at the nodes halfway.
     y, x = (np.arange(0, n, step) for n in values.shape)
     spline = RectBivariateSpline(y, x, values[::step, ::step])
     half = step // 2
@@ -333,6 +344,7 @@ def _axis(values: ArrayLike, name: str, axis_name: str) -> tuple[FloatArray, boo
             column=axis_name,
         )
     flip = bool(np.median(np.diff(axis)) < 0.0)
+    # Ascending; a longitude that wraps is unwound; then the spacing must be even.
     axis = axis[::-1] if flip else axis
     if axis_name == "longitude":  # 178 179 180 -179: the same meridians, unwound
         axis = np.degrees(np.unwrap(np.radians(axis)))
@@ -379,6 +391,7 @@ def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
     -----
     ``tr(C P)/2`` and ``tr((C P)²)/2``, C the Hessian (second-order filter; Bar-Shalom et al. 2001, 10.3).
     """
+    # C P, then half its trace and half the trace of its square.
     a, b = local.north_north * nn + local.north_east * ne, local.north_north * ne + local.north_east * ee
     c, d = local.north_east * nn + local.east_east * ne, local.north_east * ne + local.east_east * ee
     return 0.5 * (a + d), 0.5 * (a * a + 2.0 * b * c + d * d)

@@ -125,12 +125,14 @@ def _model(path: Path) -> Model:
 
 def _block(model: Model, lon: FloatArray, lat: FloatArray, depth: FloatArray, time: FloatArray) -> FloatArray:
     """Sum the series for one block of samples."""
+    # Coefficients are linear in time between epochs: sum the series at each epoch, then weight the sums.
     first, weights = _weights(model.epochs, time)
     nodes = slice(first, first + len(weights))
     phi, geodetic = np.radians(lon), np.radians(lat)
     r, geocentric = _geocentric(geodetic, -depth)
     sin, cos = np.cos(geocentric), np.sin(geocentric)  # of the colatitude θ
 
+    # cos(m phi), sin(m phi) for all orders
     order = np.arange(1, len(model.g) + 1)[:, None]
     cos_m, sin_m = np.cos(order * phi), np.sin(order * phi)
     up = np.zeros((len(weights), lat.size))
@@ -140,13 +142,16 @@ def _block(model: Model, lon: FloatArray, lat: FloatArray, depth: FloatArray, ti
     for n, (p_zero, slope_zero, s, slope) in enumerate(_legendre(sin, cos, len(model.g)), 1):
         g, h = model.g[n - 1][nodes], model.h[n - 1][nodes]
         c, d = cos_m[:n], sin_m[:n]
+        # P_nm = S_nm sin(theta); the east component needs S_nm itself, which stays finite at the poles.
         p = s * sin
+        # B = -grad V: radial, southward and eastward parts of degree n.
         up += (n + 1) * radial * (g[:, :1] * p_zero + g[:, 1:] @ (p * c) + h @ (p * d))
         south -= radial * (g[:, :1] * slope_zero + g[:, 1:] @ (slope * c) + h @ (slope * d))
         s_m = order[:n] * s
         east += radial * (g[:, 1:] @ (s_m * d) - h @ (s_m * c))
         radial = radial * ratio
 
+    # Interpolate between the epochs, then turn from geocentric to geodetic axes.
     up, south, east = (np.einsum("kn,kn->n", weights, part) for part in (up, south, east))
     tilt = geodetic - geocentric  # the ellipsoid's normal leans this far north of the radius
     sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
@@ -163,6 +168,7 @@ def _legendre(
     p_before, p = np.zeros_like(sin), np.ones_like(sin)  # P_n-1, P_n of order 0
     s_before = s = np.empty((0, sin.size))
     for n in range(1, degree + 1):
+        # P_n0 by Bonnet's recursion; S_nm by the recursion in the degree.
         p_before, p = p, ((2 * n - 1) * cos * p - (n - 1) * p_before) / n
         m = np.arange(1, n + 1)[:, None]
         root = np.sqrt(n * n - m * m)  # 0 for m = n
@@ -172,6 +178,7 @@ def _legendre(
         s[: n - 1] = (2 * n - 1) * cos * s_before / root[: n - 1]
         if n > 2:
             s[: n - 2] -= np.sqrt((n - 1) ** 2 - m[: n - 2] ** 2) / root[: n - 2] * two_before
+        # dP_nm / d theta from S of degrees n and n - 1.
         slope = n * cos * s
         slope[: n - 1] -= root[: n - 1] * s_before
         yield p, -np.sqrt(n * (n + 1) / 2) * sin * s[0], s, slope
@@ -179,6 +186,7 @@ def _legendre(
 
 def _weights(epochs: FloatArray, time: FloatArray) -> tuple[int, FloatArray]:
     """Return the first epoch that the block needs and each sample's weights on it and its successors."""
+    # Beyond the last epoch the last interval is extrapolated; the caller has checked the range.
     index = np.clip(np.searchsorted(epochs, time, side="right") - 1, 0, epochs.size - 2)
     first = int(index.min())
     weights = np.zeros((int(index.max()) - first + 2, time.size))
@@ -192,6 +200,7 @@ def _weights(epochs: FloatArray, time: FloatArray) -> tuple[int, FloatArray]:
 def _geocentric(latitude: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return radius (m) and geocentric latitude (rad) of a point over the ellipsoid."""
     sin, cos = np.sin(latitude), np.cos(latitude)
+    # Radius of curvature in the prime vertical, then distance from the axis and from the equator.
     normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin * sin)
     axis = (normal + height) * cos
     polar = (normal * (1.0 - ECCENTRICITY_SQUARED) + height) * sin

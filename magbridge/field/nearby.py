@@ -90,17 +90,20 @@ class NearbyField:
         ):
             self._fit(latitude, longitude, time)
             north = east = later = 0.0
+        # Quadratic in north, east and depth, linear in time; all scaled to the box.
         n, e, d, t = north / BOX_HALF_WIDTH_M, east / BOX_HALF_WIDTH_M, depth / DEEP, later / FITTED_TIME_S
         c0, cn, ce, cd, ct, cnn, cee, cdd, cne, cnd, ced = self._c
         field = (
             c0 + n * (cn + n * cnn + e * cne + d * cnd) + e * (ce + e * cee + d * ced) + d * (cd + d * cdd)
         )
+        # Partial derivatives of the polynomial.
         slope_north = cn + 2.0 * n * cnn + e * cne + d * cnd
         slope_east = ce + 2.0 * e * cee + n * cne + d * ced
         return field + t * ct, slope_north / BOX_HALF_WIDTH_M, slope_east / BOX_HALF_WIDTH_M
 
     def _fit(self, latitude: float, longitude: float, time: float) -> None:
         """Fit the eleven coefficients to the series on 81 nodes."""
+        # Least squares on a 3 x 3 x 3 x 3 lattice.
         nodes = np.array(list(product((-1.0, 0.0, 1.0), repeat=4)))
         n, e, d, t = nodes.T
         places = np.array(

@@ -133,6 +133,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
     first = grids[0]
     if len(grids) == 1 and spacing is None:
         return first, nan
+    # Common grid: the finest spacing, over the area of all grids, with longitudes unwound to the first one.
     step = spacing or min(float(np.diff(axis[:2])[0]) for g in grids for axis in (g.longitude, g.latitude))
     near = [(g, 360.0 * round((float(first.longitude[0]) - float(g.longitude[0])) / 360.0)) for g in grids]
     longitude = _cover([g.longitude + turn for g, turn in near], step)
@@ -143,6 +144,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
         raise OutOfRange(
             "map", f"{size} nodes", f"at most {MAX_MERGED_NODES}: set a spacing of {wide:.2g} deg or more"
         )
+    # Sums over the grids at each node, row by row to save memory.
     total, squares, variance, count = np.zeros((4, latitude.size, longitude.size))
     for grid, turn in near:
         columns = _reach(longitude, grid.longitude + turn)
@@ -155,6 +157,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
             variance[row, columns] += np.nan_to_num(local.variance)
             count[row, columns] += np.isfinite(local.anomaly)
     shared = count > 1
+    # Twice the sample variance of the grids is the mean squared difference of two of them.
     differences = 2.0 * (squares - total**2 / np.maximum(count, 1.0))[shared] / (count[shared] - 1.0)
     apart = sqrt(max(float(differences.mean()), 0.0)) if shared.any() else nan
     variance = np.fmax(variance, 0.5 * apart**2 * count)

@@ -148,6 +148,7 @@ def other_units(channels: FloatArray, reference: float) -> str:
 
     No iron changes the field tenfold.
     """
+    # A factor of ten covers any iron. Beyond it, only a sphere of the right radius proves nanoteslas.
     lengths = magnitude(channels)
     whole = np.isfinite(lengths)
     read = float(np.median(lengths[whole])) if whole.any() else reference
@@ -211,6 +212,7 @@ def placed(deployment: xr.Dataset) -> BoolArray:
     if known.sum() < FEWEST:
         return np.ones(len(time), bool)
     at = time[known]
+    # A hole is far longer than the usual interval; near its ends the position is still known.
     longest = max(HOLE * float(np.median(np.diff(at))), SHORT)
     after = np.searchsorted(at, time)
     before = np.where(known, time, at[np.maximum(after - 1, 0)])
@@ -226,6 +228,7 @@ def _interpolated(
     known = np.isfinite(values)
     if not known.any():
         return np.full(time.size, np.nan)
+    # Longitudes are unwound before they are interpolated.
     path: FloatArray = values[known] if turn is None else np.unwrap(values[known], period=turn)
     if known.all():
         return path
@@ -257,6 +260,7 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
     if reference != "magnetic" or "heading" not in deployment:
         return deployment
     require_date(deployment)
+    # True heading = magnetic heading + declination, D = atan2(B_east, B_north).
     north, east, _ = main_field(deployment).T
     heading = (deployment["heading"].to_numpy() + np.degrees(np.arctan2(east, north))) % 360.0
     out = deployment.assign(heading=("time", heading, deployment["heading"].attrs))

@@ -218,6 +218,7 @@ class _JointFit:
     def _blocks(self, chosen: IndexArray) -> tuple[ParameterBlock, ...]:
         """Return levels, slow changes, heading error and terms of some samples."""
         blocks = list(level_blocks(self.rows.samples.part(chosen)))
+        # Heading error: first and second harmonic of the heading, with one width for all four.
         harmonics = _harmonics(self.rows.heading[chosen])
         blocks.append(
             ParameterBlock("heading error", harmonics, np.ones(4), HEADING_WIDTH_NT, LOG_HEADING_SPREAD)
@@ -242,6 +243,7 @@ class _JointFit:
         problem = self._problem(chosen, self.shift, blocks)
         place = problem.samples.place
         weighed = self._weighed(blocks, float(np.median(ladder(place))))
+        # Start values: field size by the scatter of the samples, noise by the change from sample to sample.
         size = max(robust_scale(problem.samples.value - problem.mean), 5.0)
         change = max(robust_scale(np.diff(problem.samples.value)) / 2.0**0.5, FINE_NOISE_NT)
         return choose(
@@ -270,6 +272,7 @@ class _JointFit:
             reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
             return weighed.score(reduced, choice.field, choice.ratio)
 
+        # An odd number of steps contains zero.
         grid = np.linspace(-reach, reach, steps | 1)
         self.shift[component] = grid[int(np.argmax([score(value) for value in grid]))]
         sums = self._problem(chosen, self.shift, blocks).sums(choice.field, every)
@@ -325,6 +328,7 @@ class _JointFit:
             w = reduced.field(z)
             if moved:
                 self.shift[self.free] += z[-moved:]
+            # Levels and slow changes come first in z; the report needs the rest.
             used = slice(len(z) - effects - moved, None)
             solution = _Solution(
                 z[used], covariance_of(precision)[used, used], self._slopes(self.chosen, w), w
@@ -335,6 +339,7 @@ class _JointFit:
     def _slopes(self, chosen: IndexArray, w: FloatArray) -> FloatArray:
         """Return the change of samples with the free components of the shift, (n, k), nT/s and nT/m."""
         place, field = self.place(self.shift)[chosen], self.choice.field
+        # Slope of the field north and east, times the change of place with each component of the shift.
         inside = field.nodes.covers(place)
         gradient = np.zeros((len(place), 2))
         gradient[inside] = np.stack([part @ w for part in field.slopes(place[inside])], axis=1)
@@ -349,6 +354,7 @@ class _JointFit:
         edges = np.cumsum([0, *(part.shape[1] for part in columns)])
         parts = [found.effects[a:b] for a, b in pairwise(edges)]
         effects = [part @ values for part, values in zip(columns, parts, strict=True)]
+        # Uncertainty of the terms as modes of the samples: columns times a root of the covariance.
         modes = np.hstack([*columns, slopes]) @ _root(found.covariance)
         samples = replace(
             rows.samples,
@@ -378,6 +384,7 @@ class _JointFit:
         if many:
             covariance[np.ix_(self.free, self.free)] = self.solution.covariance[-many:, -many:]
         sigma = np.sqrt(np.diag(covariance))
+        # Combination that every survey determines: forward lever arm minus speed times lag.
         along = np.array([-self.speed, 1.0, 0.0])
         both = {0, 1} <= set(self.free.tolist())
         known = sigma[:2] < SEPARABLE_FRACTION * np.array([LAG_SIGMA_S, LEVER_SIGMA_M])
@@ -416,5 +423,6 @@ def _fitted_rows(samples: Samples, most: int) -> IndexArray:
     spacing = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
     extent = float(np.hypot(*np.ptp(place, axis=0)))
     longest = max(1, int(MAX_SPACING_FRACTION * extent / max(spacing, 1e-6)))
+    # Thin evenly as far as the field allows, then cut to the middle of the survey.
     rows = np.arange(0, len(place), int(np.clip(len(place) // most, 1, longest)))
     return rows[about_the_middle(place[rows], most)]

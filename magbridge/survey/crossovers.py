@@ -50,6 +50,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
     line : (n,) array
         Label of each sample's line.
     """
+    # Segments of several samples: their number bounds the work.
     step = max(len(place) // SEGMENTS, 1)
     start = np.arange(0, len(place) - step, step)
     start = start[line[start] == line[start + step]]
@@ -61,6 +62,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
     with np.errstate(divide="ignore", invalid="ignore"):
         s = (off[:, 0] * way[j, 1] - off[:, 1] * way[j, 0]) / cross
         t = (off[:, 0] * way[i, 1] - off[:, 1] * way[i, 0]) / cross
+    # Both parameters within the segments: they cross.
     met = (s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)
     i, j, s, t = i[met], j[met], s[met], t[met]
     return Crossovers(a[i] + s[:, None] * way[i], start[i], start[j], np.stack([s, t], axis=1), step)

@@ -170,6 +170,7 @@ def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
     if levels.shape[1] == 1:  # the crustal field of its size may have one sign along a single line
         groups = [ParameterBlock("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
+        # Slow changes are offered: the evidence decides whether they are needed.
         waves, shape = slow_functions(samples.time)
         if len(shape):
             groups.append(

@@ -103,6 +103,7 @@ class Kriged:
 
     def _covariance(self, separation: FloatArray) -> FloatArray:
         """Return that of places `separation` (..., 2), m, where the roughness is 1: nT²."""
+        # C(r) = s^2 h^3 / (r^2 + h^2)^(3/2)
         h = 2.0 * self.below
         return np.asarray(self.size**2 * h**3 / ((separation**2).sum(axis=-1) + h * h) ** 1.5)
 
@@ -177,6 +178,7 @@ def _share(kriged: Kriged, line: int) -> float:
         return SHARE
     rows = rows[whole]
     mean, variance = kriged.given(kriged.place[rows], near).T
+    # Likelihood of the line's own part g^2 C, times a log-normal prior of g.
     size2 = (kriged.size * kriged.roughness.evaluate(kriged.place[rows])) ** 2
     scores = [
         _likelihood(kriged.value[rows] - mean, variance + g**2 * size2 + kriged.noise**2)

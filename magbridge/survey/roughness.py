@@ -48,6 +48,7 @@ class Roughness:
         """Return that of a survey whose field has a `length`, m."""
         place = samples.place
         low, extent = place.min(axis=0), np.ptp(place, axis=0)
+        # Cells of a fraction of the smoothing length, limited in number.
         cell = max(float(extent.max()) / MAX_CELLS_PER_SIDE, REACH * length / 4.0)
         # Second differences are free of levels and slow changes; their mean square follows the roughness.
         bent = _bends(samples, LAG * length)
@@ -84,6 +85,7 @@ class Roughness:
 def _bends(samples: Samples, lag: float) -> FloatArray:
     """Return the second difference (n,) of the field over `lag` m along the line, nT; NaN at its ends."""
     y, line, place = samples.value, samples.line, samples.place
+    # y(s + lag) - 2 y(s) + y(s - lag) along one line.
     step = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
     m = max(round(lag / max(step, 1e-3)), 1)
     out = np.full(len(y), np.nan)

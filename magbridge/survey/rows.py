@@ -31,6 +31,7 @@ class Rows:
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
         """Return what the field's coefficients add to the samples `rows`: (m, nodes)."""
+        # Splines at the samples, times the roughness there.
         known = field.basis(self.samples.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.scale[rows]) @ known)
 
@@ -52,6 +53,7 @@ class Rows:
     def _pieces(self, field: GaussianField, rows: IndexArray, modes: bool) -> Iterator[LinearisedRows]:
         s = self.samples
         rows = rows[self.kept[rows]]
+        # Noise is correlated between neighbours on one line only.
         follows = np.zeros(len(rows), bool)
         follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
         for start in range(0, len(rows), BLOCK_ROWS):

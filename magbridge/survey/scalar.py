@@ -120,6 +120,7 @@ def scalar_rows(
 
 def _joined(parts: Sequence[ScalarRows]) -> ScalarRows:
     """Join the samples of several logs; a term of the same name and size is one term."""
+    # Terms of one name share their coefficients across logs; rows of other logs are zero.
     edges = np.cumsum([0, *(len(part.raw) for part in parts)])
     blocks: dict[tuple[str, int], FloatArray] = {}
     for part, first in zip(parts, edges[:-1].tolist(), strict=True):
@@ -149,6 +150,8 @@ def _log_rows(
     """Return the samples of one log."""
     require(log, ("latitude", "longitude", column, *names))
     require_date(log)
+    # A calibration of the sensor compensates it and leaves its uncertain combinations as terms; without one,
+    # the telemetry channels are the terms.
     sensors = calibration.sensors if calibration is not None else ()
     sensor = next((known for known in sensors if known.column == column), None)
     compensated: dict[str, float] = {}
@@ -163,6 +166,7 @@ def _log_rows(
     else:
         value, terms = scalar_reading(log, column), _channel_terms(log, names)
     log = moved_to_sensor(log, lever) if lever else log
+    # Anomaly = reading - main field (- daily variation).
     expected = magnitude(main_field(log))
     if "daily_variation" in log:
         expected = expected + log["daily_variation"].to_numpy()
@@ -176,6 +180,7 @@ def _log_rows(
         source, many = log.attrs.get("source", "the log"), counted(int(known.sum()), "sample")
         raise FormatError(source, f"only {many} with {column} and a position")
     time = np.asarray(log["time"].to_numpy(), float)
+    # Without a heading, the course over ground stands for it.
     velocity = _velocity(time, place)
     heading = np.arctan2(velocity[:, 1], velocity[:, 0])
     if "heading" in log:
@@ -183,6 +188,7 @@ def _log_rows(
         heading = np.where(np.isfinite(own), own, heading)
     boxes = _boxes(log, time, heading, raw, value, terms)
     # A box flight tests the compensation, so that it is not fitted.
+    # Manoeuvres of a box are not fitted: they test the result.
     for box_rows in boxes:
         known &= ~box_rows.box.rows(len(known))
     line, tie = _lines(log)
@@ -201,6 +207,7 @@ def _places(log: xr.Dataset) -> tuple[FloatArray, FloatArray, tuple[float, float
 def _velocity(time: FloatArray, place: FloatArray) -> FloatArray:
     """Return the velocity north and east (n, 2), m/s, over some seconds, never across a gap of the log."""
     interval = max(float(np.median(np.diff(time))), 1e-3)
+    # Central difference over the smoothing time, cut at gaps.
     half = max(1, round(0.5 * SPEED_SMOOTHING_S / interval))
     # Central difference over the smoothing time, cut at the ends of a stretch without gaps.
     stretch = np.cumsum(np.diff(time, prepend=time[0]) > MAX_SPEED_GAP_INTERVALS * interval)
@@ -248,6 +255,7 @@ def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[AlignmentTerm
         values = log[name].to_numpy().astype(float)
         if not np.isfinite(values).any():
             raise FormatError(log.attrs.get("source", "the log"), "expected numbers, got none", column=name)
+        # Centre and swing, so that one prior width serves channels in any unit.
         low, middle, high = np.nanquantile(values, [0.02, 0.5, 0.98]).tolist()
         z = (values - middle) / max(high - low, 1e-12)
         # A channel's field turns with the vehicle: its value, and times cosine and sine of the heading.
