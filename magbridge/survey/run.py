@@ -121,7 +121,10 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
         try:
             found = _gridded(samples, start)
         except np.linalg.LinAlgError as problem:
-            raise CalibrationError(f"the survey cannot be gridded: {problem}") from problem
+            raise CalibrationError(
+                f"the survey determines no map ({problem}): fly lines that cross, or give a calibration "
+                "(--calibration)"
+            ) from problem
     ties = crossovers(samples.place, samples.line)
     B = found.at_samples(samples)
     residual = samples.value - found.levels - B
