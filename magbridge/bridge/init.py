@@ -12,9 +12,10 @@ from magbridge.columns import TEMPERATURE
 from magbridge.logs.telemetry_fields import MAVLINK_FIELDS
 from magbridge.sensors.options import options_of
 
-__all__ = ["Answers", "bridge_toml"]
+__all__ = ["PLACEHOLDER", "Answers", "bridge_toml"]
 
 PLACEHOLDER = "FILL IN"
+"""Mark of a setting that the user must complete."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def init(
         raise WrongUse(f"{output}: is there already; choose another with -o")
 
     from magbridge.bridge.check import findings
-    from magbridge.bridge.init import Answers, bridge_toml
+    from magbridge.bridge.init import PLACEHOLDER, Answers, bridge_toml
     from magbridge.files import atomic_path
 
     known = _loaded(calibration)
@@ -77,14 +77,15 @@ def init(
         names = tuple(name for name in names if name)
     options, file = _options(option, driver), _relative(calibration, output)
     answers = Answers(driver, port, baudrate, link, number, names, options, file)
+    text = bridge_toml(answers, known)
     with atomic_path(output) as path:
-        path.write_text(bridge_toml(answers, known), encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         fatal = [one.text for one in findings(path) if one.fatal]
-        if fatal:
+        if fatal and PLACEHOLDER not in text:  # what is left to fill in is an error only when it is run
             raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
     found = [one.text for one in findings(output)]
-    for text in found:
-        complain(text)
+    for finding in found:
+        complain(finding)
     sentence = f"{output}: written; next: magbridge run --check --config {output}"
     print_result({"file": str(output), "findings": found}, sentence, json)
 

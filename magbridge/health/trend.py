@@ -112,6 +112,7 @@ class TrendCheck:
         self._log_q = log(MIN_INTENSITY)
         self._min_log_q = log(MIN_INTENSITY)
         self._has_speed = self._is_start_unsure = False
+        self._unsure_until_us = 0
         self._slope_variance = SLOPE_NT_PER_S**2
         self._before = nan  # level before a sample that only time or a motion made acceptable
         self._accepted = 0
@@ -286,9 +287,9 @@ class TrendCheck:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
         if self._is_start_unsure:
-            # either the mass is wrong, or its motion spoiled the first sample: sigma remembers it for an hour
-            self._is_start_unsure, total = False, 0.0
-            until_us = time_us + MAX_HOLD_US
+            # either the mass is wrong, or its motion spoiled the first sample: without a further jump it is
+            # forgotten after an hour
+            self._is_start_unsure, self._unsure_until_us = False, time_us + MAX_HOLD_US
         # jumps at motions come with every motion, so that they are remembered for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
@@ -313,6 +314,8 @@ class TrendCheck:
             return 0.0
         # the sum of the jumps is zero again, up to the noise
         self.is_away = now.jump_sum * now.jump_sum > GATE * self._scatter.variance
+        if now.jumps == 1 and 0 < self._unsure_until_us <= time_us:
+            self._unsure_until_us, self.is_away = 0, False
         if not self.is_away and time_us >= now.until_us:
             self._now = now._replace(jump_sum=0.0, largest=0.0)
             return 0.0

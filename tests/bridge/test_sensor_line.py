@@ -78,7 +78,7 @@ def test_an_instrument_that_hangs_is_reported(bench: Bench) -> None:
     for k in range(130):
         z = -234.5 if 5 <= k < 30 or 40 <= k < 110 else float(k)
         bench.receive(k, b"12340.5 43210.9 %.1f 4.0 %d 7\r\n" % (z, k))
-        hangs = [text for text in bench.texts if "reading" in text]
+        hangs = [text for text in bench.texts if "reading" in text and text != "ascii sends readings"]
         assert len(hangs) == (k >= 100) + (k >= 110)
     assert hangs == ["ascii sends the same reading for 60 s", "ascii's readings change again"]
 

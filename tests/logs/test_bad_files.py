@@ -140,7 +140,7 @@ def test_unknown_suffix(tmp_path: Path) -> None:
     path = tmp_path / "log.xlsx"
     path.write_text("x")
     assert re.match(r"expected a file name that ends in one of .*\.csv .*\.ulg", refused(path))
-    with pytest.raises(FormatError, match=r"ends in one of \.csv \.mcap \.nc \.parquet \.tlog$"):
+    with pytest.raises(FormatError, match=r"ends in one of \.csv \.mcap \.nc \.parquet \.tlog \.xyz$"):
         logs.Writer(tmp_path / "log.ulg")
 
 

@@ -108,7 +108,7 @@ def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], c
         rig.autopilot.send_message("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
         panel.get_by_text("frozen", exact=True).wait_for()
         field.level = 60.0
-        panel.get_by_text("map error").wait_for()
+        panel.get_by_text("offset step").wait_for()
         shown = dict(pairwise(panel.inner_text().splitlines()))
         since = time.strftime("%d %b", time.gmtime())
         assert re.fullmatch(rf"\d+ nT since {since} \d\d:\d\d UTC", shown["Not explained"])
