@@ -111,8 +111,7 @@ class TrendCheck:
         self._sigma = 0.0
         self._log_q = log(MIN_INTENSITY)
         self._min_log_q = log(MIN_INTENSITY)
-        self._has_speed = self._is_start_unsure = False
-        self._unsure_until_us = 0
+        self._has_speed = False
         self._slope_variance = SLOPE_NT_PER_S**2
         self._before = nan  # level before a sample that only time or a motion made acceptable
         self._accepted = 0
@@ -260,8 +259,6 @@ class TrendCheck:
             self._checkpoints.pop()
         if self._checkpoints and self._now is not None and self._now.time_us > since_us:
             self._now = self._checkpoints[-1]
-        elif self._now is not None and self._accepted < AGREEING and since_us < self._now.time_us:
-            self._is_start_unsure = True
         self._agreed, self._unrest, self._quiet = 0, 0.0, BURST_SAMPLES
         self.has_moved = True
 
@@ -286,10 +283,6 @@ class TrendCheck:
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
-        if self._is_start_unsure:
-            # either the mass is wrong, or its motion spoiled the first sample: without a further jump it is
-            # forgotten after an hour
-            self._is_start_unsure, self._unsure_until_us = False, time_us + MAX_HOLD_US
         # jumps at motions come with every motion, so that they are remembered for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
@@ -314,8 +307,6 @@ class TrendCheck:
             return 0.0
         # the sum of the jumps is zero again, up to the noise
         self.is_away = now.jump_sum * now.jump_sum > GATE * self._scatter.variance
-        if now.jumps == 1 and 0 < self._unsure_until_us <= time_us:
-            self._unsure_until_us, self.is_away = 0, False
         if not self.is_away and time_us >= now.until_us:
             self._now = now._replace(jump_sum=0.0, largest=0.0)
             return 0.0

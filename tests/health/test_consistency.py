@@ -129,22 +129,6 @@ def test_motion_that_is_reported_late_is_not_a_jump() -> None:
     assert not any(flags[1200:])
 
 
-def test_motion_that_had_begun_before_the_first_sample_is_forgotten_after_an_hour() -> None:
-    """The first sample is off by 130 nT, and the telemetry reports the motion only then."""
-    health, rng, flags, more = HealthMonitor(Noise(1.0)), np.random.default_rng(3), [], 0.0
-    for k in range(1000):
-        quality = int(Quality.MOVING) if 1 <= k < 10 else 0
-        if k == 1:
-            health.begin_motion(0)
-        total = FIELD + float(rng.normal()) - 130.0 * (k == 0)
-        field = (0.3 * total, 0.2 * total, 0.93 * total)
-        time_us = 4_000_000 * (k + 1)
-        more = health.check(time_us, field, field, (total, 1.5), quality, (FIELD, 145.0), nan, 0.0, list)
-        flags.append(health.flags)
-    assert not any(flags[920:])
-    assert more == 0.0
-
-
 def test_step_of_the_reference_widens_nothing() -> None:
     """Another sheet of a map: the total field has no step."""
     u, crust = glide(3)
