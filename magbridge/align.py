@@ -120,7 +120,7 @@ class Aligner:
         self._period_us, self._step_us = 0.0, 0
 
     def watch(self, name: str, max_age: float) -> None:
-        """Follow what the calibration does not need (yet): it makes no sample doubtful."""
+        """Follow a telemetry series that the calibration does not use yet; its gaps flag no sample."""
         if name not in self.by_name:
             self.by_name[name] = Track(Input(name, nan, nan, max_age))
 

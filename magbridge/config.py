@@ -68,7 +68,7 @@ class Sensor(Table, frozen=True):
 
     @property
     def label(self) -> str:
-        """Return what messages call the sensor."""
+        """Return the name of the sensor in messages."""
         return self.name or self.driver
 
     @property

@@ -305,7 +305,7 @@ class Correction:
         return HealthMonitor(calibration.noise, self._messages, level, len(self._masses))
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
-        """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""
+        """Return the part of a corrected sample's sigma that all samples share, nT; NaN without a level."""
         if self._raised is None:
             return nan
         raised = self._raised.numbers(sample.time_us, sample.field, sample.values, sample.quality)[0][0]

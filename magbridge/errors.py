@@ -120,7 +120,7 @@ class PluginError(MagbridgeError, RuntimeError):
 
 
 def _installed_from() -> str:
-    """Return what pip takes magbridge from again: the file or folder that it came from, else its name."""
+    """Return pip's source of magbridge: the file or folder that it was installed from, else its name."""
     import json  # noqa: PLC0415 - needed only in this error
     from importlib.metadata import PackageNotFoundError, distribution  # noqa: PLC0415 - slow to import
     from urllib.parse import unquote, urlsplit  # noqa: PLC0415 - as above

@@ -140,7 +140,7 @@ class OneTime:
         return out, earliest
 
     def _slopes(self, field: Vector, delay: Vector, step: float) -> Vector:
-        """Return how fast each channel has changed since the reading before, nT/s."""
+        """Return the rate of change of each channel since the previous reading, nT/s."""
         x, y, z = field
         x_then, y_then, z_then = self._field
         x_late, y_late, z_late = delay

@@ -148,7 +148,7 @@ class ScalarCorrection:
         ]
 
     def _complete(self, now_us: int) -> int:
-        """Return how many of the first pending readings need not wait any longer."""
+        """Return the number of pending readings, from the first, that need not wait longer."""
         vector_us = self._vectors[-1][0] if self._vectors else 0
         count = 0
         for k, one in enumerate(self._pending):

@@ -90,7 +90,7 @@ def _remove_key(table: dict[str, Any], key: str) -> bool:
 
 
 def _contents(config: Config) -> Iterator[ConfigFault]:
-    """Yield the faults of the values, each checked on its own."""
+    """Yield the faults of single values."""
     path = config.path
     yield from _files(config)
     calibration = None

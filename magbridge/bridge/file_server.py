@@ -129,7 +129,7 @@ class FileServer:
             waiting.clear()
 
     def _reported_once(self, sender: Sender, replies: Iterator[bytes]) -> Iterator[bytes]:
-        """Hand on replies; tell of the first refusal to a station that is more than the end of a file."""
+        """Yield replies; report the first refusal to a station, other than the end of a file."""
         for payload in replies:
             yield payload
             if why := FtpServer.refusal(payload):

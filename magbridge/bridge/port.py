@@ -197,7 +197,7 @@ class PacedPort(Port):
         """Return True if bytes handed to the system now leave soon."""
 
     def _put(self, data: bytes | bytearray) -> int:
-        """Hand `data` to the system; return how many bytes it took. Raises :class:`PortError`."""
+        """Write `data`; return the number of bytes written. Raises :class:`PortError`."""
         try:
             return os.write(self._fd, data)
         except BlockingIOError:
@@ -251,7 +251,7 @@ def cut(data: bytes) -> Iterator[bytes]:
 
 
 def _kind(frame: bytes) -> bytes | None:
-    """Return what the messages share that supersede each other; None where each of them counts."""
+    """Return the key of messages that supersede each other; None for a message that must be sent."""
     number = int.from_bytes(frame[7:10], "little")
     if frame[0] != V2 or number not in RENEWED:
         return None

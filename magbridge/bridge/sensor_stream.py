@@ -232,7 +232,7 @@ class SensorStream:
         return self.complete()
 
     def complete(self) -> list[CorrectedReading]:
-        """Return the samples of a scalar that waited for others and are complete now."""
+        """Return the waiting samples of a scalar that the vector of the same time completes."""
         if not isinstance(self.correction, ScalarCorrection):
             return []
         return self.correction.samples(self._component.codec.now_us)

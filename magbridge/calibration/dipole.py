@@ -57,7 +57,7 @@ def dipole_tensor(r: FloatArray) -> FloatArray:
 
 
 def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: float) -> FloatArray:
-    """Return what each of a dipole's nine numbers adds to the nine coefficients, with the dipole at `r`.
+    """Return the contribution of each of a dipole's nine numbers to the nine coefficients, at `r`.
 
     Parameters
     ----------

@@ -257,7 +257,7 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
         return 3 * self.count
 
     def regressors(self, x: Any) -> tuple[Any, ...]:
-        """Return what each source does."""
+        """Return the regressor of each source."""
         # (1 + x_k^2)^(-3/2) without a power of a non-integer exponent.
         near = [1.0 / (1.0 + (x - self.apart * k) ** 2) for k in range(self.count)]
         return tuple(one * one**0.5 for one in near)

@@ -78,7 +78,7 @@ def compile_kernel(calibration: Calibration) -> Kernel:
 
 
 def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Exponents]]:
-    """Return what one unit of each coefficient adds to each regressor's nine slots, and the monomials.
+    """Return the contribution of each coefficient to each regressor's nine slots, and the monomials.
 
     Returns
     -------

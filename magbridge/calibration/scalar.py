@@ -329,7 +329,7 @@ def compare_sensors(
 def _expected_field(
     mean: FloatArray, reference: FloatArray, disagrees: BoolArray
 ) -> tuple[FloatArray, float]:
-    """Return what both sensors should read (n,), nT, and its 1-sigma, nT.
+    """Return the field that both sensors should read (n,), nT, and its 1-sigma, nT.
 
     `mean` (n,) is that of both sensors; where they agree, it minus the reference is the crustal field.
     """

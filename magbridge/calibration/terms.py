@@ -203,7 +203,7 @@ class Effect(Term, frozen=True, kw_only=True):
 
     @abstractmethod
     def columns(self, field: float) -> FloatArray:
-        """Return what regressor r adds to each slot per unit of coefficient k, (K, r, 9); `field` is F_0."""
+        """Return the contribution of coefficient k to each slot by regressor r, (K, r, 9); `field` is F_0."""
 
     @abstractmethod
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:

@@ -144,7 +144,7 @@ def _no_handle(error: BaseException) -> str:
 
 
 def _file_limit() -> str:
-    """Return how many files the process may open, as a text."""
+    """Return the largest number of open files of the process, as text."""
     try:
         from resource import RLIMIT_NOFILE, getrlimit
     except ImportError:  # Windows

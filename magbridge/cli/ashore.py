@@ -75,7 +75,7 @@ def convert(
 
 
 def _og(metadata: Path) -> Callable[[Path], None]:
-    """Return what makes a netCDF a file of OG1.0."""
+    """Return a function that completes a netCDF file to one of OG1.0 with this metadata."""
     from magbridge.logs.og import complete, read_metadata
 
     return partial(complete, metadata=read_metadata(metadata))

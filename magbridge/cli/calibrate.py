@@ -277,7 +277,7 @@ def _fit(
     site_bias: float | None,
     start: FleetPrediction | None,
 ) -> tuple[Fit, Observations, dict[str, Any]]:
-    """Return the fit, its samples, and what a fleet's prior was worth; print what they leave in doubt."""
+    """Return the fit, its samples and the benefit of a fleet's prior; print the warnings."""
     from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
     from magbridge.calibration.fitting.observe import observations
@@ -416,7 +416,7 @@ def _with_scalar(
 
 
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
-    """Return a log with a reference that is its own mean, and how well that is known, nT.
+    """Return a log whose reference is its own mean, and the 1-sigma of that mean, nT.
 
     WrongUse: the log tells the true field.
     """

@@ -277,7 +277,7 @@ class Tally:
     """Samples whose total field is none of the Earth's."""
 
     def add(self, corrected: xr.Dataset, rows: int) -> None:
-        """Count a piece of the log that had so many rows, with its samples corrected."""
+        """Count the samples of a corrected piece of the log."""
         from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
         self.samples += corrected.sizes["time"]

@@ -131,7 +131,7 @@ def _in_c(known: Calibration, folder: Path) -> dict[Path, str]:
 
 
 def _filter_lag(known: Calibration, file: Path) -> list[str]:
-    """Return what the exported files lack of the sensor's filter."""
+    """Return a warning if the exported files lack the sensor's filter."""
     cutoff = known.sensor.filter_cutoff
     return [f"{file}: no export undoes the sensor's filter of {cutoff:g} Hz"] if cutoff else []
 

@@ -137,7 +137,7 @@ def delays(problem: Problem, fit: Joint) -> Delays | None:
 
 
 def motion(problem: Problem, finding: Finding) -> MotionShare | None:
-    """Return how far a cause acts only while masses move: one that moved unseen between rows looks so."""
+    """Return the fraction of a cause that acts while masses move, as an unseen motion between rows does."""
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
     # Samples next to a motion, and the cause's share of power there
@@ -183,7 +183,7 @@ def slow_share(problem: Problem, finding: Finding) -> float:
 
 
 def times_usual(candidate: Candidate, b: FloatArray) -> float:
-    """Return how many times its plausible size a cause of b (k,) is; 0 where its terms share one size."""
+    """Return the size of a cause b (k,) over its plausible size; 0 where its terms share one size."""
     return float(np.abs(b).max()) if candidate.spectra is None else 0.0
 
 
@@ -409,7 +409,7 @@ def _domain(diagnosis: Diagnosis) -> list[Diagnostic]:
 
 
 def useful(diagnosis: Diagnosis) -> Diagnostic | None:
-    """Return what the extended calibration corrects for and what not; None if nothing was added to it."""
+    """Return which causes the extended calibration corrects; None if nothing was added to it."""
     added = diagnosis.calibration.effects
     if diagnosis.refused:
         return None

@@ -35,7 +35,7 @@ class Mixture:
     """X_i and M_i."""
 
     def __call__(self, rows: slice) -> FloatArray:
-        """Return (m, k) these rows."""
+        """Return these rows of the columns, (m, k)."""
         return np.asarray(sum(M.T @ X(rows).T for X, M in self.parts)).T
 
     def times(self, widths: FloatArray) -> Mixture:
@@ -53,7 +53,7 @@ class Interpolated:
     """(c, k) V, the columns at the nodes."""
 
     def __call__(self, rows: slice) -> FloatArray:
-        """Return (m, k) these rows."""
+        """Return these rows of the columns, (m, k)."""
         return np.asarray(self.weights[rows] @ self.values)
 
 
@@ -65,7 +65,7 @@ class Since:
     fresh: BoolArray = field(compare=False)
 
     def __call__(self, rows: slice) -> FloatArray:
-        """Return (m, k) these rows."""
+        """Return these rows of the columns, (m, k)."""
         return (self.columns(rows).T * self.fresh[rows]).T
 
 
@@ -77,12 +77,12 @@ def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
 
 
 def size_of(columns: Columns) -> int:
-    """Return how many columns there are."""
+    """Return the number of columns."""
     return len(columns(slice(0, 1)).T)
 
 
 def places(sizes: Iterable[int], first: int = 0) -> list[slice]:
-    """Return where blocks of so many columns each stand side by side, from `first` on."""
+    """Return the slices of blocks of the given numbers of columns, from `first` on."""
     return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=first))]
 
 
@@ -118,7 +118,7 @@ class Products:
     """For each column, the place of its function and the slot of its slope."""
 
     def __call__(self, rows: slice) -> FloatArray:
-        """Return (m, pairs) these rows."""
+        """Return these rows of the columns, (m, pairs)."""
         functions, slots = zip(*self.pairs, strict=True)
         jacobian = self.problem.jacobian.T[_run(slots), rows]
         if self.phi is None:

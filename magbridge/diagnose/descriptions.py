@@ -246,7 +246,7 @@ class Description(NamedTuple):
 
 
 def _heat(candidate: Candidate) -> Literal["offset", "scale"] | None:
-    """Return what a candidate changes with heat that soaks through a hull; None where it is no such one."""
+    """Return whether slow heat changes offset or scale in a candidate; None without slow heat."""
     soaked = (e for e in candidate.effects if isinstance(e, ChannelEffect) and e.stages > 1)
     return next((effect.on for effect in soaked), None)
 

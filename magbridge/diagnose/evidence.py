@@ -246,7 +246,7 @@ def look_elsewhere_factors(
 
 
 def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
-    """Return how many independent hypotheses would pass as often as any of those at `places` does.
+    """Return the number of independent hypotheses that pass as often as any of those at `places`.
 
     All together they are tested at `level`.
     """
@@ -448,7 +448,7 @@ def most_visible(candidates: Sequence[Candidate], info: Information, places: Seq
 
 
 def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: float) -> Visible:
-    """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
+    """Return the signal-to-noise ratio and the sizes at which a candidate is found."""
     # Noncentrality at which a noncentral chi-square passes the threshold in 95 %
     freedom = max(score(info, place, candidate).freedom, 1)
     sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))

@@ -109,7 +109,7 @@ class ResidualNoise:
         return Predictors(self.past, self.ar)
 
     def whitened(self, columns: Columns, rows: slice) -> FloatArray:
-        """Return (m, k) these rows of whitened columns, stored column by column."""
+        """Return these rows of whitened columns (m, k), stored column by column."""
         first = max(rows.start - len(self.ar), 0)
         return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 

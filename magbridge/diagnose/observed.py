@@ -195,7 +195,7 @@ def _scaled(*values: FloatArray) -> FloatArray:
 
 
 def memory(problem: Problem, residual: FloatArray) -> Memory:
-    """Return how far from white a residual (n,), nT, is."""
+    """Return the deviation of a residual (n,), nT, from white noise."""
     survey = problem.survey
     e = residual - residual.mean()
     size = max(rms(e), 1e-300)

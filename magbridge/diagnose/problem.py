@@ -93,7 +93,7 @@ def waves() -> FloatArray:
 
 
 def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
-    """Return what 1 nT of each coefficient adds to some rows of a residual of `slopes` (n, 3), (m, k)."""
+    """Return the contribution of 1 nT of each coefficient to rows of a residual, (m, k)."""
     # cos(pi k t / T) at the middle of each sample's interval
     n, part = len(slopes), slopes.T[:, rows]
     phase = np.pi * (np.arange(n)[rows] + 0.5) / n

@@ -232,7 +232,7 @@ def search(
     rival: Rival = no_rival,
     plain: Joint | None = None,
 ) -> SearchOutcome:
-    """Find the causes that the data support, among the candidates of so many `causes`, under one noise.
+    """Find the causes that the data support under one noise model.
 
     Parameters
     ----------
@@ -342,7 +342,7 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
 
 
 def _added(state: SearchState, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
-    """Add a candidate to the model, or to its cause's own if that is in it already."""
+    """Add a candidate to the model; a cause that is in the model already gains its columns."""
     new = best.candidate
     for k, own in enumerate(model):
         if own.cause == new.cause:

@@ -175,7 +175,7 @@ def series_of(candidate: Candidate) -> str | None:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Write a number to so many significant digits without an exponent: 1070, not 1.07e+03; 2.00, not 2."""
+    """Write a number with significant digits and without an exponent: 1070, not 1.07e+03."""
     rounded = float(f"{value:.{digits}g}")
     if not rounded or not isfinite(rounded):
         return f"{rounded:g}"

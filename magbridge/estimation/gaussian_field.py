@@ -153,7 +153,7 @@ class GaussianField:
         return float(n * np.log(variance) + roots + lifted)
 
     def basis(self, place: FloatArray, deeper: FloatArray | float = 0.0) -> csr_array:
-        """Return what the coefficients add at places (n, 2), m, so many m below the nodes: (n, nodes)."""
+        """Return the contribution of the coefficients at places (n, 2), m, `deeper` m below: (n, nodes)."""
         flat = self.nodes.basis(place)
         if not self.harmonic:
             return flat

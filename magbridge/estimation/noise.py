@@ -180,7 +180,7 @@ def effective_fraction(rho: float, white: float = 0.0) -> float:
 
 
 def samples_per_independent(values: FloatArray, steps: FloatArray) -> float:
-    """Return how many samples of correlated values count as one independent sample, at least 1.
+    """Return the number of correlated samples that count as one independent sample, at least 1.
 
     Parameters
     ----------

@@ -378,7 +378,7 @@ OFF_THE_MAP: Local[float] = Local(nan, nan, nan, nan, nan, nan, nan)
 
 
 def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
-    """Return what curvature adds to mean (nT) and variance (nT²) of the map under a position's spread.
+    """Return the effect of curvature on mean (nT) and variance (nT²) of the map within a position's spread.
 
     Parameters
     ----------

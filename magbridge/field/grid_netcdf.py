@@ -137,7 +137,7 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
 
 
 def _names(name: str, attrs: Any) -> set[str]:
-    """Return what a variable is called, in small letters: its name, its standard name, its long name."""
+    """Return name, standard name and long name of a variable in lower case."""
     return {str(one).lower() for one in (name, attrs.get("standard_name", ""), attrs.get("long_name", ""))}
 
 

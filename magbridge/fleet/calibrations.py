@@ -102,7 +102,7 @@ def _row(
 
 
 def _information(calibration: Calibration, order: int) -> GaussianInformation | None:
-    """Return what its data have determined; None unless it is a polynomial of that order alone."""
+    """Return the information of its data; None unless it is a polynomial of that order alone."""
     term, *others = calibration.terms
     if others or not isinstance(term, Polynomial) or max(map(sum, term.exponents)) != order:
         return None
@@ -185,7 +185,7 @@ def start(location: str | Path, member: str, refit: str, digests: Collection[str
 
 
 def gained(found: Fit, single: Fit | None, began: FleetPrediction) -> tuple[dict[str, Any], list[str]]:
-    """Return what the fleet was worth, for machines and as lines.
+    """Return the benefit of the fleet, as values and as lines of text.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class History:
 
 
 def history(fleet: Fleet, vehicle: str) -> History:
-    """Return how a vehicle's coefficients went, and where they left their bands."""
+    """Return the history of a vehicle's coefficients, and where they left their bands."""
     mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
     names, places = _looked_at(fleet)
     rows: list[tuple[FloatArray, ...]] = []
@@ -129,7 +129,7 @@ def _significant_changes(
 
 
 def _cause(name: str, refitted: bool) -> str:
-    """Return what a technician should look for."""
+    """Return the likely cause, for a technician."""
     mass, _, _ = name.rpartition(",")
     what = (
         "iron that was magnetised, fitted or removed"

@@ -75,7 +75,7 @@ def packed(evidence: GaussianInformation | None) -> dict[str, bytes]:
 
 
 def unpacked(row: Mapping[str, bytes]) -> GaussianInformation:
-    """Return what :func:`packed` has packed."""
+    """Return the information that :func:`packed` has encoded."""
     vector = np.frombuffer(row["vector"], "<f8")
     return GaussianInformation(np.frombuffer(row["precision"], "<f8").reshape(len(vector), -1), vector)
 

@@ -78,7 +78,7 @@ def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> 
 
 
 def fleet_of(catalogue: Catalogue, vehicle: str, excluded: Collection[str] = ()) -> Fleet:
-    """Return what the vehicles with the masses of this one have taught; `excluded` as for :func:`lessons`.
+    """Return the fleet of the vehicles with the masses of this one; `excluded` as for :func:`lessons`.
 
     WrongUse: there is no such vehicle. DataError: nothing has been calibrated yet, or the columns' units
     differ.
@@ -165,7 +165,7 @@ def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
 
 
 def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
-    """Return what vehicles must have in common to learn from each other: their masses, and the order."""
+    """Return the masses and the order, which vehicles must share to be one fleet."""
     return tuple(vehicle["parameters"]), vehicle["order"]
 
 
@@ -179,7 +179,7 @@ def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting
 
 
 def _taught(row: Row) -> _Taught:
-    """Return what a calibration has taught."""
+    """Return the lesson of a calibration."""
     calibration = decode_calibration(row["calibration"].encode(), f"calibration of {row['deployment']}")
     term = calibration.terms[0]
     assert isinstance(term, Polynomial)

@@ -214,7 +214,7 @@ class ConsistencyCheck:
     def _signatures(
         self, time: float, unit: tuple[float, float, float], mass_changes: Sequence[float], begins: Any
     ) -> Any:
-        """Return what one unit of each row's error adds to the total field (rows, 3), nT."""
+        """Return the change of the total field with one unit of each row's error, (rows, 3), nT."""
         x, y, z = unit
         onsets = len(RESTART_PERIODS)
         u = np.array([x, y, z])

@@ -88,7 +88,7 @@ class Publication:
         self._weights[index] = weights
 
     def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
-        """Return the calibration that an estimator has learned from so many samples, with its origin."""
+        """Return the calibration that an estimator has learned, with its origin."""
         first, coefficients, method = self.first, estimator.coefficients, self.first.method
         covariance, level = estimator.covariance, first.level
         reference = first.reference
@@ -124,7 +124,7 @@ class Publication:
         self.age, self.renewed = 0, True
 
     def publish(self, calibration: Calibration, how: str) -> str:
-        """Publish it for a reason of its own; return what to say of that."""
+        """Publish it for another reason; return the message."""
         before = PUBLISHED if self.learned else FIRST
         self.renew(calibration)
         return self._change(how, before, CANDIDATE)

@@ -90,11 +90,11 @@ class Knowledge:
         return self._mapless if self.bank.map_doubted and self._mapless else self.nuisance
 
     def observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
-        """Return what a field (nT) is by nine coefficients (9,)."""
+        """Return the observation of a field (nT) with nine coefficients (9,)."""
         return observe(field, nine, self._field, reference)
 
     def _observation_with(self, estimator: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
-        """Return what a field, at some regressors (m,), is by an estimator's coefficients."""
+        """Return the observation of a field at regressors (m,) with an estimator's coefficients."""
         return lambda field, phi, reference: self.observe(
             field, phi @ self._model.weights(estimator.coefficients), reference
         )

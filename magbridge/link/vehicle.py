@@ -82,7 +82,7 @@ class Losses:
         numbers.count(number)
 
     def lost_frames(self, component: int) -> int:
-        """Return how many frames of a component are lost."""
+        """Return the number of lost frames of a component."""
         numbers = self._numbers.get(component)
         return 0 if numbers is None else numbers.lost
 

@@ -62,7 +62,7 @@ def reader(header: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces
 
 
 def as_table(header: Sequence[str]) -> Callable[[Iterator[str]], Iterator[str]] | None:
-    """Return what makes a table with a line of headings of the lines of a capture that begins so.
+    """Return the converter of a capture to a table with a heading, by its first lines.
 
     None: the lines are of no such form. A line that is damaged stays as it is, and is counted by the reader.
     """

@@ -197,7 +197,7 @@ def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
 
 
 def _gather(data: Bytes, starts: IndexArray, layout: np.dtype[Any], offset: int = 0) -> NDArray[Any]:
-    """Return what stands `offset` bytes after each of `starts`, read as `layout`."""
+    """Return the values at `offset` bytes after each of `starts`, read as `layout`."""
     taken = data[starts[:, None] + np.arange(offset, offset + layout.itemsize)]
     return taken.view(layout)[:, 0] if len(starts) else np.empty(0, layout)
 

@@ -125,7 +125,7 @@ class Page:
         self._track.show(state)
 
     def _offer(self, bridges: list[Bridge]) -> None:
-        """Offer the vehicles where there are several, with the number of unseen alarms."""
+        """Show a choice of vehicles where there are several, with the number of unseen alarms."""
         states = self._station.fleet.states
         unseen = [states[bridge].alarms.unseen for bridge in bridges]
         if (
@@ -178,7 +178,7 @@ class Page:
         ui.run_javascript(f"magbridge.snapshot({json.dumps(lines)}, {json.dumps(self._name() + '.png')})")
 
     def _report(self) -> None:
-        """Hand out a bug report."""
+        """Offer a bug report for download."""
         with self._station.lock:
             data = bundle(self._state, monotonic_s(), self._station.port.name)
         ui.download.content(data, f"{self._name()}.zip", "application/zip")

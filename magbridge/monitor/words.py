@@ -197,7 +197,7 @@ def whereabouts(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]
 
 
 def learnt(state: BridgeState) -> dict[str, tuple[str, bool]]:
-    """Return what the bridge says of its learning: each item's name to its text, and whether all is well."""
+    """Return the items of the learning panel: name to text, and whether the value is normal."""
     get = state.learning.get
     causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
     since = time.gmtime(min(get("alarm_since", 0) * 1e-6, MAX_ALARM_TIME_S))
@@ -218,7 +218,7 @@ def learnt(state: BridgeState) -> dict[str, tuple[str, bool]]:
 
 
 def learned_worth(learning: dict[str, Any]) -> tuple[str, bool]:
-    """Return what an accepted calibration is worth against the first, and whether it is better.
+    """Return the error of an accepted calibration relative to the first, and whether it is better.
 
     The text has the ratio of the errors of prediction with its 95 % interval. Errors of prediction are nearly
     white, so that the logarithm of an RMS of n of them has the variance 1 / (2 n); the two count as
@@ -249,7 +249,7 @@ def _calibration(published: int, first: int) -> str:
 
 
 def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
-    """Return what a person should look at, as :meth:`Alarms.update` takes it: key and words of each."""
+    """Return the conditions that need attention, key to text, for :meth:`Alarms.update`."""
     wrong = {name: FLAG_TEXTS[name] for name in state.flags if name not in ROUTINE}
     starting = now_s - state.began < STARTING
     if (quiet := silence(state, now_s)) and not starting:

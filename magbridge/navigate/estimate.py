@@ -321,7 +321,7 @@ class Estimate:
                 self._lost, self._searches = False, 0
 
     def _levels(self) -> tuple[float, float]:
-        """Return the bias's 1-sigma, nT, at other places; and that of half of them, 0: it is the same there.
+        """Return the 1-sigma (nT) of the bias at other places, and that of half of them; 0: the same.
 
         Where the position was known, the field told the bias, wherever the filter has gone since: from then
         on it may have changed by its prior sigma. After a search it is uncertain, too.

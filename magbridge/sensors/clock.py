@@ -274,7 +274,7 @@ class DeviceClock:
         return Stamp(out_us, restarted, stepped, 0 if restarted else missing)
 
     def _missing(self, sequence: int | None, arrival_us: int) -> int:
-        """Return how many readings are missing before this one, by its sequence number.
+        """Return the number of missing readings before this one, by its sequence number.
 
         The number may have wrapped many times since the last reading, so turns are added until the count fits
         the time that has passed, at the interval at which the readings came so far. That is right as long as

@@ -192,7 +192,7 @@ class FixedFramer:
         return frames
 
     def _align(self, buffer: bytes, position: int) -> tuple[int, bool]:
-        """Return how many bytes after `position` the first frame begins, and whether there is one at all."""
+        """Return the number of bytes from `position` to the first frame, and whether there is one."""
         size = self._size
         best, least, found = size, 0, False
         for offset in range(size):

@@ -333,7 +333,7 @@ class Twinleaf:
         return [(column,) for column in columns if column is not None] if all(columns) else None
 
     def _compile(self, parts: list[tuple[StreamColumn, ...]]) -> _Row | None:
-        """Return how to read samples of these parts; None where our channels are not among them."""
+        """Return the layout of samples of these parts; None if they lack our channels."""
         columns = [column for part in parts for column in part]
         names = [column.name for column in columns]
         if not set(self._options.columns) <= set(names):

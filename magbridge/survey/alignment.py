@@ -418,7 +418,7 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 def _fitted_rows(samples: Samples, most: int) -> IndexArray:
-    """Return at most so many samples: evenly thinned where they are dense, then about the middle."""
+    """Return at most `most` samples: evenly thinned where they are dense, then about the middle."""
     place = samples.place
     spacing = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
     extent = float(np.hypot(*np.ptp(place, axis=0)))

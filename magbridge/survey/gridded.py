@@ -49,7 +49,7 @@ class Posterior:
         return B @ self.w, self.sigma**2 * self.inverse.variances(B) + ((B @ self.follow) ** 2).sum(axis=1)
 
     def draw(self, rng: np.random.Generator, number: int) -> FloatArray:
-        """Return so many coefficients (nodes, number) that the data leave open, equally likely."""
+        """Draw `number` sets of coefficients (nodes, number) from the posterior."""
         # Random field by its precision, and the other uncertainties by their modes.
         off = self.sigma * SparseFactor(self.precision).draw(rng.normal(size=(len(self.w), number)))
         return np.asarray(

@@ -258,7 +258,7 @@ def _considered(
     family: PriorFamily,
     rows: IndexArray,
 ) -> FloatArray:
-    """Return how the field's coefficients follow the calibration's modes: (nodes, r), 1-sigma each."""
+    """Return the change of the field with each of the calibration's modes, (nodes, r), for 1-sigma."""
     q = len(problem.D)
     sums = problem.sums(choice.field, rows, modes=True)
     # Eliminate the field with the modes as further unknowns; then let levels follow the modes.

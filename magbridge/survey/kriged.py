@@ -109,7 +109,7 @@ class Kriged:
 
 
 def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
-    """Return what predicts from the nearest samples; its size varies with the place where that is likelier.
+    """Return the predictor from the nearest samples; its size varies with the place if that is likelier.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
 
 
 def _share(kriged: Kriged, line: int) -> float:
-    """Return the likeliest g of a line, by what the others around predict; as expected where none are."""
+    """Return the likeliest g of a line by the prediction of the others; its prior where there are none."""
     rows = np.flatnonzero(kriged.line == line)
     step = (
         float(np.median(np.linalg.norm(np.diff(kriged.place[rows], axis=0), axis=1)))

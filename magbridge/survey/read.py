@@ -218,7 +218,7 @@ def _placed(ds: xr.Dataset, value: FloatArray, lines: FloatArray, label: int) ->
 
 
 def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray) -> FloatArray:
-    """Return what each uncertain combination of coefficients does to the samples (n, r), nT for 1-sigma."""
+    """Return the change of the samples with 1-sigma of each uncertain combination of coefficients, (n, r)."""
 
     def total(calibration: Calibration, rows: slice) -> FloatArray:
         return correct(calibration, field[rows], channels[rows], time[rows]).total

@@ -30,20 +30,20 @@ class Rows:
         self.kept = np.ones(len(samples.value), bool)
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
-        """Return what the field's coefficients add to the samples `rows`: (m, nodes)."""
+        """Return the contribution of the field's coefficients to the samples `rows`, (m, nodes)."""
         # Splines at the samples, times the roughness there.
         known = field.basis(self.samples.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.scale[rows]) @ known)
 
     def mean_over_samples(self, field: GaussianField) -> FloatArray:
-        """Return what each of the field's coefficients adds to the samples' mean: (nodes,)."""
+        """Return the contribution of each of the field's coefficients to the samples' mean, (nodes,)."""
         kept, total = np.flatnonzero(self.kept), np.zeros(field.nodes.size)
         for start in range(0, len(kept), BLOCK_ROWS):
             total += self.basis(field, kept[start : start + BLOCK_ROWS]).sum(axis=0)
         return total / len(kept)
 
     def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
-        """Return what coefficients w (nodes,) of a field are at every sample: (n,), nT."""
+        """Return the field of coefficients w (nodes,) at every sample, (n,), nT."""
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def sums(self, field: GaussianField, rows: IndexArray, modes: bool = False) -> SampleSums:

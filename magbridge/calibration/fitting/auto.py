@@ -162,7 +162,7 @@ def flown(residual: FloatArray) -> BoolArray:
 
 
 def _end(outlier: BoolArray) -> int:
-    """Return how many samples of the start are mostly outliers; 0 if those are few."""
+    """Return the number of samples at the start that are mostly outliers; 0 if they are few."""
     share = np.cumsum(outlier) / np.arange(1, len(outlier) + 1)
     until = np.flatnonzero((share > MIN_OUTLIER_FRACTION) & outlier)
     return int(until[-1]) + 1 if until.size and until[-1] + 1 >= MIN_END_SAMPLES else 0

@@ -183,7 +183,7 @@ def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, Survey
 
 
 def _drift(data: Observations, sigma: float) -> Drift | None:
-    """Return how far positions may drift with time: as a random walk of `sigma` m, north and east."""
+    """Return the drift of positions, north and east, as a random walk of `sigma` m."""
     waves, shape = slow_functions(data.time, DRIFTING)
     return Drift(waves, shape, sigma) if sigma and len(shape) else None
 

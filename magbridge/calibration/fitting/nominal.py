@@ -166,7 +166,7 @@ def _chosen(
 
 
 def _every(samples: ResidualSamples, step: int) -> ResidualSamples:
-    """Return every so many samples, with their intervals counted in units of that."""
+    """Return every k-th sample; intervals are counted in units of k samples."""
     if step == 1:
         return samples
     part = samples.part(np.arange(0, len(samples.field), step))

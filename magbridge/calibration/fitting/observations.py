@@ -123,7 +123,7 @@ class Observations:
         return replace(self, **picked)
 
     def channels(self, calibration: Calibration) -> FloatArray:
-        """Return what correcting with a calibration of these data needs: (n, c), its channels in order.
+        """Return the channels (n, c), in order, that a calibration of these data needs for correction.
 
         The first columns are the positions; of effects, the temperature is known.
         """

@@ -149,12 +149,12 @@ class SurveySamples:
         return out
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
-        """Return what the field's coefficients add to the reference at `rows`: (m, nodes)."""
+        """Return the contribution of the field's coefficients to the reference at `rows`, (m, nodes)."""
         known = field.basis(self.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.unmapped[rows]) @ known)
 
     def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
-        """Return what coefficients w (nodes,) or (nodes, k) add at every sample: (n,) or (n, k), nT."""
+        """Return the field of coefficients w (nodes,) or (nodes, k) at every sample, (n,) or (n, k), nT."""
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def bend(self, field: GaussianField, w: FloatArray, latent: FloatArray) -> None:

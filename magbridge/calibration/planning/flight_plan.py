@@ -67,7 +67,7 @@ def survey_plan(
     hours: float,
     roll: float = 10.0,
 ) -> list[Proposal]:
-    """Propose surveys that calibrate themselves, of so many `hours`; arguments as for :func:`flight_plan`.
+    """Propose self-calibrating surveys of `hours`; arguments as for :func:`flight_plan`.
 
     Without a calibration they are for an unknown vehicle, whose masses' positions are `parameters`.
 

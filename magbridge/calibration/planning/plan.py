@@ -247,7 +247,7 @@ class Design:
 def evaluate_runs(
     calibration: Calibration, mission: Mission, field_ned: FloatArray, runs: Sequence[PlannedRun]
 ) -> Plan:
-    """Return what given runs are expected to bring, one after the other; `field_ned` is (3,), nT."""
+    """Return the expected error after each of the given runs; `field_ned` is (3,), nT."""
     design = Design(calibration, mission, field_ned)
     C = calibration.covariance
     course = [design.variances(C)]

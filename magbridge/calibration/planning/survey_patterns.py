@@ -57,7 +57,7 @@ class Proposal:
 def propose(
     calibration: Calibration, data: Observations, *, hours: float, roll: float = 10.0
 ) -> list[Proposal]:
-    """Return patterns of a survey that lasts so many hours, the best first.
+    """Return patterns of a survey of a given duration, the best first.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ def measured(diagnosis: Diagnosis) -> str:
 
 
 def terms(diagnosis: Diagnosis) -> str | None:
-    """Draw what each found cause adds to the total field, through what all others leave."""
+    """Draw the contribution of each cause to the total field, over the residual without it."""
     if not diagnosis.findings:
         return None
     count, part = len(diagnosis.findings), thin(len(diagnosis.problem))

@@ -22,7 +22,7 @@ FINDINGS_FORMAT = 3
 
 
 def findings(result: DiagnosisResult, remarks: Sequence[str] = ()) -> dict[str, Any]:
-    """Return what ``findings.json`` holds, as plain Python; a reader must know `remarks` of the logs."""
+    """Return the content of ``findings.json`` as plain Python; `remarks` concern the logs."""
     diagnosis, assessment = result
     listed = [_finding(diagnosis, finding) for finding in diagnosis.findings]
     if diagnosis.wrong is not None:

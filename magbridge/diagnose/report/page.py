@@ -112,7 +112,7 @@ def _pictures(diagnosis: Diagnosis) -> dict[str, str | None]:
 
 
 def _log(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return what was compared: times, counts, and whether the calibration was fitted to it."""
+    """Return times and counts of the compared log, and whether the calibration was fitted to it."""
     survey = diagnosis.problem.survey
     new = ~survey.learned
     time = survey.time[new]
@@ -125,7 +125,7 @@ def _log(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _rows(result: DiagnosisResult) -> list[dict[str, Any]]:
-    """Return what the page shows of each finding."""
+    """Return the row of each finding on the page."""
     diagnosis, rows = result.diagnosis, []
     for finding, notes in zip(diagnosis.findings, result.assessment.notes, strict=False):
         numbers = parameters(finding, len(diagnosis.problem))
