@@ -119,9 +119,9 @@ def test_wrong_names_and_values_are_refused() -> None:
 
 
 def test_garbage_is_cheap_even_byte_by_byte() -> None:
-    """A parser that restarts at every byte would need minutes."""
+    """A parser that restarts at every byte would need minutes: tens of thousands of units."""
     for garbage in (b"\xfd" * 20_000, b"\xfe\xff" * 10_000, random.Random(1).randbytes(20_000)):
         codec = Codec(1, 191)
         bytewise = (garbage[i : i + 1] for i in range(len(garbage)))
-        assert cost(lambda: [codec.parse(byte) for byte in bytewise]) < 100.0  # noqa: B023 - called at once
+        assert cost(lambda: [codec.parse(byte) for byte in bytewise]) < 1000.0  # noqa: B023 - called at once
         assert codec.bytes_skipped > len(garbage) - MAX_PENDING_BYTES - 300
