@@ -151,7 +151,7 @@ class Corrector:
                 self._prepared = prepare(self._kernel.sums_of_one(regressors))
         F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega)
         quality |= self._flags
-        # No guess: without a finite field of plausible size there is no total, and sigma is infinite.
+        # The total is never a guess: without a finite, plausible field it is NaN, and sigma is infinite.
         if not F < MAX_MEASURED_NT:  # also NaN
             quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < MAX_MEASURED_NT else GAP
             F = x = y = z = nan

@@ -449,7 +449,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
     def batch(self, series: LogSeries) -> FloatArray:
         """Return (9, n) regressors."""
-        # The same backward difference for a log; across a gap or at a repeated time the rate is zero.
+        # Backward difference, as in the stepper; across a gap or at a repeated time the rate is zero.
         monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
         apart = 1e-6 * np.diff(series.time_us)
         joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)

@@ -81,7 +81,7 @@ def init(
     with atomic_path(output) as path:
         path.write_text(text, encoding="utf-8")
         fatal = [one.text for one in findings(path) if one.fatal]
-        if fatal and PLACEHOLDER not in text:  # what is left to fill in is an error only when it is run
+        if fatal and PLACEHOLDER not in text:  # a setting to fill in is an error only when it is run
             raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
     found = [one.text for one in findings(output)]
     for finding in found:

@@ -50,7 +50,7 @@ SCALAR_REFERENCE_SIGMA_NT = 1.0
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ModelOptions:
-    """What is fitted.
+    """Terms and data of the fit.
 
     Parameters
     ----------

@@ -74,7 +74,7 @@ class CorrectionOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MapOptions:
-    """What is made of the corrected samples.
+    """Products of the corrected samples.
 
     Parameters
     ----------

@@ -107,7 +107,7 @@ class Nodes:
 
 def nodes_near(place: FloatArray, spacing: float, pad: float) -> Nodes:
     """Return the nodes within about `pad` m of places (n, 2), m north and east."""
-    # Mark the cells of the track, dilate them by the pad, and number what is marked, strip by strip.
+    # Mark the cells of the track, dilate them by the pad, and number the marked cells, strip by strip.
     around = int(np.ceil(pad / spacing)) + 2
     cells = np.floor(place / spacing).astype(np.intp)
     low = cells.min(axis=0) - around - 1

@@ -198,7 +198,7 @@ def samples_per_independent(values: FloatArray, steps: FloatArray) -> float:
     not depend on the sampling rate, as the autocorrelation of neighbours does.
     """
     longest = max(len(values) // 4, 1)
-    # place the samples on their intervals; runs are farther apart than the longest lag
+    # place the samples on their intervals; the gap between runs exceeds the longest lag
     gaps = np.minimum(np.where(np.isfinite(steps), steps, longest), longest)
     slot = (np.cumsum(gaps) - gaps[0]).astype(int)
     size = 2 ** int(np.ceil(np.log2(slot[-1] + 1 + longest)))

@@ -118,7 +118,7 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
     hole = np.isnan(grid.anomaly)
     anomaly = np.where(hole, np.nan, idctn(dctn(filled(grid.anomaly), norm="ortho") * gain, norm="ortho"))
-    # What was removed is an error of the smoothed map, correlated over a part of the wavelength.
+    # The removed part is an error of the smoothed map, correlated over a fraction of the wavelength.
     removed = np.sqrt(np.nanmean((grid.anomaly - anomaly) ** 2))
     sigma = np.hypot(np.nan_to_num(grid.sigma), removed)
     length = max(grid.sigma_length, SIGN_WAVELENGTH_FRACTION * wavelength)

@@ -272,7 +272,7 @@ class AnomalyGrid:
         middle = float(np.mean(self.latitude))
         per_latitude, per_longitude = metres_per_degree(middle)
         north, east = np.gradient(self.anomaly, self._dy * per_latitude, self._dx * per_longitude)
-        # Slopes about their mean: a regional trend is no anomaly.
+        # Slopes about their mean: a regional trend does not count as an anomaly.
         flat = north - np.nanmean(north), east - np.nanmean(east)
         slope = sqrt(float(np.nanmean(flat[0] ** 2 + flat[1] ** 2)))
         return sqrt(2.0) * self.rms / slope if self.rms > PLANE_TOLERANCE_NT else inf

@@ -259,7 +259,7 @@ def _panel(history: History, k: int) -> str:
 
 
 def _dates(ax: Axes, dates: Sequence[datetime]) -> None:
-    """Set the horizontal axis: a date at each deployment where they are few and apart, else at intervals."""
+    """Set the horizontal axis: a date at each deployment where few dates fit, else at intervals."""
     aside = max(0.08 * (dates[-1] - dates[0]), timedelta(days=10))  # one deployment alone has no span
     ax.set_xlim(dates[0] - aside, dates[-1] + aside)  # type: ignore[arg-type]
     if len(dates) == 1 or (len(dates) == 2 and dates[1] - dates[0] >= aside):

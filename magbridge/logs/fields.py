@@ -1,6 +1,6 @@
 """The table of a format: which field of its records becomes which column, in which unit.
 
-Each format lists its fields as :class:`FieldMap` records. Of several fields with one column, the first that a
+Each format lists its fields as :class:`FieldMap` records. If several fields fill one column, the first that a
 log has is read. Telemetry with times of its own is brought to the rows by :func:`latest`, as known live, or
 by :func:`linear`.
 """

@@ -103,7 +103,7 @@ def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[st
     ]
     layout = replace(layout, rate=_declared_rate(path, layout))
     taken = _declared(path, layout, names)
-    # a simulation's truth is no reading: a log that lacks a channel must not take it from there
+    # a simulation's truth is not a reading: a log that lacks a channel must not take it from there
     open_to_all = ["" if k in taken or name.startswith("truth_") else name for k, name in enumerate(names)]
     known = {k: name for k, name in aliases(open_to_all, units).items() if name not in taken.values()}
     if "time" not in {*taken.values(), *known.values(), *names}:

@@ -142,7 +142,7 @@ class Bank:
 
         A hypothesis off the map predicts the map's mean, with the map's variance, and is not updated.
         """
-        # 1. Map and its slopes at each hypothesis; where there is no map, zeros stand in for NaN.
+        # 1. Map and its slopes at each hypothesis; off the map, zeros stand in for NaN.
         north, east = self.x[:2]
         per_latitude, per_longitude = metres_per_degree(block.latitude)
         local = self._grid.evaluate(

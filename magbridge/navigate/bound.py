@@ -94,7 +94,7 @@ def position_bound(
     along = _along(corners, lat, lon)
     speed = along[-1] / (corners[-1] - corners[0])
     lasts = min(o.interval, block_length(grid) / max(speed, 1e-9))
-    # The same blocks as the filter's, so that bound and filter use as many samples.
+    # Blocks as the filter's, so that bound and filter use as many samples.
     interval = every * (int(lasts / every + 1e-9) + 1)  # a block of as many samples as the filter's
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
     if not at.size:

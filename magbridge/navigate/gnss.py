@@ -227,7 +227,7 @@ class GnssMonitor:
             Of the navigator, at this time.
         """
         sigma = max(sigma, MIN_SIGMA_M)
-        # A jammed receiver's claimed error varies: the smallest recent one limits what it may claim.
+        # A jammed receiver's claimed error varies: the smallest recent one is the limit.
         smallest = min((row.sigma for row in self._history), default=sigma)
         sigma = min(sigma, MAX_SIGMA_RATIO * smallest)
         # Every test runs on every position, because each has a history. The state then follows from the first

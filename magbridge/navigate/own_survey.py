@@ -202,7 +202,7 @@ def _dataset(
     place = field.place + moved
     latitude, longitude = offset(*origin, place[:, 0], place[:, 1])
     there = field.moved(found.typical)
-    # Posterior mean of the field, y - R K^-1 y: what remains after the noise is taken off.
+    # Posterior mean of the field, y - R K^-1 y: the anomaly without the noise.
     K, R = field.covariance(field.place + there, found.typical, found.kind)
     y = field.anomaly - field.mean - (field.slope * there).sum(axis=1)
     alone = np.sqrt(2.0 * (field.drift**2).sum(axis=1))

@@ -244,7 +244,11 @@ def facts(result: Result, path: Path) -> dict[str, Any]:
         "misties_after_nT": _rms(result.after),
         "residual_nT": _rms(result.residual[found.kept]),
         "noise_nT": found.sigma,
-        "rock": {"size_nT": found.size, "length_m": found.field.length, "smoothness": found.field.alpha - 1},
+        "crustal_field": {
+            "amplitude_nT": found.size,
+            "length_m": found.field.length,
+            "smoothness": found.field.alpha - 1,
+        },
         "depth_m": found.middle,
         "level_sigma_nT": result.samples.level_sigma,
         "warnings": result.warnings,
@@ -261,10 +265,10 @@ def summary(result: Result) -> str:
         if known["crossovers"]
         else "no crossovers"
     )
-    rock = known["rock"]
+    crust = known["crustal_field"]
     return (
         f"{known['samples']} samples on {counted(known['lines'], 'line')}, {ties}; crustal field of "
-        f"{rock['size_nT']:.0f} nT over {rock['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
+        f"{crust['amplitude_nT']:.0f} nT over {crust['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
         + (f"; {result.scalar.summary()}" if result.scalar else "")
     )
 

@@ -62,8 +62,8 @@ def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
 
 def test_crustal_field_is_not_taken_for_noise(survey: Survey) -> None:
     """Amplitude and length are those of the crustal field, the noise is the sensor's."""
-    rock = survey[2].details["rock"]
-    assert 20.0 < rock["size_nT"] < 100.0
+    rock = survey[2].details["crustal_field"]
+    assert 20.0 < rock["amplitude_nT"] < 100.0
     assert 300.0 < rock["length_m"] < 2000.0
     assert survey[2].calibration.noise.sensor == pytest.approx(NOISE, rel=0.1)
 
@@ -73,12 +73,12 @@ def test_a_field_larger_than_any_crust_is_not_taken(monkeypatch: pytest.MonkeyPa
 
     def too_large(data: Observations, order: int = 3, **_: Any) -> Fit:
         found = fit_auto(data, order)
-        return replace(found, details={**found.details, "rock": {"rms_nT": 15_000.0}})
+        return replace(found, details={**found.details, "crustal_field": {"rms_nT": 15_000.0}})
 
     monkeypatch.setattr(in_place, "fit_in_place", too_large)
     found = fit(flown()[0])
     assert found.calibration.method == "auto"
-    assert "rock" not in found.details
+    assert "crustal_field" not in found.details
 
 
 def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) -> None:
@@ -347,7 +347,7 @@ def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
     assert np.sqrt(np.mean((found.creep.offset_at(data.time) - moved) ** 2)) < 0.5 * np.sqrt(
         np.mean(moved**2)
     )
-    assert 350.0 < found.details["rock"]["length_m"] < 1400.0
+    assert 350.0 < found.details["crustal_field"]["length_m"] < 1400.0
     error, sigma = error_of(found, data, true)
     assert error > 2.0 * NOISE
     assert error < 1.25 * sigma

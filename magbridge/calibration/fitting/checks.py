@@ -244,7 +244,7 @@ def judged(found: Fit, data: Observations) -> Fit:
     warnings = (
         *_warnings(ratio, noise, heading_gap(data), lasting),
         *_noise_for_attitudes(found.samples.field, noise),
-        *rough_rock(data, found.details.get("rock"), noise),
+        *rough_rock(data, found.details.get("crustal_field"), noise),
         *_contradicted_prior(found),
     )
     if ratio > UNSUPPORTED:

@@ -99,7 +99,7 @@ def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
 
 def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[str]:
     """Yield a warning if a fit's crustal field exceeds the `noise`, nT, and is too rough for the track."""
-    if rock and data.place is not None and rock["size_nT"] > noise:
+    if rock and data.place is not None and rock["amplitude_nT"] > noise:
         yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 

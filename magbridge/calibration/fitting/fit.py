@@ -167,7 +167,7 @@ def _first_solution(
 
 def _refuse_large_crust(found: Fit) -> None:
     """Refuse a field in place that is larger than any crust's: it is the sensor's own error."""
-    if (size := found.details.get("rock", {}).get("rms_nT", 0.0)) > MAX_CRUST_NT:
+    if (size := found.details.get("crustal_field", {}).get("rms_nT", 0.0)) > MAX_CRUST_NT:
         raise NoSolutionError(
             f"survey: a crustal field of {size:.0f} nT RMS was fitted, larger than any crust's"
         )

@@ -199,9 +199,9 @@ def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:
         "outliers": int((survey.at_rest & ~survey.kept).sum()),
         "widths_nT": dict(zip(names, np.exp(found.widths.eta).tolist(), strict=True)),
         "offsets_nT": {one.name: rms(survey.offset(latent, [one])) for one in survey.offsets},
-        "rock": {
+        "crustal_field": {
             "rms_nT": rms(found.lacking),
-            "size_nT": choice.ratio * found.widths.sigma,
+            "amplitude_nT": choice.ratio * found.widths.sigma,
             "length_m": field.length,
             "smoothness": field.alpha - 1,
             "shortest_m": float(ladder(survey.place[part])[0]),
