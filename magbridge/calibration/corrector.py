@@ -72,17 +72,9 @@ class Corrector:
     def replace(self, calibration: Calibration, values: Sequence[float] = ()) -> float:
         """Continue with other coefficients of the same terms, or with effects added or removed at the end.
 
-        Parameters
-        ----------
-        calibration : Calibration
-            Effects that it has in common with the one before keep their state.
-        values : sequence of float
-            Its channels at the last sample; needed where it has effects more.
-
-        Returns
-        -------
-        float
-            nT, by which the total field of the last sample changes; NaN if there was none.
+        `calibration`: effects that it has in common with the one before keep their state. `values`: its
+        channels at the last sample; needed where it has effects more. Returns: nT, by which the total field
+        of the last sample changes; NaN if there was none.
         """
         # Total field of the last sample by the old coefficients, for the change that is returned.
         before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
@@ -170,15 +162,9 @@ class Corrector:
     ) -> list[float]:
         """Return the change (nT) of the total field over each span of a position, without effects.
 
-        Parameters
-        ----------
-        field : tuple of 3 float
-            nT, raw, sensor axes.
-        values : tuple of float
-            ``calibration.channels``, in that order.
-        spans : sequence of (int, float, float)
-            Index of a channel, and the two values between which it lies. Spans of channels that are not
-            positions are left out of the result.
+        `field`: nT, raw, sensor axes. `values`: ``calibration.channels``, in that order. `spans` (int,
+        float, float): index of a channel, and the two values between which it lies. Spans of channels that
+        are not positions are left out of the result.
         """
         positions = values[: self._positions]
         asked = positions, spans

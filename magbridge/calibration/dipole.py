@@ -40,15 +40,8 @@ SERIES_ORDER = 8
 def dipole_tensor(r: FloatArray) -> FloatArray:
     """Return ``G(r)`` of dipoles at `r` from the sensor.
 
-    Parameters
-    ----------
-    r : (..., 3) array
-        m.
-
-    Returns
-    -------
-    (..., 3, 3) array
-        m^-3; times a moment (nT m³, with mu_0/4pi in it) it is the field at the sensor, nT.
+    `r` (..., 3): m. Returns (..., 3, 3): m^-3; times a moment (nT m³, with mu_0/4pi in it) it is the field
+    at the sensor, nT.
     """
     # G(r) = (3 u u^T - I) / r^3 with u = r / |r|
     distance = np.linalg.norm(r, axis=-1)[..., None, None]
@@ -59,19 +52,9 @@ def dipole_tensor(r: FloatArray) -> FloatArray:
 def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: float) -> FloatArray:
     """Return the contribution of each of a dipole's nine numbers to the nine coefficients, at `r`.
 
-    Parameters
-    ----------
-    r : (n, 3) array
-        m, where the mass is.
-    moment, induced : (3,) arrays
-        nT at the sensor, as :class:`Dipole` keeps them; the displacement's three columns are linear in them.
-    r_0 : float
-        m, the distance at which moments are given as a field.
-
-    Returns
-    -------
-    (9, n, 9) array
-        moment x, y, z; induced x, y, z; displacement x, y, z (nT per m).
+    `r` (n, 3): m, where the mass is. `moment`, `induced` (3,): nT at the sensor, as :class:`Dipole` keeps
+    them; the displacement's three columns are linear in them. `r_0`: m, the distance at which moments are
+    given as a field. Returns (9, n, 9): moment x, y, z; induced x, y, z; displacement x, y, z (nT per m).
     """
     columns = np.zeros((9, len(r), 9))
 
@@ -95,16 +78,8 @@ def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: 
 def expand_dipole(values: FloatArray, order: int) -> FloatArray:
     """Return the power series coefficients of functions given at the Chebyshev nodes of [-1, 1].
 
-    Parameters
-    ----------
-    values : (..., n, s) array
-        At ``cos(pi (i + 1/2) / n)``, n > order.
-    order : int
-        Of the highest power.
-
-    Returns
-    -------
-    (..., order + 1, s) array
+    `values` (..., n, s): at ``cos(pi (i + 1/2) / n)``, n > order. `order`: of the highest power. The result
+    is (..., order + 1, s).
     """
     # Interpolate by Chebyshev polynomials (well conditioned), then convert to powers.
     n = values.shape[-2]

@@ -63,14 +63,8 @@ def held(values: FloatArray, first: float) -> FloatArray:
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
     """Return (n,) y that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
 
-    Parameters
-    ----------
-    time, values : (n,) array
-        s, and x.
-    lag : float
-        s, the sum of all stages; at 0, y is x.
-    stages : int
-        Number of lags in series.
+    `time`, `values` (n,): s, and x. `lag`: s, the sum of all stages; at 0, y is x. `stages`: number of lags
+    in series.
     """
     if lag <= 0.0 or len(time) < 2:
         return values
@@ -237,14 +231,9 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
     mass, makes a field that falls with the cube of their distance. Its place is unknown, but a row of
     sources near the path can make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
 
-    Attributes
-    ----------
-    centre, scale : float
-        Position of the first source, and distance of all of them from the path, in the channel's unit.
-    apart : float
-        Distance between neighbouring sources, in units of `scale`.
-    count : int
-        Number of sources.
+    `centre`, `scale`: position of the first source, and distance of all of them from the path, in the
+    channel's unit. `apart`: distance between neighbouring sources, in units of `scale`. `count`: number of
+    sources.
     """
 
     kind: ClassVar[str] = "sources"
@@ -336,16 +325,10 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
     loop closes farther away: ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate &
     Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
 
-    Attributes
-    ----------
-    width : float
-        In the channel's unit.
-    centre, scale : float
-        Position of the steel, and how far its effect reaches, in the channel's unit. With a scale far beyond
-        the travel S is linear, as for backlash.
-    order : int
-        0: S as above. In older files, the highest power of a polynomial in its place:
-        ``sum_k c_k (v^k - x^k)`` with ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``.
+    `width`: in the channel's unit. `centre`, `scale`: position of the steel, and how far its effect reaches,
+    in the channel's unit. With a scale far beyond the travel S is linear, as for backlash. `order`: 0: S as
+    above. In older files, the highest power of a polynomial in its place: ``sum_k c_k (v^k - x^k)`` with ``v
+    = (y - centre) / scale`` and ``x = (p - centre) / scale``.
     """
 
     kind: ClassVar[str] = "play"

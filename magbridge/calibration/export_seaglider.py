@@ -80,17 +80,9 @@ def seaglider(calibration: Calibration, nT_per_count: float) -> str:
 def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
     """Return the heading error due to the moving masses if only one offset and one matrix are used.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        With a boresight.
-    dip_deg : float
-        deg, inclination of the Earth's field: the error is inversely proportional to its horizontal part.
-
-    Returns
-    -------
-    list of HeadingCost
-        With all parameters at the ends of their ranges; then with one at its ends, each.
+    `calibration`: with a boresight. `dip_deg`: deg, inclination of the Earth's field: the error is inversely
+    proportional to its horizontal part. Returns: With all parameters at the ends of their ranges; then with
+    one at its ends, each.
     """
     ends = [(one.low, one.high) for one in calibration.parameters]
     centre = middle(calibration)

@@ -68,17 +68,8 @@ def box_flight(
 ) -> BoxFlight | None:
     """Find the manoeuvres of a box flight.
 
-    Parameters
-    ----------
-    time : (n,) array
-        s, ascending.
-    roll, pitch, heading : (n,) array
-        deg; NaN where unknown.
-
-    Returns
-    -------
-    BoxFlight or None
-        None if fewer than :data:`MIN_MANOEUVRES` of the twelve were flown, or the log is too slow.
+    `time` (n,): s, ascending. `roll`, `pitch`, `heading` (n,): deg; NaN where unknown. Returns: None if
+    fewer than :data:`MIN_MANOEUVRES` of the twelve were flown, or the log is too slow.
     """
     if len(time) < 100:
         return None
@@ -130,18 +121,9 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
 def figure_of_merit(box: BoxFlight, measured: FloatArray, compensated: FloatArray) -> dict[str, Any]:
     """Return figure of merit and improvement ratio.
 
-    Parameters
-    ----------
-    box : BoxFlight
-        The manoeuvres.
-    measured, compensated : (n,) array
-        nT, field before and after compensation; NaN where unknown.
-
-    Returns
-    -------
-    dict
-        ``before_nT`` and ``after_nT`` (sums), ``improvement_ratio``, ``manoeuvres`` (number), and
-        ``peak_to_peak``: a list with axis, heading (deg), before and after (nT) of each.
+    `box`: the manoeuvres. `measured`, `compensated` (n,): nT, field before and after compensation; NaN where
+    unknown. Returns: ``before_nT`` and ``after_nT`` (sums), ``improvement_ratio``, ``manoeuvres`` (number),
+    and ``peak_to_peak``: a list with axis, heading (deg), before and after (nT) of each.
     """
     # Peak to peak of each manoeuvre in the band; their sum is the figure of merit.
     seen = [_band(_filled(values), box.interval) for values in (measured, compensated)]

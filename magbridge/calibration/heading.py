@@ -72,12 +72,7 @@ class Heading:
 def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> FloatArray:
     """Return vectors (n, 3) in level axes: forward and starboard in the horizontal plane, and down.
 
-    Parameters
-    ----------
-    vector : (n, 3) array
-        Body axes, any unit.
-    roll, pitch : (n,) array
-        rad.
+    `vector` (n, 3): body axes, any unit. `roll`, `pitch` (n,): rad.
     """
     x, y, z = vector.T
     # h = R_y(pitch) R_x(roll) b
@@ -175,27 +170,11 @@ def heading_of_sample(
 ) -> tuple[float, float, float]:
     """Return :func:`heading` of one sample with :func:`published_covariance`, without arrays.
 
-    Parameters
-    ----------
-    vector : tuple of 3 float
-        nT, corrected field in body axes.
-    roll, pitch : float
-        rad.
-    declination : float
-        deg, east positive; NaN where unknown.
-    covariance : sequence of 9 float
-        nT^2, by the calibration alone, row by row.
-    boresight_covariance : sequence of 9 float
-        rad^2, of the boresight's rotation vector in body axes, row by row.
-    published_variance : float
-        nT^2, sum of the three components' published variances.
-    tilt_sigma_deg, declination_sigma_deg : float
-        deg, 1-sigma of roll and of pitch, and of the declination.
-
-    Returns
-    -------
-    magnetic, true, sigma : float
-        deg, as in :class:`Heading`.
+    `vector`: nT, corrected field in body axes. `roll`, `pitch`: rad. `declination`: deg, east positive; NaN
+    where unknown. `covariance`: nT^2, by the calibration alone, row by row. `boresight_covariance`: rad^2,
+    of the boresight's rotation vector in body axes, row by row. `published_variance`: nT^2, sum of the three
+    components' published variances. `tilt_sigma_deg`, `declination_sigma_deg`: deg, 1-sigma of roll and of
+    pitch, and of the declination. Returns `magnetic, true, sigma`: deg, as in :class:`Heading`.
     """
     x, y, z = vector
     sin_roll, cos_roll, sin_pitch, cos_pitch = sin(roll), cos(roll), sin(pitch), cos(pitch)
@@ -254,16 +233,9 @@ def published_covariance(
     Checks and moving masses increase the published variances. That increase has no direction, so each
     axis gets a third of it.
 
-    Parameters
-    ----------
-    stated : (n, 3, 3) array
-        nT^2, by the calibration alone (:func:`.correct.vector_covariance`).
-    turn : (3, 3) array
-        rad^2, covariance of the boresight's rotation vector.
-    vector : (n, 3) array
-        nT, corrected field in body axes.
-    variance : (n,) array
-        nT^2, sum of the three components' published variances.
+    `stated` (n, 3, 3): nT^2, by the calibration alone (:func:`.correct.vector_covariance`). `turn` (3, 3):
+    rad^2, covariance of the boresight's rotation vector. `vector` (n, 3): nT, corrected field in body axes.
+    `variance` (n,): nT^2, sum of the three components' published variances.
     """
     # trace of the boresight's part: tr(Omega) |b|^2 - b^T Omega b
     # A third of the excess to each axis: excess = tr(published) - tr(V) - tr(boresight's part).
@@ -277,13 +249,9 @@ def published_covariance(
 def model_declination_sigma(horizontal: FloatArray, crustal_sigma: float = 0.0) -> FloatArray:
     """Return the standard deviation of a main-field model's declination, deg.
 
-    Parameters
-    ----------
-    horizontal : (n,) array
-        nT, horizontal part of the main field.
-    crustal_sigma : float
-        nT, 1-sigma of the crustal field's total. Its component across the meridian is about
-        ``crustal_sigma / sqrt(2)``, which turns north by that over H.
+    `horizontal` (n,): nT, horizontal part of the main field. `crustal_sigma`: nT, 1-sigma of the crustal
+    field's total. Its component across the meridian is about ``crustal_sigma / sqrt(2)``, which turns north
+    by that over H.
 
     Notes
     -----

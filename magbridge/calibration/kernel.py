@@ -190,16 +190,9 @@ def apply(
 ) -> Numbers:
     """Correct one sample (or arrays of them); return total, its sigma, the vector, and the vector's sigmas.
 
-    Parameters
-    ----------
-    hx, hy, hz : float or (n,) array
-        nT, raw channels of the sensor.
-    prepared : Prepared
-        From :func:`prepare`, for the positions of the samples.
-    omega : tuple of 6 float, optional
-        xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None without a boresight.
-    root : callable
-        Square root: of one number, or ``np.sqrt`` where the samples are arrays.
+    `hx`, `hy`, `hz` (n,): nT, raw channels of the sensor. `prepared`: from :func:`prepare`, for the
+    positions of the samples. `omega`: xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None
+    without a boresight. `root`: square root: of one number, or ``np.sqrt`` where the samples are arrays.
 
     Notes
     -----

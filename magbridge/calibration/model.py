@@ -80,13 +80,9 @@ def compile_kernel(calibration: Calibration) -> Kernel:
 def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Exponents]]:
     """Return the contribution of each coefficient to each regressor's nine slots, and the monomials.
 
-    Returns
-    -------
-    tensor : (K, m, 9) array
-        nT at F_0, as :class:`~magbridge.calibration.terms.Expansion`; the regressors are the monomials, then
-        those of the effects.
-    exponents : list of tuple of int
-        The monomials in the kernel's order: each follows from one before it.
+    Returns `tensor` (K, m, 9): nT at F_0, as :class:`~magbridge.calibration.terms.Expansion`; the regressors
+    are the monomials, then those of the effects. Returns `exponents`: The monomials in the kernel's order:
+    each follows from one before it.
     """
     expansions = [term.expand(calibration.parameters) for term in calibration.terms]
     exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)

@@ -187,10 +187,7 @@ class Effect(Term, frozen=True, kw_only=True):
     :meth:`batch` computes those of a whole log at once, for simulation, comparison or fit. A NaN in
     its channel must not spoil its state: hold the last value.
 
-    Attributes
-    ----------
-    cause : str
-        What a diagnosis has added it for, as in ``findings.json``; empty where a fit or a person has.
+    `cause`: what a diagnosis has added it for, as in ``findings.json``; empty where a fit or a person has.
     """
 
     remembers: ClassVar[bool] = True

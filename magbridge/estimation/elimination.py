@@ -155,21 +155,10 @@ class FieldEliminated:
 def eliminate_field(sums: SampleSums, field: GaussianField, ratio: float, rho: float) -> FieldEliminated:
     """Eliminate the field in place.
 
-    Parameters
-    ----------
-    sums : SampleSums
-        Of the samples.
-    field : GaussianField
-        The prior of w for a field of unit variance.
-    ratio : float
-        The field's standard deviation over that of the noise.
-    rho : float
-        Autocorrelation of the noise.
+    `sums`: of the samples. `field`: the prior of w for a field of unit variance. `ratio`: the field's
+    standard deviation over that of the noise. `rho`: autocorrelation of the noise.
 
-    Raises
-    ------
-    LinAlgError
-        The precision is not positive definite in the machine's numbers, or the prior's may not be.
+    LinAlgError: the precision is not positive definite in the machine's numbers, or the prior's may not be.
     """
     if field.condition > WORST:
         raise np.linalg.LinAlgError("the nodes are too fine for so long a field")

@@ -51,12 +51,8 @@ class GaussianInformation:
     ) -> GaussianInformation:
         """Return the information of the data that moved a Gaussian prior to a Gaussian posterior.
 
-        Parameters
-        ----------
-        mean, covariance : (q,), (q, q) arrays
-            The posterior.
-        prior_mean, prior_covariance : (q,), (q, q) arrays
-            The prior; directions in which the posterior is not narrower have no information.
+        `mean`, `covariance` (q,): the posterior. `prior_mean`, `prior_covariance` (q,): the prior;
+        directions in which the posterior is not narrower have no information.
         """
         # work in units of the posterior's standard deviations, where both precisions are near 1
         scale = np.sqrt(np.diag(covariance))
@@ -105,12 +101,8 @@ class GaussianInformation:
     def marginalise(self, rows: IndexArray, prior_precision: FloatArray) -> GaussianInformation:
         """Return the information about the other unknowns, with the unknowns `rows` integrated out.
 
-        Parameters
-        ----------
-        rows : (p,) array of int
-            Unknowns to integrate out; their prior has mean 0.
-        prior_precision : (p, p) array
-            Precision of that prior, positive definite.
+        `rows` (p,): unknowns to integrate out; their prior has mean 0. `prior_precision` (p, p): precision
+        of that prior, positive definite.
         """
         keep = np.setdiff1d(np.arange(len(self.vector)), rows)
         inner = self.precision[np.ix_(rows, rows)] + prior_precision
@@ -165,10 +157,7 @@ class GaussianInformation:
 def covariance_of(precision: FloatArray) -> FloatArray:
     """Return the inverse of a positive definite precision (q, q), symmetric to the last bit.
 
-    Raises
-    ------
-    CalibrationError
-        The precision is singular: a combination of the unknowns is free.
+    CalibrationError: the precision is singular: a combination of the unknowns is free.
     """
     # A precision with unit diagonal: unknowns in different units do not spoil the factorisation.
     scale = np.sqrt(np.diag(precision))

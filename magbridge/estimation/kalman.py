@@ -61,14 +61,8 @@ class KalmanFilter:
     ) -> None:
         """Move some states on in time, by ``x <- F x`` and ``P <- F P F^T + Q``.
 
-        Parameters
-        ----------
-        transition : (m, m) array
-            F, of the `states`.
-        noise : (m, m) array, optional
-            Q, covariance of the process noise.
-        states : slice or (m,) int array, optional
-            The states that F moves; by default all.
+        `transition` (m, m): F, of the `states`. `noise` (m, m): Q, covariance of the process noise. `states`
+        (m,): the states that F moves; by default all.
         """
         chosen = slice(None) if states is None else states
         # Only the rows and columns of the chosen states change; the others are constant.
@@ -83,14 +77,8 @@ class KalmanFilter:
     def innovate(self, residual: float, row: FloatArray, noise: float) -> float:
         """Compare a measurement with its prediction; set innovation and variance, and return the innovation.
 
-        Parameters
-        ----------
-        residual : float
-            e, the part of the residual that does not depend on the state linearly.
-        row : (n,) array
-            h, derivatives of the residual by the state.
-        noise : float
-            R, variance of the measurement's noise.
+        `residual`: e, the part of the residual that does not depend on the state linearly. `row` (n,): h,
+        derivatives of the residual by the state. `noise`: R, variance of the measurement's noise.
         """
         self.row = row
         # S = h^T P h + R and v = e + h^T x; P h serves the gain as well.
@@ -102,10 +90,7 @@ class KalmanFilter:
     def update(self, considered: slice | IndexArray | None = None) -> FloatArray:
         """Update the state with the last measurement and return the gain (n,).
 
-        Parameters
-        ----------
-        considered : slice or int array, optional
-            States that the measurement must not change.
+        `considered`: states that the measurement must not change.
         """
         # K = P h / S; considered states keep their mean, but their covariance stays in S (Schmidt 1966).
         gain = self._Ph / self.variance

@@ -67,12 +67,8 @@ class NoiseModel:
     def whiten(self, values: FloatArray, steps: FloatArray) -> FloatArray:
         """Return values (n, ...) with their noise made white, of standard deviation `sigma`.
 
-        Parameters
-        ----------
-        values : (n, ...) array
-            Residuals, or columns of their Jacobian.
-        steps : (n,) array
-            Sampling intervals since the previous sample; infinite at the first of a run.
+        `values` (n, ...): Residuals, or columns of their Jacobian. `steps` (n,): sampling intervals since
+        the previous sample; infinite at the first of a run.
         """
         return Whitening(steps, *self.shape).apply(values)
 
@@ -182,13 +178,9 @@ def effective_fraction(rho: float, white: float = 0.0) -> float:
 def samples_per_independent(values: FloatArray, steps: FloatArray) -> float:
     """Return the number of correlated samples that count as one independent sample, at least 1.
 
-    Parameters
-    ----------
-    values : (n, q) array
-        Residuals times the rows of their Jacobian, in units in which the q coefficients are alike: what each
-        sample contributes to the gradient.
-    steps : (n,) array
-        Sampling intervals since the previous sample; infinite at the first of a run.
+    `values` (n, q): residuals times the rows of their Jacobian, in units in which the q coefficients are
+    alike: what each sample contributes to the gradient. `steps` (n,): sampling intervals since the previous
+    sample; infinite at the first of a run.
 
     Notes
     -----
@@ -251,14 +243,8 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> N
     nearly equal whatever white noise is between them, and an AR(1) process alone then underestimates one of
     the two.
 
-    Parameters
-    ----------
-    e : (n,) array
-        Residuals, nT.
-    steps : (n,) array
-        Sampling intervals since the previous sample.
-    noise : NoiseModel
-        The result of :func:`estimate_noise`.
+    `e` (n,): Residuals, nT. `steps` (n,): sampling intervals since the previous sample. `noise`: the result
+    of :func:`estimate_noise`.
     """
     if noise.autocorrelation < MIN_SLOW_AUTOCORRELATION:
         return noise

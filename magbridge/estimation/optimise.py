@@ -65,16 +65,9 @@ def normal_equations(
 ) -> NormalEquations:
     """Sum up the normal equations of the whitened residual, in bounded memory.
 
-    Parameters
-    ----------
-    samples : Samples
-        n samples with m monomials.
-    coefficients : (9 m,) array
-        Where to linearise, nT, monomial by monomial.
-    weight : (n,) array, optional
-        Weight of each whitened residual; 1 if not given.
-    rho, white : float
-        Autocorrelation of the noise, as for :func:`.noise.whiten`.
+    `samples`: n samples with m monomials. `coefficients` (9 m,): where to linearise, nT, monomial by
+    monomial. `weight` (n,): weight of each whitened residual; 1 if not given. `rho`, `white`:
+    autocorrelation of the noise, as for :func:`.noise.whiten`.
     """
     size = coefficients.size
     hessian, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.0

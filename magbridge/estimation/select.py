@@ -34,18 +34,9 @@ def select_blocks(
 ) -> tuple[ParameterBlock, ...]:
     """Return the groups without those that are offered and that the log does not need; one lag at most.
 
-    Parameters
-    ----------
-    quadratic : GaussianInformation
-        In the unknowns of all groups, behind those of `family`.
-    family : PriorFamily
-        Of the coefficients.
-    groups : tuple of ParameterBlock
-        All that are in the fit.
-    eta, sigma : (h,) array, float
-        Hyperparameters and noise (nT), from which to climb.
-    price : float
-        Nats that each must gain.
+    `quadratic`: in the unknowns of all groups, behind those of `family`. `family`: of the coefficients.
+    `groups`: all that are in the fit. `eta`, `sigma` (h,): hyperparameters and noise (nT), from which to
+    climb. `price`: nats that each must gain.
     """
     # Exhaustive search: evidence of each choice of blocks, less the price of every offered one.
     first, free = _starts(family, groups)

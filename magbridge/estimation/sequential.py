@@ -114,12 +114,7 @@ class SequentialTest:
     def begin(self, time: float, normalised_innovation: float) -> BoolArray:
         """Restart the onsets whose period is over; return which rows those are (rows,).
 
-        Parameters
-        ----------
-        time : float
-            Time of the measurement, s.
-        normalised_innovation : float
-            ``v / sqrt(S)``.
+        `time`: time of the measurement, s. `normalised_innovation`: ``v / sqrt(S)``.
         """
         self.count += 1
         # An onset is replaced after its period, unless its change is likely; an outstanding innovation begins
@@ -140,14 +135,9 @@ class SequentialTest:
     def test(self, estimator: KalmanFilter, signatures: FloatArray, null: FloatArray | None = None) -> float:
         """Test the filter's innovation and return the largest statistic.
 
-        Parameters
-        ----------
-        estimator : KalmanFilter
-            The filter, after :meth:`.KalmanFilter.innovate` and before its update.
-        signatures : (rows, 3) array
-            f, what one unit of each component adds to the residual.
-        null : (rows,) array, optional
-            1-sigma of the amplitude that the model itself allows, in units of the change.
+        `estimator`: the filter, after :meth:`.KalmanFilter.innovate` and before its update. `signatures`
+        (rows, 3): f, what one unit of each component adds to the residual. `null` (rows,): 1-sigma of the
+        amplitude that the model itself allows, in units of the change.
         """
         S = estimator.variance
         # Response of the innovation to a unit change: the signature less what the filter has absorbed.

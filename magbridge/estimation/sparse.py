@@ -34,10 +34,7 @@ SMALL, FULL = 1_500, 0.02
 class SparseFactor:
     """A symmetric positive definite sparse matrix (n, n), factorised; one that is nearly full as if it were.
 
-    Raises
-    ------
-    LinAlgError
-        It is not positive definite.
+    LinAlgError: it is not positive definite.
     """
 
     def __init__(self, matrix: csr_array) -> None:

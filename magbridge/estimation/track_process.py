@@ -39,10 +39,7 @@ COURSE_LENGTH_M = 10.0
 class Course:
     """The course of a track, measured from its displacements.
 
-    Attributes
-    ----------
-    angle : float
-        Course over the last completed :data:`COURSE_LENGTH_M`, rad; NaN before the first.
+    `angle`: course over the last completed :data:`COURSE_LENGTH_M`, rad; NaN before the first.
     """
 
     def __init__(self) -> None:
@@ -70,10 +67,7 @@ MAX_STEP_TIME_US = 60_000_000
 class ReferenceSteps:
     """Steps of a reference along a track that the field does not have, as from one sheet of a map to another.
 
-    Attributes
-    ----------
-    total : float
-        Sum of the steps, nT.
+    `total`: sum of the steps, nT.
     """
 
     def __init__(self) -> None:

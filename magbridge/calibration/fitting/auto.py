@@ -148,10 +148,7 @@ MIN_OUTLIER_FRACTION = 0.7
 def flown(residual: FloatArray) -> BoolArray:
     """Return a mask (n,) without samples at an end of the log that contradict the others.
 
-    Parameters
-    ----------
-    residual : (n,) array
-        Of a robust fit, in the order of the log, nT.
+    `residual` (n,): of a robust fit, in the order of the log, nT.
     """
     # an end is cut where most of its samples are outliers
     off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
@@ -181,21 +178,11 @@ def fit_auto(
 ) -> Fit:
     """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
 
-    Parameters
-    ----------
-    data : Observations
-        The calibration runs.
-    order : int
-        Highest total degree.
-    vehicle : mapping of Mounting (or of its fields), optional
-        Where the masses sit, by parameter: their coefficients' prior is then that of dipoles there.
-    known : Known, optional
-        What the coefficients are expected to be, instead of physical widths.
+    `data`: the calibration runs. `order`: highest total degree. `vehicle`: where the masses sit, by
+    parameter: their coefficients' prior is then that of dipoles there. `known`: what the coefficients are
+    expected to be, instead of physical widths.
 
-    Raises
-    ------
-    CalibrationError
-        No start reached a maximum, or the best one collapsed.
+    CalibrationError: no start reached a maximum, or the best one collapsed.
     """
     # 1. coefficients, widths and noise that maximise the evidence, from several starts
     posed = pose(data, order, vehicle, known)

@@ -105,23 +105,11 @@ def boresight_from_tilt(
 ) -> TiltBoresight:
     """Estimate the rotation from corrected sensor axes to body axes from roll and pitch alone.
 
-    Parameters
-    ----------
-    vector : (n, 3) array
-        nT, corrected field in sensor axes.
-    roll, pitch : (n,) array
-        rad.
-    total : (n,) array
-        nT, reference total field.
-    inclination : (n,) array
-        rad, of the reference field, positive downwards.
-    runs : (n,) array of int
-        Run of each sample: the tilt's offset is common to a run.
+    `vector` (n, 3): nT, corrected field in sensor axes. `roll`, `pitch` (n,): rad. `total` (n,): nT,
+    reference total field. `inclination` (n,): rad, of the reference field, positive downwards. `runs` (n,):
+    run of each sample: the tilt's offset is common to a run.
 
-    Raises
-    ------
-    CalibrationError
-        Fewer than :data:`MIN_SAMPLES` samples, or the iteration does not converge.
+    CalibrationError: fewer than :data:`MIN_SAMPLES` samples, or the iteration does not converge.
     """
     if len(vector) < MIN_SAMPLES:
         raise CalibrationError(
@@ -235,12 +223,7 @@ COMPASS_SIGMA = np.radians(0.5)
 def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
     """Turn a field from world to body axes.
 
-    Parameters
-    ----------
-    attitude : (n, 3) array
-        rad, roll, pitch, heading (3-2-1).
-    field_ned : (n, 3) array
-        nT, north-east-down.
+    `attitude` (n, 3): rad, roll, pitch, heading (3-2-1). `field_ned` (n, 3): nT, north-east-down.
     """
     body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
     return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
@@ -299,10 +282,8 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
 
     A heading that comes from the magnetometer itself contains the error that the boresight is to remove.
 
-    Raises
-    ------
-    CalibrationError
-        As :func:`find_boresight`: headings are used to notice a reversed channel or angle in any case.
+    CalibrationError: as :func:`find_boresight`: headings are used to notice a reversed channel or angle in
+    any case.
     """
     with_headings = find_boresight(calibration, data)
     if data.attitude is None or data.reference_ned is None or calibration.effects:
@@ -330,15 +311,11 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
     """Find the rotation from corrected sensor axes to body axes.
 
-    Returns
-    -------
-    Boresight or None
-        None if too few samples have both attitude and reference direction, or the calibration has effects.
+    Returns: None if too few samples have both attitude and reference direction, or the calibration has
+    effects.
 
-    Raises
-    ------
-    CalibrationError
-        No rotation takes the corrected vectors to where attitude and main field say they point.
+    CalibrationError: no rotation takes the corrected vectors to where attitude and main field say they
+    point.
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:

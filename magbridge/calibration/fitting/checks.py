@@ -62,14 +62,8 @@ class Combinations:
 def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> Combinations:
     """Find the estimable combinations, from the singular values of the Jacobian over the noise.
 
-    Parameters
-    ----------
-    samples : Samples
-        The calibration runs.
-    coefficients : (9 m,) array
-        Where to linearise.
-    sigma : float
-        nT, noise of a sample.
+    `samples`: the calibration runs. `coefficients` (9 m,): where to linearise. `sigma`: nT, noise of a
+    sample.
     """
     # thin the rows, and scale them so that they carry the information of all
     step = max(len(samples.field) // JACOBIAN_ROWS, 1)

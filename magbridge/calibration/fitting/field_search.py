@@ -64,18 +64,9 @@ def nodes_for(
 ) -> Nodes:
     """Return the nodes of a field around places (n, 2), m; coarser if they are too many.
 
-    Parameters
-    ----------
-    place : (n, 2) array
-        m.
-    length : float
-        m, of the field.
-    alpha : int
-        Its smoothness: a rough one takes finer nodes.
-    most : int
-        Nodes at most, about.
-    finer : float
-        Factor of the nodes per length of a smooth field; the error of its splines falls as the fourth power.
+    `place` (n, 2): m. `length`: m, of the field. `alpha`: its smoothness: a rough one takes finer nodes.
+    `most`: nodes at most, about. `finer`: factor of the nodes per length of a smooth field; the error of its
+    splines falls as the fourth power.
     """
     # finest spacing that the length needs, coarser until there are few enough nodes
     box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
@@ -174,24 +165,10 @@ def choose(
 ) -> Choice:
     """Choose the field without a start: lengths from a ladder, then smoothness and the rest.
 
-    Parameters
-    ----------
-    sums_of : callable
-        The samples' sums with a field.
-    place : (n, 2) array
-        m, where they are.
-    weighed : Weighed
-        What each is weighed with.
-    start : float
-        The field's size over the noise's, to begin with.
-    harmonic : bool
-        Whether the depth varies, so that a field which falls off upwards differs from one that does not.
-    rho : float, optional
-        Autocorrelation of the noise, where it is known.
-    effort : float
-        Share of the usual steps.
-    most : int
-        Nodes at most.
+    `sums_of`: the samples' sums with a field. `place` (n, 2): m, where they are. `weighed`: what each is
+    weighed with. `start`: the field's size over the noise's, to begin with. `harmonic`: whether the depth
+    varies, so that a field which falls off upwards differs from one that does not. `rho`: autocorrelation of
+    the noise, where it is known. `effort`: share of the usual steps. `most`: nodes at most.
     """
     # 1. length by a ladder at the usual smoothness; 2. falling off upwards or not; 3. smoothness; 4.
     # sources at a depth. Each step starts from the best so far and maximises the evidence over size, memory
@@ -363,12 +340,8 @@ MIN_WEIGHT = 0.01
 def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[float, Choice]]:
     """Return choices about the best one with their weights, which add up to 1; the best one first.
 
-    Parameters
-    ----------
-    score : callable
-        The log evidence of a choice; may raise LinAlgError where there is none.
-    best : Choice
-        About where that is largest.
+    `score`: the log evidence of a choice; may raise LinAlgError where there is none. `best`: about where
+    that is largest.
     """
     if best.field.nodes.size > MAX_UNCERTAIN_NODES:
         return [(1.0, best)]

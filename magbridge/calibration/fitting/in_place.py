@@ -65,25 +65,12 @@ def fit_in_place(
 ) -> Fit:
     """Fit coefficients, level, slow changes, what the offset follows, and the field in place.
 
-    Parameters
-    ----------
-    data : Observations
-        With places, none of them far from all others.
-    order : int
-        Highest total degree of the polynomials in the masses' positions.
-    level : float
-        nT, 1-sigma of the reference's error that is the same everywhere.
-    vehicle, known : optional
-        As for :func:`~.auto.fit_auto`.
-    position_sigma : float
-        m, by which dead-reckoned positions slowly drift; the fit then corrects the track to the field.
+    `data`: with places, none of them far from all others. `order`: highest total degree of the polynomials
+    in the masses' positions. `level`: nT, 1-sigma of the reference's error that is the same everywhere.
+    `vehicle`, `known`: as for :func:`~.auto.fit_auto`. `position_sigma`: m, by which dead-reckoned positions
+    slowly drift; the fit then corrects the track to the field.
 
-    Raises
-    ------
-    CalibrationError
-        The data have no positions.
-    NoSolutionError
-        The fit collapsed or did not converge.
+    CalibrationError: the data have no positions. NoSolutionError: the fit collapsed or did not converge.
     """
     if data.place is None:
         raise CalibrationError(
@@ -156,10 +143,7 @@ def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, Survey
     kept have changed the field that was searched with them: if they gain little, another search without them
     may be better.
 
-    Raises
-    ------
-    CalibrationError
-        The fit does not converge.
+    CalibrationError: the fit does not converge.
     """
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), family)

@@ -80,23 +80,11 @@ def leave_out(
 ) -> LeftOut:
     """Predict each part of the samples from the others, and later parts of the log from the earlier ones.
 
-    Parameters
-    ----------
-    samples : Samples
-        n of them.
-    prior : Prior
-        With which they were fitted.
-    z : (q,) array
-        The fit.
-    noise : NoiseModel
-        Its noise, nT.
-    runs : (n,) array
-        A label for each sample: whole runs are left out, or blocks of neighbours where there are few runs.
-    attitudes : bool
-        Leave out groups of like attitude, too. (Not where noise is correlated for longer than an attitude
-        lasts, as on an aircraft: neighbours that stay would then predict the group.)
-    weighted : NoiseModel, optional
-        With which the samples were weighed, where that is not `noise`.
+    `samples`: n of them. `prior`: with which they were fitted. `z` (q,): the fit. `noise`: its noise, nT.
+    `runs` (n,): A label for each sample: whole runs are left out, or blocks of neighbours where there are
+    few runs. `attitudes`: leave out groups of like attitude, too. (Not where noise is correlated for longer
+    than an attitude lasts, as on an aircraft: neighbours that stay would then predict the group.)
+    `weighted`: with which the samples were weighed, where that is not `noise`.
     """
     weighted = noise if weighted is None else weighted
     # positions that come late in the log do not test the fit to its beginning

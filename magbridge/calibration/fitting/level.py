@@ -34,14 +34,8 @@ def with_level(
     determine it has absorbed another effect, such as crustal anomalies that a long log's nodes leave out. The
     level is then the reference's, with the sigma of its prior: the coefficients move back by as much.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        As fitted.
-    samples : Samples
-        Those it was fitted to, without what its effects explain.
-    bias, bias_sigma : float
-        nT, of the reference's level, as found and as expected.
+    `calibration`: as fitted. `samples`: those it was fitted to, without what its effects explain. `bias`,
+    `bias_sigma`: nT, of the reference's level, as found and as expected.
     """
     part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
     own = calibration.coefficients[: 9 * part.phi.shape[1]]

@@ -33,17 +33,9 @@ MIN_SLOPE_TIME_CONSTANTS = 4.0
 def unfiltered(data: Observations, corner: float) -> Observations:
     """Return `data` as they would be without a first-order filter of that corner.
 
-    Parameters
-    ----------
-    data : Observations
-        As the filter passed them on.
-    corner : float
-        Hz.
+    `data`: as the filter passed them on. `corner`: Hz.
 
-    Raises
-    ------
-    CalibrationError
-        The time constant of the filter is longer than the data.
+    CalibrationError: the time constant of the filter is longer than the data.
     """
     if len(data) < 3:
         return data

@@ -76,9 +76,7 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
 def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
     """Return the 1-sigma (nT) of the corrected total field from the position terms alone, without noise.
 
-    Returns
-    -------
-    (n,) array
+    The result is (n,).
     """
     # forward to the reading and back: the sigma of the way back is that of the position terms
     model = replace(calibration.without_effects(), noise=Noise(0.0), boresight=None)

@@ -90,16 +90,9 @@ def mass_columns(
 ) -> FloatArray:
     """Return ``dc/dl`` (order + 1, 9, 12) of a mass: its coefficients, the constant first, by latent numbers.
 
-    Parameters
-    ----------
-    place, travel : (3,) arrays
-        m, and m per unit of the parameter.
-    parameter : Parameter
-        That moves it.
-    order : int
-        Of the highest power.
-    latent : (12,) array
-        Moment (nT), induced moment (nT), shift (m), change of the travel (m per unit).
+    `place`, `travel` (3,): m, and m per unit of the parameter. `parameter`: that moves it. `order`: of the
+    highest power. `latent` (12,): moment (nT), induced moment (nT), shift (m), change of the travel (m per
+    unit).
     """
     # A dipole's field is evaluated at Chebyshev points of the travel, together with its derivatives, and
     # expanded in powers of the position: these are the coefficients of the monomials x, x^2 ...
@@ -123,21 +116,11 @@ def mounted_prior(
 ) -> PriorFamily:
     """Add to the free polynomials a dipole for each mass of `vehicle`.
 
-    Parameters
-    ----------
-    free : PriorFamily
-        The result of :func:`~magbridge.estimation.priors.polynomial_prior`.
-    exponents : tuple of tuple of int
-        Its monomials.
-    parameters : tuple of Parameter
-        Scales of the monomials' positions.
-    vehicle : mapping of Mounting (or of its fields)
-        Keyed by the parameter's name.
+    `free`: the result of :func:`~magbridge.estimation.priors.polynomial_prior`. `exponents`: its monomials.
+    `parameters`: scales of the monomials' positions. `vehicle`: keyed by the parameter's name.
 
-    Raises
-    ------
-    CalibrationError
-        `vehicle` names a mass that no parameter moves, or one too near the sensor for a power series.
+    CalibrationError: `vehicle` names a mass that no parameter moves, or one too near the sensor for a power
+    series.
     """
     names = [parameter.name for parameter in parameters]
     masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]

@@ -102,21 +102,11 @@ def nominal(
 ) -> Ellipsoid:
     """Fit one ellipsoid.
 
-    Parameters
-    ----------
-    data : Observations
-        Its parameters are not used.
-    axes_fixed : bool
-        ``M = I``: no rotation, as the paper does.
-    equal_xz : bool
-        ``S_x = S_z``, as the paper does.
-    scale_sigma, gain_sigma : float
-        Prior 1-sigma of soft iron, and of the gain common to all axes.
+    `data`: its parameters are not used. `axes_fixed`: ``M = I``: no rotation, as the paper does. `equal_xz`:
+    ``S_x = S_z``, as the paper does. `scale_sigma`, `gain_sigma`: prior 1-sigma of soft iron, and of the
+    gain common to all axes.
 
-    Raises
-    ------
-    NoSolutionError
-        The fit collapsed or did not converge.
+    NoSolutionError: the fit collapsed or did not converge.
     """
     return _chosen(
         data, axes_fixed=axes_fixed, equal_xz=equal_xz, scale_sigma=scale_sigma, gain_sigma=gain_sigma

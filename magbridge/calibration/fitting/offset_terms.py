@@ -87,16 +87,8 @@ def with_temperature(
 ) -> Calibration:
     """Return the calibration with the effect of the temperature that was found, if any.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Its position terms.
-    data : Observations
-        Of the fit.
-    groups : tuple of ParameterBlock
-        That are in the fit, in order.
-    found : tuple of (q,), (q, q), (9 m, q) arrays
-        The unknowns, their covariance, and what they do to the coefficients.
+    `calibration`: its position terms. `data`: of the fit. `groups`: that are in the fit, in order. `found`
+    (q,): the unknowns, their covariance, and what they do to the coefficients.
     """
     # The offset by temperature becomes a channel effect with three more coefficients: the rows of z that
     # are its own are copied into them, with their covariance with all others.

@@ -54,12 +54,7 @@ ANYTHING = 1e4
 def fit_cubic(data: Observations, order: int = 3) -> Fit:
     """Fit all coefficients by damped least squares on the scalar residual.
 
-    Parameters
-    ----------
-    data : Observations
-        The calibration runs.
-    order : int
-        Highest total degree; the paper's is 3.
+    `data`: the calibration runs. `order`: highest total degree; the paper's is 3.
     """
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)

@@ -47,14 +47,8 @@ WORTHY = 0.5
 def undeclared(calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray]) -> list[str]:
     """Return a line for each column that explains the residual of a fit without being its parameter.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Fitted to `data`.
-    data : Observations
-        Whose sensor's channels are exactly the calibration's parameters.
-    columns : mapping of str to (n,) array
-        Telemetry at the samples of `data`.
+    `calibration`: fitted to `data`. `data`: whose sensor's channels are exactly the calibration's
+    parameters. `columns` (n,): telemetry at the samples of `data`.
 
     Notes
     -----
@@ -167,21 +161,10 @@ def best_parameters(
 ) -> tuple[tuple[str, ...], list[Offer]]:
     """Return the columns to use as parameters, and the improvement of each that was tried.
 
-    Parameters
-    ----------
-    deployment : Dataset
-        As :func:`~.observe.observations` takes it.
-    offered : sequence of str
-        Columns that may move the field.
-    grid : AnomalyGrid, optional
-        Added to the IGRF.
-    **options
-        Of :func:`~.fit.fit`.
+    `deployment`: as :func:`~.observe.observations` takes it. `offered`: columns that may move the field.
+    `grid`: added to the IGRF. `options`: of :func:`~.fit.fit`.
 
-    Raises
-    ------
-    CalibrationError
-        The data do not support a fit without parameters.
+    CalibrationError: the data do not support a fit without parameters.
     """
     taken: tuple[str, ...] = ()
     found = fit(observations(deployment, taken, grid=grid), **options)

@@ -113,14 +113,8 @@ def rescaling(
 ) -> FloatArray:
     """Return the matrix (9 m, 9 m) that makes coefficients in `new` scales of those in `old`.
 
-    Parameters
-    ----------
-    exponents : sequence of tuple of int
-        The m monomials: all up to a degree.
-    old, new : sequence of Parameter
-        The same ones, scaled in two ways.
-    field_old, field_new : float
-        nT, F_0.
+    `exponents`: the m monomials: all up to a degree. `old`, `new`: the same ones, scaled in two ways.
+    `field_old`, `field_new`: nT, F_0.
     """
     # x_old = s x_new + t, so x_old^p = sum of binom(p, q) s^q t^(p-q) x_new^q; A is over F_0, T is not
     s = [n.scale / o.scale for o, n in zip(old, new, strict=True)]
@@ -152,21 +146,11 @@ class Posed:
 def pose(data: Observations, order: int, vehicle: Vehicle | None = None, known: Known | None = None) -> Posed:
     """Return the problem of fitting polynomials up to `order` to `data`.
 
-    Parameters
-    ----------
-    data : Observations
-        The calibration runs.
-    order : int
-        Highest total degree; of no account where `known` is given, which has its own.
-    vehicle : mapping of Mounting (or of its fields), optional
-        Where the masses sit, by parameter.
-    known : Known, optional
-        What the coefficients are expected to be.
+    `data`: the calibration runs. `order`: highest total degree; of no account where `known` is given, which
+    has its own. `vehicle`: where the masses sit, by parameter. `known`: what the coefficients are expected
+    to be.
 
-    Raises
-    ------
-    CalibrationError
-        Both are given, or `known` is of other parameters.
+    CalibrationError: both are given, or `known` is of other parameters.
     """
     # without an expectation: priors of physical width, and dipoles where masses have a place
     if known is None:

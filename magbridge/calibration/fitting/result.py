@@ -93,22 +93,11 @@ def assemble(
 ) -> Fit:
     """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
 
-    Parameters
-    ----------
-    data, samples
-        The calibration runs, and the samples used from them.
-    parameters, exponents
-        The positions that the coefficients depend on, and the m monomials in them.
-    coefficients : (9 m,) array
-        nT, monomial by monomial.
-    covariance : (9 m, 9 m) array
-        nT².
-    noise, method, details
-        As :class:`Fit` and its calibration have them.
-    left_out : LeftOut, optional
-        What the fit is worth on parts left out: the sigmas grow by its ratio.
-    prior : Prior, optional
-        Of all coefficients, as they were fitted with it.
+    `data`, `samples`: the calibration runs, and the samples used from them. `parameters`, `exponents`: the
+    positions that the coefficients depend on, and the m monomials in them. `coefficients` (9 m,): nT,
+    monomial by monomial. `covariance` (9 m, 9 m): nT². `noise`, `method`, `details`: as :class:`Fit` and its
+    calibration have them. `left_out`: what the fit is worth on parts left out: the sigmas grow by its ratio.
+    `prior`: of all coefficients, as they were fitted with it.
     """
     # sigma and covariance grow by the ratio of held-out errors to claimed ones
     e = residuals_of(samples, coefficients)

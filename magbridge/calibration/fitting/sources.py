@@ -61,16 +61,8 @@ def heterogeneous_logs(
 ) -> str:
     """Return the reason why logs are not of one vehicle in one state; empty without one.
 
-    Parameters
-    ----------
-    logs : sequence of Dataset
-        The logs of which `data` was made.
-    data : Observations
-        Samples of the fit.
-    found : Fit or None
-        The fit to all; None if it collapsed.
-    refit : callable
-        Fits a part of the data in the same way.
+    `logs`: the logs of which `data` was made. `data`: samples of the fit. `found`: the fit to all; None if
+    it collapsed. `refit`: fits a part of the data in the same way.
     """
     if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
         return ""  # the residuals are noise from one sample to the next

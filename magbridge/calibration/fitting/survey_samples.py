@@ -43,14 +43,7 @@ def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> Bo
 
     When a mass begins to move after its last report, no telemetry gives its position.
 
-    Parameters
-    ----------
-    time : (n,) array
-        s.
-    values : (n, k) array
-        Positions of the masses.
-    spans : (k,) array
-        Range of each mass.
+    `time` (n,): s. `values` (n, k): positions of the masses. `spans` (k,): range of each mass.
     """
     # a step of a position by more than its slowest motion allows means that the mass moves
     fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
@@ -71,16 +64,9 @@ def _at_rest(data: Observations) -> BoolArray:
 class SurveySamples:
     """The data of a joint fit, and their linearisation about any answer.
 
-    Parameters
-    ----------
-    data : Observations
-        With places; where `unmapped` is 0 the reference is the true field.
-    samples : Samples
-        The samples, with the monomials of the positions.
-    groups : tuple of ParameterBlock
-        Unknowns in addition to the coefficients.
-    drift : Drift, optional
-        How positions may be off: further unknowns, which act through the field's slope.
+    `data`: with places; where `unmapped` is 0 the reference is the true field. `samples`: the samples, with
+    the monomials of the positions. `groups`: unknowns in addition to the coefficients. `drift`: how
+    positions may be off: further unknowns, which act through the field's slope.
     """
 
     def __init__(

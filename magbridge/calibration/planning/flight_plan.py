@@ -24,23 +24,12 @@ __all__ = ["facts", "flight_plan", "summary", "survey_plan"]
 def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
     """Choose runs for a mission.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Calibration so far.
-    mission : Dataset (time)
-        Attitude, position and masses as the mission will have them; magnetometer columns are not needed.
-    runs : int
-        How many to choose.
-    roll : float
-        deg, the largest bank either way.
+    `calibration`: calibration so far. `mission`: Attitude, position and masses as the mission will have
+    them; magnetometer columns are not needed. `runs`: how many to choose. `roll`: deg, the largest bank
+    either way.
 
-    Raises
-    ------
-    CalibrationError
-        The mission has no attitude or position.
-    FormatError
-        It lacks a parameter of the calibration, or has it in another unit.
+    CalibrationError: the mission has no attitude or position. FormatError: it lacks a parameter of the
+    calibration, or has it in another unit.
     """
     require_units(mission, calibration.units)
     names = tuple(calibration.units)

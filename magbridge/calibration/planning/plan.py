@@ -153,14 +153,8 @@ def expected_calibration(
 ) -> Calibration:
     """Return the prior of a vehicle before its first run: the physical widths of its coefficients.
 
-    Parameters
-    ----------
-    parameters : tuple of Parameter
-        Parameters that vary, with their ranges.
-    field, noise : float
-        nT, the field where runs are flown, and a sample's noise.
-    order : int
-        Highest total degree.
+    `parameters`: parameters that vary, with their ranges. `field`, `noise`: nT, the field where runs are
+    flown, and a sample's noise. `order`: highest total degree.
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(p.name for p in parameters), field)
@@ -266,23 +260,11 @@ def plan(
 ) -> Plan:
     """Choose the runs to fly next.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Calibration so far; :func:`expected_calibration` before the first run.
-    mission : Mission
-        Where the error is to be small.
-    field_ned : (3,) array
-        nT, where the runs will be flown.
-    limits : Limits
-        Pitch, bank and positions that the vehicle can fly.
-    runs : int
-        How many spirals.
+    `calibration`: calibration so far; :func:`expected_calibration` before the first run. `mission`: where
+    the error is to be small. `field_ned` (3,): nT, where the runs will be flown. `limits`: Pitch, bank and
+    positions that the vehicle can fly. `runs`: how many spirals.
 
-    Raises
-    ------
-    CalibrationError
-        The limits leave nothing to fly.
+    CalibrationError: the limits leave nothing to fly.
     """
     with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
         design = Design(calibration, mission, field_ned)

@@ -59,21 +59,11 @@ def propose(
 ) -> list[Proposal]:
     """Return patterns of a survey of a given duration, the best first.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Where to linearise, with the noise of a sample: the calibration so far, or the prior of any vehicle.
-    data : Observations
-        The mission: attitude, position and masses as they will be.
-    hours : float
-        How long it may take.
-    roll : float
-        deg, by which the vehicle can bank either way.
+    `calibration`: where to linearise, with the noise of a sample: the calibration so far, or the prior of
+    any vehicle. `data`: the mission: attitude, position and masses as they will be. `hours`: how long it may
+    take. `roll`: deg, by which the vehicle can bank either way.
 
-    Raises
-    ------
-    CalibrationError
-        The mission has no attitude or position, or does not move.
+    CalibrationError: the mission has no attitude or position, or does not move.
     """
     known, attitude, ned = data.directed()
     if not known.any() or data.place is None:
