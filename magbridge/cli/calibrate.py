@@ -290,8 +290,8 @@ def _fit(
         names = chosen_parameters(names, deployment, grid=anomalies, order=model.order, site_bias=site_bias)
         read = (*request.files, *request.reading.sensor_log, *filter(None, [request.truth.base]))
         data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
-        for line in unused_logs(logs, data):
-            complain(line)
+        for unused in unused_logs(logs, data):
+            complain(unused.text)
         data = unfiltered(data, model.filter_cutoff) if model.filter_cutoff else data
         if model.position_sigma:
             if not (data.lacks_rock and model.method in ("auto", "survey")):
@@ -306,7 +306,8 @@ def _fit(
             found, remarks = _fitted(logs, data, model, site_bias=site_bias, **options)
             worth = {}
     refused = not (found.supported or request.force)
-    for line in (*found.warnings[refused:], *remarks, *_undeclared_columns(deployment, data, found)):
+    warnings = [warning.text for warning in found.warnings[refused:]]
+    for line in (*warnings, *remarks, *_undeclared_columns(deployment, data, found)):
         complain(line)
     return found, data, worth
 
@@ -315,7 +316,7 @@ def _refuse_unsupported(request: _Request, found: Fit) -> None:
     """DataError: the data do not support the fit, and it is not to be written all the same."""
     if not (found.supported or request.force):
         raise DataError(
-            f"{request.output}: not written, because {found.warnings[0]}; --force writes it all the same"
+            f"{request.output}: not written, because {found.warnings[0].text}; --force writes it all the same"
         )
 
 
@@ -333,10 +334,10 @@ def _fitted(
         found = fit(data, model.method, model.order, **options)
     except CalibrationError as error:
         if reason := heterogeneous_logs(logs, data, None, refitted):
-            raise CalibrationError(reason) from error
+            raise CalibrationError(reason.text) from error
         raise
     reason = heterogeneous_logs(logs, data, found, refitted)
-    return found, [reason] if reason else []
+    return found, [reason.text] if reason else []
 
 
 def _from_fleet(
@@ -468,7 +469,8 @@ def _facts(found: Fit, data: Observations) -> dict[str, Any]:
         "supported": found.supported,
         "scales": found.scales,
         "noise_nT": found.calibration.noise.sensor,
-        "warnings": found.warnings,
+        "warnings": [warning.text for warning in found.warnings],
+        "warning_codes": [warning.code for warning in found.warnings],
         "paper": facts(found.calibration),
     }
 

@@ -115,7 +115,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     parts : str
         Parts that were held out in turn to measure the RMS after; empty if none was.
     """
-    from magbridge.diagnose.texts import number
+    from magbridge.diagnostics import number
 
     before, after = (number(facts[f"rms_{when}_nT"]) for when in ("before", "after"))
     use, improvement = facts["assessment"], facts["improvement"]
@@ -135,7 +135,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 def causes_of(facts: dict[str, Any]) -> list[str]:
     """Return a line for each cause found, with the alternatives to it, and for the unexplained residual."""
     from magbridge.diagnose.observed import WHITE
-    from magbridge.diagnose.texts import number
+    from magbridge.diagnostics import number
 
     causes = []
     warnings = [*facts["assessment"]["warnings"], []]  # none of outliers, which stand last

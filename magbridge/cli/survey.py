@@ -149,7 +149,7 @@ def survey(
         else:
             done = make(_samples(logs, correction, reading))
     for warning in done.warnings:
-        complain(warning)
+        complain(warning.text)
     if products.predict:
         _predict(done, products.predict, output)
     else:
@@ -240,7 +240,7 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
         with suppress(CalibrationError):  # a map must not attribute the crustal field to the vehicle
             found = fit(data, "survey", order=order, **options)
     for warning in found.warnings:
-        complain(warning)
+        complain(warning.text)
     if strict and not found.supported:
         raise DataError(
             "the survey does not support a calibration (see the warnings), and --strict was given"

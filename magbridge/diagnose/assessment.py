@@ -28,16 +28,8 @@ from magbridge.diagnose.problem import (
     derivatives,
     samples_of,
 )
-from magbridge.diagnose.texts import (
-    CONDITION_CODES,
-    Diagnostic,
-    label,
-    measured,
-    names_of,
-    number,
-    series_of,
-    write_text,
-)
+from magbridge.diagnose.texts import label, measured, names_of, series_of
+from magbridge.diagnostics import CONDITION_CODES, Diagnostic, number, write_text
 from magbridge.estimation.residual import residuals, residuals_of, rms
 
 CANCEL = 0.7

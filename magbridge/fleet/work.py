@@ -146,7 +146,7 @@ def _calibration(job: Job, found: Fit, start: float) -> Row:
         "start": start, "sensor": calibration.sensor.name or job.sensor, "method": calibration.method,
         "rms": found.rms, "noise": calibration.noise.sensor,
         "expected": found.details["expected_over_noise"] * calibration.noise.sensor,
-        "supported": found.supported, "warnings": list(found.warnings),
+        "supported": found.supported, "warnings": [warning.text for warning in found.warnings],
         "calibration": encode_calibration(calibration).decode(),
         **packed(found.information),
     }  # fmt: skip

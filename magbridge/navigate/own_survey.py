@@ -34,6 +34,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import offset, separation
 from magbridge.logs.deployment import deployment as made
@@ -156,7 +157,9 @@ def localise(
         if known is not None:
             result = with_bound(result, field, found.moved.mean(axis=0), found.typical, found.kind)
     attrs = {"source": source, "map": "none: its own survey", "motion": motion}
-    return result.assign_attrs(attrs | {"findings": "\n".join(_findings(result, field, found, step))})
+    return result.assign_attrs(
+        attrs | {"findings": "\n".join(finding.text for finding in _findings(result, field, found, step))}
+    )
 
 
 def _unaided(field: OwnField) -> FloatArray:
@@ -220,46 +223,39 @@ def _dataset(
     return made("track", field.time, columns, COLUMN_UNITS | {"unaided_sigma": "m"})
 
 
-def _findings(result: xr.Dataset, field: OwnField, found: _PosteriorTracks, step: int) -> Iterator[str]:
-    """Yield sentences on how much the field improved the track."""
+def _findings(
+    result: xr.Dataset, field: OwnField, found: _PosteriorTracks, step: int
+) -> Iterator[Diagnostic]:
+    """Yield statements on how much the field improved the track."""
     sigma = np.sqrt((result["covariance_nn"] + result["covariance_ee"]).to_numpy())
     alone = result["unaided_sigma"].to_numpy()
     size, length, noise = found.scales.tolist()
-    yield (
-        f"field of {size:.0f} nT over {length:.0f} m; position 1-sigma {np.median(sigma):.0f} m in the "
-        f"median, {sigma[-1]:.0f} m at the end; dead reckoning alone {np.median(alone):.0f} and "
-        f"{alone[-1]:.0f} m"
+    yield Diagnostic(
+        "own_track",
+        {
+            "amplitude_nT": size,
+            "length_m": length,
+            "median_m": float(np.median(sigma)),
+            "last_m": float(sigma[-1]),
+            "alone_median_m": float(np.median(alone)),
+            "alone_last_m": float(alone[-1]),
+        },
     )
     if "bound_sigma" in result:
         best = float((result["bound_sigma"] ** 2).mean()) ** 0.5
-        yield f"no estimator could be better than {best:.0f} m RMS here, with this track and this field"
+        yield Diagnostic("own_track.bound", {"bound_m": best})
     if noise >= MAX_NOISE_RATIO:
-        yield (
-            f"field and track contradict each other (noise of {noise:.1f} times what the calibration "
-            "claims): the calibration or the options for dead reckoning are not good; do not use it"
-        )
+        yield Diagnostic("own_track.contradiction", {"noise_ratio": noise})
     if length < field.shortest:
-        apart = f"{field.shortest / 4.0:.0f} m apart"
-        yield (
-            f"the field changes over {length:.0f} m, and measurements are {apart}"
-            + (f" (every {step}th is used)" if step > 1 else "")
-            + ": it is hardly followed"
-        )
+        thinned = f" (every {step}th is used)" if step > 1 else ""
+        values = {"length_m": length, "apart_m": field.shortest / 4.0, "thinned": thinned}
+        yield Diagnostic("own_track.too_short", values)
     if found.lost:
-        yield (
-            "tracks that differ by more than the field's length agree with it equally well, and not all are "
-            "known: this is dead reckoning alone"
-        )
+        yield Diagnostic("own_track.lost")
     elif np.median(alone) > length:
-        yield (
-            "dead reckoning may be off by more than the field's length: the track may be at another "
-            "repetition of the field, which its sigma does not count; check it against a fix"
-        )
+        yield Diagnostic("own_track.ambiguous")
     elif np.median(sigma) > MAX_IMPROVED_RATIO * np.median(alone):
-        yield (
-            "the field adds little to dead reckoning: the track has to come back to places it has met, "
-            "before it has drifted by more than the field's length"
-        )
+        yield Diagnostic("own_track.little")
 
 
 COVARIANCE_KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")

@@ -22,6 +22,7 @@ from magbridge.calibration.fitting.crossings import (
 from magbridge.calibration.fitting.field_search import Choice
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, DataError, FormatError
 from magbridge.survey.alignment import ScalarTerms, align
 from magbridge.survey.crossovers import Crossovers, crossovers
@@ -54,7 +55,7 @@ class Result:
     """`before`, `after`, (m,), nT, mis-ties before levelling and after."""
     residual: FloatArray
     """(n,), nT, of every sample."""
-    warnings: tuple[str, ...]
+    warnings: tuple[Diagnostic, ...]
     scalar: ScalarTerms | None = None
     """Lag, lever arm and heading error of a scalar magnetometer, where the survey is its."""
 
@@ -111,11 +112,11 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
     CalibrationError
         The samples cannot be gridded.
     """
-    warnings: list[str] = []
+    warnings: list[Diagnostic] = []
     # 1. Leave out samples far from all others. 2. Grid. 3. Compare lines at their crossings before and after.
     far = far_off(samples.place)
     if count := int(far.sum()):
-        warnings.append(f"{counted(count, 'sample')} far from all others (a jump in position): left out")
+        warnings.append(Diagnostic("far_position", {"samples": counted(count, "sample")}))
     samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:
@@ -131,20 +132,15 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
     before = ties.misties(samples.value)
     after = ties.misties(samples.value - found.levels)
     if not len(before) and samples.line.any():
-        warnings.append(
-            "no line crosses another: only the smoothness of the crustal field separates it from line levels"
-        )
+        warnings.append(Diagnostic("no_crossing_lines"))
     elif not samples.line.any() and not sum(
         crossed(*courses(samples.place), PLACE_LENGTH_FRACTION * found.field.length)
     ):
-        warnings.append(
-            "the track never crosses itself: slow changes with time cannot be distinguished from the crustal "
-            "field, and are in the map"
-        )
+        warnings.append(Diagnostic("no_crossing_track"))
     if found.size > found.sigma:
         warnings += too_rough(samples.place, found.field.length)
     if (out := int((~found.kept).sum())) > 0.02 * len(residual):
-        warnings.append(f"{out} of {len(residual)} samples are outliers and were left out of the map")
+        warnings.append(Diagnostic("outliers", {"count": out, "samples": len(residual), "product": "map"}))
     return Result(samples, found, ties, before, after, residual, tuple(warnings))
 
 
@@ -251,7 +247,7 @@ def facts(result: Result, path: Path) -> dict[str, Any]:
         },
         "depth_m": found.middle,
         "level_sigma_nT": result.samples.level_sigma,
-        "warnings": result.warnings,
+        "warnings": [warning.text for warning in result.warnings],
         **({"scalar": result.scalar.facts()} if result.scalar else {}),
     }
 

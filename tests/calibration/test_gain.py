@@ -35,5 +35,5 @@ def test_a_gain_that_the_attitudes_do_not_show_is_refused(gain: float) -> None:
     """The prior of a usual gain decides, and the fit takes the rest of the field for an offset."""
     found = fit(turned(gain, tilt=5.0), "nominal")
     assert not found.supported
-    assert any("separate it from the offset" in text for text in found.warnings)
+    assert any("separate it from the offset" in text for text in found.calibration.warnings)
     assert fit(turned(1.0, tilt=5.0), "nominal").supported

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gliders import codes
 from surveyed_rock import NOISE, OFFSET, error_of, flown
 
 from magbridge.arrays import FloatArray
@@ -21,6 +22,7 @@ from magbridge.calibration.fitting.level import apart_from_level, level_of, with
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.model import Noise, identity
+from magbridge.diagnostics import Diagnostic
 from magbridge.survey.gridding import gridded
 from magbridge.survey.samples import Samples
 
@@ -153,7 +155,7 @@ def test_straight_line_is_not_supported() -> None:
     assert not found.supported
     error, sigma = error_of(found, data, true)
     assert error < 1.5 * sigma
-    assert any("never crossed your own track" in line for line in found.warnings)
+    assert "never_crossed" in codes(found)
 
 
 def test_a_zigzag_separates_crustal_field_and_heading_without_a_crossing() -> None:
@@ -175,7 +177,7 @@ def test_a_jump_in_position_is_left_out_and_reported() -> None:
     found = fit(replace(data, place=place))
     error, sigma = error_of(found, data, true)
     assert 0.8 < error / sigma < 1.25
-    assert any("3 samples far from all others" in line for line in found.warnings)
+    assert Diagnostic("far_position", {"samples": "3 samples"}) in found.warnings
     assert sum(run.samples for run in found.calibration.runs) == len(data) - 3
 
 
@@ -187,8 +189,10 @@ def test_samples_without_a_position_are_distinguished_from_a_jump() -> None:
     hole[300:350] = np.nan
     moved[500:, 0] += 600.0
     holed, jumped = (fit(replace(data, place=place), "survey") for place in (hole, moved))
-    assert "50 samples without a position: left out" in holed.warnings
-    assert any("the position jumps by 60" in line and "--position-sigma" in line for line in jumped.warnings)
+    assert Diagnostic("without_position", {"samples": "50 samples"}) in holed.warnings
+    (jump,) = (one for one in jumped.warnings if one.code == "position_jumps")
+    assert jump.values["step_m"] == pytest.approx(605.0, abs=5.0)
+    assert "--position-sigma" in jump.text
     for found in (holed, jumped):
         error, sigma = error_of(found, data, true)
         assert error < 1.25 * sigma
@@ -234,8 +238,8 @@ def test_a_field_is_rough_given_the_distance_of_tracks_or_at_the_shortest_length
     along = np.arange(0.0, 4_000.0, 20.0)
     turned = [along[:: 1 if line % 2 else -1] for line in range(11)]
     lines = np.concatenate([np.stack([x, np.full(len(x), 400.0 * i)], axis=1) for i, x in enumerate(turned)])
-    assert "(about 3" in next(too_rough(lines, 100.0))
-    assert "shortest length that these samples can tell being 300 m" in next(too_rough(lines, 290.0, 300.0))
+    assert next(too_rough(lines, 100.0)).code == "rough_crust"
+    assert next(too_rough(lines, 290.0, 300.0)).code == "shortest_crust"
     assert not list(too_rough(lines, 290.0))
     assert not list(too_rough(lines[:200], 10.0))
 
@@ -292,7 +296,7 @@ def test_offset_that_follows_the_temperature_is_found_and_written(lag: float) ->
     error, sigma = error_of(found, seen, true)
     assert error < 1.15 * NOISE
     assert 0.8 < error / sigma < 1.25
-    assert any("follows its temperature" in line for line in found.warnings)
+    assert "temperature_removed" in codes(found)
     again = decode_calibration(encode_calibration(found.calibration))
     assert again.effects == found.calibration.effects
 
@@ -333,7 +337,7 @@ def test_creep_of_the_offset_goes_neither_into_the_field_nor_into_the_map() -> N
     error, sigma = error_of(found, seen, true)
     assert error > 2.0 * NOISE
     assert 0.4 < error / sigma < 1.5
-    assert any("crept by" in line for line in found.warnings)
+    assert "offset_crept" in codes(found)
 
 
 def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:

@@ -22,7 +22,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.findings import FINDINGS_FORMAT, findings_json
 from magbridge.diagnose.search import Outliers
-from magbridge.diagnose.texts import number
+from magbridge.diagnostics import number
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))
 

@@ -19,7 +19,8 @@ from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.problem import isotropic
 from magbridge.diagnose.report.page import marked_up
-from magbridge.diagnose.texts import chance, measured, number
+from magbridge.diagnose.texts import chance, measured
+from magbridge.diagnostics import number
 
 
 @pytest.mark.parametrize("cause", CAUSES)

@@ -19,7 +19,8 @@ from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.search import Outliers
-from magbridge.diagnose.texts import measured, number, write_text
+from magbridge.diagnose.texts import measured
+from magbridge.diagnostics import number, write_text
 
 
 def answer(diagnosis: Diagnosis) -> Assessment:

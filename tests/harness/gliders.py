@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.result import Fit
 from sitl.instrument import Instrument
 from sitl.mission import LIMITS, CrissCross, Spirals
 from sitl.platform import Vehicle, draw_vehicle
@@ -70,3 +71,8 @@ def make(seed: int, masses: int = 2, noise: float = 1.0, memory: float = 0.0) ->
         parts.append((data, true))
     (runs, _), (survey, quiet) = parts
     return Glider(vehicle, runs, survey, quiet)
+
+
+def codes(found: Fit) -> list[str]:
+    """Return the codes of a fit's warnings."""
+    return [warning.code for warning in found.warnings]

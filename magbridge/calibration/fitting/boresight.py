@@ -40,6 +40,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Boresight, Calibration
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 
 __all__ = [
@@ -245,8 +246,8 @@ def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
     return rotation, float(np.degrees(np.median(left)))
 
 
-def magnetic_headings(calibration: Calibration, data: Observations) -> str:
-    """Return a warning if headings seem to be measured from magnetic north; else "".
+def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnostic | None:
+    """Return a warning if headings seem to be measured from magnetic north; else None.
 
     Notes
     -----
@@ -258,7 +259,7 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> str:
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
-        return ""
+        return None
     # compare two boresights: with the headings as they are, and with the declination added
     declination = np.arctan2(reference_ned[:, 1], reference_ned[:, 0])
     D = float(np.degrees(np.arctan2(np.sin(declination).mean(), np.cos(declination).mean())))
@@ -269,12 +270,9 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> str:
     turn, rest_turn = np.degrees([as_read.magnitude(), as_true.magnitude()])
     level = abs(turn - abs(D)) < NEAR and rest_turn < NEAR
     if abs(D) < 2.0 * NEAR or not (left > 2.0 * max(rest, LEAST) or level):
-        return ""
-    return (
-        f"the headings look magnetic: with the declination of {D:+.1f} degrees added, the sensor is turned "
-        f"by {rest_turn:.1f} degrees and not by {turn:.1f}, and {rest:.1f} not {left:.1f} are left "
-        "(--heading-reference magnetic)"
-    )
+        return None
+    angles = {"declination": D, "true_turn": rest_turn, "turn": turn, "true_left": rest, "left": left}
+    return Diagnostic("magnetic_headings", angles)
 
 
 def choose_boresight(calibration: Calibration, data: Observations) -> Boresight | None:

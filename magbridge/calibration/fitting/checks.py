@@ -14,9 +14,10 @@ from magbridge.calibration.fitting.crossings import rough_rock
 from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.fitting.mission import expected_error, nearby_mission
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.offset_terms import in_words
+from magbridge.calibration.fitting.offset_terms import offset_diagnostics
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Polynomial
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 from magbridge.wording import counted
@@ -85,12 +86,12 @@ def expected_ratio(calibration: Calibration, data: Observations) -> float:
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
 
-def warnings_for(calibration: Calibration, data: Observations) -> tuple[str, ...]:
+def warnings_for(calibration: Calibration, data: Observations) -> tuple[Diagnostic, ...]:
     """Return warnings about quantities that the runs leave undetermined."""
-    return tuple(text for check in CHECKS for text in check(calibration, data))
+    return tuple(found for check in CHECKS for found in check(calibration, data))
 
 
-def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
+def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
     for k, parameter in enumerate(calibration.parameters):
         order = max(
             (e[k] for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents),
@@ -104,15 +105,17 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
             continue  # it moved all along: no positions to count
         if len(groups) <= min(order, 3):
             places = " and ".join(f"{np.median(g):.4g}" for g in groups)
-            yield (
-                f"{parameter.name} was nearly always at {counted(len(groups), 'position')} "
-                f"({places} {parameter.unit}".rstrip()
-                + "): elsewhere the correction rests on the physical model, "
-                "not on measurements; fly a run with it at another position"
+            yield Diagnostic(
+                "few_positions",
+                {
+                    "parameter": parameter.name,
+                    "positions": counted(len(groups), "position"),
+                    "places": f"{places} {parameter.unit}".rstrip(),
+                },
             )
 
 
-def _moved_together(calibration: Calibration, data: Observations) -> Iterator[str]:
+def _moved_together(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
     names = [parameter.name for parameter in calibration.parameters]
     if len(names) < 2:
         return
@@ -121,13 +124,11 @@ def _moved_together(calibration: Calibration, data: Observations) -> Iterator[st
     for i, one in enumerate(names):
         for j, other in enumerate(names[:i]):
             if abs(together[i, j]) > MAX_CORRELATION:
-                yield (
-                    f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): their "
-                    "effects cannot be distinguished; fly a run that moves only one of them"
-                )
+                values = {"one": other, "other": one, "correlation": float(together[i, j])}
+                yield Diagnostic("moved_together", values)
 
 
-def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
+def _attitudes(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
     if data.attitude is None:
         return
     known = data.attitude[np.isfinite(data.attitude).all(axis=1)]
@@ -138,22 +139,17 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
     low, high = np.quantile(roll, [0.02, 0.98])
     variance = calibration.covariance[8, 8]  # of T's z
     if high - low < BANKED and variance > (5.0 * calibration.noise.sensor) ** 2:
-        yield (
-            f"roll stayed within {low:z.0f} to {high:z.0f} degrees: the vertical offset is known only to "
-            f"{np.sqrt(variance):.0f} nT; fly a run banked the other way"
-        )
+        values = {"low": float(low), "high": float(high), "sigma_nT": float(np.sqrt(variance))}
+        yield Diagnostic("narrow_roll", values)
+    angles = {"low": float(pitch.min()), "high": float(pitch.max())}
     if pitch.min() > -DIVE_PITCH_DEG and pitch.max() < DIVE_PITCH_DEG:
-        yield (
-            f"pitch stayed within {pitch.min():z.0f} to {pitch.max():z.0f} degrees: nothing steeper was "
-            "measured; fly dives and climbs"
-        )
+        yield Diagnostic("narrow_pitch", angles)
     elif pitch.min() > -DIVE_PITCH_DEG or pitch.max() < DIVE_PITCH_DEG:
         seen, lacking = ("climbs", "dives") if pitch.min() > -DIVE_PITCH_DEG else ("dives", "climbs")
-        angles = f"pitch {pitch.min():z.0f} to {pitch.max():z.0f}"
-        yield f"only {seen} ({angles}): nothing was measured in {lacking}"
+        yield Diagnostic("one_pitch_sign", {"seen": seen, "lacking": lacking, **angles})
     left, gap = _widest_gap(heading)
     if gap > OPEN:
-        yield f"no run headed between {left:03.0f} and {(left + gap) % 360.0:03.0f}: fly full turns"
+        yield Diagnostic("heading_gap", {"left": left, "right": (left + gap) % 360.0})
 
 
 def heading_gap(data: Observations) -> float:
@@ -174,19 +170,19 @@ def _widest_gap(heading: FloatArray) -> tuple[float, float]:
     return float(courses[widest]), float(gaps[widest])
 
 
-def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:
+def _runs(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
     count = len(np.unique(data.runs))
     if calibration.parameters and count < 4:
-        yield f"only {counted(count, 'run')}: too few to validate the fit on runs left out"
+        yield Diagnostic("few_runs", {"runs": counted(count, "run")})
 
 
-CHECKS: tuple[Callable[[Calibration, Observations], Iterator[str]], ...] = (
+CHECKS: tuple[Callable[[Calibration, Observations], Iterator[Diagnostic]], ...] = (
     _positions,
     _moved_together,
     _attitudes,
     _runs,
 )
-"""Checks of a set of runs; each yields a sentence for each fault that it finds."""
+"""Checks of a set of runs; each yields a diagnostic for each fault that it finds."""
 
 
 # ---- The checks of a whole fit ----
@@ -219,7 +215,8 @@ MAX_HEADING_GAP_DEG = 270.0
 def judged(found: Fit, data: Observations) -> Fit:
     """Return the fit with its boresight and with warnings about undetermined quantities."""
     # 1. boresight; 2. reasons against the fit, which `--strict` refuses; 3. remarks that leave it valid
-    whole, mismatch = found.calibration, []
+    whole = found.calibration
+    mismatch: list[Diagnostic] = []
     calibration = whole.without_effects()
     if whole.effects or found.creep:  # they have been subtracted
         data = replace(data, field=found.samples.field)
@@ -227,7 +224,7 @@ def judged(found: Fit, data: Observations) -> Fit:
         try:
             calibration = replace(calibration, boresight=choose_boresight(calibration, data))
         except CalibrationError as error:
-            mismatch.append(str(error))
+            mismatch.append(Diagnostic("no_boresight", {"reason": str(error)}))
             data = replace(data, attitude=None)
         if magnetic := magnetic_headings(calibration, data):
             mismatch.append(magnetic)
@@ -243,11 +240,12 @@ def judged(found: Fit, data: Observations) -> Fit:
     )
     if ratio > UNSUPPORTED:
         warnings = (*warnings, *found.open)
-    unsupported = [f"the data do not support this fit: {'; '.join(warnings)}"] if warnings else []
+    reasons = tuple(warning.text for warning in warnings)
+    unsupported = [Diagnostic("unsupported_fit", {"reasons": "; ".join(reasons)})] if reasons else []
     seen = combinations(found.samples, calibration.coefficients, max(noise, 1e-9))
     return replace(
         found,
-        calibration=replace(whole, boresight=calibration.boresight, warnings=warnings),
+        calibration=replace(whole, boresight=calibration.boresight, warnings=reasons),
         warnings=(
             *unsupported,
             *(found.open if ratio <= UNSUPPORTED else ()),
@@ -264,74 +262,48 @@ def judged(found: Fit, data: Observations) -> Fit:
     )
 
 
-def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
+def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[Diagnostic]:
     """Yield reasons not to support a fit: error over `noise` (nT), widest gap of headings (deg), correlation.
 
     `lasting` is the residual's autocorrelation after the crustal field has been subtracted.
     """
     if lasting > MAX_NOISE_AUTOCORRELATION:
-        yield (
-            f"residuals of {noise:.0f} nT last for many samples (autocorrelation {lasting:.3f}) without the "
-            "crustal field: two vehicles in one log, an offset that jumped, or wrong positions"
-        )
+        yield Diagnostic("lasting_residual", {"noise_nT": noise, "autocorrelation": lasting})
     if ratio > UNSUPPORTED:
-        yield (
-            "at these pitches and positions, on any heading and with 10 degrees more roll, expect "
-            f"{ratio * noise:.0f} nT of error"
-        )
+        yield Diagnostic("expected_error", {"error_nT": ratio * noise})
     if gap > MAX_HEADING_GAP_DEG:
-        yield (
-            f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
-            "cannot be distinguished from the Earth's"
-        )
+        yield Diagnostic("narrow_headings", {"width_deg": 360.0 - gap})
 
 
-def _contradicted_prior(found: Fit) -> Iterator[str]:
+def _contradicted_prior(found: Fit) -> Iterator[Diagnostic]:
     """Report scales that the prior of an ellipsoid does not expect, and attitudes that do not prove them."""
     # both must hold: where the data overrule the prior, an unusual gain is the sensor's
     unlikely = found.details.get("prior_chi_squared", 0.0) > MAX_PRIOR_CHI_SQUARED
     if unlikely and found.details["scale_sigma_ratio"] > MAX_SCALE_SIGMA_RATIO:
         low, high = found.scales
-        yield (
-            f"the readings ask for a gain that is further from 1 than sensors have (so far {low:.2f} to "
-            f"{high:.2f}), and their attitudes are too few to separate it from the offset: check the unit "
-            "and the reference, or fly dives, climbs and banked turns"
-        )
+        yield Diagnostic("unusual_gain", {"low": low, "high": high})
 
 
-def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[str]:
+def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[Diagnostic]:
     """Report if the sensor's noise (nT) is not small against the variation of the field (n, 3), nT."""
     # smallest variation of the field along any axis: noise must be small against it (errors in variables)
     least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(field.T))[0], 0.0)))
     if least < MIN_SIGNAL_TO_NOISE * noise:
-        yield (
-            f"the noise of {noise:.0f} nT is not small against the variation of the field along one axis "
-            f"({least:.0f} nT), so that noise passes for attitudes: average readings, or turn further"
-        )
+        yield Diagnostic("noise_for_attitudes", {"noise_nT": noise, "variation_nT": least})
 
 
-def _suspicions(found: Fit) -> Iterator[str]:
+def _suspicions(found: Fit) -> Iterator[Diagnostic]:
     """Yield warnings about the samples or their reference that follow from the fit."""
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
-        yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
-    yield from in_words(found.calibration, found.creep)
+        yield Diagnostic("outliers", {"count": outliers, "samples": samples, "product": "fit"})
+    yield from offset_diagnostics(found.calibration, found.creep)
     if ends := found.details.get("ends", 0):
-        yield (f"{counted(ends, 'sample')} at the ends of the log left out: unlike the others (a crash?)")
+        yield Diagnostic("ends_left_out", {"samples": counted(ends, "sample")})
     if (ratio := found.details.get("left_out_ratio", 1.0)) > MAX_ERROR_RATIO:
-        yield (
-            f"held-out parts have errors of {ratio:.1f} times the fit's sigma, so its sigmas were raised by "
-            "that: an effect is missing in the model (magbridge diagnose), or in the reference"
-        )
+        yield Diagnostic("held_out_errors", {"ratio": ratio})
     if (gained := found.details.get("next_order", 0.0)) > LIKELIER:
-        yield (
-            f"--order is too low: one more raises the log-likelihood by {gained:.0f}, and the sigmas do not "
-            "include the missing terms"
-        )
+        yield Diagnostic("order_too_low", {"gain": gained})
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
-        yield (
-            f"the fit multiplies the readings by {smallest:.2f} to {largest:.2f}, and anomalies with them: "
-            "unless the sensor is that far off, the reference is; fit to runs at one place, or with a better "
-            "map (--grid)"
-        )
+        yield Diagnostic("unusual_scales", {"low": smallest, "high": largest})

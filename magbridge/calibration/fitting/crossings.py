@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.diagnostics import Diagnostic
 from magbridge.wording import counted
 
 __all__ = [
@@ -72,38 +73,32 @@ def tells_rock(data: Observations) -> bool:
     return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(revisits_cells, PLACES))
 
 
-def left_open(data: Observations, length: float) -> Iterator[str]:
+def left_open(data: Observations, length: float) -> Iterator[Diagnostic]:
     """Yield advice for separating a crustal field of a `length`, m, from the vehicle's field."""
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
     yield from left_open_by(data.place[:, :2], length)
 
 
-def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
+def left_open_by(track: FloatArray, length: float) -> Iterator[Diagnostic]:
     """Yield what a track (n, 2), m, cannot separate over an unmapped crustal field of a `length`, m."""
     place, course = courses(track)
     if not len(place) or np.ptp(place, axis=0).max() < PLACE_LENGTH_FRACTION * length:
         return  # all at one place: the crustal field is a constant
     cells, reversed_cells = crossed(place, course, PLACE_LENGTH_FRACTION * length)
     if cells + reversed_cells == 0:
-        yield (
-            "you never crossed your own track: only its smoothness separates the crustal field from heading; "
-            "fly legs that cross earlier ones at other headings"
-        )
+        yield Diagnostic("never_crossed")
     elif cells < FEW and reversed_cells < FEW:
-        yield (
-            f"you crossed your own track at {counted(cells + reversed_cells, 'place')} only: little "
-            "separates the crustal field from heading; fly more legs that cross earlier ones"
-        )
+        yield Diagnostic("few_crossings", {"places": counted(cells + reversed_cells, "place")})
 
 
-def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[str]:
+def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[Diagnostic]:
     """Yield a warning if a fit's crustal field exceeds the `noise`, nT, and is too rough for the track."""
     if rock and data.place is not None and rock["amplitude_nT"] > noise:
         yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 
-def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[str]:
+def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[Diagnostic]:
     """Yield a warning if a crustal field of a `length`, m, changes too fast for a track (n, 2), m.
 
     `shortest` is the least length, m, that was tried: a fit that ends there has found the limit, not the
@@ -116,15 +111,9 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
     way = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
     apart = float(ConvexHull(place, qhull_options="QJ").volume) / way  # in a plane its volume is an area
     if length < MIN_LENGTH_SPACINGS * apart:
-        than = f"less than half the distance between your tracks (about {apart:.0f} m)"
+        yield Diagnostic("rough_crust", {"length_m": length, "spacing_m": apart})
     elif length <= shortest:
-        than = f"the shortest length that these samples can tell being {shortest:.0f} m"
-    else:
-        return
-    yield (
-        f"the crustal field changes over {length:.0f} m, {than}: it is hardly separated from vehicle and "
-        "noise, and the map is uncertain between tracks; fly tracks closer together"
-    )
+        yield Diagnostic("shortest_crust", {"length_m": length, "shortest_m": shortest})
 
 
 def far_off(place: FloatArray) -> BoolArray:
@@ -135,23 +124,21 @@ def far_off(place: FloatArray) -> BoolArray:
     return np.asarray(~(distance <= FARTHEST * usual))
 
 
-def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
+def jumped(place: FloatArray, time: FloatArray) -> Iterator[Diagnostic]:
     """Yield notes on dropped places (n, 2), m, at times (n,), s, and on jumps of the track."""
     without = ~np.isfinite(place).all(axis=1)
     far = far_off(place) & ~without
-    for left_out, why in ((without, "without a position"), (far, "far from all others (a jump in position)")):
+    for left_out, code in ((without, "without_position"), (far, "far_position")):
         if count := int(left_out.sum()):
-            yield f"{counted(count, 'sample')} {why}: left out"
+            yield Diagnostic(code, {"samples": counted(count, "sample")})
     kept = ~without & ~far
     if kept.sum() < FEW:
         return
     at = jumps(place[kept], time[kept])
     if len(at):
         step = np.linalg.norm(np.diff(place[kept], axis=0)[at], axis=1)
-        yield (
-            f"the position jumps by {step.max():.0f} m ({counted(len(at), 'jump')} of more than "
-            f"{LEAP:.0f} m): a fix after dead reckoning? --position-sigma bends the track between"
-        )
+        values = {"step_m": float(step.max()), "jumps": counted(len(at), "jump"), "limit_m": LEAP}
+        yield Diagnostic("position_jumps", values)
 
 
 def jumps(place: FloatArray, time: FloatArray) -> IndexArray:

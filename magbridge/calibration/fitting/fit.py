@@ -16,6 +16,7 @@ from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.columns import CHANNELS
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
@@ -35,11 +36,6 @@ METHODS: dict[str, str] = {
 
 ONE_ATTITUDE = 5.0
 """Largest angle from the mean direction within which all samples are one attitude, deg."""
-NO_FIELD_IN_PLACE = "the crustal field was not found with the calibration: its part stays in the errors"
-ONE_ELLIPSOID = (
-    "method auto has no solution, so that one ellipsoid was fitted (method nominal), without parameters"
-)
-WITHOUT_PARAMETERS = "method nominal has no solution: used was method auto, without parameters"
 UNKNOWN_LENGTH = 500.0
 """Length assumed for the crustal field without a field in place, m."""
 MAIN_FIELD_SIGMA_NT = 145.0
@@ -112,7 +108,7 @@ def fit(
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
         # positions that jump would put one place's field into another
-        away: tuple[str, ...] = ()
+        away: tuple[Diagnostic, ...] = ()
         if method in ("auto", "survey") and data.place is not None:
             known = np.isfinite(data.place[:, :2]).all(axis=1) | (method == "survey")
             away = tuple(jumped(data.place[known, :2], data.time[known]))
@@ -131,23 +127,23 @@ def fit(
 
 def _first_solution(
     data: Observations, method: str, order: int, bias: float, in_place: bool, options: dict[str, Any]
-) -> tuple[Fit, str, tuple[str, ...]]:
+) -> tuple[Fit, str, tuple[Diagnostic, ...]]:
     """Return the fit of the first method that has a solution, that method, and the reasons of the others.
 
     CalibrationError: no method has one; the message is that of the first.
     """
     # each attempt: method, data, options, and the notes that explain why it is not the first choice
     bare = replace(data, parameters=data.parameters[:, :0], names=(), units=())
-    attempts: list[tuple[str, Observations, dict[str, Any], tuple[str, ...]]] = []
+    attempts: list[tuple[str, Observations, dict[str, Any], tuple[Diagnostic, ...]]] = []
     if method == "survey":
         attempts.append(("survey", data, {"level": bias, **options}, ()))
     if method != "survey" or (in_place and "position_sigma" not in options):
-        lacking: tuple[str, ...] = (NO_FIELD_IN_PLACE,) if in_place else ()
+        lacking: tuple[Diagnostic, ...] = (Diagnostic("no_field_in_place"),) if in_place else ()
         attempts.append(("auto" if in_place else method, data, options, lacking))
     if attempts[-1][0] == "auto" and not options:
-        attempts.append(("nominal", bare, {}, (*attempts[-1][3], ONE_ELLIPSOID)))
+        attempts.append(("nominal", bare, {}, (*attempts[-1][3], Diagnostic("one_ellipsoid"))))
     elif method == "nominal" and not options:
-        attempts.append(("auto", bare, {}, (WITHOUT_PARAMETERS,)))
+        attempts.append(("auto", bare, {}, (Diagnostic("without_parameters"),)))
     failures: list[CalibrationError] = []
     for name, part, own, notes in attempts:
         try:

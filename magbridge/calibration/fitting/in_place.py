@@ -38,6 +38,7 @@ from magbridge.calibration.fitting.pose import Known, Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.rounds import FIRST_SAMPLES, SEARCHED, WIDE, Answer, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.blocks import ParameterBlock, slow_functions
 from magbridge.estimation.noise import NoiseModel
@@ -110,10 +111,7 @@ def fit_in_place(
         calibration = with_level(calibration, lifted, float(z[q]), level)
     unclear = [*left_open(data, found.choice.field.length)]
     if level and contradicts(bias := float(z[q]), level):
-        unclear.append(
-            f"the level of the field is the reference's, to {level:.0f} nT: the fit's own, {bias:+.0f} nT "
-            "from it, is not plausible (an effect is missing in the model)"
-        )
+        unclear.append(Diagnostic("level_of_reference", {"level_nT": level, "bias_nT": bias}))
     fit = replace(fit, calibration=calibration, open=tuple(unclear))
     if not creep.any():
         return fit

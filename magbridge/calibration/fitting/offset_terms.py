@@ -19,9 +19,10 @@ from magbridge.calibration.effects import ChannelEffect, held, lagged
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
 from magbridge.columns import TEMPERATURE
+from magbridge.diagnostics import Diagnostic
 from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, slow_functions
 
-__all__ = ["Creep", "in_words", "offered", "with_creep", "with_temperature"]
+__all__ = ["Creep", "offered", "offset_diagnostics", "with_creep", "with_temperature"]
 
 TEMPERATURE_LAGS_S = (0.0, 600.0, 2400.0)
 """Time constants with which the offset may follow the temperature, s: a bare sensor, in its housing, in a
@@ -116,19 +117,14 @@ def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
     return replace(calibration, covariance=covariance)
 
 
-def in_words(calibration: Calibration, creep: Creep | None) -> Iterator[str]:
+def offset_diagnostics(calibration: Calibration, creep: Creep | None) -> Iterator[Diagnostic]:
     """Yield the quantities that the offset depends on."""
     for effect in calibration.effects:
         if isinstance(effect, ChannelEffect):
             slope = float(np.linalg.norm(calibration.coefficients[-effect.size :]))
             late = f", {effect.lag / 60:.0f} minutes late" if effect.lag else ""
-            yield (
-                f"the sensor's offset follows its temperature by {slope:.1f} nT/degC{late}: the calibration "
-                f"takes that off, and needs {effect.channel}"
-            )
+            values = {"slope": slope, "late": late, "channel": effect.channel}
+            yield Diagnostic("temperature_removed", values)
     if creep is not None:
         size = float(np.sqrt(np.mean((creep.offset**2).sum(axis=1))))
-        yield (
-            f"the sensor's offset crept by {size:.1f} nT (RMS) during the survey: its mean stands in the "
-            "calibration, and the sigma counts the rest"
-        )
+        yield Diagnostic("offset_crept", {"rms_nT": size})

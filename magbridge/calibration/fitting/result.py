@@ -14,6 +14,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep
 from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference, Run
 from magbridge.calibration.terms import Polynomial
+from magbridge.diagnostics import Diagnostic
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.priors import Prior
@@ -31,14 +32,14 @@ class Fit:
     calibration: Calibration
     residual: FloatArray
     """(n,), nT in the sensor's own units: ``(F - H_e) / |A^T u|``."""
-    warnings: tuple[str, ...]
-    """What the data could not determine, in words for a pilot."""
+    warnings: tuple[Diagnostic, ...]
+    """What the data could not determine, and which samples were left out."""
     details: dict[str, Any]
     """Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
     each estimable combination from the data alone (nT)."""
     samples: ResidualSamples
     """The data as fitted, for :mod:`.checks`."""
-    open: tuple[str, ...] = ()
+    open: tuple[Diagnostic, ...] = ()
     """What the track leaves open, which is a reason for an error that is large."""
     information: GaussianInformation | None = None
     """What the data alone say of the coefficients; None where the method's prior is none of all of them."""
@@ -51,7 +52,7 @@ class Fit:
 
     def _repr_html_(self) -> str:
         """Return the same for a notebook, with the warnings."""
-        warnings = "".join(f"<li>{escape(warning)}</li>" for warning in self.warnings)
+        warnings = "".join(f"<li>{escape(warning.text)}</li>" for warning in self.warnings)
         return f"<p>{escape(repr(self))}</p>" + f"<ul>{warnings}</ul>" * bool(warnings)
 
     @property

@@ -12,6 +12,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.columns import CHANNELS
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 
@@ -38,8 +39,8 @@ def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
     return which
 
 
-def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]:
-    """Yield a line for each of `logs` that adds no sample to `data`."""
+def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[Diagnostic]:
+    """Yield a warning for each of `logs` that adds no sample to `data`."""
     which = source_of(logs, data.time)
     for k, log in enumerate(logs):
         sampled = _sampled(log)
@@ -53,19 +54,19 @@ def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]
         if not reasons and others:
             reasons = [f"{others[0]} has samples at the same times, and the first counts"]
         why = ", ".join(reasons) or "no row has every value and a reference"
-        yield f"{log.attrs['source']}: adds no sample to the fit: {why}"
+        yield Diagnostic("unused_log", {"log": log.attrs["source"], "reason": why})
 
 
 def heterogeneous_logs(
     logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, refit: Callable[[Observations], Fit]
-) -> str:
-    """Return the reason why logs are not of one vehicle in one state; empty without one.
+) -> Diagnostic | None:
+    """Return a warning if logs are not of one vehicle in one state.
 
     `logs`: the logs of which `data` was made. `data`: samples of the fit. `found`: the fit to all; None if
     it collapsed. `refit`: fits a part of the data in the same way.
     """
     if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
-        return ""  # the residuals are noise from one sample to the next
+        return None  # the residuals are noise from one sample to the next
     # compare the residual of one common fit with those of a fit to each of the largest logs
     which = source_of(logs, data.time)
     count = np.bincount(which[which >= 0], minlength=len(logs))
@@ -79,14 +80,11 @@ def heterogeneous_logs(
     # RMS of the separate fits, weighted by samples
     own = float(np.sqrt(np.average([one**2 for _, one in alone], weights=count[judged]))) if alone else 0.0
     if len(alone) < 2 or (found and rms(found.residual[np.isin(which, judged)]) < MAX_JOINT_RMS_RATIO * own):
-        return ""
+        return None
     fits = ", ".join(f"{logs[k].attrs['source']} {one:.3g}" for k, one in sorted(alone)[:3])
     more = f" and {len(alone) - 3} more" if len(alone) > 3 else ""
     together = f"{found.rms:.3g} nT RMS together" if found else "together the fit collapses"
-    return (
-        f"one calibration does not fit all logs: {together}, each on its own {fits}{more} nT RMS; they are "
-        "of two vehicles, or of one that changed in between (its iron, or a mass that no --parameter names)"
-    )
+    return Diagnostic("several_vehicles", {"together": together, "fits": fits + more})
 
 
 def _sampled(log: xr.Dataset) -> FloatArray:

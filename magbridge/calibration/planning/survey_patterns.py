@@ -90,7 +90,9 @@ def propose(
             positions = data.parameters[known][as_flown]
             rms, worst = _expected(design, flown, where, positions, noise)
             met = sum(crossed(*courses(where), 0.25 * LENGTH))
-            found.append(Proposal(name, rms, worst, met, tuple(left_open_by(where, LENGTH))))
+            found.append(
+                Proposal(name, rms, worst, met, tuple(one.text for one in left_open_by(where, LENGTH)))
+            )
     return sorted(found, key=lambda one: one.worst)
 
 

@@ -15,7 +15,7 @@ from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.joint import CONFIDENCE_LEVEL, Improvement, normal
 from magbridge.diagnose.observed import Seen
-from magbridge.diagnose.texts import Diagnostic
+from magbridge.diagnostics import Diagnostic
 
 FINDINGS_FORMAT = 3
 """Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""

@@ -32,10 +32,10 @@ from magbridge.diagnose.texts import (
     label,
     measured,
     names_of,
-    number,
     series_of,
     sizes,
 )
+from magbridge.diagnostics import number
 from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path, new_folder
 from magbridge.wording import counted
