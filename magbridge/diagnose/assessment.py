@@ -64,24 +64,12 @@ class Delays(NamedTuple):
 
 
 class TelemetryDelay(NamedTuple):
-    """Delay of the telemetry behind the sensor, and the delays that the model corrects itself."""
+    """Delay of the telemetry, s, its 1-sigma, and the RMS error as given and with the delay undone, nT."""
 
     delay_s: float
-    """Time by which the telemetry is late, s."""
     sigma_s: float
-    """Standard deviation of the delay, s."""
     before_nt: float
-    """RMS error of the corrected field as given, nT."""
     after_nt: float
-    """RMS error with the telemetry moved by the delay and the calibration as given, nT."""
-
-
-class MotionShare(NamedTuple):
-    """Fraction of a cause's power next to moving masses, fraction of such samples, and the interval, s."""
-
-    share: float
-    usual: float
-    interval: float
 
 
 class Budget(NamedTuple):
@@ -128,8 +116,11 @@ def delays(problem: Problem, fit: Joint) -> Delays | None:
     return Delays(later, np.sqrt(np.diag(covariance)), taken)
 
 
-def motion(problem: Problem, finding: Finding) -> MotionShare | None:
-    """Return the fraction of a cause that acts while masses move, as an unseen motion between rows does."""
+def motion(problem: Problem, finding: Finding) -> dict[str, float] | None:
+    """Return the fraction of a cause's power next to moving masses, that of such samples, the interval, s.
+
+    An unseen motion between rows acts there alone; None where the cause acts elsewhere as well.
+    """
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
     # Samples next to a motion, and the cause's share of power there
@@ -137,8 +128,8 @@ def motion(problem: Problem, finding: Finding) -> MotionShare | None:
     moving = np.append(steps, False) | np.append(False, steps)
     power = (finding.candidate.columns(slice(0, len(survey))) @ finding.coefficients) ** 2
     share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
-    interval = float(np.median(np.diff(survey.time)))
-    return None if usual > 0.5 or share < 0.8 else MotionShare(share, usual, interval)
+    found = {"share": share, "usual": usual, "interval": float(np.median(np.diff(survey.time)))}
+    return None if usual > 0.5 or share < 0.8 else found
 
 
 def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | None:
@@ -166,23 +157,15 @@ def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | 
 
 
 def slow_share(problem: Problem, finding: Finding) -> float:
-    """Return the share of a cause's power, about its mean, that a trend and a bend over the log explain."""
-    field, time = finding.field(problem), problem.survey.time
-    # Parabola over the log: the part of the field's variance that it removes
-    x = (time - time.mean()) / max(float(np.ptp(time)), 1e-300)
-    smooth = np.polynomial.Polynomial.fit(x, field, 2)(x)
-    return 1.0 - float(np.var(field - smooth) / max(np.var(field), 1e-300))
+    """Return the share of a cause's power, about its mean, that a parabola over the log explains."""
+    field = finding.field(problem)
+    smooth = np.polynomial.Polynomial.fit(problem.survey.time, field, 2)(problem.survey.time)
+    return 1.0 - float(np.var(field - smooth)) / max(float(np.var(field)), 1e-300)
 
 
 def times_usual(candidate: Candidate, b: FloatArray) -> float:
     """Return the size of a cause b (k,) over its plausible size; 0 where its terms share one size."""
     return float(np.abs(b).max()) if candidate.spectra is None else 0.0
-
-
-def stays(diagnosis: Diagnosis) -> list[Candidate]:
-    """Return the named causes that the extended calibration does not correct for."""
-    added = diagnosis.calibration.effects
-    return [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
 
 
 def cancelling(diagnosis: Diagnosis) -> list[tuple[Finding, Finding, float, float, float]]:
@@ -233,7 +216,7 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Diagnostic]:
     candidate, rest = finding.candidate, diagnosis.unexplained
     found = motion(diagnosis.problem, finding)
     if found is not None:
-        yield Diagnostic("beside_moving_masses", found._asdict())
+        yield Diagnostic("beside_moving_masses", found)
     late = telemetry_delay(diagnosis, finding)
     if late is not None and late.after_nt < late.before_nt:
         values = {"delay_s": late.delay_s, "before_nT": late.before_nt, "after_nT": late.after_nt}
@@ -250,11 +233,6 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Diagnostic]:
         yield Diagnostic("rest_is_stronger")
 
 
-def contested(finding: Finding) -> bool:
-    """Return True if another cause, not only another series, remains possible."""
-    return any(hypothesis.candidate.cause != finding.candidate.cause for hypothesis in finding.competing)
-
-
 def not_separated(candidate: Candidate, cause: Cause, competing: Sequence[CompetingHypothesis]) -> Diagnostic:
     """Return a note on the causes that could take its place, and on how to distinguish them."""
     others = [hypothesis.candidate for hypothesis in competing]
@@ -268,12 +246,9 @@ def not_separated(candidate: Candidate, cause: Cause, competing: Sequence[Compet
 
 def separation(track: Returns) -> Diagnostic:
     """Return whether a track distinguishes place from time."""
-    values = {
-        "share": track.share, "hours": track.longest / 3600.0, "like": 1.0 - track.separable,
-    }  # fmt: skip
-    if not track.share:
-        return Diagnostic("track.never")
-    return Diagnostic("track.separable" if track.distinguishable else "track.alike", values)
+    code = "separable" if track.distinguishable else "alike" if track.share else "never"
+    values = {"share": track.share, "hours": track.longest / 3600.0, "like": 1.0 - track.separable}
+    return Diagnostic(f"track.{code}", values)
 
 
 @dataclass(frozen=True)
@@ -283,7 +258,6 @@ class Assessment:
     fit_for_use: Fitness
     """Usability of the written calibration in place of the given one."""
     reason: Reason
-    """Code of the reason for that."""
     condition: str
     """Condition of a conditional verdict; empty otherwise."""
     summary: str
@@ -299,9 +273,7 @@ class Assessment:
     delays: Delays | None
     """Delays of the sensor's axes, if they look interpolated."""
     budget: Budget
-    """RMS predicted, before, after, fitted."""
     residual: Memory
-    """Autocorrelation of the residual: how far from white it is."""
     follows: Seen
     """Series that the residual follows."""
     returns: Returns | None
@@ -326,7 +298,15 @@ def assess(diagnosis: Diagnosis) -> DiagnosisResult:
     if use:
         against += _domain(diagnosis)
     fitness, reason = _fitness(diagnosis, bool(use), against)
-    manoeuvres = tuple(dict.fromkeys(_manoeuvres(diagnosis)))
+    # Manoeuvres that would distinguish the possible causes
+    uncertain = [
+        f.candidate
+        for f in diagnosis.findings
+        if any(h.candidate.cause != f.candidate.cause for h in f.competing)
+    ]
+    if diagnosis.unexplained is not None:
+        uncertain += [h.candidate for h in diagnosis.unexplained.within[:1]]
+    manoeuvres = tuple(dict.fromkeys(diagnosis.causes[c.cause].disambiguation for c in uncertain))
     condition = _condition(diagnosis, against, manoeuvres) if fitness == "conditional" else ""
     if use and diagnosis.other_day is None:
         against.append(Diagnostic("same_log"))
@@ -385,12 +365,11 @@ def _domain(diagnosis: Diagnosis) -> list[Diagnostic]:
     """List the ranges of attitude, depth and telemetry in which the improvement was measured."""
     survey, known = diagnosis.problem.survey, diagnosis.problem.calibration
     fresh = ~survey.learned
-    series: dict[str, tuple[FloatArray, str]] = {}
+    names = dict.fromkeys([*known.units, *diagnosis.calibration.channels])
+    series = {name: (survey.channels[name].values, survey.channels[name].unit) for name in names}
     if survey.attitude is not None:
-        for k, name in enumerate(("roll", "pitch")):
-            series[name] = survey.attitude[:, k], "deg"
-    for name in dict.fromkeys([*known.units, *diagnosis.calibration.channels]):
-        series[name] = survey.channels[name].values, survey.channels[name].unit
+        roll, pitch, _ = survey.attitude.T
+        series = {"roll": (roll, "deg"), "pitch": (pitch, "deg")} | series
     texts: list[str] = []
     ends: dict[str, float] = {}
     for name, (values, unit) in series.items():
@@ -407,7 +386,8 @@ def useful(diagnosis: Diagnosis) -> Diagnostic | None:
         return None
     if all(c.about != "vehicle" or (c.effects and set(added).isdisjoint(c.effects)) for c in diagnosis.named):
         return None
-    others = ", ".join(label(*candidate.group) for candidate in stays(diagnosis))
+    stays = [c for c in diagnosis.named if not c.effects or any(effect not in added for effect in c.effects)]
+    others = ", ".join(label(*candidate.group) for candidate in stays)
     verdict = write_text("use.good" if diagnosis.improvement.shown else "use.bad")
     return Diagnostic(
         "use", {"verdict": verdict, "but": write_text("use.but", others=others) if others else ""}
@@ -443,16 +423,6 @@ def _against(
         yield Diagnostic("cancelling", {**values, "one_nT": a, "other_nT": b, "together_nT": both})
     if rest:
         yield Diagnostic("unexplained", {"signal_to_noise": rest.signal_to_noise})
-
-
-def _manoeuvres(diagnosis: Diagnosis) -> Iterator[str]:
-    """Yield the manoeuvres that would distinguish the possible causes."""
-    for finding in diagnosis.findings:
-        if contested(finding):
-            yield diagnosis.causes[finding.candidate.cause].disambiguation
-    rest = diagnosis.unexplained
-    if rest is not None and rest.within:
-        yield diagnosis.causes[rest.within[0].candidate.cause].disambiguation
 
 
 def _name(finding: Finding) -> str:

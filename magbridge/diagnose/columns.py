@@ -8,7 +8,6 @@ from itertools import accumulate, pairwise
 from typing import Any, Literal
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.terms import Effect
@@ -37,24 +36,6 @@ class Mixture:
     def __call__(self, rows: slice) -> FloatArray:
         """Return these rows of the columns, (m, k)."""
         return np.asarray(sum(M.T @ X(rows).T for X, M in self.parts)).T
-
-    def times(self, widths: FloatArray) -> Mixture:
-        """Return the columns in units of `widths` (k,)."""
-        return Mixture(tuple((X, M * widths) for X, M in self.parts))
-
-
-@dataclass(frozen=True, eq=False)
-class Interpolated:
-    """Columns interpolated from their values at a few nodes: ``W V``."""
-
-    weights: csr_array
-    """(n, c) W, the weights of each row's nodes."""
-    values: FloatArray
-    """(c, k) V, the columns at the nodes."""
-
-    def __call__(self, rows: slice) -> FloatArray:
-        """Return these rows of the columns, (m, k)."""
-        return np.asarray(self.weights[rows] @ self.values)
 
 
 @dataclass(frozen=True)
@@ -86,15 +67,6 @@ def places(sizes: Iterable[int], first: int = 0) -> list[slice]:
     return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=first))]
 
 
-def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
-    """Return the product (m,) of rows and coefficients c (k,), without all columns where possible."""
-    if isinstance(columns, Mixture):
-        return np.asarray(sum(times(X, rows, M @ c) for X, M in columns.parts))
-    if isinstance(columns, Interpolated):
-        return np.asarray(columns.weights[rows] @ (columns.values @ c))
-    return np.asarray(columns(rows) @ c)
-
-
 def join_columns(columns: Sequence[Columns]) -> Mixture:
     """Return all columns side by side as one mixture, in which shared parts occur once."""
     listed = [parts(one) for one in columns]
@@ -119,18 +91,9 @@ class Products:
 
     def __call__(self, rows: slice) -> FloatArray:
         """Return these rows of the columns, (m, pairs)."""
-        functions, slots = zip(*self.pairs, strict=True)
-        jacobian = self.problem.jacobian.T[_run(slots), rows]
-        if self.phi is None:
-            return np.asarray(jacobian).T
-        shared = len(set(functions)) == 1
-        return np.asarray(self.phi(rows)[_run(functions[:1] if shared else functions)] * jacobian).T
-
-
-def _run(places: Sequence[int]) -> slice | list[int]:
-    """Return consecutive places as a slice, which indexes without a copy."""
-    run = range(places[0], places[0] + len(places))
-    return slice(run.start, run.stop) if tuple(run) == tuple(places) else list(places)
+        functions, slots = (list(places) for places in zip(*self.pairs, strict=True))
+        jacobian = self.problem.jacobian.T[slots, rows]
+        return np.asarray(jacobian if self.phi is None else self.phi(rows)[functions] * jacobian).T
 
 
 def effect_columns(
@@ -138,8 +101,9 @@ def effect_columns(
     effect: Effect,
     phi: FloatArray | Callable[[slice], FloatArray] | None = None,
     origin: float = 0.0,
+    widths: float | FloatArray = 1.0,
 ) -> Mixture:
-    """Return the columns of an effect's coefficients.
+    """Return the columns of an effect's coefficients, in units of their `widths` (k,).
 
     Its regressors are `phi` less `origin`; `phi` is (r, n), or a function from m rows to (r, m); by default
     they are those of the effect's own array form.
@@ -147,21 +111,22 @@ def effect_columns(
     if phi is None and effect.remembers:
         # Single precision: a search tries dozens of histories, of 5 MB for a month each in double
         phi = effect.batch(problem.series(effect)).astype(np.float32)
-    elif phi is None:
-        phi = lambda rows: effect.batch(problem.series(effect, rows))  # noqa: E731
+    history = phi if isinstance(phi, np.ndarray) else None
+
+    def regressors(rows: slice) -> FloatArray:
+        if history is not None:
+            return history[:, rows]
+        return phi(rows) if callable(phi) else effect.batch(problem.series(effect, rows))
+
     # C_krs of the effect: only the pairs (r, s) of nonzero entries are computed
     tensor = -effect.columns(problem.calibration.reference.field)
-    pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]
-    M = np.stack([tensor[:, r, s] for r, s in pairs])
+    pairs = tuple((int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0)))
+    M = np.stack([tensor[:, r, s] for r, s in pairs]) * widths
     # (phi - origin) C = phi C - origin C: one history serves every origin
-    made = Products(problem, phi if callable(phi) else _rows(phi), tuple(pairs))
+    made = Products(problem, phi if callable(phi) else regressors, pairs)
     if not origin:
         return Mixture(((made, M),))
-    return Mixture(((made, M), (Products(problem, None, tuple(pairs)), -origin * M)))
-
-
-def _rows(phi: FloatArray) -> Callable[[slice], FloatArray]:
-    return lambda rows: phi[:, rows]
+    return Mixture(((made, M), (Products(problem, None, pairs), -origin * M)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +276,7 @@ def of_effect(
     `origin`. `unit` is that of all its coefficients, or has one for each of as many equal parts of them.
     """
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
-    columns = effect_columns(problem, effect, phi, origin).times(widths)
+    columns = effect_columns(problem, effect, phi, origin, widths)
     if not names:
         powers = effect.size // 3
         names = tuple(

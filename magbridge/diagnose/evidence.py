@@ -44,15 +44,7 @@ from scipy.special import chdtri, chndtrinc, log_ndtr
 from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.diagnose.columns import (
-    Candidate,
-    Columns,
-    Group,
-    join_columns,
-    parts,
-    places,
-    slices,
-)
+from magbridge.diagnose.columns import Candidate, Columns, Group, join_columns, parts, places, slices
 from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
 from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import DERIVATIVE_ROWS, Problem, side_by_side
@@ -66,10 +58,7 @@ IDEAL = 0.2
 competes with it."""
 REMNANT = 0.3
 """Fraction of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
-not another cause.
-
-The price: a second cause of so low a signal-to-noise is not named.
-"""
+not another cause, and is not named."""
 SMOOTH, MOST_REMAINING = 0.1, 8.0
 """Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant: a process has
 a flexible shape, but not any shape equally, and the remnant of a map's error is slow in time, too."""
@@ -113,9 +102,7 @@ class Information:
         """Project out the model of `base` as well, whose columns are the last."""
         m = len(self.score) - base.coefficients.size
         prior = base.prior[len(base.z) :]
-        K: FloatArray = np.asarray(
-            np.linalg.solve(self.matrix[m:, m:] + np.diag(prior), self.matrix[m:, :m]), float
-        )
+        K = np.asarray(np.linalg.solve(self.matrix[m:, m:] + np.diag(prior), self.matrix[m:, :m]), float)
         return Information(
             self.matrix[:m, :m] - self.matrix[:m, m:] @ K,
             self.score[:m] - K.T @ (self.score[m:] - prior * base.coefficients),
@@ -168,8 +155,7 @@ def information(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Score:
+class Score(NamedTuple):
     """Score of a candidate under a noise: likelihood ratio, freedoms, log evidence, estimate, prior."""
 
     ratio: float
@@ -394,8 +380,7 @@ def wald_ratio(fit: Joint, candidate: Candidate) -> float:
     return fit.wald(own) - 2.0 * spread
 
 
-@dataclass(frozen=True)
-class Visible:
+class Visible(NamedTuple):
     """How large one cause must be to be found."""
 
     cause: str
@@ -423,18 +408,17 @@ def isolability(
     untestable: Mapping[str, str],
 ) -> Isolability:
     """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
-    at = slices(candidates)
+    at, visible, alike = slices(candidates), {}, []
     # One candidate for each cause and channel, with the price of all hypotheses behind it
-    picked = most_visible(candidates, info, at)
-    among = [candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0) for k in picked]
-    visible = [_visible(candidates[k], info, at[k], count) for k, count in zip(picked, among, strict=True)]
-    pairs = [
-        (one, other, likeness(info, candidates[a], at[a], candidates[b], at[b]))
-        for (one, a), (other, b) in combinations(zip(visible, picked, strict=True), 2)
-        if one.cause != other.cause
-    ]
-    alike = sorted((pair for pair in pairs if pair[2] > CONFOUNDED), key=lambda pair: -pair[2])
-    return Isolability(tuple(visible), tuple(alike), dict(untestable))
+    for k in most_visible(candidates, info, at):
+        count = candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0)
+        visible[k] = _visible(candidates[k], info, at[k], count)
+    for (a, one), (b, other) in combinations(visible.items(), 2):
+        rho = likeness(info, candidates[a], at[a], candidates[b], at[b])
+        if one.cause != other.cause and rho > CONFOUNDED:
+            alike.append((one, other, rho))
+    alike.sort(key=lambda pair: -pair[2])
+    return Isolability(tuple(visible.values()), tuple(alike), dict(untestable))
 
 
 def most_visible(candidates: Sequence[Candidate], info: Information, places: Sequence[slice]) -> list[int]:
@@ -453,21 +437,20 @@ def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: 
     freedom = max(score(info, place, candidate).freedom, 1)
     sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))
     power = np.diag(info.matrix[place, place])
+    names, widths, units = candidate.names, candidate.width, candidate.units
     if candidate.spectra is not None:  # what counts is what all of them do together
-        x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
-        sizes = {"size": (_plausible(x), "times the usual one")}
-    else:
-        size = sure / np.sqrt(np.maximum(power, 1e-300))
-        sizes = {
-            name: (_plausible(float(x)) * float(w), unit)
-            for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
-        }
-    return Visible(candidate.cause, candidate.channel, sizes)
-
-
-def _plausible(size: float) -> float:
-    """Return a size in units of a plausible one; infinite where nothing plausible would show."""
-    return size if size < MAX_PLAUSIBLE_MULTIPLE else float("inf")
+        power, names, widths, units = (
+            power.sum(keepdims=True),
+            ("size",),
+            np.ones(1),
+            ("times the usual one",),
+        )
+    # Infinite where nothing plausible would show
+    size = sure / np.sqrt(np.maximum(power, 1e-300))
+    size = np.where(size < MAX_PLAUSIBLE_MULTIPLE, size * widths, np.inf).tolist()
+    return Visible(
+        candidate.cause, candidate.channel, dict(zip(names, zip(size, units, strict=True), strict=True))
+    )
 
 
 def likeness(info: Information, first: Candidate, a: slice, second: Candidate, b: slice) -> float:
@@ -477,5 +460,5 @@ def likeness(info: Information, first: Candidate, a: slice, second: Candidate, b
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (first, second))
     M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)
     N = C.T @ np.linalg.solve(A + p * np.eye(len(A)), C)
-    shares = [float(np.trace(X) / (np.trace(Y) + 1e-12)) for X, Y in ((M, A), (N, B))]
-    return float(np.sqrt(np.clip(max(shares), 0.0, 1.0)))
+    share = max(np.trace(M) / (np.trace(A) + 1e-12), np.trace(N) / (np.trace(B) + 1e-12))
+    return float(np.sqrt(np.clip(share, 0.0, 1.0)))

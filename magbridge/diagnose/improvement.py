@@ -120,22 +120,22 @@ def extension_of(
     # From the prior as given to a tighter one, until the corrected field passes every check
     first = None
     for factor in TIGHTENING:
-        attempt = _attempt(problem, model, fit, counts, grid, factor)
-        if not attempt.refused:
-            return attempt
-        first = first or attempt
-        attempt.problem.let_go()
+        tried = attempt(problem, model, fit, counts, grid, factor)
+        if not tried.refused:
+            return tried
+        first = first or tried
+        tried.problem.let_go()
     assert first is not None
     return replace(first, calibration=problem.calibration)
 
 
-def _attempt(
+def attempt(
     problem: Problem,
     model: Sequence[Candidate],
     fit: Joint,
     counts: BoolArray,
-    grid: Sequence[Candidate],
-    factor: float,
+    grid: Sequence[Candidate] = (),
+    factor: float = 1.0,
 ) -> Extension:
     """Extend the calibration with its prior sigma multiplied by `factor`, and check the result."""
     if factor < 1.0:
@@ -340,17 +340,3 @@ def fit_without(
     ridge, start = fit.prior[len(fit.z) + kept], np.append(fit.z, fit.coefficients[kept])
     columns, noise = [candidate.columns for candidate in others], fit.noise
     return others, fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
-
-
-def error_without(
-    problem: Problem, model: Sequence[Candidate], left_out: Sequence[int], fit: Joint
-) -> FloatArray:
-    """Return the held-out error (n,), nT, of an extension by a model without the causes at some places."""
-    # The same steps as for the whole model: converge, hold folds out, correct them
-    others, alone = fit_without(problem, model, left_out, fit)
-    settled, blocks, alone = relinearised(problem, others, alone)
-    out = held_out(settled, blocks, alone)
-    settled.let_go()
-    _, dropped = flyable(problem.survey, extend(problem, others, alone))
-    error, reference_error = _held_out_error(problem, others, alone, out, dropped)
-    return error - reference_error

@@ -45,7 +45,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from magbridge.diagnose.columns import Columns, places, size_of, times
+from magbridge.diagnose.columns import Columns, places, size_of
 from magbridge.diagnose.noise import ResidualNoise, fit_noise
 from magbridge.diagnose.problem import DELAYS, Problem, row_blocks, side_by_side
 from magbridge.estimation.residual import robust_scale
@@ -104,12 +104,12 @@ class JointDesign:
 
     def times(self, c: FloatArray) -> FloatArray:
         """Return (n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
-        asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
 
         def piece(rows: slice) -> FloatArray:
             out = np.asarray(self.problem.calibration_rows(rows) @ c[: self.q])
-            for own, column in asked:
-                out += times(column, rows, c[own])
+            for own, column in zip(self.at, self.columns, strict=True):
+                if c[own].any():
+                    out += column(rows) @ c[own]
             return out
 
         return np.concatenate(in_threads(len(self.problem), piece, self.pieces))
@@ -124,10 +124,9 @@ def normal(
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``X^T X`` (k, k) and ``X^T y`` (k,), X whitened if a noise is given.
 
-    They are summed up in pieces that fit the processor's cache. Long logs are shared out among threads,
-    always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
-    `asked` for are computed, and their transposes; the others are zero. With a `stride`, only every so many
-    pieces of the log count.
+    They are summed up in pieces that fit the processor's cache, which threads share always in the same way,
+    so any machine returns the same numbers. Of ``X^T X`` only the blocks that are `asked` for are computed,
+    and their transposes. With a `stride`, only every so many pieces of the log count.
     """
     k = size_of(X)
 
@@ -385,16 +384,17 @@ def _plain(
 
 
 class HeldOut(NamedTuple):
-    """Result of leaving out dives, fold by fold."""
+    """Result of leaving out dives, fold by fold.
+
+    It has the residual (n,) of every sample under the fit without its fold, by the linear model, nT of the
+    sensor; the log predictive density of all folds; the number (n,) of each sample's fold; and the
+    coefficients (f, q + k) of calibration and effects, fitted without each fold.
+    """
 
     residual: FloatArray
-    """Residual (n,) of every sample under the fit without its fold, by the linear model, nT of the sensor."""
     score: float
-    """Log predictive density of all folds."""
     fold: IntArray
-    """Number (n,) of the fold that each sample belongs to."""
     coefficients: FloatArray
-    """Coefficients (f, q + k) of calibration and effects, fitted without each fold."""
 
 
 def held_out(
@@ -444,8 +444,7 @@ def held_out(
     return HeldOut(residual, noise.log_likelihood - 0.5 * float(price), of, without)
 
 
-@dataclass(frozen=True)
-class Improvement:
+class Improvement(NamedTuple):
     """Held-out RMS before and after, nT, their ratio, its interval over dives (:data:`CONFIDENCE_LEVEL`)."""
 
     before: float
@@ -462,11 +461,9 @@ class Improvement:
 def paired(
     error_before: FloatArray, error_after: FloatArray, dive: IntArray, counts: BoolArray
 ) -> Improvement:
-    """Compare two residuals on the same samples.
+    """Compare two errors (n,), nT, on the samples that count.
 
-    The errors (n,) are in nT, `dive` (n,) is the number of each sample's dive, `counts` (n,) says which
-    samples count. The interval comes from a bootstrap of whole dives, so correlation within a dive does no
-    harm.
+    The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
     """
     # Sums of squares of each dive: the bootstrap then draws dives, not samples
     number = np.unique(dive[counts], return_inverse=True)[1]
@@ -475,10 +472,5 @@ def paired(
     drawn = rng.integers(0, b.size, (DRAWS, b.size))
     ratios = np.sqrt(a[drawn].sum(axis=1) / (b[drawn].sum(axis=1) + 1e-300))
     low, high = np.quantile(ratios, QUANTILES)
-    n = int(counts.sum())
-    return Improvement(
-        float(np.sqrt(b.sum() / n)),
-        float(np.sqrt(a.sum() / n)),
-        float(np.sqrt(a.sum() / (b.sum() + 1e-300))),
-        (float(low), float(high)),
-    )
+    before, after = np.sqrt(np.array([b.sum(), a.sum()]) / counts.sum()).tolist()
+    return Improvement(before, after, after / (before + 1e-150), (float(low), float(high)))

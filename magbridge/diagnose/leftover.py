@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.diagnose.alternatives import CompetingHypothesis
-from magbridge.diagnose.columns import Candidate, Columns, places, times
+from magbridge.diagnose.columns import Candidate, Columns, places
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
 from magbridge.diagnose.joint import Joint, JointDesign, Ridge, Statistic, in_threads, precomputed
@@ -208,9 +208,8 @@ def leftover(
     # stricter where no cause was found: the distribution is only asymptotic
     if p_value >= (FALSE_ALARM_RATE if model else 0.1 * FALSE_ALARM_RATE):
         return None
-    every = slice(0, len(problem))
     # RMS of the fitted description in the total field
-    shape = times(likeliest.columns, every, likeliest.fit.coefficients[-len(best.variance) :])
+    shape = likeliest.columns(slice(0, len(problem))) @ likeliest.fit.coefficients[-len(best.variance) :]
     size = rms(shape / problem.reference_jacobian)
     return Leftover(
         kind, best.signal_to_noise, p_value, evidence, one.period, one.channel, one, count,

@@ -33,7 +33,7 @@ from scipy.special import gammaln
 
 from magbridge.arrays import FloatArray, IntArray
 from magbridge.diagnose.columns import Columns
-from magbridge.diagnose.problem import DERIVATIVE_ROWS
+from magbridge.diagnose.problem import row_blocks
 from magbridge.diagnose.survey import MAX_LAG, Past
 from magbridge.estimation.residual import robust_scale
 
@@ -114,21 +114,10 @@ class ResidualNoise:
         return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
-        """Whiten columns for least squares: a product with a band matrix, computed band by band.
+        """Whiten columns (m, k), rows of the log from `start` on, for least squares.
 
-        Parameters
-        ----------
-        values : (m, k) array
-            Rows from `start` on of the whole log's columns, best stored column by column.
-        start : int
-            Place of the first row in the log.
-        skip : int
-            Rows at the beginning that serve only as the past of the others.
-
-        Returns
-        -------
-        (m - skip, k) array
-            Stored column by column.
+        The first `skip` rows serve only as the past of the others. The product with a band matrix is computed
+        in blocks; arguments and result are best stored column by column.
         """
         # Band matrix of f (1, -a) in blocks of BAND rows: one dense product for each block
         p, k, own = len(self.ar), values.shape[1], len(values) - skip
@@ -137,8 +126,13 @@ class ResidualNoise:
         lacking = max(p - skip, 0), BAND * count - own
         if any(lacking):
             V = np.pad(V, ((0, 0), lacking))
+        # Rows of the band matrix: (1, -a), or f (1, -a') after a gap, over the scale
+        rows, past = slice(start + skip, start + len(values)), self.past
         weights = np.zeros((BAND * count, p + 1))
-        weights[:own] = self._weights(slice(start + skip, start + len(values)))
+        weights[:own] = np.append(1.0, -self.ar)
+        some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
+        weights[past.rows[some] - rows.start] = self.near_gaps.weights[past.pattern[some]]
+        weights[:own] *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
         bands = np.zeros((count, BAND + p, BAND))
         band, row, each = bands.strides
         diagonals = as_strided(bands, (count, BAND, p + 1), (band, row + each, row))
@@ -150,16 +144,6 @@ class ResidualNoise:
         )
         np.matmul(pieces, bands, out=filtered)
         return out[:, :own].T
-
-    def _weights(self, rows: slice) -> FloatArray:
-        """Return (m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
-        past, gaps = self.past, self.near_gaps
-        # Rows of the band matrix: (1, -a), or f (1, -a') after a gap, over the scale
-        weights = np.tile(np.append(1.0, -self.ar), (rows.stop - rows.start, 1))
-        some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
-        weights[past.rows[some] - rows.start] = gaps.weights[past.pattern[some]]
-        weights *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
-        return weights
 
     def whiten(self, y: FloatArray) -> FloatArray:
         """Return (n,) whitened y (n,): :meth:`filter` of a single whole column."""
@@ -294,7 +278,9 @@ def fit_noise(
     :data:`BRIEFEST`.
     """
     n, order, whole = len(residual), history.order, history.whole
-    count = _counts(n)
+    # Blocks of equal length, in each of which the level is constant
+    count = np.full(max(n // NOISE_BLOCK_SAMPLES, 1), NOISE_BLOCK_SAMPLES)
+    count[-1] += n - count.sum()
     # a view of the p samples before each, which takes no memory
     lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
     # First weights: all equal, or those of the noise that this one will be like
@@ -326,20 +312,12 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
     """Return (p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
     p = lags.shape[1]
     P, b = np.zeros((p, p)), np.zeros(p)
-    for start in range(0, len(r), DERIVATIVE_ROWS):
-        rows = slice(start, start + DERIVATIVE_ROWS)
+    for rows in row_blocks(len(r)):
         X = np.ascontiguousarray(lags[rows])
         weighted = X * weight[rows, None]
         P += weighted.T @ X
         b += weighted.T @ r[rows]
     return np.asarray(np.linalg.lstsq(P, b, rcond=None)[0], float)
-
-
-def _counts(n: int) -> IntArray:
-    """Return (blocks,) samples in each block."""
-    count = np.full(max(n // NOISE_BLOCK_SAMPLES, 1), NOISE_BLOCK_SAMPLES)
-    count[-1] += n - count.sum()
-    return count
 
 
 def _stable(ar: FloatArray, n: int) -> FloatArray:
@@ -383,7 +361,7 @@ def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray
                 tried[near] = _levels(square, count, TAILS[near], tried[at][1])
         best = max((k for k in (at - 1, at, at + 1) if k in tried), key=lambda k: (tried[k][0], k == at))
         if best == at:
-            return TAILS[at], _spread(tried[at][1], count), tried[at][0]
+            return TAILS[at], np.repeat(tried[at][1], count), tried[at][0]
         at = best
 
 
@@ -396,7 +374,7 @@ def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -
     power = level**2
     # Expectation maximisation of a Student scale, all blocks at once
     for _ in range(ALTERNATIONS):
-        before, each = power, _each(power, count)
+        before, each = power, np.repeat(power, count)
         weighted = square if nu > GAUSSIAN else (nu + 1.0) * each * square / (nu * each + square)
         sums = _sums(weighted, count)
         # Shrunk towards the level of all blocks, with the weight of ten samples
@@ -405,22 +383,10 @@ def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -
         power = power + 1e-24
         if nu > GAUSSIAN or np.abs(power / before - 1.0).max() < 1e-3:
             break
-    x2 = square / _each(power, count)
+    x2 = square / np.repeat(power, count)
     if nu > GAUSSIAN:
         value = -0.5 * (float(x2.sum()) + n * np.log(2.0 * np.pi))
     else:
         constant = gammaln((nu + 1.0) / 2.0) - gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
         value = n * constant - 0.5 * (nu + 1.0) * float(np.log1p(x2 / nu).sum())
     return float(value - 0.5 * count @ np.log(power)), np.sqrt(power)
-
-
-def _spread(levels: FloatArray, count: IntArray) -> FloatArray:
-    """Return (n,) level of each sample; of a single block it takes no memory."""
-    if count.size == 1:
-        return np.broadcast_to(levels, int(count.sum()))
-    return np.repeat(levels, count)
-
-
-def _each(values: FloatArray, count: IntArray) -> FloatArray | float:
-    """Return (n,) a block's value for each of its samples; a number where there is one block."""
-    return np.repeat(values, count) if count.size > 1 else float(values[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,7 +18,7 @@ from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.instrument import InterferenceTone
-from magbridge.diagnose.columns import Candidate, Columns, Group, absent_before, slices
+from magbridge.diagnose.columns import Candidate, Group, absent_before, slices
 from magbridge.diagnose.diagnosis import MIN_RMS_REDUCTION, Diagnosis, Finding, counted, small, verdict_of
 from magbridge.diagnose.evidence import (
     ODDS,
@@ -31,9 +31,9 @@ from magbridge.diagnose.evidence import (
 )
 from magbridge.diagnose.improvement import (
     Extension,
+    attempt,
     check_written,
     corrected,
-    error_without,
     extension_of,
     fit_without,
 )
@@ -42,7 +42,7 @@ from magbridge.diagnose.leftover import Leftover, leftover, switching, unlisted,
 from magbridge.diagnose.noise import autoregressive_order
 from magbridge.diagnose.observed import memory
 from magbridge.diagnose.problem import Problem, pose, with_slow_noise
-from magbridge.diagnose.search import Outliers, SearchOutcome, beside_slow_noise, outliers, search
+from magbridge.diagnose.search import SearchOutcome, beside_slow_noise, outliers, search
 from magbridge.diagnose.survey import Survey, days_of, load_survey
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
@@ -61,19 +61,6 @@ MIN_SLOW_FRACTION = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
 
 
-class Names(NamedTuple):
-    """The causes that are asserted, their competing hypotheses, and their joint fit."""
-
-    chosen: tuple[Hypothesis, ...]
-    competing: tuple[tuple[CompetingHypothesis, ...], ...]
-    fit: Joint
-
-    @property
-    def model(self) -> list[Candidate]:
-        """Their candidates."""
-        return [hypothesis.candidate for hypothesis in self.chosen]
-
-
 def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
 
@@ -84,11 +71,10 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
     every eighth dive as well. They remain possible unless one beats them 20:1, allowing for the error of
     their regressors.
     """
-    model = [h.candidate for h in outcome.chosen]
+    model = outcome.model
     # Names: their likelihood ratio with all prices
-    uneven = [
-        one for candidate in model if (one := varying(problem, candidate, outcome.look_elsewhere)) is not None
-    ]
+    varied = [varying(problem, candidate, outcome.look_elsewhere) for candidate in model]
+    uneven = [description for description in varied if description is not None]
     rest = residual = leftover(problem, model, outcome.fit, tone, also=uneven)
     if not model:
         return False, rest
@@ -110,7 +96,7 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
     if free is None:
         return True, rest
     # Free descriptions of the whole signal: by evidence, and by prediction of held-out dives
-    ours = _foretold(problem, [candidate.columns for candidate in model], outcome.fit, residual)
+    ours = _foretold(problem, model, outcome.fit, residual)
     behind = max(free.evidence_of_choice - names, _foretold(problem, [], outcome.null, free) - ours - AGAINST)
     if behind <= 0.0:
         return True, rest
@@ -128,9 +114,7 @@ def settle(
 
     def rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> float | None:
         free = leftover(problem, model, fit, tone, but=[further])
-        if free is None:
-            return None
-        return _foretold(problem, [candidate.columns for candidate in model], fit, free)
+        return None if free is None else _foretold(problem, model, fit, free)
 
     plain = search(problem, candidates, causes, rival)
     asserted, rest = accept(problem, plain, tone)
@@ -140,14 +124,15 @@ def settle(
     return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome, tone))
 
 
-def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Leftover | None) -> float:
+def _foretold(problem: Problem, model: Sequence[Candidate], fit: Joint, best: Leftover | None) -> float:
     """Return the log odds by which a model with the best description, if any, predicts every eighth dive.
 
     Descriptions that were picked from many places or periods pay for that, as in the fit.
     """
-    scores = [held_out(problem, model, fit, interleaved=True).score]
+    columns = [candidate.columns for candidate in model]
+    scores = [held_out(problem, columns, fit, interleaved=True).score]
     for one in best.fitted if best else ():
-        score = held_out(problem, [*model, one.columns], one.fit, interleaved=True).score
+        score = held_out(problem, [*columns, one.columns], one.fit, interleaved=True).score
         scores.append(score - float(np.log(one.look_elsewhere)))
     return max(scores)
 
@@ -272,16 +257,22 @@ def _examine(
     progress("preparing causes")
     candidates, untestable = _put_forward(problem, causes)
     progress("searching")
-    tone = _strongest_tone(problem, candidates)
+    # The strongest tone describes the remainder where tones are not among the causes
+    known_tone = any(isinstance(e, TimeEffect) and e.shape == "tone" for c in candidates for e in c.effects)
+    tone = None if known_tone else next(iter(InterferenceTone().candidates(problem)), None)
     outcome, stand, rest = settle(problem, candidates, len(causes), tone)
     # The search is over: for a month its arrays would fill hundreds of megabytes during the extension
     rest = rest and rest._replace(fitted=())
     for one in (problem, outcome.problem):
         one.let_go()
     problem = outcome.problem
-    nothing = Names((), (), outcome.null)
-    names = Names(outcome.chosen, outcome.competing, outcome.fit) if stand else nothing
-    off = _wrong_samples(outcome, names.chosen, len(causes))
+    nothing = outcome.with_chosen((), outcome.null)
+    names = outcome if stand else nothing
+    # Wrong samples, unless they may be a remnant of the strongest cause and nothing switches
+    off = outliers(outcome.fit, len(causes))
+    strongest = max((h.signal_to_noise for h in names.chosen), default=0.0)
+    if off is not None and not outcome.switches and off.ratio < (REMNANT * strongest) ** 2:
+        off = None
     if switched := switching(problem, outcome.fit, names.chosen, off, ended=outcome.switches):
         rest, names = switched, nothing
     wrong = off if off is not None and off.isolated else None
@@ -329,7 +320,7 @@ def _refused(diagnosis: Diagnosis, values: tuple[float, float]) -> Diagnosis:
     unchanged = paired(diagnosis.before, diagnosis.before, problem.survey.dive, counts)
     return replace(
         diagnosis, calibration=problem.calibration, refused="written_file", refusal_values=values,
-        improvement=unchanged, over_refit=replace(diagnosis.over_refit, after=unchanged.after),
+        improvement=unchanged, over_refit=diagnosis.over_refit._replace(after=unchanged.after),
         other_day=None,
     )  # fmt: skip
 
@@ -347,50 +338,28 @@ def _posed(survey: Survey, calibration: Calibration) -> Problem:
 
 
 def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Candidate], dict[str, str]]:
-    """Return all candidates, and the requirements of causes that have none."""
+    """Return all candidates, and the requirements of the causes that have none."""
     candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
     untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
     if len(untestable) == len(causes):
         needs = "; ".join(sorted(set(untestable.values())))
         raise DataError(f"{problem.survey.source}: nothing can be tested here; it would take {needs}")
     every = [candidate for made in candidates.values() for candidate in made]
-    return _whenever(every, problem.survey.learned), untestable
-
-
-def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candidate]:
-    """Return the candidates and, given the calibration's own logs, of each a variant absent from those logs.
-
-    Steps, drifts and tones have no variant, since they have a time of their own; nor have errors of the
-    reference.
-    """
-    if not learned.any():
-        return list(candidates)
-    lasting = [c for c in candidates if c.effects and not any(isinstance(e, TimeEffect) for e in c.effects)]
-    return [*candidates, *(absent_before(candidate, learned) for candidate in lasting)]
-
-
-def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the strongest tone, to describe the remainder, if tones are not among the candidates."""
-    known = any(isinstance(e, TimeEffect) and e.shape == "tone" for c in candidates for e in c.effects)
-    return None if known else next(iter(InterferenceTone().candidates(problem)), None)
-
-
-def _wrong_samples(outcome: SearchOutcome, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
-    """Return the wrong samples, unless they may be a remnant of the strongest cause and nothing switches."""
-    off = outliers(outcome.fit, causes)
-    strongest = max((h.signal_to_noise for h in named), default=0.0)
-    own = outcome.switches or (off is not None and off.ratio >= (REMNANT * strongest) ** 2)
-    return off if own else None
+    if problem.survey.learned.any():
+        # A variant that is absent from the calibration's own logs; what has a time of its own needs none
+        lasting = [c for c in every if c.effects and not any(isinstance(e, TimeEffect) for e in c.effects)]
+        every += [absent_before(candidate, problem.survey.learned) for candidate in lasting]
+    return every, untestable
 
 
 def _extended(
     problem: Problem,
-    names: Names,
+    names: SearchOutcome,
     refit: Extension,
     counts: BoolArray,
     grid: Sequence[Candidate],
     causes: Mapping[str, Cause],
-) -> tuple[Names, Extension, dict[int, Improvement]]:
+) -> tuple[SearchOutcome, Extension, dict[int, Improvement]]:
     """Extend the calibration by the names that the held-out dives support, with each family's improvement."""
     while names.chosen:
         # Extend by all names, then measure each family against an extension by the others
@@ -401,10 +370,12 @@ def _extended(
         groups = _families(names.chosen, causes)
         after, gains = extension.error - extension.reference_error, {}
         for group in groups:
-            without = refit.error
+            without = refit
             if len(group) < len(names.chosen):
-                without = error_without(problem, names.model, group, names.fit)
-            gains[group[0]] = paired(without, after, problem.survey.dive, counts)
+                without = attempt(problem, *fit_without(problem, names.model, group, names.fit), counts)
+                without.problem.let_go()
+            error = without.error - without.reference_error
+            gains[group[0]] = paired(error, after, problem.survey.dive, counts)
         # A further name that does not improve the held-out corrected field is a remnant without a name
         strongest = max(gains, key=lambda k: names.chosen[k].signal_to_noise)
         idle = [
@@ -412,15 +383,14 @@ def _extended(
         ]
         if not idle:
             return names, extension, gains
-        kept = [k for k in range(len(names.chosen)) if k not in idle]
         _, fit = fit_without(problem, names.model, idle, names.fit)
-        names = Names(tuple(names.chosen[k] for k in kept), tuple(names.competing[k] for k in kept), fit)
-    return Names((), (), names.fit), refit, {}
+        names = names.with_chosen([k for k in range(len(names.chosen)) if k not in idle], fit)
+    return names.with_chosen((), names.fit), refit, {}
 
 
 def _findings(
     problem: Problem,
-    names: Names,
+    names: SearchOutcome,
     extension: Extension,
     gains: Mapping[int, Improvement],
     outcome: SearchOutcome,

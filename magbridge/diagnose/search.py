@@ -23,7 +23,7 @@ candidates under the noise that is left, the other causes projected out.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -206,7 +206,7 @@ class SearchOutcome:
     problem: Problem
     """With slow noise, if that is the likelier."""
     chosen: tuple[Hypothesis, ...]
-    """In the order found; each against the model without it."""
+    """In the order found; each against the model without it; none where names are not asserted."""
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
     """For each chosen one, all others that it does not beat by
     :func:`~.evidence.bayes_factor_threshold`, the best first."""
@@ -223,6 +223,16 @@ class SearchOutcome:
     """Log evidence of the causes found and of their noise, against the null without slow noise."""
     switches: bool
     """True if the search ended because of a switching signal that no cause describes."""
+
+    @property
+    def model(self) -> list[Candidate]:
+        """The candidates of the chosen causes."""
+        return [hypothesis.candidate for hypothesis in self.chosen]
+
+    def with_chosen(self, places: Sequence[int], fit: Joint) -> SearchOutcome:
+        """Return the outcome with only the causes at some places, whose joint fit is given."""
+        competing = tuple(self.competing[k] for k in places)
+        return replace(self, chosen=tuple(self.chosen[k] for k in places), competing=competing, fit=fit)
 
 
 def search(

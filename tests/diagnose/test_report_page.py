@@ -127,7 +127,7 @@ def test_every_cause_has_a_meaning() -> None:
 def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
     """Its sizes would all read as infinite."""
     report = clear.isolability
-    gone = replace(report.visible[0], sizes={"x": (np.inf, "nT")})
+    gone = report.visible[0]._replace(sizes={"x": (np.inf, "nT")})
     blind = replace(clear, isolability=replace(report, visible=(gone, *report.visible[1:])))
     part, whole = (section(one, "What this log could have shown") for one in (blind, clear))
     assert part.count("<tr><td>") == len(report.visible) - 1

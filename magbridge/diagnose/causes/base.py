@@ -51,11 +51,10 @@ class Cause(ABC):
     def jacobian_error(self, problem: Problem, candidate: Candidate) -> float:
         """Return the largest error of a candidate's columns, as a fraction of their largest number.
 
-        The columns are compared with differences of the residual of the nonlinear model, for which the
-        calibration is extended by the candidate's effects. Readings are those of :attr:`.Problem.reading`,
-        whose residual is zero, because there the columns are derivatives. An effect whose regressors the
-        search computes differently from the live correction, and an error of the reference, cannot be
-        compared in this way: 0 is returned.
+        The columns are compared with differences of the residual of the calibration extended by the
+        candidate's effects, at the readings of :attr:`.Problem.reading`, whose residual is zero. 0 is
+        returned for an error of the reference, and for an effect whose regressors the search computes
+        differently from the live correction.
         """
         if not candidate.effects or candidate.regressors is not None or candidate.since:
             return 0.0

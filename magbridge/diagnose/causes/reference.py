@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.causes.base import Cause
-from magbridge.diagnose.columns import Candidate, Interpolated, of_reference
+from magbridge.diagnose.columns import Candidate, of_reference
 from magbridge.diagnose.problem import Problem
 
 MAX_MAP_ERROR_CELLS = 300
@@ -75,7 +75,7 @@ class MapError(Cause):
         made = []
         for functions, variances, spectra in (lacking, drawn):
             width = ERROR * np.sqrt(variances)
-            columns = Interpolated(seen, functions * width)
+            columns = partial(_interpolated, seen, functions * width)
             names, units = tuple(f"function {k + 1}" for k in range(len(width))), ("nT",) * len(width)
             made.append(
                 Candidate(self.name, None, columns, width, names, units, spectra=spectra, about="place")
@@ -136,6 +136,11 @@ def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArr
     corners, of = _each(np.concatenate([low + step for step in steps]))
     rows = np.tile(np.arange(len(place), dtype=np.int32), len(steps))
     return csr_array((share, (rows, of.astype(np.int32))), (len(place), len(corners))), corners * side
+
+
+def _interpolated(weights: csr_array, values: FloatArray, rows: slice) -> FloatArray:
+    """Return rows of columns that are interpolated from their values at a few nodes."""
+    return np.asarray(weights[rows] @ values)
 
 
 def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from base64 import b64encode
 from io import BytesIO
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogFormatter, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator
 from PIL import Image
 from scipy.signal import periodogram
 
@@ -30,8 +29,8 @@ DOT_STYLE: dict[str, Any] = {
     "marker": "s",
     "markersize": 1.6,
     "markeredgewidth": 0,
-    "linestyle": "none",
     "alpha": 0.5,
+    "ls": "none",
 }
 """Samples as squares of whole pixels: round dots look the same, but their edges double the picture."""
 LINE_GAP_STEPS = 20.0
@@ -42,15 +41,6 @@ CHANNELS, BINS = 12, 20
 """Channels drawn, and bins of each."""
 MAX_SEPARATED_DIVES = 60
 """Dives from which on no lines separate them."""
-PERIOD_LABELS = {
-    10.0: "10 s",
-    60.0: "1 min",
-    600.0: "10 min",
-    3600.0: "1 h",
-    43200.0: "12 h",
-    864e3: "10 days",
-}
-"""Periods that the spectrum names, s."""
 
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, Any]:
@@ -59,16 +49,19 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more:
     axes = figure.subplots(rows, columns, squeeze=False, **more)
     for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(colors=INK, labelsize=MIN_FONT_PT)
-        axis.xaxis.label.set_size(MIN_FONT_PT + 0.5)
-        axis.yaxis.label.set_size(MIN_FONT_PT + 0.5)
+        axis.tick_params(which="both", colors=INK, labelsize=MIN_FONT_PT)
         axis.grid(color="#e6e9ec", linewidth=0.6)
         axis.set_axisbelow(True)
     return figure, axes
 
 
-def png(figure: Figure) -> str:
-    """Return the picture as a PNG in base64, its colours those of a palette."""
+def png(figure: Figure, names: Any = None) -> str:
+    """Return the picture as a PNG in base64, its colours those of a palette; `names` are of which axis."""
+    if names is not None:
+        handles = names.get_legend_handles_labels()
+        figure.legend(
+            *handles, fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=3, markerscale=4
+        )
     literal(figure)
     drawn, packed = BytesIO(), BytesIO()
     figure.savefig(drawn, format="png")
@@ -87,30 +80,34 @@ def clock(diagnosis: Diagnosis) -> tuple[float, str]:
     return (3600.0, "hours") if np.ptp(diagnosis.problem.survey.time) > 7200.0 else (60.0, "minutes")
 
 
-def curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]:
-    """Return (m,) of time since the start and each of `values` (n,), thinned, with no line across a gap."""
+def in_time(diagnosis: Diagnosis, axis: Any, values: FloatArray, colour: str, name: str) -> FloatArray:
+    """Draw samples (n,) in time with their running mean; return the times (m,) of the samples drawn."""
     t, part = diagnosis.problem.survey.time, thin(len(diagnosis.problem))
-    since = (t[part] - t[0]) / clock(diagnosis)[0]
-    steps = np.diff(since)
-    gap = np.append(steps > LINE_GAP_STEPS * np.median(steps), False)
-    return since, *(np.where(gap, np.nan, value[part]) for value in values)
-
-
-def rolling(diagnosis: Diagnosis, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (m,) of time since the start and the mean of `values` (n,) in equal stretches; NaN in gaps."""
-    t = diagnosis.problem.survey.time
-    edges = np.linspace(t[0], t[-1], STRETCHES + 1)
-    place = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, STRETCHES - 1)
+    since, unit = t - t[0], clock(diagnosis)[0]
+    axis.plot(since[part] / unit, values[part], color=colour, label=name, **DOT_STYLE)
+    # Means in equal stretches; NaN in gaps
+    edges = np.linspace(0.0, since[-1], STRETCHES + 1)
+    place = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, STRETCHES - 1)
     count = np.bincount(place, minlength=STRETCHES)
     mean = np.bincount(place, values, STRETCHES) / np.where(count, count, np.nan)
-    return (0.5 * (edges[1:] + edges[:-1]) - t[0]) / clock(diagnosis)[0], mean
+    middle = 0.5 * (edges[1:] + edges[:-1]) / unit
+    axis.plot(middle, mean, color=INK, linewidth=1.0, label="its running mean")
+    axis.axhline(0.0, color=INK, linewidth=0.5)
+    axis.set_ylabel("nT")
+    return np.asarray(since[part] / unit)
 
 
-def ends(*values: FloatArray, low: float, high: float) -> tuple[float, float]:
-    """Return an axis' limits for `values` (n,) without extremes; `low`, `high`: margins, as fractions."""
+def unjoined(since: FloatArray, values: FloatArray) -> FloatArray:
+    """Return values (m,) with NaN before each gap in the times, so that no line crosses it."""
+    steps = np.diff(since, append=since[-1])
+    return np.where(steps > LINE_GAP_STEPS * np.median(steps), np.nan, values)
+
+
+def ends(*values: FloatArray, margin: float) -> tuple[float, float]:
+    """Return an axis' limits for `values` (n,) without extremes, with a margin, a fraction of their span."""
     first, last = np.nanquantile(np.concatenate(values), [0.002, 0.998])
     span = max(float(last - first), 1e-9)
-    return float(first) - low * span, float(last) + high * span
+    return float(first) - margin * span, float(last) + margin * span
 
 
 def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
@@ -128,29 +125,27 @@ def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
 
 def measured(diagnosis: Diagnosis) -> str:
     """Draw the difference of measured and reference field, before and after, one below the other."""
-    survey, part = diagnosis.problem.survey, thin(len(diagnosis.problem))
+    survey, both = diagnosis.problem.survey, sides(diagnosis)
     figure, axes = canvas(10, 4.0, 2, 1, sharex=True)
-    unit, hours = clock(diagnosis)
-    since, stated = curves(diagnosis, 2.0 * np.sqrt(diagnosis.problem.stated))
-    both = sides(diagnosis)
-    limits = ends(*(residual for residual, _ in both.values()), low=0.15, high=0.15)
+    stated = 2.0 * np.sqrt(diagnosis.problem.stated)[thin(len(survey))]
+    limits = ends(*(residual for residual, _ in both.values()), margin=0.15)
     starts = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
+    starts = starts if starts.size < MAX_SEPARATED_DIVES else starts[:0]
+    unit, hours = clock(diagnosis)
     for axis, (name, (residual, colour)) in zip(axes[:, 0], both.items(), strict=True):
+        since = in_time(diagnosis, axis, residual, colour, name)
+        band = unjoined(since, stated)
         axis.fill_between(
-            since, -stated, stated, color=FAINT, alpha=0.25, linewidth=0, label="±2 sigma as calibrated"
+            since, -band, band, color=FAINT, alpha=0.25, linewidth=0, label="±2 sigma as calibrated"
         )
-        axis.plot(since, residual[part], color=colour, label=name, **DOT_STYLE)
-        axis.plot(*rolling(diagnosis, residual), color=INK, linewidth=1.0, label="its running mean")
-        axis.axhline(0.0, color=INK, linewidth=0.5)
-        for start in starts if starts.size < MAX_SEPARATED_DIVES else ():
+        for start in starts:
             axis.axvline((start - survey.time[0]) / unit, color=FAINT, linewidth=0.4)
         axis.set_ylim(limits)
-        axis.set_ylabel("nT")
         axis.legend(  # above the axes, where it covers nothing
             fontsize=MIN_FONT_PT, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), markerscale=5,
             ncols=3, borderaxespad=0.0,
         )  # fmt: skip
-    lines = f"; grey lines separate the {survey.parts}" if starts.size < MAX_SEPARATED_DIVES else ""
+    lines = f"; grey lines separate the {survey.parts}" if starts.size else ""
     axes[-1, 0].set_xlabel(f"{hours} since the start{lines}")
     return png(figure)
 
@@ -164,21 +159,14 @@ def terms(diagnosis: Diagnosis) -> str | None:
     for axis, finding in zip(axes[:, 0], diagnosis.findings, strict=True):
         added = finding.field(diagnosis.problem)
         alone = added + diagnosis.residual / diagnosis.problem.reference_jacobian
-        since, line = curves(diagnosis, added)
-        axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOT_STYLE)
-        axis.plot(*rolling(diagnosis, alone), color=INK, linewidth=0.9, label="its running mean")
+        since = in_time(diagnosis, axis, alone, FAINT, "all else removed")
+        line = unjoined(since, added[part])
         axis.plot(since, line, color=AFTER, linewidth=1.4, label="what the cause adds")
-        axis.axhline(0.0, color=INK, linewidth=0.5)
-        low, high = ends(alone, low=0.1, high=0.1)
+        low, high = ends(alone, margin=0.1)
         axis.set_ylim(min(low, 0.0), max(high, 0.0))
-        axis.set_ylabel("nT")
         axis.set_title(label(*finding.candidate.group), fontsize=MIN_FONT_PT + 1.0, loc="left")
     axes[-1, 0].set_xlabel(f"{clock(diagnosis)[1]} since the start")
-    handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(
-        *handles, fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=3, markerscale=5
-    )
-    return png(figure)
+    return png(figure, axes[0, 0])
 
 
 def spectrum(diagnosis: Diagnosis) -> str:
@@ -198,8 +186,12 @@ def spectrum(diagnosis: Diagnosis) -> str:
     figure, axes = canvas(5.8, 4.0)
     axis = axes[0, 0]
     for name, (values, colour) in sides(diagnosis).items():
-        frequency, density = _density(values, interval)
-        axis.loglog(frequency, density, color=colour, label=name)
+        # Means of the periodogram in bins that widen with frequency
+        frequency, power = periodogram(values, 1.0 / interval, detrend="constant")
+        starts = np.unique(np.geomspace(1, len(frequency) - 1, 60).astype(int))
+        size = np.diff(starts, append=len(frequency))
+        f, density = (np.add.reduceat(x, starts) / size for x in (frequency, power))
+        axis.loglog(f, np.sqrt(density), color=colour, label=name)
     noise = diagnosis.fit.noise
     f = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
     lags = np.exp(-2j * np.pi * f[:, None] * interval * np.arange(1, len(noise.ar) + 1))
@@ -208,70 +200,54 @@ def spectrum(diagnosis: Diagnosis) -> str:
     axis.loglog(f, model, "--", color=INK, linewidth=1.2, label="noise model")
     axis.yaxis.set_major_formatter(LogFormatter())
     axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
-    axis.tick_params(which="minor", labelsize=MIN_FONT_PT, colors=INK)
     axis.set_xlabel("frequency (Hz)")
     axis.set_ylabel("amplitude density (nT/√Hz)")
-    _periods(axis)
-    figure.legend(fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=3)
-    return png(figure)
-
-
-def _density(values: FloatArray, interval: float) -> tuple[list[float], list[float]]:
-    """Return frequencies (Hz) and amplitude densities (nT/√Hz), in bins that widen with frequency."""
-    frequency, power = periodogram(values, 1.0 / interval, detrend="constant")
-    edges = np.unique(np.geomspace(1, len(frequency), 60).astype(int))
-    where = [slice(a, b) for a, b in pairwise(edges)]
-    return [float(frequency[w].mean()) for w in where], [float(np.sqrt(power[w].mean())) for w in where]
-
-
-def _periods(axis: Any) -> None:
-    """Name periods above an axis of frequencies, as people think of them."""
-    low, high = axis.get_xlim()
-    above = axis.secondary_xaxis("top")
-    seen = {1.0 / period: name for period, name in PERIOD_LABELS.items() if low < 1.0 / period < high}
-    above.xaxis.set_major_locator(FixedLocator(list(seen)))
-    above.set_xticks(list(seen), list(seen.values()))
-    above.xaxis.set_minor_locator(NullLocator())
-    above.xaxis.set_minor_formatter(NullFormatter())
+    # Periods above, as people think of them; matplotlib asks for that of 0 Hz, too
+    unit, hours = clock(diagnosis)
+    inverse = lambda value: 1.0 / unit / np.maximum(value, 1e-12)  # noqa: E731 - a conversion is one line
+    above = axis.secondary_xaxis("top", functions=(inverse, inverse))
+    above.set_xlabel(f"period ({hours})")
     above.tick_params(labelsize=MIN_FONT_PT, colors=INK)
-    above.spines["top"].set_visible(False)
+    return png(figure, axis)
 
 
 def channels(diagnosis: Diagnosis) -> str:
     """Draw the difference against the channels that it follows most: mean and scatter, all at one scale."""
     survey, both = diagnosis.problem.survey, sides(diagnosis)
-    units = {name: channel.unit for name, channel in survey.channels.items() if name not in survey.still}
-    values = {name: survey.channels[name].values for name in units}
+    series = {
+        name: (one.values, one.unit) for name, one in survey.channels.items() if name not in survey.still
+    }
     if survey.attitude is not None:
-        angles = ("roll", "pitch", "heading")
-        units |= dict.fromkeys(angles, "deg")
-        values |= dict(zip(angles, survey.attitude.T, strict=True))
-    binned = {name: [_binned(values[name], residual) for residual, _ in both.values()] for name in units}
+        angles = zip(("roll", "pitch", "heading"), survey.attitude.T, strict=True)
+        series |= {name: (values, "deg") for name, values in angles}
+    binned = {
+        name: [_binned(values, residual) for residual, _ in both.values()]
+        for name, (values, _) in series.items()
+    }
     power = {name: float(np.nansum(count * mean**2)) for name, [(count, mean, _), _] in binned.items()}
     names = sorted(power, key=power.__getitem__, reverse=True)[:CHANNELS]
     columns = min(3, max(len(names), 1))
     rows = max(-(-len(names) // columns), 1)
     figure, axes = canvas(10, 2.4 * rows, rows, columns, sharey=True)
-    seen = []
+    drawn = []
     for axis, name in zip(axes.flat, names, strict=False):
-        middle = np.linspace(values[name].min(), values[name].max(), 2 * BINS + 1)[1::2]
+        values, unit = series[name]
+        middle = np.linspace(values.min(), values.max(), 2 * BINS + 1)[1::2]
         for (_, mean, spread), (side, (_, colour)) in zip(binned[name], both.items(), strict=True):
             axis.vlines(middle, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=5)
             axis.plot(middle, mean, "o-", color=colour, markersize=2.5, linewidth=1.2, label=side)
-            seen += [mean - spread, mean + spread]
+            drawn += [mean - spread, mean + spread]
         axis.axhline(0.0, color=INK, linewidth=0.5)
-        axis.set_xlabel(f"{name} ({units[name]})" if units[name] else name)
+        axis.set_xlabel(f"{name} ({unit})" if unit else name)
         axis.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
     for axis in axes[:, 0]:
         axis.set_ylabel("difference (nT)")
-    if seen:  # a bin or two of wild samples do not set the scale
-        low, high = np.nanquantile(seen, [0.02, 0.98])
+    if drawn:  # a bin or two of wild samples do not set the scale
+        low, high = np.nanquantile(drawn, [0.02, 0.98])
         axes[0, 0].set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
-        handles = axes[0, 0].get_legend_handles_labels()
-        figure.legend(*handles, fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=2)
-    return png(figure)
+    return png(figure, axes[0, 0])
 
 
 def _binned(values: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -292,32 +268,21 @@ def track(diagnosis: Diagnosis) -> str | None:
     part = thin(len(place))
     north, east = np.ptp(place[:, :2], axis=0)
     scale, unit = (1e3, "km") if max(north, east) > 2e3 else (1.0, "m")
-    if east > 2.0 * north:  # a long track lies better above the other one
-        height = 0.6 + 2.0 * (0.35 + 8.0 * max(float(north / east), 0.1))
-        figure, axes = canvas(10, height, 2, 1, sharex=True, sharey=True)
-    else:
-        figure, axes = canvas(10, 4.2, 1, 2, sharex=True, sharey=True)
+    # A long track lies better above the other one
+    shape = (2, 1) if east > 2.0 * north else (1, 2)
+    height = 0.6 + 2.0 * (0.35 + 8.0 * max(float(north / east), 0.1)) if east > 2.0 * north else 4.2
+    figure, axes = canvas(10, height, *shape, sharex=True, sharey=True)
     limit = float(np.quantile(np.abs(diagnosis.before), 0.98)) + 1e-9
-    dots = None
+    style: dict[str, Any] = {"s": 6, "cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     for axis, (title, (values, _)) in zip(axes.flat, sides(diagnosis).items(), strict=True):
-        dots = axis.scatter(
-            place[part, 1] / scale,
-            place[part, 0] / scale,
-            c=values[part],
-            s=6,
-            cmap="RdBu_r",
-            vmin=-limit,
-            vmax=limit,
-        )
+        dots = axis.scatter(place[part, 1] / scale, place[part, 0] / scale, c=values[part], **style)
         axis.set_facecolor("#f2f4f6")  # so that white, no difference, is seen
         axis.set_aspect("equal", adjustable="box")
         axis.xaxis.set_major_locator(MaxNLocator(4))
         axis.set_title(title, fontsize=MIN_FONT_PT + 1.0, loc="left")
-    for axis in axes[-1]:
         axis.set_xlabel(f"east ({unit})")
-    for axis in axes[:, 0]:
         axis.set_ylabel(f"north ({unit})")
-    assert dots is not None
+        axis.label_outer()
     bar = figure.colorbar(dots, ax=axes, shrink=0.8, extend="both")
     bar.set_label("measured − reference (nT)", size=MIN_FONT_PT)
     bar.ax.tick_params(labelsize=MIN_FONT_PT)
