@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from magbridge.bridge.sensor_stream import check
+from magbridge.bridge.sensor import check
 from magbridge.calibration.model import Calibration, Parameter, identity
 from magbridge.config import (
     Align,

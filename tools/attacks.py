@@ -27,7 +27,7 @@ from rich.console import Console
 from rig import Rig
 from studies import table
 
-from magbridge.link.ftp import FTP_HEADER, Opcode
+from magbridge.link.files import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Signing
 
 KEY = bytes(range(1, 33))

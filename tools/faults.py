@@ -21,9 +21,8 @@ import xarray as xr
 from studies import Column, Row, Study, study_options
 
 from magbridge.arrays import FloatArray
-from magbridge.bridge import states
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.events import Event, StartEvent, standstill
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
@@ -238,7 +237,7 @@ def stalls(length_us: int, every_us: int = 600_000_000) -> Callable[[Events], Ev
                 waiting.append(event)
                 continue
             if waiting:
-                yield Event(end_us, Channel.STATE, states.standstill(end_us, length_us))
+                yield Event(end_us, Channel.STATE, standstill(end_us, length_us))
                 for channel in (Channel.LINK, Channel.SENSOR):  # as the live edge reads them
                     if data := b"".join(one.data for one in waiting if one.channel == channel):
                         yield Event(end_us, channel, data)

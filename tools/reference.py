@@ -112,8 +112,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str
 def parameters() -> Iterator[str]:
     """Yield the page of the parameters on the link, for a bridge whose telemetry is ``battpos``."""
     from magbridge.config import Align, Telemetry  # noqa: PLC0415
-    from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS  # noqa: PLC0415
     from magbridge.link.parameters import alignment, file_rate, rates, telemetry_ages  # noqa: PLC0415
+    from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS  # noqa: PLC0415
 
     table = (
         *alignment(Align()),

@@ -21,7 +21,7 @@ import numpy as np
 from small import bridge_text
 from studies import command_line
 
-from magbridge.bridge import states
+from magbridge.bridge import events
 from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import save
@@ -130,7 +130,7 @@ class Soak:
             count = int(self.rng.integers(500, 3000))
             waited = b"".join([self.reading() for _ in range(count)])
             end_us = BEGIN_US + self.made * 1000 + 400
-            self.feed(Channel.STATE, states.standstill(end_us, count * 1000))
+            self.feed(Channel.STATE, events.standstill(end_us, count * 1000))
             self.telemetry()
             self.feed(Channel.SENSOR, waited)
         elif which == "spike":

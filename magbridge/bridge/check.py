@@ -1,31 +1,44 @@
-"""Find all faults of a ``bridge.toml`` without opening a port."""
+"""Find the faults of a ``bridge.toml``: in the file, or by the messages that arrive on its ports."""
 
 from __future__ import annotations
 
 import glob
 import os
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import partial
+from math import isnan
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from magbridge.bridge.bus_port import sensor_port
+from msgspec.structs import replace
+
+from magbridge.bridge.devices import sensor_port
+from magbridge.bridge.drive import drive
+from magbridge.bridge.events import Event, HostClock
+from magbridge.bridge.heading import nmea_port
 from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
-from magbridge.bridge.nmea import nmea_port
-from magbridge.bridge.sensor_stream import open_correction, open_drivers, other_calibrations, unmet
+from magbridge.bridge.live import LiveEdge
+from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.port import cut
+from magbridge.bridge.run import Keeper, leave_wrong_devices, ports
+from magbridge.bridge.sensor import open_correction, open_drivers, other_calibrations, unmet
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, Sensor, load, parse
 from magbridge.errors import ConfigError, MagbridgeError
-from magbridge.link.message_rates import check_publish
-from magbridge.link.telemetry import TelemetryMap
-from magbridge.mavlink import load_key
+from magbridge.link.publish import check_publish
+from magbridge.link.telemetry import MIN_RATE_FRACTION, TelemetryMap
+from magbridge.link.vehicle import VehicleClock
+from magbridge.mavlink import Codec, Message, load_key, spec
+from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.records import Channel
 from magbridge.sensors import is_scalar, open_driver
 from magbridge.toml import load_toml
 
-__all__ = ["ConfigFault", "access", "findings"]
+__all__ = ["LISTEN_TIME_S", "ConfigFault", "LiveCheck", "access", "findings"]
 
 CALIBRATION_KEYS = ("calibration.file", "learning.prior")
 MIN_FREE_BYTES = 100e6
@@ -249,3 +262,235 @@ def _log(config: Config) -> Iterator[ConfigFault]:
         yield ConfigFault(fatal=False, text=f"{key}: {there} cannot be written to")
     elif (free := shutil.disk_usage(there).free) < MIN_FREE_BYTES:
         yield ConfigFault(fatal=False, text=f"{key}: {free / 1e6:.0f} MB are free")
+
+
+LISTEN_TIME_S = 20.0
+"""s for which the ports are read."""
+RATE_INTERVALS = 4
+"""Intervals of that time over which rates are measured: after the first one, rates are requested."""
+SENT: Final = frozenset(spec(name).id for name in ("HEARTBEAT", "TIMESYNC", "COMMAND_LONG"))
+"""Messages that the check sends: routers forward only to a sender of heartbeats."""
+SYSTEM_TIME: Final = spec("SYSTEM_TIME").id
+ARDUPILOT_GROUPS: Final = {
+    "ATTITUDE": "EXTRA1", "VFR_HUD": "EXTRA2", "EKF_STATUS_REPORT": "EXTRA3", "BATTERY_STATUS": "EXTRA3",
+    "SYSTEM_TIME": "EXTRA3", "ESC_TELEMETRY_1_TO_4": "EXTRA3", "RPM": "EXTRA3", "SYS_STATUS": "EXT_STAT",
+    "GPS_RAW_INT": "EXT_STAT", "GLOBAL_POSITION_INT": "POSITION", "LOCAL_POSITION_NED": "POSITION",
+    "SERVO_OUTPUT_RAW": "RC_CHAN", "RAW_IMU": "RAW_SENS", "SCALED_PRESSURE": "RAW_SENS",
+}  # fmt: skip
+"""Groups by which ArduPilot sets rates (``ArduPlane/GCS_MAVLink_Plane.cpp``, ``STREAM_*_msgs``)."""
+MAX_CLOCK_DIFFERENCE_S = 2.0
+"""s between the host's clock and SYSTEM_TIME above which the difference is reported."""
+YEAR_2001_US = 10**15
+"""Lowest SYSTEM_TIME that is a date, µs; before, the autopilot does not know the time."""
+NO_READING = {
+    MAG_PORT_STATE.LOST: "the port is not open; the bridge would wait for it",
+    MAG_PORT_STATE.SILENT: "check power, cable, sensor.baudrate and sensor.options",
+    MAG_PORT_STATE.ABSENT: "check power, cable, sensor.baudrate and sensor.options",
+}
+
+
+class Arrived(NamedTuple):
+    """A message that arrived, or that the bridge needs."""
+
+    name: str
+    sender: str
+    """System and component, ``1:1``."""
+    rate_hz: float
+    """Rate in the last quarter of the check, after the requests; of a rarer message, over all of it."""
+    needed_hz: float
+    """Rate that the bridge needs; 0 if it needs none."""
+
+
+class LiveCheck:
+    """Open the ports of a configuration for some seconds and count the messages.
+
+    The bridge's own pipeline reads the bytes, so that the sensor is started and messages are requested as by
+    ``run``. No sample and no fix is sent, and no log is written.
+
+    Parameters
+    ----------
+    config : Config
+        A configuration with which the bridge would start.
+    duration_s : float
+        s for which the ports are read.
+
+    Attributes
+    ----------
+    arrived : list of Arrived
+        Messages by sender, the needed ones first.
+    readings_hz : dict of str to float
+        Rate of each sensor's readings, by the sensor's name.
+    faults : list of ConfigFault
+        One warning for each thing that is missing, with its remedy.
+    """
+
+    def __init__(self, config: Config, duration_s: float) -> None:
+        self.arrived: list[Arrived] = []
+        self.readings_hz: dict[str, float] = {}
+        self.faults: list[ConfigFault] = []
+        own = self._link = config.link
+        self._config, self._duration_us, self._begin_us = config, round(duration_s * 1e6), 0
+        self._ear = Codec(0, 0)
+        self._counts: Counter[tuple[int, int, int]] = Counter()
+        self._late_counts: Counter[tuple[int, int, int]] = Counter()
+        self._telemetry = TelemetryMap(config.telemetry, own.autopilot, config.path)
+        self._values: Counter[str] = Counter()
+        self._unknown_values: Counter[str] = Counter()
+        self._clock_difference_s = 0.0
+
+    def listen(self) -> None:
+        """Read the ports, then fill the attributes."""
+        config, link = self._config, self._link
+        keeper, clock = Keeper(config), HostClock()
+        key = load_key(config.resolve(link.signing_key)) if link.signing_key else None
+        start = keeper.start(clock.now_us())
+        others = other_calibrations(config)
+        pipeline = Pipeline(replace(config, log=None), first_calibration(config), start, key, more=others)
+        pipeline.component.streams.interval_us = self._duration_us // RATE_INTERVALS
+        self._begin_us = start.time_us
+        link_port, sensor_ports = ports(config)
+        edge = LiveEdge({Channel.LINK: link_port, **sensor_ports}, clock)
+        keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
+
+        def finish_event(time_us: int) -> None:
+            leave_wrong_devices(pipeline, sensor_ports)
+            if time_us - self._begin_us > self._duration_us:
+                edge.stop()
+
+        try:
+            drive(pipeline, _Tap(edge, self._receive), None, finish_event)
+        finally:
+            keeper.save(pipeline, last=True)
+            edge.close()
+        self._compare(pipeline)
+
+    def _receive(self, event: Event) -> None:
+        """Count the messages and the values of telemetry in an event of the link."""
+        late = event.time_us - self._begin_us >= self._duration_us * (RATE_INTERVALS - 1) // RATE_INTERVALS
+        for message in self._ear.parse(event.data, final=self._link.shared):
+            if not message.known:
+                continue
+            key = message.system, message.component, message.id
+            self._counts[key] += 1
+            self._late_counts[key] += late
+            if message.system == self._link.system:
+                self._read(message, event.time_us)
+
+    def _read(self, message: Message, time_us: int) -> None:
+        """Read the date and the values of telemetry in a message of the vehicle."""
+        if message.id == SYSTEM_TIME and message["time_unix_usec"] > YEAR_2001_US:
+            self._clock_difference_s = (time_us - message["time_unix_usec"]) * 1e-6
+        for name, value, _ in self._telemetry.values(message, time_us, VehicleClock()):
+            if self._config.telemetry[name].component in (None, message.component):
+                counts = self._unknown_values if isnan(value) else self._values
+                counts[name] += 1
+
+    def _rate(self, key: tuple[int, int, int]) -> float:
+        """Return the rate of a message in Hz."""
+        late_s = self._duration_us * 1e-6 / RATE_INTERVALS
+        if late := self._late_counts[key]:
+            return late / late_s
+        return self._counts[key] / (late_s * RATE_INTERVALS)
+
+    def _compare(self, pipeline: Pipeline) -> None:
+        """List the messages that arrived, and report the missing ones."""
+        streams, system = pipeline.component.streams, self._link.system
+        needed = {(system, *stream): streams.rate_of(stream) for stream in streams.needed}
+        for key in sorted(needed.keys() | self._counts.keys(), key=lambda key: (key not in needed, key)):
+            sender = f"{key[0]}:{key[1]}"
+            self.arrived.append(Arrived(spec(key[2]).name, sender, self._rate(key), needed.get(key, 0.0)))
+        texts = [
+            text for severity, text in pipeline.component.announcer.texts if severity <= MAV_SEVERITY.WARNING
+        ]
+        denied = streams.denied.values()
+        for text in dict.fromkeys(texts):
+            if text not in denied:
+                self._warn("", text)
+        self._compare_sensor(pipeline)
+        heartbeat = system, self._link.autopilot, spec("HEARTBEAT").id
+        if heartbeat not in self._counts:
+            self._warn("link", self._no_autopilot())
+            return
+        for one in self.arrived:
+            is_autopilot = one.sender == f"{system}:{self._link.autopilot}"
+            # another component may send a message that the autopilot is expected to send
+            rate_hz = max(one.rate_hz, streams.measured.get(one.name, 0.0)) if is_autopilot else one.rate_hz
+            if rate_hz < MIN_RATE_FRACTION * one.needed_hz:
+                self._warn(
+                    "link", _too_rare(one, streams.denied.get(one.name, ""), is_autopilot=is_autopilot)
+                )
+        for name in self._config.telemetry:
+            if not self._values[name]:
+                self._warn(f"telemetry.{name}", self._no_value(name))
+        if abs(self._clock_difference_s) > MAX_CLOCK_DIFFERENCE_S:
+            text = f"the host's clock differs from SYSTEM_TIME by {self._clock_difference_s:+.0f} s"
+            self._warn("link", f"{text}: set it by NTP or GPS")
+
+    def _compare_sensor(self, pipeline: Pipeline) -> None:
+        for stream in pipeline.streams:
+            self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
+            if not stream.samples:
+                name, remedy = stream.sensor.driver, NO_READING[MAG_PORT_STATE(stream.line.state)]
+                text = f"{name}: no reading in {self._duration_us * 1e-6:.0f} s: {remedy}"
+                self._warn(stream.sensor.key, text)
+
+    def _no_autopilot(self) -> str:
+        """Return the faults of a link without a heartbeat of the autopilot."""
+        text = f"no HEARTBEAT of {self._link.system}:{self._link.autopilot}"
+        senders = sorted({f"{system}:{component}" for system, component, _ in self._counts})
+        if not senders:
+            return f"{text} and no other message: check link.url, the baud rate and the autopilot's port"
+        return f"{text}, but messages of {', '.join(senders)}: check link.system and link.autopilot"
+
+    def _no_value(self, name: str) -> str:
+        """Return why a parameter has no value, and the remedy."""
+        wanted = self._config.telemetry[name]
+        if self._unknown_values[name]:
+            return f"{wanted.message}.{wanted.field} is marked as not known by its sender"
+        number = spec(wanted.message).id
+        senders = [key[1] for key in self._counts if key[0] == self._link.system and key[2] == number]
+        if not senders:
+            return f"no {wanted.message} arrives: start its sender, or name another message"
+        components = ", ".join(map(str, sorted(senders)))
+        return f"{wanted.message} of component {components} does not match: check match and component"
+
+    def _warn(self, key: str, text: str) -> None:
+        place = f"{self._config.path}: {key}" if key else f"{self._config.path}"
+        self.faults.append(ConfigFault(fatal=False, text=f"{place}: {text}"))
+
+
+def _too_rare(arrived: Arrived, denied: str, *, is_autopilot: bool) -> str:
+    """Return the fault of a message that arrives too rarely, with the remedy."""
+    arrives = f"arrives at {arrived.rate_hz:.2g} Hz" if arrived.rate_hz else "does not arrive"
+    why = f" ({denied})" if denied else ""
+    remedy = f"request it of PX4 by `mavlink stream -s {arrived.name} -r {arrived.needed_hz:g}`"
+    if not is_autopilot:
+        remedy = f"set its rate in {arrived.sender}, or correct telemetry.*.component"
+    elif group := ARDUPILOT_GROUPS.get(arrived.name):
+        remedy = f"set SRn_{group} (MAVn_{group} since ArduPilot 4.7) to {arrived.needed_hz:g}, or {remedy}"
+    return f"{arrived.name} {arrives} and is needed at {arrived.needed_hz:g} Hz{why}: {remedy}"
+
+
+class _Tap:
+    """An edge whose link events are counted, and over which only :data:`SENT` goes out."""
+
+    def __init__(self, edge: LiveEdge, receive: Callable[[Event], None]) -> None:
+        self._edge, self._receive = edge, receive
+
+    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield the events of the edge."""
+        for event in self._edge.events(deadline):
+            if event.channel is Channel.LINK:
+                self._receive(event)
+            yield event
+
+    def send(self, number: int, data: bytes) -> None:
+        """Send to a sensor; send only permitted messages to the link."""
+        if number == Channel.LINK:
+            data = b"".join(frame for frame in cut(data) if int.from_bytes(frame[7:10], "little") in SENT)
+        if data:
+            self._edge.send(number, data)
+
+    def credit(self, frames: list[bytes]) -> None:
+        """Report to the link which frames are signed with the key."""
+        self._edge.credit(frames)

@@ -8,7 +8,7 @@ from typing import Protocol
 from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.bridge.learning import first_calibration
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.sensor_stream import other_calibrations
+from magbridge.bridge.sensor import other_calibrations
 from magbridge.config import Config
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import load_key

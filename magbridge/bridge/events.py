@@ -1,16 +1,30 @@
-"""Events: all inputs of the bridge, which a log must therefore contain."""
+"""Events, all inputs of the bridge: how they are announced, recorded for the log and declared in it."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
+from struct import Struct
+from typing import Any, Final
 
 import msgspec
 
-from magbridge.mavlink import Stream
-from magbridge.mavlink.enums import MAG_PORT_NAME
+from magbridge.bridge.port import Port
+from magbridge.bridge.position import CLOCK_SET_US
+from magbridge.bridge.sensor import SensorLine
+from magbridge.config import Config, Sensor, Telemetry
+from magbridge.link.output import Announcer
+from magbridge.mavlink import Codec, Stream, spec
+from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
 from magbridge.records import Channel
+from magbridge.sensors import Driver, is_scalar
+from magbridge.version import __version__
 
-__all__ = ["Event", "HostClock", "StartEvent", "port_number", "source_of"]
+__all__ = [
+    "Event", "HostClock", "Recorder", "StartEvent", "StateChanges", "beginning", "clock_step", "declarations",
+    "interleaved", "log_state", "notice", "opened", "port", "port_number", "source_of", "standstill",
+    "too_slow",
+]  # fmt: skip
 
 
 class StartEvent(msgspec.Struct, frozen=True):
@@ -87,3 +101,293 @@ class HostClock:
             before, utc, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
             if after - before < 1000 * self.AT_ONCE_US:
                 return (utc - before) // 1000
+
+
+def _frame(name: str, **fields: object) -> bytes:
+    return Codec(0, 0).pack(name, **fields)
+
+
+def clock_step(time_us: int, step_us: int) -> bytes:
+    """Return the frame for a step of the host's clock by `step_us` µs."""
+    return _frame("MAG_CLOCK_STEP", time_usec=time_us + step_us, step=step_us)
+
+
+def standstill(time_us: int, duration_us: int) -> bytes:
+    """Return the frame for a stall of the bridge of `duration_us` µs that ends now."""
+    return _frame("MAG_HOST_STALL", time_usec=time_us, duration=min(duration_us, 2**32 - 1))
+
+
+def interleaved(count: int) -> bytes:
+    """Return the frame for `count` sent frames that are not in the log."""
+    return _frame("MAG_INTERLEAVED", count=count)
+
+
+def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:
+    """Return the frame of a text that the bridge forwards, at most 50 characters."""
+    return _frame("STATUSTEXT", severity=int(severity), text=text)
+
+
+def port(number: int, link: Port, reason: str) -> bytes:
+    """Return the frame for a port that opened (no `reason`) or that is not open, with the reason."""
+    state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
+    # the name last, because the end of a long text is cut off
+    why = f"{reason}: {link.name}" if reason else ""
+    return _frame("MAG_PORT", port=number, state=int(state), dropped=link.dropped, reason=why)
+
+
+def too_slow(number: int, link: Port) -> bytes:
+    """Return the frame for an open port that is too slow for the sent data."""
+    why = f"too slow, {link.overrun} bytes not sent so far"
+    state = int(MAG_PORT_STATE.OK)
+    return _frame("MAG_PORT", port=number, state=state, dropped=link.dropped, reason=why)
+
+
+def opened(name: int) -> bytes:
+    """Return the frame for a port that opened, for a replay, which has no `Port`."""
+    return _frame("MAG_PORT", port=int(name), state=int(MAG_PORT_STATE.OK))
+
+
+def log_state(reason: str, lost: int) -> bytes:
+    """Return the frame for the log's state: written (no `reason`) or not, and the lost records."""
+    state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
+    return _frame("MAG_PORT", port=int(MAG_PORT_NAME.LOG), state=int(state), dropped=lost, reason=reason)
+
+
+INTERLEAVED = spec("MAG_INTERLEAVED").id
+CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
+    spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_HOST_STALL")
+)
+GRACE_US = 500_000
+"""µs after a standstill within which more of what waited comes: what a full buffer had no room for."""
+NOTICE_US = 1_000_000
+"""µs from which on a standstill is announced."""
+
+
+class StateChanges:
+    """Record and announce the changes that the frames of :mod:`.states` report.
+
+    Parameters
+    ----------
+    codec : Codec
+        The link's: its ``utc_offset_us`` follows the host's clock.
+    announcer : Announcer
+    sensors : mapping of int to SensorLine
+        By sensor id.
+
+    Attributes
+    ----------
+    log_state : MAG_LOG_STATE
+    log_lost : int
+        Records that the log has lost.
+    since_us, until_us : int
+        µs: inputs up to `until_us` may have waited since `since_us`.
+    """
+
+    def __init__(self, codec: Codec, announcer: Announcer, sensors: Mapping[int, SensorLine]) -> None:
+        self._codec, self._announcer, self._sensors = codec, announcer, sensors
+        self.log_state, self.log_lost = MAG_LOG_STATE.OFF, 0
+        self.since_us = self.until_us = 0
+        self._clock_unset = False
+
+    @staticmethod
+    def held_up(data: bytes) -> int:
+        """Return the duration (µs) of a stall of the bridge by these frames; 0 without one."""
+        return sum(one["duration"] for one in Codec(0, 0).parse(data) if one.id == STANDSTILL)
+
+    def receive(self, data: bytes, time_us: int) -> None:
+        """Process frames received at `time_us`."""
+        for message in Codec(0, 0).parse(data):
+            if message.id == CLOCK_STEP:
+                self._codec.utc_offset_us += message["step"]
+                step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
+                self._announcer.send_statustext(step, MAV_SEVERITY.NOTICE)
+                self.check_clock()
+            elif message.id == INTERLEAVED:  # in a replay
+                self._codec.skip(message["count"])
+            elif message.id == NOTICE:
+                self._announcer.send_statustext(message["text"], MAV_SEVERITY(message["severity"]))
+            elif message.id == STANDSTILL:
+                self._stood_still(time_us, message["duration"])
+            elif message.id == PORT:
+                well = message["state"] == MAG_PORT_STATE.OK
+                self._port(message["port"], well, message["reason"], message["dropped"], time_us)
+
+    def check_clock(self) -> None:
+        """Announce that the host's clock was never set."""
+        unset = self._codec.utc_us < CLOCK_SET_US
+        if unset or self._clock_unset:
+            text = "host clock was never set: no date, no main field" if unset else "host clock is set"
+            severity = MAV_SEVERITY.WARNING if unset else MAV_SEVERITY.INFO
+            self._announcer.state("clock", text, severity)
+        self._clock_unset = unset
+
+    def _stood_still(self, time_us: int, duration_us: int) -> None:
+        if time_us > self.until_us:  # else one more of a row of them
+            self.since_us = time_us - duration_us
+        self.until_us = time_us + GRACE_US
+        if duration_us >= NOTICE_US:
+            text = f"stood still for {duration_us * 1e-6:.1f} s: late samples are flagged"
+            self._announcer.send_statustext(text, MAV_SEVERITY.WARNING)
+
+    def _port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
+        severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR
+        if port == MAG_PORT_NAME.LOG:
+            self.log_state = MAG_LOG_STATE.OK if well else MAG_LOG_STATE.FAILED
+            self.log_lost = dropped
+            self._announcer.state("log", f"log: {reason or 'being written'}", severity)
+        elif port != MAG_PORT_NAME.LINK:
+            if (sensor := self._sensors.get(source_of(port)[1])) is not None:
+                sensor.opened(time_us) if well else sensor.lost(reason)
+        else:
+            severity = MAV_SEVERITY.WARNING if well and reason else severity
+            self._announcer.state("link", f"link: {reason or 'open'}", severity)
+
+
+BYTES: Final = spec("MAG_SENSOR_BYTES")
+RAW: Final = spec("MAG_RAW")
+BYTES_HEADER: Final = Struct("<BB")
+"""The fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
+RECORDED_BYTES: Final = BYTES.fields["data"].count
+SENT, LINK, SENSOR, STATE = Channel
+
+
+class Recorder:
+    """Collect records until :meth:`drain`.
+
+    Attributes
+    ----------
+    active : bool
+        Whether records are collected and counted; False without a log.
+    count : int
+        Records collected since the start.
+    """
+
+    def __init__(self, system: int, component: int, *, active: bool) -> None:
+        self.active = active
+        self.count = 0
+        self._records: list[tuple[int, Channel, bytes]] = []
+        self._scribe = Codec(system, component)
+
+    def sent(self, frames: list[tuple[int, bytes]]) -> None:
+        """Record the frames sent over the link, each with its event time (µs)."""
+        if self.active and frames:
+            self._records += [(time_us, SENT, frame) for time_us, frame in frames]
+            self.count += len(frames)
+
+    def link(self, time_us: int, frames: list[bytes]) -> None:
+        """Record the frames that came over the link."""
+        for frame in frames:
+            self._add(time_us, LINK, frame)
+
+    def sensor(self, time_us: int, data: bytes, sensor_id: int = 0) -> None:
+        """Record bytes as they came from a sensor."""
+        if not self.active:
+            return
+        while data:
+            piece, data = data[:RECORDED_BYTES], data[RECORDED_BYTES:]
+            frame = self._scribe.frame(BYTES, BYTES_HEADER.pack(sensor_id, len(piece)) + piece)
+            self._add(time_us, SENSOR, frame)
+
+    def state(self, time_us: int, frame: bytes) -> None:
+        """Record a frame of :mod:`magbridge.bridge.events`, or of the run's start."""
+        self._add(time_us, STATE, frame)
+
+    def raw(self, time_us: int, payload: bytes) -> None:
+        """Record a MAG_RAW in the log only, because a calibration needs every sample."""
+        self._add(time_us, STATE, self._scribe.frame(RAW, payload))
+
+    def drain(self) -> list[tuple[int, Channel, bytes]]:
+        """Return and clear the records collected so far, in order: event time in µs, channel, frame."""
+        records, self._records = self._records, []
+        return records
+
+    def _add(self, time_us: int, channel: Channel, frame: bytes) -> None:
+        if self.active:
+            self._records.append((time_us, channel, frame))
+            self.count += 1
+
+
+def beginning(
+    config: Config, start: StartEvent, calibration_id: int, parameters: Mapping[str, float]
+) -> list[bytes]:
+    """Return the frames that record how a run started, with these values of the parameters by name."""
+    codec = Codec(config.link.system, config.link.component)
+    frames = [
+        codec.pack(
+            "MAG_BRIDGE_START",
+            time_usec=start.time_us,
+            signing_timestamp=start.signing_timestamp,
+            calibration_id=calibration_id,
+            config_digest=bytes.fromhex(config.digest),
+            version=__version__,
+            driver=config.sensor.driver,
+        )
+    ]
+    for link, system, sender, ahead, stamp in start.signing_streams:
+        stream = {"link": link, "system": system, "sender": sender, "ahead": ahead, "stamp": stamp}
+        frames.append(codec.pack("MAG_SIGNING_STREAM", **stream))
+    for name, value in parameters.items():
+        real = MAV_PARAM_TYPE.REAL32
+        frames.append(codec.pack("PARAM_VALUE", param_id=name, param_value=value, param_type=real))
+    return frames
+
+
+def declarations(
+    system: int,
+    component: int,
+    telemetry: Mapping[str, Telemetry],
+    nt_per_count: float = 0.0,
+    settings: Mapping[str, float] | None = None,
+    sensors: Sequence[tuple[Sensor, Driver]] = (),
+) -> list[bytes]:
+    """Return the frames that declare source and correction of each column of the log.
+
+    Parameters
+    ----------
+    system, component : int
+        The bridge's own.
+    telemetry : mapping of str to Telemetry
+        By parameter.
+    nt_per_count : float
+        nT per count of the sensor, 0 for one without counts. A reader then takes the channels from the
+        counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
+    settings : mapping of str to float, optional
+        What decides about flags and sigmas, by its key in the configuration: attributes of the log.
+    sensors : sequence of (Sensor, Driver)
+        The sensors after the first. Their columns have the name of the sensor: ``NAME`` for a scalar, else
+        ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the reading.
+    """
+    codec = Codec(system, component)
+    columns: list[dict[str, Any]] = [
+        {"column": key, "scale": value} for key, value in (settings or {}).items()
+    ]
+    columns += [
+        {
+            "column": name,
+            "unit": one.unit,
+            "message": one.message,
+            "field": one.field,
+            "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
+            "scale": one.scale,
+            "offset": one.offset,
+            "component": one.component or 0,
+        }
+        for name, one in telemetry.items()
+    ]
+    if nt_per_count:
+        raw = {"unit": "nT", "message": "MAG_RAW", "scale": nt_per_count}
+        columns += [raw | {"column": f"mag_{axis}", "field": f"count_{axis}"} for axis in "xyz"]
+    for sensor, driver in sensors:
+        columns += _sensor_columns(sensor, driver)
+    return [codec.pack("MAG_COLUMN", **column) for column in columns]
+
+
+def _sensor_columns(sensor: Sensor, driver: Driver) -> list[dict[str, Any]]:
+    """Return the columns of a sensor after the first."""
+    raw: dict[str, Any] = {"message": "MAG_RAW", "match": f"sensor_id={sensor.id}", "unit": "nT"}
+    prefix = "count_" if driver.nt_per_count else ""
+    raw["scale"] = driver.nt_per_count or 1.0
+    names = {"x": sensor.name} if is_scalar(driver) else {axis: f"{sensor.name}_{axis}" for axis in "xyz"}
+    columns = [raw | {"column": name, "field": f"{prefix}{axis}"} for axis, name in names.items()]
+    time = {"column": f"{sensor.name}_time", "field": "time_usec", "unit": "s", "scale": 1e-6}
+    return [*columns, raw | time]

@@ -14,9 +14,8 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
 
-from magbridge.bridge import states
-from magbridge.link.ftp import FtpServer
-from magbridge.link.tree import LogTransfer, Tree
+from magbridge.bridge import events
+from magbridge.link.files import FtpServer, LogTransfer, Tree
 from magbridge.mavlink import Message, Spec, spec
 
 __all__ = ["FileServer"]
@@ -136,7 +135,7 @@ class FileServer:
                 text = f"file for {sender[0]}:{sender[1]} refused: {why}"
                 if text not in self._reported and len(self._reported) < REQUESTS:
                     self._reported.add(text)
-                    self._notify(states.notice(text[:50]))
+                    self._notify(events.notice(text[:50]))
 
     def _turn(self) -> None:
         """Prepare a batch for each station in turn, and pause as long as sending takes."""

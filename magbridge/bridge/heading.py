@@ -1,27 +1,32 @@
-"""The heading of the live bridge: the corrected vector, levelled with the autopilot's roll and pitch."""
+"""The heading of the live bridge: the corrected vector, levelled by the autopilot's roll and pitch; NMEA."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from math import atan2, cos, degrees, hypot, inf, isfinite, nan, radians, sin, tan
 from typing import Final
 
 import numpy as np
 
 from magbridge.align import Sample
+from magbridge.bridge import events
+from magbridge.bridge.links import open_link
+from magbridge.bridge.port import Port
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.heading import heading_of_sample, model_declination_sigma
 from magbridge.calibration.model import Calibration
-from magbridge.config import HeadingOutput
-from magbridge.link.attitude import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
+from magbridge.config import Config, HeadingOutput
+from magbridge.errors import PortError
 from magbridge.link.component import Component
+from magbridge.link.estimates import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
 from magbridge.link.output import Rate
 from magbridge.link.telemetry import own_time, sent_us
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
 from magbridge.records import Corrected, Quality, Vector
 
-__all__ = ["LiveHeading"]
+__all__ = ["LiveHeading", "NmeaOutput", "nmea_port"]
 
 ATTITUDE, HEARTBEAT = spec("ATTITUDE"), spec("HEARTBEAT").id
 MAX_ATTITUDE_AGE_US: Final = 1_000_000
@@ -160,3 +165,59 @@ class LiveHeading:
             self._send(self._component.outbox, attitude, max(utc_us, 0), self.stack)
         if self._nmea_rate.due(time_us):
             self.nmea.append(nmea_sentences(attitude, max(utc_us, 0)))
+
+
+NMEA_RETRY_US = 1_000_000
+"""µs between two attempts to open the port."""
+
+
+def nmea_port(config: Config) -> Port | None:
+    """Return the (unopened) port of ``[heading] nmea``, None without one.
+
+    ConfigError: it is neither ``udp:HOST:PORT`` nor a serial device.
+    """
+    name = config.heading.nmea
+    if name is None:
+        return None
+    url = f"udpout:{name.removeprefix('udp:')}" if name.startswith("udp:") else f"serial:{name}"
+    return open_link(url, config.heading.nmea_baudrate, str(config.path), "heading.nmea")
+
+
+class NmeaOutput:
+    """Sends sentences on a port, which it opens again when it is lost.
+
+    Parameters
+    ----------
+    port : Port
+    notify : callable
+        Receives a state frame when the port cannot be opened or is lost, once for each reason.
+    """
+
+    def __init__(self, port: Port, notify: Callable[[bytes], None]) -> None:
+        self._port, self._notify = port, notify
+        self._reported = ""
+        self._retry_us = 0
+
+    def send(self, sentences: deque[bytes], time_us: int) -> None:
+        """Send the sentences and empty the queue; those that come while the port is down are dropped."""
+        if not sentences:
+            return
+        data = b"".join(sentences)
+        sentences.clear()
+        try:
+            if not self._port.is_open:
+                if time_us < self._retry_us:
+                    return
+                self._retry_us = time_us + NMEA_RETRY_US
+                self._port.open()
+                self._reported = ""
+            self._port.write(data)
+            self._port.flush()
+        except PortError as error:
+            if error.reason != self._reported:
+                self._reported = error.reason
+                self._notify(events.notice(f"heading.nmea: {error.reason}"[:50]))
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()

@@ -1,17 +1,398 @@
-"""The MAVLink link, by its URL: UDP, TCP, or a serial line."""
+"""Links by UDP, TCP (client and server) or a serial line; addresses are HOST:PORT or [IPV6]:PORT."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import errno
+import os
+import re
+import select
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from ipaddress import IPv6Address
 from math import inf
+from operator import itemgetter
+from typing import Any, cast
 
-from magbridge.bridge.peers import Peers
-from magbridge.bridge.port import Port
-from magbridge.bridge.serial_port import may_be_device, serial_line
-from magbridge.bridge.sockets import TcpClient, TcpServer, UdpPort, parse_address
-from magbridge.errors import ConfigError
+from magbridge.bridge.devices import may_be_device, serial_line
+from magbridge.bridge.port import PEER_READ_BYTES, READ_BYTES, PacedPort, Peer, Peers, Port, cut
+from magbridge.errors import ConfigError, PortError
 
 __all__ = ["LINKS", "open_link"]
+
+ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
+UNSENT = 4096
+"""Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
+CONNECTIONS = 16
+"""Most clients of a server; for another one, one that has said nothing valid has to go."""
+GREETING = 0.2
+"""s that a client has to say something valid before it has to go for another."""
+ACCEPTED = 4
+"""Most clients that are accepted before the sensor's turn."""
+PEER_TIMEOUT = 30.0
+"""s without a packet after which the peer of ``udpout`` is connected again."""
+DATAGRAM = 1400
+"""Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
+DATAGRAMS = 512
+"""Most that are read before the sensor's turn: empty ones could keep it waiting for ever."""
+NO_LISTENER_ERRORS = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
+"""What a UDP socket reports when no program listens (yet): not a fault of the port."""
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Return host and port; raises ValueError."""
+    match = ADDRESS.fullmatch(text)
+    if match is None or int(match["port"]) > 65535:
+        raise ValueError(text)
+    if match["ipv6"]:
+        return str(IPv6Address(match["ipv6"])), int(match["port"])
+    match["host"].encode("idna")  # raises UnicodeError, as looking it up would
+    return match["host"], int(match["port"])
+
+
+def resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int, Any]:
+    """Return the family and the socket address of a host; of a name that has both, IPv4's. Raises OSError."""
+    host, port = address
+    found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE if listen else 0)
+    family, *_, resolved = min(found, key=itemgetter(0))
+    return family, resolved
+
+
+class _Connection(PacedPort):
+    """One TCP connection."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, UNSENT, PEER_READ_BYTES, "closed by the other end")
+        self._connection: socket.socket | None = None
+
+    def write(self, data: bytes) -> None:
+        """Send as :meth:`PacedPort.write` does; without a connection, `data` are dropped."""
+        if self._connection is None:
+            self.dropped += len(data)
+        else:
+            super().write(data)
+
+    def _room(self) -> bool:
+        return self._connection is not None and bool(select.select([], [self._connection], [], 0)[1])
+
+    def write_all(self, data: bytes) -> None:
+        """Send `data` whole, waiting for a slow reader."""
+        assert self._connection is not None
+        self._connection.setblocking(True)
+        self._connection.sendall(data)
+        self._connection.setblocking(False)
+
+    def adopt(self, connection: socket.socket) -> None:
+        """Use `connection`."""
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
+        self.close()
+        self._connection, self._fd = connection, connection.fileno()
+
+    def close(self) -> None:
+        """Close the connection and discard the bytes still to be sent on it."""
+        if self._connection is not None:
+            self._connection.close()
+        self._connection, self._fd = None, -1
+        self._forget()
+
+
+class TcpClient(_Connection):
+    """``tcp``: connection to a server."""
+
+    def __init__(self, name: str, address: tuple[str, int]) -> None:
+        super().__init__(name)
+        self._address = address
+
+    def open(self) -> None:
+        """Connect, waiting at most a second; raises :class:`PortError`."""
+        try:
+            self.adopt(socket.create_connection(self._address, timeout=1.0))
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+
+
+class _Client(_Connection):
+    """One client of a server; the server continues when it leaves."""
+
+    def __init__(self, name: str, connection: socket.socket) -> None:
+        super().__init__(name)
+        self.since = time.monotonic()
+        self.adopt(connection)
+
+    def open(self) -> None:
+        """Raise :class:`PortError`, because only a client can open the connection."""
+        raise PortError(self.name, "not connected")
+
+
+class TcpServer(Port):
+    """``tcpin``: server that answers the clients which :class:`Peers` accepts.
+
+    On a link without signatures a client is answered at once, because it may only want to listen, and its
+    address cannot be forged. A client that has sent something valid is never disconnected for another.
+    """
+
+    def __init__(self, name: str, address: tuple[str, int], peers: Peers, *, signed: bool = False) -> None:
+        super().__init__(name, peers)
+        self._peers: Peers
+        self._address, self._signed = address, signed
+        self._listener: socket.socket | None = None
+        self._clients: dict[int, _Client] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """Return True if the server listens."""
+        return self._listener is not None
+
+    def open(self) -> None:
+        """Listen; raises :class:`PortError`."""
+        try:
+            family, address = resolve(self._address, socket.SOCK_STREAM, listen=True)
+            both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+            listener = socket.create_server(address, family=family, dualstack_ipv6=both)
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+        listener.setblocking(False)
+        self._listener = listener
+
+    def fds(self) -> list[int]:
+        """Return the listener's descriptor and the clients'."""
+        return ([self._listener.fileno()] if self._listener is not None else []) + list(self._clients)
+
+    def read(self) -> bytes:
+        """Accept clients that wait, then return the bytes of all; a client that leaves is not an error."""
+        assert self._listener is not None
+        with suppress(OSError):  # no client waits, or it has gone, or there are too many open files
+            for _ in range(ACCEPTED):
+                self._accept(self._listener.accept()[0])
+        for fd, client in list(self._clients.items()):
+            try:
+                if data := client.read():
+                    self._peers.receive(fd, data)
+            except PortError:
+                self._dismiss(fd)
+        return self._peers.drain()
+
+    def write(self, data: bytes) -> None:
+        """Send to the accepted clients; drop `data` without one."""
+        peers = self._chosen()
+        chosen = [fd for fd, peer in peers.items() if self._peers.affords(peer, len(data))]
+        for fd in chosen:
+            self._write_one(fd, data)
+        if not chosen:
+            self.dropped += len(data)
+        elif (first := self._clients.get(chosen[0])) is not None:  # the others have no use for it
+            self.dropped, self.overrun = self.dropped + first.dropped, self.overrun + first.overrun
+            first.dropped = first.overrun = 0
+
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
+        """Send only to the client from which a system and component was last heard."""
+        peer = self._peers.route(sender)
+        if peer is not None and peer.address in self._clients and self._peers.affords(peer, len(data)):
+            self._write_one(peer.address, data)
+
+    def _write_one(self, fd: int, data: bytes) -> None:
+        """Send to one client; one that leaves is not an error."""
+        try:
+            self._clients[fd].write(data)
+        except PortError:
+            self._dismiss(fd)
+
+    def _chosen(self) -> dict[int, Peer | None]:
+        """Return those to send to by their descriptors, in the order in which to send."""
+        valid = {cast(int, peer.address): peer for peer in self._peers.answered()}
+        chosen: dict[int, Peer | None] = {fd: peer for fd, peer in valid.items() if fd in self._clients}
+        if not self._signed:
+            chosen |= {fd: None for fd in self._clients if fd not in chosen}
+        return chosen
+
+    @property
+    def waiting(self) -> bool:
+        """Return True if bytes wait that a slow client could not buffer."""
+        return any(client.waiting for client in self._clients.values())
+
+    def flush(self) -> None:
+        """Send to the clients; one that leaves is not an error."""
+        for fd, client in list(self._clients.items()):
+            try:
+                client.flush()
+            except PortError:
+                self._dismiss(fd)
+
+    def blocked(self) -> list[int]:
+        """Return the descriptors of clients that take more once they are writable."""
+        return [fd for fd, client in self._clients.items() if client.waiting]
+
+    def write_all(self, data: bytes) -> None:
+        """Send `data` whole to every client, waiting for a slow reader."""
+        for client in self._clients.values():
+            client.write_all(data)
+
+    def close(self) -> None:
+        """Close the clients and the listener."""
+        for fd in list(self._clients):
+            self._dismiss(fd)
+        if self._listener is not None:
+            self._listener.close()
+        self._listener = None
+
+    def _accept(self, connection: socket.socket) -> None:
+        """Accept a client; if necessary, in place of one that has sent nothing valid for some time."""
+        if len(self._clients) >= CONNECTIONS:
+            late = time.monotonic() - GREETING
+            mute = (fd for fd, one in self._clients.items() if not self._peers.is_known(fd))
+            idle = next((fd for fd in mute if self._clients[fd].since < late), None)
+            if idle is None:
+                connection.close()
+                return
+            self._dismiss(idle)
+        self._clients[connection.fileno()] = _Client(self.name, connection)
+
+    def _dismiss(self, fd: int) -> None:
+        self._clients.pop(fd).close()
+        self._peers.forget(fd)
+
+
+class UdpPort(Port):
+    """``udpout`` sends to one address; ``udpin``, given its `peers`, answers those of them that are valid."""
+
+    def __init__(self, name: str, address: tuple[str, int], peers: Peers | None = None) -> None:
+        super().__init__(name, peers)
+        self._address = address
+        self._socket: socket.socket | None = None
+        self._received = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Return True if the socket is open."""
+        return self._socket is not None
+
+    def open(self) -> None:
+        """Bind or connect; raises :class:`PortError`."""
+        try:
+            opened = self._new()
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+        self._socket, self._received = opened, time.monotonic()
+
+    def tend(self) -> None:
+        """Connect again if nothing has come for long, and the host, or we, have another address by now."""
+        opened, now = self._socket, time.monotonic()
+        if opened is None or self._peers is not None or now - self._received < PEER_TIMEOUT:
+            return
+        self._received = now
+        with suppress(OSError), self._new() as new:  # not known at present, or closed meanwhile
+            if _ends(new) != _ends(opened):
+                # the same descriptor, because the bridge may be waiting for it
+                os.dup2(new.fileno(), opened.fileno(), inheritable=False)
+
+    def _new(self) -> socket.socket:
+        """Return a socket that is bound or connected; raises OSError."""
+        listen = self._peers is not None
+        family, address = resolve(self._address, socket.SOCK_DGRAM, listen=listen)
+        opened = socket.socket(family, socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        try:
+            (opened.bind if listen else opened.connect)(address)
+        except OSError:
+            opened.close()
+            raise
+        return opened
+
+    def fds(self) -> list[int]:
+        """Return the one descriptor, if open."""
+        return [self._socket.fileno()] if self._socket is not None else []
+
+    def read(self) -> bytes:
+        """Return the datagrams that have come; an unreachable peer is nothing, not an error.
+
+        All that are waiting are returned at once, as from a stream, so that samples that queued up while the
+        bridge stood still meet the telemetry that queued up with them.
+        """
+        assert self._socket is not None
+        datagrams: list[bytes] = []
+        size = 0
+        while size < READ_BYTES and len(datagrams) < DATAGRAMS:
+            try:
+                datagram, peer = self._socket.recvfrom(READ_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                if datagrams or error.errno in NO_LISTENER_ERRORS:
+                    break  # first return the received bytes
+                raise self.lost(error.strerror) from error
+            size += len(datagram)
+            datagrams.append(datagram)
+            if self._peers is not None:
+                self._peers.receive(peer, datagram)
+        if datagrams:
+            self._received = time.monotonic()
+        return b"".join(datagrams) if self._peers is None else self._peers.drain()
+
+    def write(self, data: bytes) -> None:
+        """Send to each peer, mostly one datagram; what cannot be sent is dropped and counted."""
+        if self._peers is None:
+            self._send(data, None)
+            return
+        for peer in self._peers.answered():
+            if self._peers.affords(peer, len(data)):
+                self._send(data, peer.address)
+
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
+        """Send only to the peer from which a system and component was last heard."""
+        if self._peers is None:
+            self._send(data, None)
+        elif (peer := self._peers.route(sender)) is not None and self._peers.affords(peer, len(data)):
+            self._send(data, peer.address)
+
+    def _send(self, data: bytes, peer: Any) -> None:
+        for datagram in _datagrams(data):
+            self._send_one(datagram, peer)
+
+    def _send_one(self, data: bytes, peer: Any) -> None:
+        assert self._socket is not None
+        try:
+            if peer is None:
+                self._socket.send(data)
+            else:
+                self._socket.sendto(data, peer)
+        except BlockingIOError:
+            self.overran(data)
+        except OSError as error:
+            self.dropped += len(data)
+            if self._peers is not None:  # an impossible address, as one with port 0, is not a fault
+                self._peers.forget(peer)
+            elif error.errno not in NO_LISTENER_ERRORS:
+                raise self.lost(error.strerror) from error
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+
+def _datagrams(data: bytes) -> Iterator[bytes]:
+    """Yield `data` in datagrams of whole messages: after a standstill, thousands are sent at once."""
+    if len(data) <= DATAGRAM:
+        yield data
+        return
+    begun = b""
+    for frame in cut(data):
+        if len(begun) + len(frame) > DATAGRAM:
+            yield begun
+            begun = b""
+        begun += frame
+    yield begun
+
+
+def _ends(connected: socket.socket) -> tuple[Any, Any]:
+    """Return our own address, without its port, and the peer's."""
+    return connected.getsockname()[0], connected.getpeername()
+
 
 CLIENT_LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpClient}
 """Kinds of link that go to one peer, by the first part of the URL, as in the MAVLink world."""

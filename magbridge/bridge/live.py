@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 
-from magbridge.bridge import states
+from magbridge.bridge import events
 from magbridge.bridge.events import Event, HostClock, source_of
 from magbridge.bridge.port import Port
 from magbridge.errors import PortError
@@ -83,7 +83,7 @@ class LiveEdge:
             while not self._changes.empty():  # the news that a port opened comes before its data
                 yield Event(now_us, Channel.STATE, self._changes.get())
             if held := now_us - turned_us > STANDSTILL_US:
-                yield Event(now_us, Channel.STATE, states.standstill(now_us, now_us - turned_us))
+                yield Event(now_us, Channel.STATE, events.standstill(now_us, now_us - turned_us))
             turned_us = now_us
             for fd in ready:
                 if fd != self._woken and (data := self._waiting(lines[fd], fd, held)):
@@ -99,11 +99,11 @@ class LiveEdge:
     def _look(self, now_us: int) -> Iterator[bytes]:
         """Yield the state frames of the host's clock and of the link that are due."""
         if step_us := self._clock.step_us():
-            yield states.clock_step(now_us, step_us)
+            yield events.clock_step(now_us, step_us)
         if text := self._ports[Channel.LINK].notice():
-            yield states.notice(text)
+            yield events.notice(text)
         if self._too_slow(now_us):
-            yield states.too_slow(Channel.LINK, self._ports[Channel.LINK])
+            yield events.too_slow(Channel.LINK, self._ports[Channel.LINK])
 
     def send(self, number: int, data: bytes) -> None:
         """Send to a port; while the port is down, data are dropped and counted."""
@@ -188,7 +188,7 @@ class LiveEdge:
         return True
 
     def _lost(self, number: int, error: PortError) -> None:
-        self.notify(states.port(number, self._ports[number], error.reason))
+        self.notify(events.port(number, self._ports[number], error.reason))
 
     def _keep_open(self, number: int, port: Port, tried: threading.Event) -> None:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
@@ -203,7 +203,7 @@ class LiveEdge:
                 except PortError as error:
                     reason = error.reason
                 if not reason or reported != reason:
-                    self.notify(states.port(number, port, reason))
+                    self.notify(events.port(number, port, reason))
                 reported = reason
             tried.set()
             time.sleep(PORT_RETRY_S)

@@ -14,9 +14,8 @@ from math import degrees, hypot, isfinite, isnan, nan
 from typing import Any
 
 from magbridge.field.geodesy import separation
-from magbridge.link.attitude import quaternion
 from magbridge.link.component import Component
-from magbridge.link.fixes import Pose
+from magbridge.link.estimates import Pose, quaternion
 from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator

@@ -1,34 +1,310 @@
-"""The navigator on the link: dead reckoning from the vehicle's telemetry in, fixes out."""
+"""The navigator on the link: dead reckoning from the vehicle's telemetry in, fixes to the autopilot out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from math import hypot, inf
 
 import numpy as np
 
-from magbridge.bridge.fixing import FIX_3D, Fixing
 from magbridge.bridge.motion import Frame, Motion, MotionSource
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.config import Navigation as Wanted
 from magbridge.errors import ConfigError
+from magbridge.field.geodesy import separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid
 from magbridge.link.component import Component
-from magbridge.link.fixes import FIX_MESSAGES, Kind
+from magbridge.link.estimates import FIX_MESSAGES, Fix, Kind, widened
 from magbridge.link.output import Rate
-from magbridge.mavlink import Message, spec
-from magbridge.mavlink.enums import MAV_SEVERITY
+from magbridge.mavlink import Message, by_id, spec
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.navigate import NavigationOptions, NavigationState, Navigator, Record
 from magbridge.navigate.depth import at_depth
-from magbridge.navigate.gnss import GnssReason, GnssState
+from magbridge.navigate.gnss import GnssMonitor, GnssReason, GnssState
 from magbridge.navigate.options import informed
+from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
 from magbridge.toml import convert
 from magbridge.wording import one_of
 
 __all__ = ["NavigationService", "open_navigation"]
+
+FIX_3D = 3
+"""Lowest GPS_RAW_INT.fix_type whose position is used."""
+SHORTEST_US, LONGEST_US = 5_000_000, 60_000_000
+"""µs without a GPS position after which GPS is lost: three times its period, within these."""
+HELD_US = 60_000_000
+"""µs of good GPS, after which the autopilot's position is that of the GPS."""
+ASK_US = 5_000_000
+"""µs between two requests for the origin of the local frame."""
+OVERRATED = "ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
+ANSWER_PAUSE_US = 20_000_000
+"""µs between two reports that the autopilot begins or ceases to accept fixes."""
+UNUSED_US = 45_000_000
+"""µs for which the autopilot's position must differ from the fixes until that is reported."""
+MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
+"""Differences from the autopilot's position that count as none: m, and 1-sigmas of the fix."""
+PX4_KEEPS_CLAIM = 1, 16
+"""Version of PX4 up to which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's own uncertainty; a later one
+fuses it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
+ARDUPILOT_FUSES: tuple[int, int] | None = None
+"""Version from which ArduPilot fuses EXTERNAL_POSITION_ESTIMATE and accepts GLOBAL_POSITION_SENSOR; None as
+long as no release does (pull request 31738)."""
+UNANSWERED = 3
+"""Commands in a row without an answer before that is reported."""
+HINTS = {
+    MAV_RESULT.FAILED: " (it still uses GPS, has no origin, or nothing measures its speed)",
+    MAV_RESULT.TEMPORARILY_REJECTED: " (it does not dead-reckon)",
+}
+"""What the answers of ArduPilot (setLatLng) and PX4 (EKF2.cpp) mean."""
+
+
+class Gps:
+    """Track whether the autopilot's GPS has a position."""
+
+    def __init__(self) -> None:
+        self._last_us = self._since_us = -LONGEST_US
+        self._allowed_us = 0
+
+    def receive(self, message: Message, time_us: int, *, used: bool = True) -> bool:
+        """Process a GPS_RAW_INT; return True if its position is used."""
+        good: bool = message["fix_type"] >= FIX_3D and used
+        if not good:
+            self._allowed_us = 0
+            return False
+        if not self.good(time_us):
+            self._since_us = time_us
+        period_us = time_us - self._last_us
+        self._last_us = time_us
+        self._allowed_us = min(max(3 * period_us, SHORTEST_US), LONGEST_US)
+        return True
+
+    def good(self, time_us: int) -> bool:
+        """Return True if there is a recent position."""
+        return time_us - self._last_us < self._allowed_us
+
+    def held(self, time_us: int) -> bool:
+        """Return True if there has been a position long enough for the autopilot to adopt it."""
+        return self.good(time_us) and time_us - self._since_us > HELD_US
+
+
+class Fixing:
+    """Send fixes while the autopilot has no GPS, and process its answers.
+
+    Parameters
+    ----------
+    kind : Kind
+        Of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
+    component : Component
+    frame : Frame
+        Has received each message before.
+    gnss : GnssMonitor
+        Has tested each GPS position before.
+
+    Attributes
+    ----------
+    gps : Gps
+    stack : int
+        MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    sent, accepted, refused : int
+        Number of fixes, and of answers.
+    """
+
+    def __init__(self, kind: Kind, component: Component, frame: Frame, gnss: GnssMonitor) -> None:
+        self.gps, self.stack = Gps(), int(MAV_AUTOPILOT.GENERIC)
+        self.sent = self.accepted = self.refused = 0
+        self._kind, self._component, self._frame = kind, component, frame
+        self._gnss = gnss
+        self._position_us = -LONGEST_US  # when the receiver last sent a position, used or not
+        self._reported_unused = False
+        self._version: tuple[int, int] | None = None  # of the autopilot's firmware
+        self._last: Fix | None = None
+        self._agreed_us = 0  # when the autopilot's position was last that of our fixes
+        self._before_us: int | None = None
+        self._waiting = 0
+        self._result, self._report_us = -1, 0  # the answer that was reported; when another may be
+        self._reboots = component.vehicle.reboots
+        self._handlers = by_id(
+            AUTOPILOT_VERSION=self._read_version, COMMAND_ACK=self._answer,
+            GLOBAL_POSITION_INT=self._compare, GPS_RAW_INT=self._gps, HEARTBEAT=self._heartbeat,
+        )  # fmt: skip
+        if kind.local:
+            component.timers.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
+
+    @property
+    def velocity_stays(self) -> bool:
+        """Whether a fix leaves the autopilot's velocity alone: ArduPilot's setLatLng does, PX4 does not."""
+        return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4 and not self._ardupilot_fuses
+
+    @property
+    def is_fused(self) -> bool:
+        """Return True if the autopilot fuses a fix with its own position, so that it must be widened."""
+        replaced = self._version is not None and self._version <= PX4_KEEPS_CLAIM
+        fused_by_px4 = self.stack == MAV_AUTOPILOT.PX4 and not replaced
+        return self._kind.fused or fused_by_px4 or self._ardupilot_fuses
+
+    @property
+    def _ardupilot_fuses(self) -> bool:
+        """Return True if the autopilot is an ArduPilot of :data:`ARDUPILOT_FUSES` or later."""
+        if ARDUPILOT_FUSES is None or self._version is None:
+            return False
+        return self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._version >= ARDUPILOT_FUSES
+
+    def receive(self, message: Message, time_us: int) -> None:
+        """Process a message of the autopilot."""
+        if handler := self._handlers.get(message.id):
+            handler(message, time_us)
+
+    def send(self, reckoned: Reckoned | None, resets: int) -> bool:
+        """Send the present position as a fix if the autopilot needs it; return True if it was sent."""
+        now_us = self._component.codec.now_us
+        fix = self._fix(reckoned, resets, now_us)
+        if isinstance(fix, str):
+            self._before_us = self._last = None
+            self._report_none(fix)
+            return False
+        if self._last is None:
+            self._agreed_us = now_us
+        self._last = fix
+        if self.is_fused:
+            since_us = inf if self._before_us is None else now_us - self._before_us
+            fix = widened(fix, since_us * 1e-6)
+        self._before_us = now_us
+        self._kind.send(self._component.outbox, fix, *self._component.peer)
+        self.sent += 1
+        rejected = self._gnss.state is GnssState.REJECTED and self._has_gps(now_us)
+        self._state(f"fixes go to the autopilot: GPS is {'rejected' if rejected else 'lost'}")
+        if not self._kind.fused:
+            self._await_answer()
+        return True
+
+    def _fix(self, reckoned: Reckoned | None, resets: int, now_us: int) -> Fix | str:
+        """Return the fix, or the reason why there is none."""
+        unwanted = self._unwanted(now_us)
+        if unwanted or reckoned is None:
+            return unwanted or "no valid position"
+        pose = self._frame.pose(now_us, reckoned.latitude, reckoned.longitude) if self._kind.local else None
+        if isinstance(pose, str):
+            return pose
+        fix = Fix(
+            time_us=now_us + self._component.codec.utc_offset_us,
+            latitude=reckoned.latitude,
+            longitude=reckoned.longitude,
+            covariance_nn=reckoned.covariance_nn,
+            covariance_ne=reckoned.covariance_ne,
+            covariance_ee=reckoned.covariance_ee,
+            altitude=self._frame.altitude(now_us),
+            pose=pose,
+            resets=resets,
+        )
+        if self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._kind.overrated(fix):
+            return OVERRATED
+        return fix
+
+    def _unwanted(self, now_us: int) -> str:
+        """Return the reason why the autopilot needs or accepts no fix; empty without one."""
+        accepted = self._ardupilot_fuses and not self._kind.local
+        if self.stack in self._kind.refused_by and not accepted:
+            return self._kind.refused_by[self.stack]
+        if self.gps.good(now_us):
+            return "GPS is good"
+        suspect = self._gnss.state is GnssState.SUSPECT and self._has_gps(now_us)
+        return "GPS is suspect" if suspect else ""
+
+    def _await_answer(self) -> None:
+        """Count a fix that the autopilot has not yet answered; report if it answers none."""
+        self._waiting += 1
+        if self._waiting > UNANSWERED:
+            text = "the autopilot does not answer fixes"
+            self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
+
+    def _answer(self, message: Message, time_us: int) -> None:
+        if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:
+            return
+        self._waiting, result = 0, message["result"]
+        accepted = result == MAV_RESULT.ACCEPTED
+        self.accepted += accepted
+        self.refused += not accepted
+        if time_us < self._report_us and result != self._result:
+            return
+        if result != self._result:
+            self._result, self._report_us = result, time_us + ANSWER_PAUSE_US
+        if accepted:
+            self._component.announcer.state("answer", "the autopilot takes fixes")
+            return
+        known = result in set(MAV_RESULT)
+        name = MAV_RESULT(result).name if known else f"result {result}"
+        text = f"the autopilot refuses fixes: {name}{HINTS.get(result, '')}"
+        self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
+
+    def _compare(self, message: Message, time_us: int) -> None:
+        """Compare the autopilot's position with the last fix, and report if they differ for long."""
+        if self._last is None or self._before_us is None:
+            return
+        own = message["lat"] * 1e-7, message["lon"] * 1e-7
+        distance = hypot(*separation(self._last.latitude, self._last.longitude, *own))
+        if distance < MIN_DIFFERENCE_M + DIFFERENCE_SIGMA * self._last.sigma:
+            self._agreed_us = time_us
+            self._component.announcer.forget("use")
+        elif time_us - self._agreed_us > UNUSED_US:
+            text = f"the autopilot does not use the fixes: its position is {distance:.0f} m off"
+            # one text for one state, whatever the distance is
+            if not self._reported_unused:
+                self._component.announcer.state("use", text, MAV_SEVERITY.WARNING)
+        self._reported_unused = distance >= MIN_DIFFERENCE_M and time_us - self._agreed_us > UNUSED_US
+
+    def _read_version(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
+        version = message["flight_sw_version"]
+        if version:
+            self._version = version >> 24, version >> 16 & 0xFF
+
+    def _has_gps(self, time_us: int) -> bool:
+        """Return True if the receiver sends positions, even unused ones."""
+        return time_us - self._position_us < LONGEST_US
+
+    def _gps(self, message: Message, time_us: int) -> None:
+        if message["fix_type"] >= FIX_3D:
+            self._position_us = time_us
+        used = self._gnss.state in (GnssState.NONE, GnssState.GOOD)
+        if self.gps.receive(message, time_us, used=used) and self._before_us is not None:
+            self._before_us = self._last = None
+            self._report_none("GPS is good")
+
+    def _heartbeat(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
+        if self.stack != message["autopilot"] and self._version is None:
+            self._request("AUTOPILOT_VERSION")
+        self.stack = message["autopilot"]
+
+    def _ask_origin(self, time_us: int) -> None:  # noqa: ARG002 - a timer's action
+        component = self._component
+        if component.vehicle.reboots != self._reboots:
+            self._reboots, self._frame.origin = component.vehicle.reboots, None
+        if self._frame.origin is None:
+            self._request("GPS_GLOBAL_ORIGIN")
+
+    def _request(self, name: str) -> None:
+        """Ask the autopilot for one message."""
+        system, autopilot = self._component.peer
+        self._component.outbox.send(
+            "COMMAND_LONG",
+            command=MAV_CMD.REQUEST_MESSAGE,
+            param1=float(spec(name).id),
+            target_system=system,
+            target_component=autopilot,
+        )
+
+    def _report_none(self, reason: str) -> None:
+        wanted = "GPS" not in reason
+        self._state(
+            f"no fixes to the autopilot: {reason}", MAV_SEVERITY.WARNING if wanted else MAV_SEVERITY.INFO
+        )
+
+    def _state(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+        self._component.announcer.state("fixes", text, severity)
+
 
 GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
 STATE_TEXTS = {
@@ -64,7 +340,7 @@ class NavigationService:
     grid : AnomalyGrid
     options : Options
     fix : Kind
-        Of :data:`~magbridge.link.fixes.FIX_MESSAGES`.
+        Of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
     component : Component
     """
 

@@ -7,27 +7,22 @@ from math import nan, sqrt
 from typing import TYPE_CHECKING, Final
 
 from magbridge.align import Sample
-from magbridge.bridge import states
-from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge import events
+from magbridge.bridge.events import Event, Recorder, StartEvent, StateChanges, beginning, declarations
 from magbridge.bridge.heading import LiveHeading
 from magbridge.bridge.learning import LearningService, open_learner
 from magbridge.bridge.position import Position
-from magbridge.bridge.recorder import Recorder, beginning, declarations
-from magbridge.bridge.sensor_stream import SensorStream, open_correction, open_drivers
-from magbridge.bridge.states import StateChanges
+from magbridge.bridge.sensor import SensorStream, open_correction, open_drivers
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.config import Align, Config
 from magbridge.correction import Correction
 from magbridge.health.comparison import SensorComparison
-from magbridge.link.attitude import NO_ATTITUDE, Attitude
-from magbridge.link.authority import Sources
 from magbridge.link.component import Component
-from magbridge.link.message_rates import check_publish
+from magbridge.link.estimates import NO_ATTITUDE, Attitude
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
-from magbridge.link.reports import Condition
-from magbridge.link.requests import needed_rates
-from magbridge.link.telemetry import TelemetryMap, is_possible
+from magbridge.link.publish import Condition, check_publish
+from magbridge.link.telemetry import Sources, TelemetryMap, is_possible, needed_rates
 from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
@@ -225,7 +220,7 @@ class Pipeline:
     def interleaved(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
         """Return the frames of messages that are sent besides those of :meth:`feed` and are not logged."""
         codec = self.component.codec
-        self.recorder.state(codec.now_us, states.interleaved(len(messages)))
+        self.recorder.state(codec.now_us, events.interleaved(len(messages)))
         return b"".join([codec.frame(layout, payload) for layout, payload in messages])
 
     def _set_late(self, since_us: int) -> None:

@@ -145,7 +145,7 @@ def _check(config: Path, *, live: bool, json: bool) -> None:
 
 def _listen(config: Path, *, quiet: bool) -> tuple[list[ConfigFault], dict[str, Any]]:
     """Listen on the ports; return the faults, and what arrived for JSON; print that unless `quiet`."""
-    from magbridge.bridge.live_check import LISTEN_TIME_S, LiveCheck
+    from magbridge.bridge.check import LISTEN_TIME_S, LiveCheck
     from magbridge.config import load
 
     loaded = load(config)

@@ -8,19 +8,24 @@ from functools import partial
 from math import isfinite
 
 from magbridge.config import Link
-from magbridge.link import metadata
-from magbridge.link.authority import Authority
-from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS, MessageRates
+from magbridge.link.files import GENERAL, metadata_files
 from magbridge.link.output import Announcer, Outbox, Timers
-from magbridge.link.parameters import Parameters, ParameterService, Tunable, rates
-from magbridge.link.publish import PUBLISHED, Publisher
-from magbridge.link.reports import Condition, Reports
-from magbridge.link.requests import Stream, StreamRequests
+from magbridge.link.parameters import Authority, Parameters, ParameterService, Tunable, rates
+from magbridge.link.publish import (
+    DEFAULT_RATES_HZ,
+    LIMITS,
+    PUBLISHED,
+    Condition,
+    MessageRates,
+    Publisher,
+    Reports,
+)
+from magbridge.link.telemetry import Stream, StreamRequests
 from magbridge.link.vehicle import VehicleState
 from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
+from magbridge.mavlink.codec import NOT_SIGNED
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
-from magbridge.mavlink.framing import is_signed
-from magbridge.mavlink.signing import NOT_SIGNED
+from magbridge.mavlink.messages import is_signed
 
 __all__ = ["TIMESYNC_US", "Component"]
 
@@ -263,11 +268,11 @@ class Component:
         self._message_rates = MessageRates(self.parameters, self.timers, self.codec)
         self.rates = self._message_rates.by_name
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
-        self.metadata = metadata.files(self.parameters.table.values(), link.component)
+        self.metadata = metadata_files(self.parameters.table.values(), link.component)
         self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
         self._reports = Reports(
             self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking,
-            self.metadata[metadata.GENERAL],
+            self.metadata[GENERAL],
         )  # fmt: skip
         by_clock = {"HEARTBEAT": self._reports.heartbeat, "MAG_STATUS": self._report_status}
         self._authority = Authority(link.system, link.autopilot)

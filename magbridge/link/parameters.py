@@ -1,4 +1,4 @@
-"""What can be tuned over the link: rates and settings, and the parameter protocol."""
+"""What can be tuned over the link and by whom: rates and settings, and the parameter protocol."""
 
 from __future__ import annotations
 
@@ -9,15 +9,50 @@ from struct import pack, unpack
 import msgspec
 
 from magbridge.config import Align, Telemetry
-from magbridge.link.authority import Authority
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Message
-from magbridge.mavlink.enums import MAV_PARAM_TYPE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_PARAM_TYPE, MAV_SEVERITY, MAV_TYPE
 
 __all__ = [
-    "ParameterService", "Parameters", "Tunable", "alignment", "file_rate", "learning", "rate_name", "rates",
-    "telemetry_ages",
+    "Authority", "ParameterService", "Parameters", "Tunable", "alignment", "file_rate", "learning",
+    "rate_name", "rates", "telemetry_ages",
 ]  # fmt: skip
+
+MAX_COMPONENTS = 64
+"""Components whose kind is remembered."""
+
+
+class Authority:
+    """Allow the autopilot and ground stations, and no other component, to change parameters and rates.
+
+    A station is a sender with a heartbeat of that type. A sender of another system without a heartbeat is
+    taken for one, because small programs send none; another component of our own vehicle is not.
+
+    Parameters
+    ----------
+    system, autopilot : int
+        Of our own vehicle.
+    """
+
+    def __init__(self, system: int, autopilot: int) -> None:
+        self._system, self._autopilot = system, autopilot
+        self._kinds: dict[tuple[int, int], int] = {}
+
+    def heartbeat(self, message: Message) -> bool:
+        """Record the type of a component; return True for a ground station."""
+        kind: int = message["type"]
+        self._kinds.pop((message.system, message.component), None)
+        self._kinds[message.system, message.component] = kind
+        if len(self._kinds) > MAX_COMPONENTS:
+            del self._kinds[next(iter(self._kinds))]
+        return kind == MAV_TYPE.GCS
+
+    def may_change(self, message: Message) -> bool:
+        """Return True if its sender may change the bridge's settings."""
+        who = message.system, message.component
+        ours = message.system == self._system
+        kind = self._kinds.get(who, None if ours else MAV_TYPE.GCS)
+        return kind == MAV_TYPE.GCS or who == (self._system, self._autopilot)
 
 
 class Tunable(msgspec.Struct, frozen=True):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from magbridge.mavlink.codec import Codec, FrameLogReader, FrameLogWriter
-from magbridge.mavlink.framing import SECRET
-from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, by_id, spec
-from magbridge.mavlink.signing import Signing, Stream, load_key, readable_by_all
-from magbridge.mavlink.source import Source
+from magbridge.mavlink.codec import (
+    Codec,
+    FrameLogReader,
+    FrameLogWriter,
+    Signing,
+    Stream,
+    load_key,
+    readable_by_all,
+)
+from magbridge.mavlink.messages import BAD_DATA, REFUSED, SECRET, Message, Source, Spec, by_id, spec
 from magbridge.mavlink.tlog import LogReader, TlogRecord, pack_record, pack_records
 
 __all__ = [

@@ -1,4 +1,9 @@
-"""The messages of pymavlink's dialect ``all`` and of magbridge: their layouts, and a received message."""
+"""Messages of pymavlink's dialect ``all`` and of magbridge: layouts, received messages, frames.
+
+pymavlink computes the checksums of frames and decodes them. Finding them replaces its ``parse_char``: after a
+wrong checksum, that method skips as many bytes as the header claimed, so that garbage that looks like a
+header swallows valid frames (ArduPilot/pymavlink#387).
+"""
 
 from __future__ import annotations
 
@@ -10,20 +15,20 @@ from typing import Any, Final, TypeVar
 from pymavlink.dialects.v20 import all as upstream
 
 from magbridge.mavlink import dialect
+from magbridge.mavlink.dialect import (
+    MAVLINK_IFLAG_SIGNED,
+    MAVLINK_SIGNATURE_BLOCK_LEN,
+    PROTOCOL_MARKER_V1,
+    PROTOCOL_MARKER_V2,
+    x25crc,
+)
 from magbridge.mavlink.enums import INVALID
 
 __all__ = [
-    "BAD_DATA",
-    "MESSAGES",
-    "MESSAGE_IDS",
-    "REFUSED",
-    "Field",
-    "Message",
-    "Spec",
-    "by_id",
-    "east_e7",
-    "spec",
-    "split_index",
+    "BAD_DATA", "EXTRA", "MAX_MESSAGE_ID", "MESSAGES", "MESSAGE_IDS", "NEEDS_MORE", "REFUSED", "SECRET",
+    "SIGNATURE", "SIGNED", "V1", "V2", "Field", "Message", "Source", "Spec", "by_id", "checksum", "east_e7",
+    "find_magic", "frame_end", "is_signed", "message", "spec", "split_index", "without_secret",
+    "without_secrets",
 ]  # fmt: skip
 
 BAD_DATA: Final = -1
@@ -232,3 +237,176 @@ def split_index(field: str) -> tuple[str, int | None]:
 def east_e7(longitude: float) -> int:
     """Return a longitude (deg, of any turn) in 1e-7 deg, -180 to 180: beyond 214, 32 bits overflow."""
     return (round(longitude * 1e7) + TURN_E7 // 2) % TURN_E7 - TURN_E7 // 2
+
+
+V1: Final = PROTOCOL_MARKER_V1
+V2: Final = PROTOCOL_MARKER_V2
+SIGNED: Final = MAVLINK_IFLAG_SIGNED
+SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
+"""Length of a signature, bytes: link id, 6 of time stamp, 6 of hash."""
+NOT_A_FRAME: Final = 0
+NEEDS_MORE: Final = -1
+MAX_MESSAGE_ID: Final = 0xFFFF
+"""The last message id that a message outside the dialect may have."""
+EXTRA: Final = {number: bytes((layout.crc_extra,)) for number, layout in MESSAGES.items()}
+"""CRC_EXTRA of each message, the last byte that its checksum covers."""
+
+
+def checksum(data: bytes, extra: bytes) -> int:
+    """Return the checksum of a frame's bytes after the magic byte, and of its CRC_EXTRA."""
+    crc: int = x25crc(data + extra).crc
+    return crc
+
+
+def find_magic(data: bytes, start: int, stop: int) -> int:
+    """Return where the first magic byte of ``data[start:stop]`` is; `stop` where there is none.
+
+    A regular expression would take a hundred times as long for a long run of other bytes.
+    """
+    if start < stop and (data[start] == V2 or data[start] == V1):  # as almost always: right after a frame
+        return start
+    v2 = data.find(V2, start, stop)
+    end = v2 if v2 >= 0 else stop
+    v1 = data.find(V1, start, end)
+    return v1 if v1 >= 0 else end
+
+
+def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
+    """Return where the frame ends that begins at ``data[start]``.
+
+    The checksum of a message outside the dialect cannot be checked; it is believed when its header is
+    plausible and another frame begins at its end, or when it ends with the data. A random
+    header hardly ever is plausible, so that garbage does not delay the frames behind it.
+
+    Parameters
+    ----------
+    data : bytes
+        Bytes received; ``data[start]`` is a magic byte.
+    start, stop : int
+        Look at no more than ``data[start:stop]``.
+    last : bool
+        Nothing comes after `stop`.
+
+    Returns
+    -------
+    int
+        The end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the bytes from `stop` on are needed to decide.
+    """
+    available = stop - start
+    header = 10 if data[start] == V2 else 6
+    flags = data[start + 2] if header == 10 and available > 2 else 0
+    # an incompatibility flag that we do not know: by the standard, not to be read
+    if flags > SIGNED or available < header:
+        return NOT_A_FRAME if flags > SIGNED else NEEDS_MORE
+    number = data[start + 5] if header == 6 else _number(data, start)
+    extra = EXTRA.get(number)
+    if extra is None and (header == 6 or data[start + 3] or number > MAX_MESSAGE_ID):
+        return NOT_A_FRAME
+    body_end = start + header + data[start + 1]
+    end = body_end + 2 + (SIGNATURE if flags else 0)
+    if end > stop:
+        return NEEDS_MORE
+    if extra is not None:
+        right = checksum(data[start + 1 : body_end], extra)
+        return end if right == data[body_end] | data[body_end + 1] << 8 else NOT_A_FRAME
+    if end >= stop:
+        return end if last else NEEDS_MORE
+    return end if data[end] in (V1, V2) else NOT_A_FRAME
+
+
+def message(frame: bytes) -> Message:
+    """Parse a frame that :func:`frame_end` has accepted."""
+    header = 10 if frame[0] == V2 else 6
+    number = frame[5] if header == 6 else _number(frame, 0)
+    payload = frame[header : header + frame[1]]
+    known = number in EXTRA
+    if known:
+        payload = payload.ljust(spec(number).size, b"\0")
+    # the sequence, the sender's system and its component stand before the message's id
+    sender = 4 if header == 10 else 2
+    return Message(number, frame[sender + 1], frame[sender + 2], frame[sender], payload, frame, known)
+
+
+def is_signed(frame: bytes) -> bool:
+    """Return True if a frame carries a signature."""
+    return frame[0] == V2 and bool(frame[2] & SIGNED)
+
+
+def _number(data: bytes, start: int) -> int:
+    """Return the id of the message whose version 2 frame begins at ``data[start]``."""
+    return data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
+
+
+SECRET = frozenset(
+    spec(name).id for name in ("SETUP_SIGNING", "AUTH_KEY", "CHANGE_OPERATOR_CONTROL", "WIFI_CONFIG_AP")
+)
+"""Ids of the messages with a key, a passkey or a password in them. The bridge accepts none over the link, so
+that a log or the memory keeps only the fact that they came."""
+SECRET_HEADER = re.compile(
+    rb"\xfd.{6}(?:" + b"|".join(re.escape(number.to_bytes(3, "little")) for number in SECRET) + rb")",
+    re.DOTALL,
+)
+
+
+def without_secret(frame: bytes) -> bytes:
+    """Return a frame of such a message with zeros for its payload, and the checksum that belongs to it."""
+    header = 10 if frame[0] == V2 else 6
+    number = int.from_bytes(frame[7:10], "little") if header == 10 else frame[5]
+    body = frame[1:header] + bytes(frame[1])
+    end = header + frame[1]
+    right = checksum(body, EXTRA[number])
+    return frame[:1] + body + right.to_bytes(2, "little") + frame[end + 2 :]
+
+
+def without_secrets(data: bytes) -> bytes:
+    """Return bytes that are not a whole frame, with zeros wherever the payload of such a message may be."""
+    for match in SECRET_HEADER.finditer(data):
+        begin = match.end()
+        end = min(begin + data[match.start() + 1], len(data))
+        data = data[:begin] + bytes(end - begin) + data[end:]
+    return data
+
+
+class Source:
+    """Lets one value come from one component at a time: live, and when a bridge's log is read.
+
+    That is the `wanted` one; else the first heard, but the autopilot goes before all others, and another
+    takes its place when nothing has come for longer than `patience_us`.
+
+    Parameters
+    ----------
+    autopilot : int
+        Component of the autopilot.
+    patience_us : int
+        µs.
+    wanted : int or None
+        The only component that counts.
+
+    Attributes
+    ----------
+    component : int or None
+        Where the last value came from.
+    """
+
+    __slots__ = ("_autopilot", "_patience_us", "_received_us", "component", "wanted")
+
+    def __init__(self, autopilot: int, patience_us: int, wanted: int | None = None) -> None:
+        self._autopilot, self._patience_us, self.wanted = autopilot, patience_us, wanted
+        self.component: int | None = None
+        self._received_us = 0
+
+    def admit(self, component: int, time_us: int) -> bool:
+        """Return True if a value from `component` at `time_us` (µs) counts."""
+        if component != self.component:
+            if self.wanted is not None:
+                if component != self.wanted:
+                    return False
+            elif (
+                self.component is not None
+                and component != self._autopilot
+                and time_us - self._received_us <= self._patience_us
+            ):
+                return False
+            self.component = component
+        self._received_us = time_us
+        return True

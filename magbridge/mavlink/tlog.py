@@ -18,8 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import IndexArray
-from magbridge.mavlink.framing import EXTRA, MAX_MESSAGE_ID, SIGNATURE, SIGNED, V1, V2, checksum, message
-from magbridge.mavlink.messages import Message, spec
+from magbridge.mavlink.messages import (
+    EXTRA,
+    MAX_MESSAGE_ID,
+    SIGNATURE,
+    SIGNED,
+    V1,
+    V2,
+    Message,
+    checksum,
+    message,
+    spec,
+)
 
 __all__ = ["LogReader", "RecordBlock", "TlogRecord", "blocks", "pack_record", "pack_records"]
 

@@ -8,8 +8,8 @@ from math import nan
 from nicegui import ui
 
 from magbridge.config import Align, Telemetry
-from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS
 from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
+from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import BridgeState

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import msgspec
 
+from magbridge.bridge.devices import SerialPort
 from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.bridge.links import open_link
 from magbridge.bridge.port import Port
-from magbridge.bridge.serial_port import SerialPort
 from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError
 from magbridge.logs.tlog import TlogWriter

@@ -13,7 +13,7 @@ from math import isfinite, nan
 import numpy as np
 import xarray as xr
 
-from magbridge.bridge import states
+from magbridge.bridge import events
 from magbridge.bridge.events import Event
 from magbridge.config import Config
 from magbridge.mavlink.enums import MAG_PORT_NAME
@@ -63,7 +63,7 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
     driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
     answers = b"".join(fluxgate.feed(command) for command in driver.start())
     for port in (MAG_PORT_NAME.SENSOR, MAG_PORT_NAME.LINK):
-        yield Event(begin_us, Channel.STATE, states.opened(port))
+        yield Event(begin_us, Channel.STATE, events.opened(port))
     if answers:
         yield Event(begin_us, Channel.SENSOR, answers)
     last_us = begin_us

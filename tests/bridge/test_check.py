@@ -12,9 +12,8 @@ import pytest
 from rig import Rig
 from small import bridge_text
 
-from magbridge.bridge import live_check
-from magbridge.bridge.check import findings
-from magbridge.bridge.live_check import Arrived, LiveCheck
+from magbridge.bridge import check
+from magbridge.bridge.check import Arrived, LiveCheck, findings
 from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter, identity
 from magbridge.calibration.terms import Polynomial
@@ -208,7 +207,7 @@ def test_live_reports_silent_ports(
     make_rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = make_rig()
-    monkeypatch.setattr(live_check, "LISTEN_TIME_S", 1.0)
+    monkeypatch.setattr(check, "LISTEN_TIME_S", 1.0)
     assert main(["run", "--check", "--live", "--config", str(rig.config)]) == 0
     out, err = capsys.readouterr()
     assert "sensor digitizer: 0 readings/s" in out

@@ -10,7 +10,7 @@ import pytest
 from small import START, small_bridge
 
 from magbridge import logs
-from magbridge.bridge import states
+from magbridge.bridge import events
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.model import Parameter
@@ -91,7 +91,7 @@ def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(20):
             if k == 10:
-                stall = states.standstill(START + k * 1_000_000, 5_000_000)
+                stall = events.standstill(START + k * 1_000_000, 5_000_000)
                 pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.STATE, stall))
             position = 0.9 if k >= 10 else 0.0
             frame = autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=position)

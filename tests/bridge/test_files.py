@@ -10,7 +10,7 @@ import pytest
 from checks import replays
 from rig import Rig
 
-from magbridge.link.ftp import FTP_HEADER, Opcode
+from magbridge.link.files import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Message, Signing
 
 KEY = bytes(range(7, 39))

@@ -192,7 +192,7 @@ def test_px4_fuses_an_external_position_since_december_2025(
 def test_a_later_ardupilot_fuses_and_accepts_both_messages(
     version: tuple[int, int] | None, released: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("magbridge.bridge.fixing.ARDUPILOT_FUSES", (4, 8))
+    monkeypatch.setattr("magbridge.bridge.navigation.ARDUPILOT_FUSES", (4, 8))
     for kind, field in (("GLOBAL_POSITION_SENSOR", "eph"), ("EXTERNAL_POSITION_ESTIMATE", "param3")):
         bench = Bench(kind)
         bench.receive("HEARTBEAT", autopilot=ARDUPILOT)

@@ -27,7 +27,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.errors import ConfigError
 from magbridge.field.igrf import igrf
-from magbridge.link.attitude import NO_ATTITUDE, nmea_sentences
+from magbridge.link.estimates import NO_ATTITUDE, nmea_sentences
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from small import START, small_bridge
 
 from magbridge.bridge.events import StartEvent
-from magbridge.bridge.keeper import SAVE_US, Keeper
-from magbridge.bridge.keeper import load_state as kept
+from magbridge.bridge.run import SAVE_US, Keeper
+from magbridge.bridge.run import load_state as kept
 from magbridge.calibration.model import Parameter
 from magbridge.config import load
 

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.events import Event, StartEvent, declarations
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.recorder import declarations
 from magbridge.calibration.model import Parameter
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.events import Event, StartEvent, clock_step
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.states import clock_step
 from magbridge.calibration.model import Parameter
 from magbridge.config import Align
 from magbridge.mavlink import Codec, Message

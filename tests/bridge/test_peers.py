@@ -13,10 +13,8 @@ from typing import Any
 
 import pytest
 
-from magbridge.bridge.links import open_link
-from magbridge.bridge.peers import ANSWERED, MAX_PARSED_PEERS, PEER_READ_BYTES, Peers
-from magbridge.bridge.port import Port
-from magbridge.bridge.sockets import CONNECTIONS
+from magbridge.bridge.links import CONNECTIONS, open_link
+from magbridge.bridge.port import ANSWERED, MAX_PARSED_PEERS, PEER_READ_BYTES, Peers, Port
 from magbridge.mavlink import Codec
 
 PILOT = (1, 1)
@@ -141,7 +139,7 @@ def test_two_senders_as_the_autopilot_are_reported() -> None:
 
 def test_a_peer_that_falls_silent_is_no_longer_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
-    monkeypatch.setattr("magbridge.bridge.peers.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("magbridge.bridge.port.time.monotonic", lambda: now[0])
     both = Peers(PILOT)
     both.receive("station", beat(190, 255))
     assert [one.address for one in both.answered()] == ["station"]
@@ -213,7 +211,7 @@ def test_connections_never_turn_the_autopilot_out() -> None:
 
 
 def test_a_client_that_only_listens_gives_way_to_one_that_sends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("magbridge.bridge.sockets.GREETING", 0.0)
+    monkeypatch.setattr("magbridge.bridge.links.GREETING", 0.0)
     with opened("tcpin") as (port, place), ExitStack() as stack:
         mute = [stack.enter_context(socket.create_connection(place)) for _ in range(CONNECTIONS)]
         for _ in mute:

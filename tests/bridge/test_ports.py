@@ -19,13 +19,11 @@ import pytest
 from checks import soon
 from standstill import standstill
 
+from magbridge.bridge.devices import SerialPort
 from magbridge.bridge.events import HostClock
-from magbridge.bridge.links import open_link
+from magbridge.bridge.links import TcpServer, open_link
 from magbridge.bridge.live import LiveEdge
-from magbridge.bridge.peers import Peers
-from magbridge.bridge.port import MAX_WAIT_S, MAX_WAITING_MESSAGES
-from magbridge.bridge.serial_port import SerialPort
-from magbridge.bridge.sockets import TcpServer
+from magbridge.bridge.port import MAX_WAIT_S, MAX_WAITING_MESSAGES, Peers
 from magbridge.errors import ConfigError, PortError
 from magbridge.mavlink import Codec, Message, Signing
 from magbridge.records import Channel

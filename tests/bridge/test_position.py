@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from small import small_bridge
 
-from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.events import Event, StartEvent, clock_step
 from magbridge.bridge.position import Position
-from magbridge.bridge.states import clock_step
 from magbridge.calibration.model import Parameter
 from magbridge.field.igrf import igrf, total_field
 from magbridge.mavlink import Codec

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from small import START, small_bridge
 
-from magbridge.bridge import states
+from magbridge.bridge import events
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.sensor_line import SensorLine
+from magbridge.bridge.sensor import SensorLine
 from magbridge.calibration.model import Parameter
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Codec
@@ -41,7 +41,7 @@ class Bench:
                     self.texts.append(message["text"])
 
     def open(self, seconds: float) -> None:
-        self.feed(seconds, Channel.STATE, states.opened(MAG_PORT_NAME.SENSOR))
+        self.feed(seconds, Channel.STATE, events.opened(MAG_PORT_NAME.SENSOR))
 
     def receive(self, seconds: float, data: bytes) -> None:
         self.feed(seconds, Channel.SENSOR, data)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from devices import open_line
 
-from magbridge.bridge import states
+from magbridge.bridge import events
 from magbridge.bridge.check import findings
 from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent, port_number
@@ -116,7 +116,7 @@ class Bench:
         self.messages: list[Message] = []
         self._ear = Codec(0, 0)
         for sensor_id in (0, 1):
-            self.feed(0.0, Channel.STATE, states.opened(port_number(sensor_id)))
+            self.feed(0.0, Channel.STATE, events.opened(port_number(sensor_id)))
 
     def feed(self, seconds: float, channel: Channel, data: bytes, sensor_id: int = 0) -> None:
         """Feed one event at a time after the start, s."""

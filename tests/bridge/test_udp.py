@@ -48,7 +48,7 @@ def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pyte
         port.write(b"1")
         _, peer = before.recvfrom(9)
         host[0] = "127.0.0.2"
-        monkeypatch.setattr("magbridge.bridge.sockets.PEER_TIMEOUT", 0.3)
+        monkeypatch.setattr("magbridge.bridge.links.PEER_TIMEOUT", 0.3)
         for _ in range(4):
             time.sleep(0.1)
             before.sendto(b"here", peer)

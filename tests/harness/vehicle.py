@@ -9,7 +9,7 @@ from passages import OPTIONS, PLACE, hills
 from magbridge.bridge.navigation import NavigationService
 from magbridge.config import Link
 from magbridge.link.component import Component
-from magbridge.link.fixes import FIX_MESSAGES
+from magbridge.link.estimates import FIX_MESSAGES
 from magbridge.mavlink import Codec, Message
 from magbridge.navigate.record import Reckoned
 

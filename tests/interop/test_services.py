@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v10 import common as version_1
 from rig import Rig
 
-from magbridge.link.ftp import FTP_HEADER, Opcode
+from magbridge.link.files import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Message
 
 LOG = "20250101T000000Z_0001.tlog"

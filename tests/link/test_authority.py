@@ -12,8 +12,8 @@ from small import START, small_bridge
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.model import Parameter
 from magbridge.config import Telemetry
-from magbridge.link.authority import Sources
 from magbridge.link.output import Announcer, Outbox, Timers
+from magbridge.link.telemetry import Sources
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT
 from magbridge.records import Channel

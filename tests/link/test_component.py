@@ -15,9 +15,8 @@ from line import Line, MakeLine
 from magbridge.config import Align, Link
 from magbridge.errors import ConfigError
 from magbridge.link.component import Component
-from magbridge.link.message_rates import check_publish
 from magbridge.link.parameters import alignment
-from magbridge.link.reports import Condition
+from magbridge.link.publish import Condition, check_publish
 from magbridge.mavlink import Codec, FrameLogReader, Signing, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE
 

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from scipy.linalg import solve_continuous_are
 
-from magbridge.link.fixes import FIX_MESSAGES, WALK, Fix, Pose, widened
+from magbridge.link.estimates import FIX_MESSAGES, WALK, Fix, Pose, widened
 from magbridge.link.output import Outbox
 from magbridge.mavlink import Codec, Message
 

@@ -13,10 +13,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from line import Line
 
-from magbridge.link import metadata
-from magbridge.link.ftp import BURST, DATA, EACH, FTP_HEADER, SESSIONS, Error, FtpServer, Opcode, Request
-from magbridge.link.metadata import crc32
-from magbridge.link.tree import LogTransfer, Tree
+from magbridge.link import files as metadata
+from magbridge.link.files import (
+    BURST,
+    DATA,
+    EACH,
+    FTP_HEADER,
+    SESSIONS,
+    Error,
+    FtpServer,
+    LogTransfer,
+    Opcode,
+    Request,
+    Tree,
+    crc32,
+)
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAV_CMD
 

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from line import Line, MakeLine
 
-from magbridge.bridge.keeper import StoredState, load_state, save_state
+from magbridge.bridge.run import StoredState, load_state, save_state
 from magbridge.config import Align, Telemetry
 from magbridge.errors import FormatError
-from magbridge.link.message_rates import LIMITS
 from magbridge.link.parameters import Parameters, Tunable, alignment, rates, real32, telemetry_ages
+from magbridge.link.publish import LIMITS
 
 
 def write(link: Line, name: str, value: float, kind: int = 9) -> list[Any]:

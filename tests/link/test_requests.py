@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from magbridge.config import Telemetry
 from magbridge.link.output import Announcer, Outbox, Timers
-from magbridge.link.requests import Stream, StreamRequests, needed_rates
+from magbridge.link.telemetry import Stream, StreamRequests, needed_rates
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
 

@@ -11,8 +11,8 @@ import pytest
 
 from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
-from magbridge.link.clock import VehicleClock
 from magbridge.link.telemetry import TelemetryMap
+from magbridge.link.vehicle import VehicleClock
 from magbridge.mavlink import SECRET, Codec, LogReader
 from magbridge.mavlink.messages import MESSAGES, spec
 

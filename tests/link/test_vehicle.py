@@ -10,7 +10,7 @@ from math import isnan
 import pytest
 from line import Line
 
-from magbridge.link.clock import VehicleClock
+from magbridge.link.vehicle import VehicleClock
 from magbridge.mavlink import Codec, spec
 
 START = 1_700_000_000_000_000

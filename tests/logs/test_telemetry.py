@@ -12,7 +12,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as v1
 
 from magbridge import logs
-from magbridge.bridge.recorder import declarations
+from magbridge.bridge.events import declarations
 from magbridge.config import Telemetry
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment, passed_over

@@ -10,7 +10,7 @@ import pytest
 
 from magbridge.errors import FormatError
 from magbridge.mavlink import REFUSED, Codec, Signing, load_key, readable_by_all
-from magbridge.mavlink.signing import timestamp
+from magbridge.mavlink.codec import timestamp
 
 KEY = bytes(range(32))
 NOW = 1_700_000_000_000_000

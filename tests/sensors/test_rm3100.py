@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from magbridge.bridge import bus_port
-from magbridge.bridge.bus_port import BusPort, sensor_port
+from magbridge.bridge import devices
+from magbridge.bridge.devices import BusPort, sensor_port
 from magbridge.config import load
 from magbridge.errors import ConfigError, PortError
 from magbridge.records import Reading
@@ -84,7 +84,7 @@ def test_a_rate_that_the_cycle_count_does_not_allow_is_refused() -> None:
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> Rm3100Registers:
     made = Rm3100Registers()
-    monkeypatch.setattr(bus_port, "open_bus", lambda _: made)
+    monkeypatch.setattr(devices, "open_bus", lambda _: made)
     return made
 
 
@@ -101,7 +101,7 @@ def wait_for(port: BusPort, part: Rm3100, seconds: float = 5.0) -> Reading:
 
 
 def test_a_frozen_part_is_configured_again(bus: Rm3100Registers, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_port, "MIN_SILENCE_S", 0.05)
+    monkeypatch.setattr(devices, "MIN_SILENCE_S", 0.05)
     port, part = BusPort("i2c:1:0x20", driver(rate=150.0, cycle_count=100)), driver(cycle_count=100)
     port.open()
     try:

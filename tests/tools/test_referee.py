@@ -18,8 +18,8 @@ from referee.px4 import PX4_RATES_HZ
 from magbridge.bridge.motion import Motion
 from magbridge.config import Link
 from magbridge.link.component import Component
-from magbridge.link.fixes import Kind
-from magbridge.link.requests import needed_rates
+from magbridge.link.estimates import Kind
+from magbridge.link.telemetry import needed_rates
 from magbridge.mavlink import Codec, spec
 
 BRIDGE = Codec(1, 191)

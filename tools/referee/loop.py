@@ -15,8 +15,8 @@ from magbridge.config import Link
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.link.component import Component
-from magbridge.link.fixes import FIX_MESSAGES
-from magbridge.link.requests import needed_rates
+from magbridge.link.estimates import FIX_MESSAGES
+from magbridge.link.telemetry import needed_rates
 from magbridge.navigate import NavigationOptions
 from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth

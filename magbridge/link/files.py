@@ -1,21 +1,211 @@
-"""MAVLink FTP: a station reads files of the bridge and cannot write.
+"""Files that a station may read and cannot write: metadata of the parameters, and logs.
 
-Requests in, replies out, without port and clock (MAVLink guide, 'File Transfer Protocol'). A request that
-cannot be granted gets the protocol's own error.
+By MAVLink FTP (MAVLink guide, 'File Transfer Protocol') and, for logs, by LOG_REQUEST_*: requests in, replies
+out, without port and clock. A station asks for COMPONENT_METADATA, reads the general file that it names, and
+from there the file of the parameters (MAVLink guide, 'Component Metadata Protocol').
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import errno
+import os
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from enum import IntEnum
+from io import BytesIO
+from math import ceil, log10
+from pathlib import Path
 from struct import Struct
 from typing import BinaryIO, NamedTuple
 
-from magbridge.link.metadata import crc32
-from magbridge.link.tree import Entry, Tree
+import msgspec
 
-__all__ = ["DATA", "Error", "FtpServer", "Opcode", "Request"]
+from magbridge.link.parameters import Tunable
+from magbridge.mavlink import Spec, spec
+
+__all__ = ["GENERAL", "FtpServer", "LogTransfer", "Tree", "crc32", "metadata_files", "uri"]
+
+GENERAL, PARAMETERS = "/general.json", "/parameter.json"
+PARAMETER_TYPE = 1
+"""COMP_METADATA_TYPE_PARAMETER"""
+GROUPS = {"publish": "Rates", "align": "Alignment", "telemetry": "Telemetry", "metadata_files": "Files"}
+"""By the first part of a parameter's key."""
+MOST_PLACES = 7
+
+
+def crc32(data: bytes, initial: int = 0) -> int:
+    """Return the CRC-32 of MAVLink FTP: that of zlib without the inversions at begin and end."""
+    return zlib.crc32(data, initial ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def uri(component: int, path: str) -> str:
+    """Return the URI of a file of `component`."""
+    return f"mftp://[;comp={component}]{path}"
+
+
+def metadata_files(parameters: Iterable[Tunable], component: int) -> Mapping[str, bytes]:
+    """Return the general file and that of the parameters, by path."""
+    rows = msgspec.json.encode({"version": 1, "parameters": [describe(row) for row in parameters]})
+    kinds = [{"type": PARAMETER_TYPE, "uri": uri(component, PARAMETERS), "fileCrc": crc32(rows)}]
+    general = msgspec.json.encode({"version": 1, "metadataTypes": kinds})
+    return {GENERAL: general, PARAMETERS: rows}
+
+
+def describe(row: Tunable) -> dict[str, object]:
+    """Return the metadata of one parameter by the schema of MAVLink."""
+    smallest = min((abs(value) for value in (row.default, row.low) if value), default=1.0)
+    return {
+        "name": row.name,
+        "type": "Float",
+        "shortDesc": row.doc[:1].upper() + row.doc[1:],
+        "longDesc": f"{row.key} of the configuration. Takes effect at once, and is kept over restarts.",
+        "units": row.unit,
+        "default": row.default,
+        "min": row.low,
+        "max": row.high,
+        "decimalPlaces": min(max(ceil(-log10(smallest)) + 1, 2), MOST_PLACES),
+        "rebootRequired": False,
+        "volatile": False,
+        "group": GROUPS.get(row.key.partition(".")[0], "Standard"),
+        "category": "Standard",
+    }
+
+
+LOG = re.compile(r"(\d{8}T\d{6})Z_\d{4,}\.tlog")
+"""Names that the bridge gives its logs: its key or configuration may lie in the same folder."""
+LOGS = ("@MAV_LOG", "logs")
+"""The folder of the logs, as the MAVLink guide calls it and as people do."""
+
+
+class Entry(NamedTuple):
+    """A name in a folder, and its size in bytes; None is a folder."""
+
+    name: str
+    size: int | None
+
+
+class Tree:
+    """A read-only tree.
+
+    Parameters
+    ----------
+    texts : mapping of str to bytes
+        Files of the root, ``/name``.
+    logs : Path or None
+        The folder of the logs.
+    """
+
+    def __init__(self, texts: Mapping[str, bytes], logs: Path | None) -> None:
+        self._texts = {name.strip("/"): text for name, text in texts.items()}
+        self._logs = logs
+
+    def entries(self, path: str) -> list[Entry]:
+        """Return the entries of a folder, in order; raises OSError if it does not exist."""
+        match parts(path):
+            case []:
+                texts = [Entry(name, len(text)) for name, text in self._texts.items()]
+                return [*(Entry(name, None) for name in LOGS if self._logs is not None), *texts]
+            case [name] if name in LOGS and self._logs is not None:
+                return self.logs()
+        raise FileNotFoundError(errno.ENOENT, path)
+
+    def open(self, path: str) -> tuple[BinaryIO, int]:
+        """Return a file and its size in bytes; raises OSError where there is none."""
+        match parts(path):
+            case [name] if name in self._texts:
+                return BytesIO(self._texts[name]), len(self._texts[name])
+            case [folder, name] if folder in LOGS and self._logs is not None and LOG.fullmatch(name):
+                opened = os.open(self._logs / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+                return os.fdopen(opened, "rb", buffering=0), os.fstat(opened).st_size
+        raise FileNotFoundError(errno.ENOENT, path)
+
+    def logs(self) -> list[Entry]:
+        """Return the logs, oldest first."""
+        if self._logs is None or not self._logs.is_dir():
+            return []
+        with os.scandir(self._logs) as found:
+            logs = [
+                Entry(one.name, one.stat().st_size)
+                for one in found
+                if LOG.fullmatch(one.name) and one.is_file(follow_symlinks=False)
+            ]
+        return sorted(logs)
+
+
+def parts(path: str) -> list[str]:
+    """Return the names along a path; raise OSError if it leads upward."""
+    names = [name for name in path.split("/") if name not in ("", ".")]
+    if ".." in names or "\0" in path:
+        raise PermissionError(errno.EACCES, path)
+    return names
+
+
+def began_s(name: str) -> int:
+    """Return the start of a log's run by the log's name, s since 1970."""
+    found = LOG.fullmatch(name)
+    return int(datetime.strptime(found[1], "%Y%m%dT%H%M%S").replace(tzinfo=UTC).timestamp()) if found else 0
+
+
+LOG_ENTRY, LOG_DATA = spec("LOG_ENTRY"), spec("LOG_DATA")
+LOG_DATA_BYTES = LOG_DATA.fields["data"].count
+LOG_BLOCK_BYTES = 256 * LOG_DATA_BYTES
+LAST_LOG_ID = 0xFFFF
+
+
+class LogTransfer:
+    """List logs and send their data.
+
+    Logs are numbered from 1, the oldest, as they were when they were last listed.
+    """
+
+    def __init__(self, tree: Tree) -> None:
+        self._tree = tree
+        self._logs: list[Entry] = []
+
+    def entries(self, start: int, end: int) -> Iterator[tuple[Spec, bytes]]:
+        """Yield the LOG_ENTRY of each log from `start` to `end`; one with no logs where there are none."""
+        with suppress(OSError):
+            self._logs = self._tree.logs()[-LAST_LOG_ID:]
+        count = len(self._logs)
+        if not count:
+            yield LOG_ENTRY, LOG_ENTRY.payload()
+        for number, one in enumerate(self._logs, 1):
+            if start <= number <= end:
+                fields = {"id": number, "num_logs": count, "last_log_num": count, "size": one.size or 0}
+                yield LOG_ENTRY, LOG_ENTRY.payload(**fields, time_utc=began_s(one.name))
+
+    def data(self, number: int, offset: int, count: int) -> Iterator[tuple[Spec, bytes]]:
+        """Yield LOG_DATA from `offset` of a log; one that is not full, perhaps empty, ends the log.
+
+        An empty one is also the answer where there is no such log, or it cannot be read.
+        """
+        if not self._logs:
+            with suppress(OSError):
+                self._logs = self._tree.logs()[-LAST_LOG_ID:]
+        end = offset + count
+        try:
+            name = self._logs[number - 1].name if 0 < number <= len(self._logs) else ""
+            file, _ = self._tree.open(f"logs/{name}")
+        except OSError:
+            yield LOG_DATA, LOG_DATA.payload(id=number, ofs=offset)
+            return
+        with file:
+            while offset < end:
+                file.seek(offset)
+                block = file.read(min(LOG_BLOCK_BYTES, end - offset)) or b""
+                for at in range(0, len(block), LOG_DATA_BYTES):
+                    piece = block[at : at + LOG_DATA_BYTES]
+                    fields = {"id": number, "ofs": offset + at, "count": len(piece)}
+                    yield LOG_DATA, LOG_DATA.payload(**fields, data=piece.ljust(LOG_DATA_BYTES, b"\0"))
+                offset += len(block)
+                if len(block) < LOG_BLOCK_BYTES and offset < end:
+                    if not len(block) % LOG_DATA_BYTES:
+                        yield LOG_DATA, LOG_DATA.payload(id=number, ofs=offset)
+                    return
+
 
 FTP_HEADER = Struct("<HBBBBBxI")
 """Sequence, session, opcode, size, opcode replied to, whether the burst is complete, offset."""
