@@ -202,7 +202,7 @@ def plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll:
     roll : float
         deg, largest bank either way.
     """
-    from magbridge.calibration.planning.flight_plan import flight_plan  # noqa: PLC0415 - scipy only where it is used
+    from magbridge.calibration.planning.plan import flight_plan  # noqa: PLC0415 - scipy only where it is used
 
     return flight_plan(calibration, in_seconds(mission), runs=runs, roll=roll)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.errors import MissingExtra, WrongUse
 from magbridge.estimation.residual import rms

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.forward import forward
+from magbridge.calibration.correct import forward
 from magbridge.calibration.model import Calibration
 from magbridge.toml import Table
 from sitl.world import MU_0_OVER_4_PI, dipole_field

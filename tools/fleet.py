@@ -25,9 +25,8 @@ from study_worlds import MASSES, BestFit, Glider
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.fitting.pose import Known
+from magbridge.calibration.fitting.pose import Known, Mounting
 from magbridge.calibration.model import Calibration, Noise, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError

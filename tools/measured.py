@@ -37,7 +37,7 @@ from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.parameter_choice import best_parameters
-from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import CalibrationError, MagbridgeError

@@ -18,9 +18,9 @@ from studies import Column, Row, Study, percentile, study_options
 from study_worlds import MASSES, glider
 
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.planning.plan import (
     Limits,
     PlannedRun,

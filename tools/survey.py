@@ -26,8 +26,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.field_search import nodes_for
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.fitting.uncertainty import level_of
 from magbridge.calibration.model import Calibration
 from magbridge.errors import CalibrationError
 from magbridge.estimation.gaussian_field import GaussianField

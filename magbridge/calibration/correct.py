@@ -1,4 +1,8 @@
-"""Correct raw samples, many at once, with the functions that :class:`.corrector.Corrector` uses for one."""
+"""Correct raw samples, many at once, with the functions that :class:`.corrector.Corrector` uses for one.
+
+:func:`forward` is the inverse, from the true field to the readings: ``H_r = A^-1 R^T H + T``. Effects that
+depend on the reading itself are solved for by iteration; all others are exact in the first pass.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +25,10 @@ from magbridge.calibration.kernel import Kernel, apply, prepare, variances
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import LogSeries, Step
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import PAIRS
+from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.records import MAX_MEASURED_NT
 
-__all__ = ["CorrectedArrays", "correct", "regressors", "vector_covariance"]
+__all__ = ["CorrectedArrays", "correct", "forward", "regressors", "vector_covariance"]
 
 CORRECTED_AT_ONCE = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
@@ -164,3 +168,37 @@ def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:
     linear, V = prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
     return [row[back] for row in linear], [[row[back] for row in entry] for entry in V]
+
+
+def forward(
+    calibration: Calibration, field_body: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """Return the noiseless readings in a true field.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the simulated sensor.
+    field_body : (n, 3) array
+        nT, the true field in body axes (in the calibration's sensor axes if it has no boresight).
+    channels : (n, k) array
+        ``calibration.channels``, in that order.
+    time : (n,) array
+        s.
+
+    Returns
+    -------
+    (n, 3) array
+        nT, raw channels.
+    """
+    truth = np.asarray(field_body, float)
+    if calibration.boresight is not None:
+        truth = truth @ calibration.boresight.matrix()
+    reading = truth
+    # the first pass is exact unless effects depend on the reading; each further one then gains two digits
+    for _ in range(6 if calibration.effects else 1):
+        # the nine coefficients at every sample, with effects
+        phi = regressors(calibration, reading, np.asarray(channels, float), time)
+        theta = phi.T @ calibration.kernel.weights
+        reading = np.linalg.solve(symmetric(theta), truth[:, :, None])[:, :, 0] + theta[:, 6:]
+    return reading

@@ -1,11 +1,10 @@
-"""Effects of telemetry and of masses: terms that depend on something other than the present positions.
+"""Effects of telemetry, masses and the instrument: terms that do not depend on the present positions alone.
 
 Notes
 -----
 An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
 regressors sample by sample (`begin` returns a stepper with a fresh state) or of a whole log (`batch`).
-
-Effects of the instrument itself are in :mod:`.instrument_effects`.
+Without a state one function does both (:class:`MomentaryEffect`).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from itertools import accumulate, repeat
-from math import exp, isnan, tanh
+from math import exp, isnan, pi, tanh
 from operator import mul, sub
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -27,14 +26,13 @@ from magbridge.calibration.terms import MAX_ORDER, Effect, Exponents, LogSeries,
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "MAX_INTERVAL", "ChannelEffect", "ClockEffect", "LegendreEffect", "PathEffect", "PlayEffect",
-    "PowersEffect", "SourcesEffect", "held", "lagged", "offsets", "play", "powers",
+    "ChannelEffect", "ClockEffect", "LegendreEffect", "PathEffect", "PlayEffect", "PowersEffect",
+    "RateEffect", "ResponseEffect", "SourcesEffect", "TimeEffect", "held", "lagged", "offsets", "play",
+    "powers",
 ]  # fmt: skip
 
 MAX_INTERVAL = 60_000_000
 """Longest gap over which a rate of change is computed, µs."""
-Factors = list[tuple[int, float, float, list[float]]]
-"""Of each: place of the position, its centre and scale, coefficients of its polynomial, the highest first."""
 
 
 def offsets(regressors: int) -> FloatArray:
@@ -94,6 +92,18 @@ def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
         kept[step:] = kept[step:] * kept[:-step]
         step *= 2
     return y
+
+
+class MomentaryEffect(Effect, frozen=True, kw_only=True):
+    """An effect without a state: the function that :meth:`begin` returns accepts numbers and arrays."""
+
+    remembers: ClassVar[bool] = False
+
+    def batch(self, series: LogSeries) -> FloatArray:
+        """Return (r, n) regressors."""
+        step: Any = self.begin(tuple(series.values), series.kernel)
+        rows = step(series.time_us, *series.reading.T, [*series.values.values()])
+        return np.stack([np.broadcast_to(row, len(series.time)) for row in rows])
 
 
 class SingleChannelEffect(Effect, frozen=True, kw_only=True):
@@ -252,7 +262,7 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
         return tuple(one * one**0.5 for one in near)
 
 
-class LegendreEffect(Effect, frozen=True, kw_only=True):
+class LegendreEffect(MomentaryEffect, frozen=True, kw_only=True):
     """What the calibration's own positions do beyond its terms: ``T += c prod_k P_e_k(x_k)``.
 
     P_e is Legendre's polynomial of degree e: of x^e it is what a fit of all lower powers leaves, over the
@@ -260,7 +270,6 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
     """
 
     kind: ClassVar[str] = "legendre"
-    remembers: ClassVar[bool] = False
     exponents: Exponents
     """Degrees, one for each parameter, of positions scaled as the calibration scales them."""
 
@@ -281,39 +290,23 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
         return offsets(1)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper; it has no state."""
-        factors = self._factors(kernel)
-
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
-            return (_product(factors, values),)
-
-        return step
-
-    def batch(self, series: LogSeries) -> FloatArray:
-        """Return (1, n) regressors."""
-        values = list(series.values.values())
-        return np.reshape(_product(self._factors(series.kernel), values), (1, -1))
-
-    def _factors(self, kernel: Kernel) -> Factors:
-        return [
-            (k, centre, scale, leg2poly([0.0] * e + [1.0])[::-1].tolist())
-            for k, (centre, scale, e) in enumerate(
-                zip(kernel.centre, kernel.scale, self.exponents, strict=True)
-            )
+        """Return the product of the positions' polynomials, by Horner's scheme."""
+        factors = [
+            (k, kernel.centre[k], kernel.scale[k], leg2poly([0.0] * e + [1.0])[::-1].tolist())
+            for k, e in enumerate(self.exponents)
             if e
         ]
 
+        def step(time_us: int, hx: Any, hy: Any, hz: Any, values: Sequence[Any]) -> tuple[Any]:
+            product: Any = 1.0
+            for k, centre, scale, polynomial in factors:
+                x, value = (values[k] - centre) / scale, 0.0
+                for c in polynomial:
+                    value = value * x + c
+                product = product * value
+            return (product,)
 
-def _product(factors: Factors, values: Sequence[Any]) -> Any:
-    """Return the product of the factors' polynomials, by Horner's scheme, of numbers or arrays."""
-    # Product over the positions of P_e(x), by Horner's scheme.
-    product: Any = 1.0
-    for k, centre, scale, polynomial in factors:
-        x, value = (values[k] - centre) / scale, 0.0
-        for c in polynomial:
-            value = value * x + c
-        product = product * value
-    return product
+        return step
 
 
 class PlayEffect(MassEffect, frozen=True, kw_only=True):
@@ -439,3 +432,162 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         rates = np.zeros_like(monomials)
         rates[:, 1:] = np.where(joined, np.diff(monomials) / np.where(joined, apart, 1.0), 0.0)
         return np.asarray(series.kernel.rate_weights.T @ rates)
+
+
+# ---- Effects of the instrument: time, the rate of change of the reading, a nonlinear response ----
+
+
+class TimeEffect(MomentaryEffect, frozen=True, kw_only=True):
+    """An offset that depends on time alone."""
+
+    kind: ClassVar[str] = "time"
+    shape: Literal["step", "drift", "tone"]
+    """Step: ``H(t - t_0)``. Drift: ``x = (t - t_0) / period`` and its powers, with x held at -1 and 1 beyond
+    them, because nothing is known of a drift outside the time it was fitted to. Tone: ``cos`` and ``sin`` of
+    ``2 pi (t - t_0) / period``."""
+    start: Annotated[float, Meta(ge=-1e12, le=1e12)]
+    """t_0, s since 1970 UTC."""
+    period: Width = 86_400.0
+    """Period of the slowest term, s."""
+    order: Power = 1
+    """Highest power of a drift."""
+
+    @property
+    def regressors(self) -> int:
+        """Number of functions of time."""
+        return {"step": 1, "drift": self.order, "tone": 2}[self.shape]
+
+    @property
+    def size(self) -> int:
+        """Three coefficients (nT) for each function of time."""
+        return 3 * self.regressors
+
+    def columns(self, field: float) -> FloatArray:
+        """Offsets."""
+        return offsets(self.regressors)
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return the functions of time."""
+        start, period, shape, order = round(self.start * 1e6), self.period * 1e6, self.shape, self.order
+
+        def step(time_us: Any, hx: Any, hy: Any, hz: Any, values: Sequence[Any]) -> tuple[Any, ...]:
+            if shape == "step":
+                return (1.0 * (time_us >= start),)
+            x = (time_us - start) / period
+            if shape == "tone":
+                return np.cos(2.0 * pi * x), np.sin(2.0 * pi * x)
+            return powers(np.clip(x, -1.0, 1.0), order)
+
+        return step
+
+
+class RateEffect(Effect, frozen=True, kw_only=True):
+    """Offsets proportional to the rate of change of the reading, ``dH_r/dt``; coefficients in s.
+
+    Notes
+    -----
+    Live, later samples are not known, so the rate is the second-order backward difference of three samples.
+    """
+
+    kind: ClassVar[str] = "rate"
+    on: Literal["skew", "eddy"]
+    """``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three
+    coefficients. ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six
+    coefficients xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961)."""
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients (times, s)."""
+        return {"skew": 3, "eddy": 6}[self.on]
+
+    def columns(self, field: float) -> FloatArray:
+        """Return three regressors, the rates of the three channels (nT/s)."""
+        columns = np.zeros((self.size, 3, 9))
+        if self.on == "skew":
+            for k in range(3):
+                columns[k, k, 6 + k] = 1.0
+        else:
+            # k_ij: channel j's rate adds to offset i.
+            pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
+            for k, (i, j) in enumerate(pairs):
+                columns[k, j, 6 + i] = 1.0
+        return columns
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return a stepper; rates are zero until three samples have come without a gap."""
+        before: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        slope: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        then, apart_before, count = 0, 0.0, 0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+            nonlocal before, slope, then, apart_before, count
+            if hx + hy + hz - (hx + hy + hz) != 0.0:  # NaN: as if the sample had not come
+                return 0.0, 0.0, 0.0
+            # Second-order backward difference: slope + (slope - previous slope) h / (h + previous h).
+            apart = 1e-6 * (time_us - then)
+            if count == 0 or not 0.0 < apart < 1e-6 * MAX_INTERVAL:
+                before, then, count = (hx, hy, hz), time_us, 1
+                return 0.0, 0.0, 0.0
+            now = ((hx - before[0]) / apart, (hy - before[1]) / apart, (hz - before[2]) / apart)
+            share = apart / (apart + apart_before) if count > 1 else 0.0
+            x, y, z = [a + (a - b) * share for a, b in zip(now, slope, strict=True)]
+            before, slope, then, apart_before, count = (hx, hy, hz), now, time_us, apart, 2
+            return x, y, z
+
+        return step
+
+    def batch(self, series: LogSeries) -> FloatArray:
+        """Return the same backward difference (3, n): a centred one shares less noise with its sample."""
+        # Rates over the finite samples only, as the stepper skips the others.
+        known = np.flatnonzero(np.isfinite(series.reading).all(axis=1))
+        apart = 1e-6 * np.diff(series.time_us[known])
+        joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)
+        apart = np.where(joined, apart, 1.0)
+        now = np.diff(series.reading[known], axis=0) * (joined / apart)[:, None]
+        joined[:1], joined[1:] = False, joined[1:] & joined[:-1]
+        share = joined * apart / (apart + np.roll(apart, 1))
+        out = np.zeros((3, len(series.time)))
+        out[:, known[1:]] = (now + (now - np.roll(now, 1, axis=0)) * share[:, None]).T
+        return out
+
+
+class ResponseEffect(MomentaryEffect, frozen=True, kw_only=True):
+    """A nonlinear response: a power of each channel's reading, or one channel with a knee."""
+
+    kind: ClassVar[str] = "response"
+    unit: Annotated[float, Meta(ge=1.0, le=1e9)]
+    """Unit of the coefficients, nT."""
+    power: Annotated[int, Meta(ge=0, le=MAX_ORDER)] = 0
+    """``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead."""
+    axis: Annotated[int, Meta(ge=0, le=2)] = 0
+    """Index of the channel that has the knee."""
+    knee: float = 0.0
+    """Knee of the curve, nT, for either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) /
+    unit``: two coefficients, nT."""
+
+    @property
+    def size(self) -> int:
+        """Three coefficients for a power, two for a knee."""
+        return 3 if self.power else 2
+
+    def columns(self, field: float) -> FloatArray:
+        """For a power, each channel has a regressor of its own; for a knee, one channel has both."""
+        columns = np.zeros((self.size, self.size, 9))
+        for k in range(self.size):
+            columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0
+        return columns
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return the powers of the readings, or the two functions beyond the knee."""
+        power, unit, axis, knee = self.power, self.unit, self.axis, self.knee
+        sign = 1.0 if knee >= 0.0 else -1.0
+
+        def step(time_us: int, hx: Any, hy: Any, hz: Any, values: Sequence[Any]) -> tuple[Any, ...]:
+            if power:
+                return tuple(powers(h / unit, power)[-1] for h in (hx, hy, hz))
+            # Beyond the knee: a step of c_1 and a slope of c_2.
+            over = sign * ((hx, hy, hz)[axis] - knee)
+            beyond = sign * (over >= 0.0)
+            return beyond, beyond * over / unit
+
+        return step

@@ -28,20 +28,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import atan2, cos, degrees, hypot, inf, isnan, nan, radians, sin, sqrt
+from typing import Any
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
 
+Components = Sequence[Any]
+"""Components of one sample, or arrays (n,) of them."""
+
 __all__ = [
-    "DEFAULT_TILT_SIGMA_DEG",
-    "Heading",
-    "heading",
-    "heading_of_sample",
-    "level_vector",
-    "model_declination_sigma",
-    "published_covariance",
-]
+    "DEFAULT_TILT_SIGMA_DEG", "Heading", "heading", "heading_of_sample", "level_vector",
+    "model_declination_sigma", "published_covariance",
+]  # fmt: skip
 
 DEFAULT_TILT_SIGMA_DEG = 0.3
 """1-sigma of roll and of pitch where the log does not state one, deg."""
@@ -74,13 +73,75 @@ def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> Flo
 
     `vector` (n, 3): body axes, any unit. `roll`, `pitch` (n,): rad.
     """
-    x, y, z = vector.T
-    # h = R_y(pitch) R_x(roll) b
-    y_rolled = np.cos(roll) * y - np.sin(roll) * z
-    z_rolled = np.sin(roll) * y + np.cos(roll) * z
-    forward = np.cos(pitch) * x + np.sin(pitch) * z_rolled
-    down = -np.sin(pitch) * x + np.cos(pitch) * z_rolled
-    return np.stack([forward, y_rolled, down], axis=1)
+    turn = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+    return np.stack(_level(tuple(vector.T), turn), axis=1)
+
+
+def _level(b: Components, turn: Components) -> Components:
+    """Return h = R_y(pitch) R_x(roll) b; `turn`: sine and cosine of roll, then of pitch.
+
+    This function and the next two accept numbers (one sample) and arrays (a log).
+    """
+    (x, y, z), (sin_roll, cos_roll, sin_pitch, cos_pitch) = b, turn
+    z_rolled = sin_roll * y + cos_roll * z
+    return (
+        cos_pitch * x + sin_pitch * z_rolled,
+        cos_roll * y - sin_roll * z,
+        cos_pitch * z_rolled - sin_pitch * x,
+    )
+
+
+def _variance(
+    b: Components,
+    h: Components,
+    turn: Components,
+    covariance: Components,
+    boresight: Components,
+    added_variance: Any,
+    tilt_sigma: Any,
+) -> Any:
+    """Return the variance of the magnetic heading, rad^2, as in the module's notes.
+
+    `covariance`, `boresight`: nine entries each, row by row, nT^2 and rad^2. `added_variance`: nT^2, of
+    each axis in addition. `tilt_sigma`: rad.
+    """
+    (x, y, z), (h_x, h_y, h_z), (sin_roll, cos_roll, sin_pitch, cos_pitch) = b, h, turn
+    horizontal_squared = h_x * h_x + h_y * h_y
+    # g = L^T (h_y, -h_x, 0) / H^2, the rows of L written out
+    along, across = h_y / horizontal_squared, -h_x / horizontal_squared
+    g = (
+        cos_pitch * along,
+        sin_pitch * sin_roll * along + cos_roll * across,
+        sin_pitch * cos_roll * along - sin_roll * across,
+    )
+    w = (y * g[2] - z * g[1], z * g[0] - x * g[2], x * g[1] - y * g[0])  # w = b x g
+    variance = _quadratic_form(covariance, g) + added_variance * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    variance = variance + _quadratic_form(boresight, w)
+    # dpsi/dphi and dpsi/dtheta
+    by_roll = along * sin_pitch * h_y - across * (sin_roll * y + cos_roll * z)
+    by_pitch = along * h_z
+    return variance + (by_roll * by_roll + by_pitch * by_pitch) * tilt_sigma * tilt_sigma
+
+
+def _excess(b: Components, covariance: Components, boresight: Components, published: Any) -> Any:
+    """Return a third of the published variance, nT^2, beyond ``tr V + tr Omega |b|^2 - b^T Omega b``.
+
+    Checks and moving masses increase the published variances. That increase has no direction, so each axis
+    gets a third of it.
+    """
+    trace = boresight[0] + boresight[4] + boresight[8]
+    known = covariance[0] + covariance[4] + covariance[8] - _quadratic_form(boresight, b)
+    return (published - known - trace * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2])) / 3.0
+
+
+def _quadratic_form(m: Components, v: Components) -> Any:
+    """Return ``v^T M v`` of a matrix (9 numbers, row by row)."""
+    a, b, c = v
+    return (
+        a * (m[0] * a + m[1] * b + m[2] * c)
+        + b * (m[3] * a + m[4] * b + m[5] * c)
+        + c * (m[6] * a + m[7] * b + m[8] * c)
+    )
 
 
 def heading(
@@ -119,36 +180,16 @@ def heading(
         Where the horizontal field is not larger than its own standard deviation, a heading does not exist:
         sigma there is that of a uniform angle, 180 / sqrt(3) deg.
     """
-    vector = np.asarray(vector, float).reshape(-1, 3)
-    roll = np.broadcast_to(np.asarray(roll, float), len(vector))
-    pitch = np.broadcast_to(np.asarray(pitch, float), len(vector))
+    b = tuple(np.asarray(vector, float).reshape(-1, 3).T)
+    V, Omega = (
+        tuple(np.zeros(9) if given is None else np.reshape(given, (-1, 9)).T)
+        for given in (covariance, boresight_covariance)
+    )
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        h_x, h_y, h_z = level_vector(vector, roll, pitch).T
-        horizontal_squared = h_x * h_x + h_y * h_y
-        magnetic = np.degrees(np.arctan2(-h_y, h_x)) % 360.0
-        # g = L^T (h_y, -h_x, 0) / H^2, the rows of L written out
-        along, across = h_y / horizontal_squared, -h_x / horizontal_squared
-        gradient = np.stack(
-            [
-                np.cos(pitch) * along,
-                np.sin(pitch) * np.sin(roll) * along + np.cos(roll) * across,
-                np.sin(pitch) * np.cos(roll) * along - np.sin(roll) * across,
-            ],
-            axis=1,
-        )
-        # sigma^2 = g^T V g + w^T Omega w + tilt + declination, all in rad^2 until the declination.
-        variance = np.zeros(len(vector))
-        if covariance is not None:
-            variance += np.einsum("ni,nij,nj->n", gradient, covariance, gradient)
-        if boresight_covariance is not None:
-            turn = np.cross(vector, gradient)  # w = b x g
-            variance += np.einsum("ni,ij,nj->n", turn, boresight_covariance, turn)
-        # dpsi/dphi and dpsi/dtheta
-        z_rolled = np.sin(roll) * vector[:, 1] + np.cos(roll) * vector[:, 2]
-        by_roll = along * np.sin(pitch) * h_y - across * z_rolled
-        by_pitch = along * h_z
-        variance += (by_roll**2 + by_pitch**2) * np.radians(tilt_sigma_deg) ** 2
-        sigma = np.degrees(np.sqrt(variance))
+        turn = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+        h = _level(b, turn)
+        magnetic = np.degrees(np.arctan2(-h[1], h[0])) % 360.0
+        sigma = np.degrees(np.sqrt(_variance(b, h, turn, V, Omega, 0.0, np.radians(tilt_sigma_deg))))
         sigma = np.hypot(sigma, np.nan_to_num(declination_sigma_deg))
         # Nothing is worse known than a uniform angle.
         sigma = np.minimum(np.where(np.isnan(sigma), np.inf, sigma), UNIFORM_SIGMA_DEG)
@@ -176,53 +217,22 @@ def heading_of_sample(
     components' published variances. `tilt_sigma_deg`, `declination_sigma_deg`: deg, 1-sigma of roll and of
     pitch, and of the declination. Returns `magnetic, true, sigma`: deg, as in :class:`Heading`.
     """
-    x, y, z = vector
-    sin_roll, cos_roll, sin_pitch, cos_pitch = sin(roll), cos(roll), sin(pitch), cos(pitch)
-    # h = R_y R_x b
-    z_rolled = sin_roll * y + cos_roll * z
-    h_x, h_y = cos_pitch * x + sin_pitch * z_rolled, cos_roll * y - sin_roll * z
-    h_z = cos_pitch * z_rolled - sin_pitch * x
-    horizontal_squared = h_x * h_x + h_y * h_y
-    if isnan(horizontal_squared):
+    turn = sin(roll), cos(roll), sin(pitch), cos(pitch)
+    h = _level(vector, turn)
+    if isnan(h[0] + h[1]):
         return nan, nan, inf
-    magnetic = degrees(atan2(-h_y, h_x)) % 360.0
+    magnetic = degrees(atan2(-h[1], h[0])) % 360.0
     true = (magnetic + declination) % 360.0
-    if horizontal_squared == 0.0:
+    if h[0] == h[1] == 0.0:
         return magnetic, true, UNIFORM_SIGMA_DEG
-    # g = L^T (h_y, -h_x, 0) / H^2
-    along, across = h_y / horizontal_squared, -h_x / horizontal_squared
-    g = (
-        cos_pitch * along,
-        sin_pitch * sin_roll * along + cos_roll * across,
-        sin_pitch * cos_roll * along - sin_roll * across,
-    )
-    w = (y * g[2] - z * g[1], z * g[0] - x * g[2], x * g[1] - y * g[0])  # w = b x g
-    # a third of the published variance beyond tr(V) + tr(Omega) |b|^2 - b^T Omega b goes to each axis
-    trace = boresight_covariance[0] + boresight_covariance[4] + boresight_covariance[8]
-    known = covariance[0] + covariance[4] + covariance[8] + trace * (x * x + y * y + z * z)
-    known -= _quadratic_form(boresight_covariance, vector)
-    more = min(max(published_variance - known, 0.0) / 3.0, MAX_ADDED_VARIANCE)
-    variance = _quadratic_form(covariance, g) + more * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-    variance += _quadratic_form(boresight_covariance, w)
-    # dpsi/dphi and dpsi/dtheta
-    by_roll, by_pitch = along * sin_pitch * h_y - across * z_rolled, along * h_z
-    tilt_sigma = radians(tilt_sigma_deg)
-    variance += (by_roll * by_roll + by_pitch * by_pitch) * tilt_sigma * tilt_sigma
+    added = _excess(vector, covariance, boresight_covariance, published_variance)
+    added = min(max(added, 0.0), MAX_ADDED_VARIANCE)
+    tilt = radians(tilt_sigma_deg)
+    variance = _variance(vector, h, turn, covariance, boresight_covariance, added, tilt)
     if not variance >= 0.0:
         return magnetic, true, UNIFORM_SIGMA_DEG
     sigma = hypot(degrees(sqrt(variance)), 0.0 if isnan(declination_sigma_deg) else declination_sigma_deg)
     return magnetic, true, min(sigma, UNIFORM_SIGMA_DEG)
-
-
-def _quadratic_form(matrix: Sequence[float], v: tuple[float, float, float]) -> float:
-    """Return ``v^T M v`` of a matrix (9 numbers, row by row)."""
-    a, b, c = v
-    m = matrix
-    return (
-        a * (m[0] * a + m[1] * b + m[2] * c)
-        + b * (m[3] * a + m[4] * b + m[5] * c)
-        + c * (m[6] * a + m[7] * b + m[8] * c)
-    )
 
 
 def published_covariance(
@@ -230,19 +240,12 @@ def published_covariance(
 ) -> FloatArray:
     """Return the covariance of published vectors without the boresight's part, (n, 3, 3) nT^2.
 
-    Checks and moving masses increase the published variances. That increase has no direction, so each
-    axis gets a third of it.
-
     `stated` (n, 3, 3): nT^2, by the calibration alone (:func:`.correct.vector_covariance`). `turn` (3, 3):
     rad^2, covariance of the boresight's rotation vector. `vector` (n, 3): nT, corrected field in body axes.
     `variance` (n,): nT^2, sum of the three components' published variances.
     """
-    # trace of the boresight's part: tr(Omega) |b|^2 - b^T Omega b
-    # A third of the excess to each axis: excess = tr(published) - tr(V) - tr(boresight's part).
-    length = np.einsum("ni,ni->n", vector, vector)
-    known = np.trace(stated, axis1=1, axis2=2)
-    known = known + np.trace(turn) * length - np.einsum("ni,ij,nj->n", vector, turn, vector)
-    more = np.nan_to_num(np.maximum(variance - known, 0.0) / 3.0, posinf=MAX_ADDED_VARIANCE)
+    more = _excess(tuple(vector.T), tuple(stated.reshape(-1, 9).T), tuple(np.ravel(turn)), variance)
+    more = np.nan_to_num(np.maximum(more, 0.0), posinf=MAX_ADDED_VARIANCE)
     return np.asarray(stated + more[:, None, None] * np.eye(3))
 
 

@@ -37,18 +37,8 @@ from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.wording import counted
 
 __all__ = [
-    "LEVEL_STEP_SIGMA",
-    "MIN_HALF_RANGE",
-    "Boresight",
-    "CalibratedRange",
-    "CalibratedSensor",
-    "Calibration",
-    "Noise",
-    "Parameter",
-    "Reference",
-    "Run",
-    "coefficient_tensor",
-    "identity",
+    "LEVEL_STEP_SIGMA", "MIN_HALF_RANGE", "Boresight", "CalibratedRange", "CalibratedSensor", "Calibration",
+    "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "identity",
 ]  # fmt: skip
 
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))

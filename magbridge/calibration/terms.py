@@ -25,22 +25,8 @@ from magbridge.plugins import load, plugins
 from magbridge.wording import one_of
 
 __all__ = [
-    "MAX_ORDER",
-    "SLOTS",
-    "TERMS",
-    "Effect",
-    "Expansion",
-    "Exponents",
-    "LogSeries",
-    "Parameter",
-    "Polynomial",
-    "PositionTerm",
-    "Power",
-    "Step",
-    "Term",
-    "Width",
-    "full_order",
-    "term_class",
+    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "LogSeries", "Parameter", "Polynomial",
+    "PositionTerm", "Power", "Step", "Term", "Width", "full_order", "term_class",
 ]  # fmt: skip
 
 Exponents = tuple[int, ...]
@@ -65,9 +51,9 @@ TERMS: dict[str, str] = {
     "legendre": "magbridge.calibration.effects:LegendreEffect",
     "play": "magbridge.calibration.effects:PlayEffect",
     "clock": "magbridge.calibration.effects:ClockEffect",
-    "time": "magbridge.calibration.instrument_effects:TimeEffect",
-    "rate": "magbridge.calibration.instrument_effects:RateEffect",
-    "response": "magbridge.calibration.instrument_effects:ResponseEffect",
+    "time": "magbridge.calibration.effects:TimeEffect",
+    "rate": "magbridge.calibration.effects:RateEffect",
+    "response": "magbridge.calibration.effects:ResponseEffect",
 }
 """Name in ``cal.json`` -> ``module:class``; others join by the entry point group ``magbridge.terms``."""
 

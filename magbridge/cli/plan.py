@@ -57,7 +57,8 @@ def plan(
         Largest bank angle in deg that the vehicle can fly, either way.
     """
     from magbridge.calibration.file import load
-    from magbridge.calibration.planning import flight_plan, survey_patterns
+    from magbridge.calibration.planning import plan as flights
+    from magbridge.calibration.planning import survey_patterns
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read
 
@@ -71,10 +72,10 @@ def plan(
     with naming(deployment), waiting("planning"):
         if survey is None:
             assert known is not None
-            found = flight_plan.flight_plan(known, deployment, runs=runs, roll=roll)
-            result = flight_plan.facts(found, known), flight_plan.summary(found, known)
+            found = flights.flight_plan(known, deployment, runs=runs, roll=roll)
+            result = flights.facts(found, known), flights.summary(found, known)
         else:
-            proposed = flight_plan.survey_plan(known, deployment, parameter, hours=survey, roll=roll)
+            proposed = survey_patterns.survey_plan(known, deployment, parameter, hours=survey, roll=roll)
             for line in proposed[0].open:
                 complain(line)
             result = survey_patterns.facts(proposed), survey_patterns.summary(proposed)

@@ -21,11 +21,12 @@ from magbridge.calibration.effects import (
     LegendreEffect,
     PathEffect,
     PlayEffect,
+    RateEffect,
+    ResponseEffect,
     lagged,
     play,
     powers,
 )
-from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import Candidate, Columns, effect_columns, size_of

@@ -29,8 +29,7 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.effects import ClockEffect
-from magbridge.calibration.instrument_effects import RateEffect
+from magbridge.calibration.effects import ClockEffect, RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import Candidate, Columns, slices

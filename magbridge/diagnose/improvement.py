@@ -23,8 +23,8 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import CorrectedArrays, correct
+from magbridge.calibration.effects import TimeEffect
 from magbridge.calibration.file import decode_calibration
-from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.correction import Correction
 from magbridge.diagnose.columns import Candidate, Columns, slices

@@ -11,8 +11,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import BoolArray
+from magbridge.calibration.effects import TimeEffect
 from magbridge.calibration.file import encode_calibration
-from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, assess

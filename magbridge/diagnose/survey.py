@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
-from magbridge.calibration.fitting.survey_samples import beside_motion
+from magbridge.calibration.fitting.rounds import beside_motion
 from magbridge.calibration.model import Calibration
 from magbridge.columns import AGE, CHANNELS, require, require_units
 from magbridge.errors import DataError

@@ -15,8 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.mounted_masses import Mounting
-from magbridge.calibration.fitting.pose import Known, rescaling
+from magbridge.calibration.fitting.pose import Known, Mounting, rescaling
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import DataError

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from magbridge.calibration.file import decode_calibration
-from magbridge.calibration.fitting.mounted_masses import Mounting
+from magbridge.calibration.fitting.pose import Mounting
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import DataError, WrongUse
 from magbridge.fleet.catalogue import Catalogue, Row

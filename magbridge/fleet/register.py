@@ -27,7 +27,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from magbridge.calibration.fitting.mounted_masses import Mounting
+from magbridge.calibration.fitting.pose import Mounting
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.files import digest, existing
 from magbridge.fleet.catalogue import Catalogue, Row

@@ -1,7 +1,7 @@
 r"""How a refit moves a vehicle's coefficients together, where it is known where its masses sit.
 
 A refit changes the moment of a mass, its susceptibility, and its place. Each of these moves the coefficients
-along a shape of its own, the derivative of the mass's polynomials (:mod:`.mounted_masses`). That by the place
+along a shape of its own, the derivative of the mass's polynomials (``mass_columns``). That by the place
 needs the moment: so a dipole is first fitted to what the vehicle's deployments say together, N(m, P),
 
 .. math:: l = \arg\min\ (c(l) - m)^T P^{-1} (c(l) - m) + l^T W^{-1} l,
@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.mounted_masses import LATENT, Mounting, mass_columns, mounted_prior
+from magbridge.calibration.fitting.pose import LATENT, Mounting, mass_columns, mounted_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.estimation.priors import polynomial_prior

@@ -11,8 +11,8 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.fitting.observe import at_one_time
+from magbridge.calibration.fitting.uncertainty import apart_from_level
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.correction import Correction

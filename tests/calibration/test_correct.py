@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magbridge.calibration.correct import correct
+from magbridge.calibration.correct import correct, forward
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.dipole import Dipole
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.forward import forward
 from magbridge.calibration.kernel import TABLE_SUMS
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, identity
 from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, full_order

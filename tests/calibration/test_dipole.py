@@ -10,7 +10,7 @@ from gliders import Gliders
 
 from magbridge.calibration.dipole import Dipole, dipole_tensor
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.mounted_masses import read_vehicle
+from magbridge.calibration.fitting.pose import read_vehicle
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.errors import CalibrationError, ConfigError
 

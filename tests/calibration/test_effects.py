@@ -14,9 +14,11 @@ from magbridge.calibration.effects import (
     LegendreEffect,
     PlayEffect,
     PowersEffect,
+    RateEffect,
+    ResponseEffect,
     SourcesEffect,
+    TimeEffect,
 )
-from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import MAX_ORDER, TERMS, Effect, LogSeries, Polynomial, term_class
 from magbridge.errors import CalibrationError

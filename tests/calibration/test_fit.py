@@ -11,10 +11,10 @@ from gliders import Glider, Gliders, codes
 from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.auto import ellipsoid
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, METHODS, fit
-from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
@@ -104,8 +104,8 @@ def test_errors_in_variables_take_the_bias_away() -> None:
         w = h * np.sin(heading) * np.sin(roll) + level * np.cos(roll)
         field = 5e4 * np.column_stack([x, y, w]) + [300.0, -200.0, 500.0] + rng.normal(0, 5, (n, 3))
         data = Observations(field, np.full(n, 5e4), np.empty((n, 0)))
-        coefficients, covariance, *_ = nominal(data, scale_sigma=1e-3, gain_sigma=0.02)
-        off.append((coefficients[8] - 500.0) / np.sqrt(covariance[8, 8]))
+        _, found, _ = ellipsoid(data, scale_sigma=1e-3, gain_sigma=0.02)
+        off.append((found.coefficients[8] - 500.0) / np.sqrt(found.covariance[8, 8]))
     assert abs(np.mean(off)) < 3.0 / np.sqrt(len(off)) + 0.3
     assert np.std(off) < 1.6
 
@@ -267,11 +267,11 @@ def test_without_parameters_auto_is_one_ellipsoid(glider: Gliders) -> None:
 
 
 def test_nominal_constraints(glider: Gliders) -> None:
-    coefficients, covariance, *_ = nominal(glider(0).runs, axes_fixed=True, equal_xz=True)
-    assert coefficients[0] == coefficients[2]
-    assert not coefficients[3:6].any()
-    assert not covariance[3:6].any()
-    assert nominal_samples(glider(0).runs).phi.shape[1] == 1
+    posed, found, _ = ellipsoid(glider(0).runs, axes_fixed=True, equal_xz=True)
+    assert found.coefficients[0] == found.coefficients[2]
+    assert not found.coefficients[3:6].any()
+    assert not found.covariance[3:6].any()
+    assert posed.samples.phi.shape[1] == 1
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import magbridge as mb
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import TiltBoresight, boresight_from_tilt
-from magbridge.calibration.fitting.validate import expected_heading_sigma
+from magbridge.calibration.fitting.uncertainty import expected_heading_sigma
 from magbridge.calibration.heading import (
     heading,
     heading_of_sample,

@@ -18,9 +18,9 @@ from magbridge.calibration.fitting import in_place
 from magbridge.calibration.fitting.auto import fit_auto
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit, fit
-from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
+from magbridge.calibration.fitting.uncertainty import apart_from_level, level_of, with_level
 from magbridge.calibration.model import Noise, identity
 from magbridge.diagnostics import Diagnostic
 from magbridge.survey.gridding import gridded

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.calibration.fitting.nominal import check_scales
+from magbridge.calibration.fitting.solve import check_scales
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples
 

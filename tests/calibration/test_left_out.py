@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.fitting.uncertainty import in_sensor_units
 
 FIELD = np.array([21_000.0, 2_000.0, 42_000.0])
 BOOTS = np.repeat([0, 1, 2], [400, 100, 100])

@@ -10,7 +10,7 @@ import pytest
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.fitting.uncertainty import in_sensor_units
 
 pytestmark = pytest.mark.real
 

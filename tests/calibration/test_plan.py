@@ -11,7 +11,7 @@ from gliders import Gliders
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.mission import Mission, expected_error
+from magbridge.calibration.fitting.uncertainty import Mission, expected_error
 from magbridge.calibration.model import identity
 from magbridge.calibration.planning.plan import (
     Limits,

@@ -17,10 +17,12 @@ from magbridge.calibration.effects import (
     LegendreEffect,
     PlayEffect,
     PowersEffect,
+    RateEffect,
+    ResponseEffect,
     SourcesEffect,
+    TimeEffect,
 )
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import effect_columns

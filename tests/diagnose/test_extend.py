@@ -9,8 +9,7 @@ from posed import candidate, regressors_of, right
 from scipy.linalg import inv
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.effects import ClockEffect, PowersEffect
-from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
+from magbridge.calibration.effects import ClockEffect, PowersEffect, RateEffect, TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.assessment import level
 from magbridge.diagnose.causes import CAUSES

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from posed import calibrated, candidate, right, surveyed
 from scipy.signal import lfilter
 
-from magbridge.calibration.instrument_effects import TimeEffect
+from magbridge.calibration.effects import TimeEffect
 from magbridge.diagnose.causes.reference import ReferenceBias
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import ODDS

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pages import PAGES, ROOT, Block, blocks, commands
 
-from magbridge.calibration.fitting.mounted_masses import read_vehicle
+from magbridge.calibration.fitting.pose import read_vehicle
 from magbridge.cli.common import app
 from magbridge.config import load
 from magbridge.fleet.register import read_fleet

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from fleets import fly
 
-from magbridge.calibration.fitting.mounted_masses import Mounting
+from magbridge.calibration.fitting.pose import Mounting
 from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import folder as room

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.mounted_masses import LATENT, MOMENT, Mounting, mass_columns
+from magbridge.calibration.fitting.pose import LATENT, MOMENT, Mounting, mass_columns
 from magbridge.calibration.model import Parameter
 from magbridge.fleet.shapes import shape_groups, shapes_of
 

@@ -8,8 +8,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.fit import Fit
-from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.uncertainty import level_of
 
 MAIN = np.array([18_000.0, -5_000.0, 48_000.0])
 IRON = np.eye(3) + np.array([[0.012, 0.003, -0.004], [0.003, -0.008, 0.002], [-0.004, 0.002, 0.005]])

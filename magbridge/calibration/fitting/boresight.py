@@ -31,7 +31,9 @@ estimate from the scatter between a few runs would be far too small: it is not u
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -44,8 +46,8 @@ from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "TiltBoresight", "boresight_from_tilt", "choose_boresight", "down_in_body",
-    "field_body", "find_boresight", "magnetic_headings",
+    "TiltBoresight", "boresight_from_tilt", "choose_boresight", "down_in_body", "field_body",
+    "find_boresight", "magnetic_headings",
 ]  # fmt: skip
 
 # ---- From roll and pitch alone ----
@@ -121,14 +123,25 @@ def boresight_from_tilt(
     down = down_in_body(roll, pitch)
     prior = np.zeros((4, 4))
     prior[3, 3] = 1.0 / np.radians(INCLINATION_SIGMA_DEG) ** 2
-    problem = _Problem(vector, down, total, inclination, horizontal, prior)
+
+    def rows(x: FloatArray, start: Rotation, part: IndexArray | slice) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (n,), rad of tilt, and derivatives (n, 4) by a further rotation and by dI."""
+        turned = (Rotation.from_rotvec(x[:3]) * start).apply(vector[part])
+        steep = inclination[part] + x[3]
+        e = ((down[part] * turned).sum(axis=1) - total[part] * np.sin(steep)) / horizontal[part]
+        # d (down . (delta x v)) / d delta = v x down
+        J = np.column_stack([np.cross(turned, down[part]), -total[part] * np.cos(steep)])
+        return e, J / horizontal[part, None]
+
     # The cost has several minima: search from the 24 orientations of a cube on a few samples.
-    few = problem.part(np.linspace(0, len(vector) - 1, min(len(vector), SEARCH_SAMPLES)).astype(int))
-    searched = [_gauss_newton(few, start) for start in Rotation.create_group("O")]
-    start = min(searched, key=lambda result: result[2])[0]
-    rotation, shift, _ = _gauss_newton(problem, start)
+    few = np.linspace(0, len(vector) - 1, min(len(vector), SEARCH_SAMPLES)).astype(int)
+    searched = [
+        _gauss_newton(partial(rows, part=few), prior, start, 0.0) for start in Rotation.create_group("O")
+    ]
+    rotation, shift, _ = min(searched, key=lambda result: result[2])
+    rotation, shift, _ = _gauss_newton(partial(rows, part=slice(None)), prior, rotation, shift)
     turned = rotation.apply(vector)
-    e, J = problem.rows(rotation, shift)
+    e, J = rows(np.array([0.0, 0.0, 0.0, shift]), rotation, slice(None))
     tilt_sigma = max(float(np.sqrt(np.mean(e * e))), np.radians(MIN_TILT_SIGMA_DEG))
     # derivative of gravity's direction by roll and by pitch; t_i is what they do to the row
     by_roll = np.stack([np.zeros(len(roll)), np.cos(roll) * np.cos(pitch), -np.sin(roll) * np.cos(pitch)], 1)
@@ -147,8 +160,7 @@ def boresight_from_tilt(
     _, run = np.unique(runs, return_inverse=True)
     meat = N.copy()
     for index in range(int(run.max()) + 1):
-        rows = run == index
-        lever = J[rows].T @ offsets[rows] / tilt_sigma**2  # (4, 2)
+        lever = J[run == index].T @ offsets[run == index] / tilt_sigma**2  # (4, 2)
         meat += np.radians(RUN_TILT_SIGMA_DEG) ** 2 * lever @ lever.T
     inverse = np.linalg.inv(N)
     covariance = (inverse @ meat @ inverse)[:3, :3]
@@ -158,53 +170,26 @@ def boresight_from_tilt(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """The samples and the prior; shapes as for :func:`boresight_from_tilt`."""
-
-    vector: FloatArray
-    down: FloatArray
-    total: FloatArray
-    inclination: FloatArray
-    horizontal: FloatArray
-    prior: FloatArray
-
-    def part(self, rows: IndexArray) -> _Problem:
-        """Return the problem of some of the samples."""
-        return _Problem(
-            self.vector[rows], self.down[rows], self.total[rows], self.inclination[rows],
-            self.horizontal[rows], self.prior,
-        )  # fmt: skip
-
-    def rows(self, rotation: Rotation, shift: float) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals (n,), rad of tilt, and their derivatives (n, 4) by the rotation and by dI."""
-        turned, inclination = rotation.apply(self.vector), self.inclination + shift
-        e = ((self.down * turned).sum(axis=1) - self.total * np.sin(inclination)) / self.horizontal
-        J = np.empty((len(e), 4))
-        J[:, :3] = np.cross(turned, self.down) / self.horizontal[:, None]  # d (down . (delta x v)) / d delta
-        J[:, 3] = -self.total * np.cos(inclination) / self.horizontal
-        return e, J
-
-
-def _gauss_newton(problem: _Problem, rotation: Rotation) -> tuple[Rotation, float, float]:
+def _gauss_newton(
+    rows: Callable[[FloatArray, Rotation], tuple[FloatArray, FloatArray]],
+    prior: FloatArray,
+    rotation: Rotation,
+    shift: float,
+) -> tuple[Rotation, float, float]:
     """Iterate from one start; return the rotation, dI (rad) and the cost."""
-    shift, sigma, cost = 0.0, np.radians(RUN_TILT_SIGMA_DEG), np.inf
+    sigma, x = np.radians(RUN_TILT_SIGMA_DEG), np.array([0.0, 0.0, 0.0, shift])
     for _ in range(MAX_ITERATIONS):
-        e, J = problem.rows(rotation, shift)
-        hessian = J.T @ J / sigma**2 + problem.prior
-        gradient = J.T @ e / sigma**2 + problem.prior @ np.array([0.0, 0.0, 0.0, shift])
+        e, J = rows(x, rotation)
+        hessian = J.T @ J / sigma**2 + prior
         hessian += DAMPING * np.trace(hessian) * np.eye(4)
-        step = -np.linalg.solve(hessian, gradient)
-        length = np.linalg.norm(step[:3])
-        if length > MAX_STEP_RAD:
-            step *= MAX_STEP_RAD / length
-        rotation = Rotation.from_rotvec(step[:3]) * rotation
-        shift += float(step[3])
+        step = -np.linalg.solve(hessian, J.T @ e / sigma**2 + prior @ x)
+        step *= min(MAX_STEP_RAD / max(float(np.linalg.norm(step[:3])), 1e-300), 1.0)
+        # the rotation so far becomes the start, so that the derivative is always taken at none
+        rotation, x[3] = Rotation.from_rotvec(step[:3]) * rotation, x[3] + step[3]
         if np.linalg.norm(step) < CONVERGED_RAD:
             break
-    e, _ = problem.rows(rotation, shift)
-    cost = float(e @ e) / sigma**2 + problem.prior[3, 3] * shift**2
-    return rotation, shift, cost
+    e, _ = rows(x, rotation)
+    return rotation, float(x[3]), float(e @ e) / sigma**2 + prior[3, 3] * float(x[3]) ** 2
 
 
 # ---- With headings, and the choice ----

@@ -11,10 +11,9 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import choose_boresight, magnetic_headings
 from magbridge.calibration.fitting.crossings import rough_rock
-from magbridge.calibration.fitting.level import apart_from_level
-from magbridge.calibration.fitting.mission import expected_error, nearby_mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import offset_diagnostics
+from magbridge.calibration.fitting.uncertainty import apart_from_level, expected_error, nearby_mission
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnostics import Diagnostic

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.estimation.residual import rms, robust_scale
 from magbridge.pictures import save

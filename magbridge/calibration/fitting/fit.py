@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.fitting.checks import judged
 from magbridge.calibration.fitting.crossings import far_off, jumped, left_open, tells_rock
-from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
+from magbridge.calibration.fitting.uncertainty import with_level
 from magbridge.columns import CHANNELS
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, NoSolutionError
@@ -27,7 +27,7 @@ __all__ = ["MAIN_FIELD_SIGMA_NT", "METHODS", "Fit", "fit"]
 METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",
     "survey": "magbridge.calibration.fitting.in_place:fit_in_place",
-    "nominal": "magbridge.calibration.fitting.nominal:fit_nominal",
+    "nominal": "magbridge.calibration.fitting.auto:fit_nominal",
     "cubic": "magbridge.calibration.fitting.paper_methods:fit_cubic",
     "runs": "magbridge.calibration.fitting.paper_methods:fit_per_run",
     "horizontal": "magbridge.calibration.fitting.paper_methods:fit_horizontal",
@@ -96,8 +96,8 @@ def fit(
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
     if in_place:
         method = "survey"
-    if method != "survey" and len(data) > MAX_FIT_SAMPLES:
-        data = data.part(np.arange(len(data)) % -(-len(data) // MAX_FIT_SAMPLES) == 0)
+    if method != "survey":
+        data = data.thinned(MAX_FIT_SAMPLES)
     if method != "survey" and options.get("position_sigma"):
         raise CalibrationError(
             "position_sigma: the log does not show the crustal field, so its positions do not matter"
@@ -133,7 +133,7 @@ def _first_solution(
     CalibrationError: no method has one; the message is that of the first.
     """
     # each attempt: method, data, options, and the notes that explain why it is not the first choice
-    bare = replace(data, parameters=data.parameters[:, :0], names=(), units=())
+    bare = data.without_parameters()
     attempts: list[tuple[str, Observations, dict[str, Any], tuple[Diagnostic, ...]]] = []
     if method == "survey":
         attempts.append(("survey", data, {"level": bias, **options}, ()))
@@ -177,7 +177,7 @@ def _function(method: str) -> Callable[..., Fit]:
 
 def _rock_may_show(data: Observations, order: int) -> bool:
     """Return True if a fit without the crustal field leaves a residual that this field can explain."""
-    few = data.part(np.arange(len(data)) % max(len(data) // CRUST_TEST_SAMPLES, 1) == 0)
+    few = data.thinned(CRUST_TEST_SAMPLES)
     for method in ("nominal", "auto"):
         try:
             with threadpool_limits(1, "blas"):

@@ -30,14 +30,21 @@ import numpy as np
 from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.field_search import about_the_middle, ladder
 from magbridge.calibration.fitting.left_out import leave_out
-from magbridge.calibration.fitting.level import contradicts, with_level
-from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
 from magbridge.calibration.fitting.pose import Known, Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.rounds import FIRST_SAMPLES, SEARCHED, WIDE, Answer, Rounds
-from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
+from magbridge.calibration.fitting.rounds import (
+    FIRST_SAMPLES,
+    SEARCHED,
+    WIDE,
+    Answer,
+    Drift,
+    Rounds,
+    SurveySamples,
+)
+from magbridge.calibration.fitting.solve import CoefficientPosterior, check_scales
+from magbridge.calibration.fitting.uncertainty import contradicts, with_level
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.blocks import ParameterBlock, slow_functions
@@ -88,24 +95,20 @@ def fit_in_place(
     except np.linalg.LinAlgError as problem:
         raise NoSolutionError("the fit to the survey has no solution: the crustal field is free") from problem
     prior, z = found.family.prior(found.widths.eta), found.z
-    coefficients = prior.coefficients(z)
-    check_scales(samples, coefficients)
     covariance = found.covariance()
     creep = survey.offset(z[q:], [one for one in survey.offsets if one.lag is None])
     # with what the survey found added to the reference, the samples are those of a fit with a true field
     lifted = replace(
         samples, reference=samples.reference + found.lacking, field=samples.field - survey.offset(z[q:])
     )
-    noise = NoiseModel(found.widths.sigma, found.choice.rho)
-    # the coefficients' part of the prior, without that of the other unknowns
+    noise = NoiseModel(found.widths.sigma, found.choice.rho, weight=survey.kept.astype(float))
+    # the coefficients' part of prior and posterior, without that of the other unknowns
     own = Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset)
+    posterior = CoefficientPosterior(lifted, own, z[:q], covariance[:q, :q], noise, noise, settled=True)
+    check_scales(samples, posterior.coefficients)
     # predict parts from the others, the field in place as found: a figure to compare parameters by
-    left = leave_out(lifted, own, z[:q], replace(noise, weight=survey.kept.astype(float)), data.runs)
-    details = {**_details(found, survey), "left_out_nT": left.rms}
-    fit = assemble(
-        data, lifted, posed.ranges, posed.exponents, coefficients, prior.E @ covariance @ prior.E.T,
-        noise, "survey", prior=own, details=details,
-    )  # fmt: skip
+    details = {**_details(found, survey), "left_out_nT": leave_out(posterior, data.runs).rms}
+    fit = assemble(data, posed, posterior, "survey", details=details, informative=True)
     calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
     if level:
         calibration = with_level(calibration, lifted, float(z[q]), level)

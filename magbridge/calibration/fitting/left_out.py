@@ -26,16 +26,14 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.solve import CoefficientPosterior, thinned_rows
 from magbridge.estimation.information import covariance_of
-from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, effective_fraction
+from magbridge.estimation.noise import OUTLIER_SIGMA, effective_fraction
 from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
-from magbridge.estimation.priors import Prior
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
-__all__ = ["LeftOut", "error_between", "error_forward", "leave_out", "thinned", "thinned_rows"]
+__all__ = ["LeftOut", "error_between", "error_forward", "leave_out"]
 
-ENOUGH, BLOCK = 6000, 50
-"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
 PARTS, BLOCKS = 10, 4
 """Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three, or one
 that is most of the log."""
@@ -68,48 +66,28 @@ class LeftOut:
     """RMS with later parts of the log predicted from the earlier ones among the parts, nT."""
 
 
-def leave_out(
-    samples: ResidualSamples,
-    prior: Prior,
-    z: FloatArray,
-    noise: NoiseModel,
-    runs: NDArray[np.generic],
-    *,
-    attitudes: bool = False,
-    weighted: NoiseModel | None = None,
-) -> LeftOut:
-    """Predict each part of the samples from the others, and later parts of the log from the earlier ones.
+def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitudes: bool = False) -> LeftOut:
+    """Predict each part of a fit's samples from the others, and later parts of the log from the earlier ones.
 
-    `samples`: n of them. `prior`: with which they were fitted. `z` (q,): the fit. `noise`: its noise, nT.
-    `runs` (n,): A label for each sample: whole runs are left out, or blocks of neighbours where there are
-    few runs. `attitudes`: leave out groups of like attitude, too. (Not where noise is correlated for longer
-    than an attitude lasts, as on an aircraft: neighbours that stay would then predict the group.)
-    `weighted`: with which the samples were weighed, where that is not `noise`.
+    `runs` (n,): a label for each sample: whole runs are left out, or blocks of neighbours where there are few
+    runs. `attitudes`: leave out groups of like attitude, too. (Not where noise is correlated for longer than
+    an attitude lasts, as on an aircraft: neighbours that stay would then predict the group.)
     """
-    weighted = noise if weighted is None else weighted
     # positions that come late in the log do not test the fit to its beginning
-    forward = samples.phi.shape[1] == 1
-    found = _left_out(samples, prior, z, noise, _parts(runs), weighted, forward)
-    if attitudes and noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:
-        apart = _left_out(samples, prior, z, noise, _alike(samples), weighted)
-        found = replace(found, ratio=max(found.ratio, apart.ratio))
-    return found
+    left = _left_out(found, _parts(runs), forward=found.samples.phi.shape[1] == 1)
+    if attitudes and found.noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:
+        apart = _left_out(found, _alike(found.samples))
+        left = replace(left, ratio=max(left.ratio, apart.ratio))
+    return left
 
 
-def _left_out(
-    samples: ResidualSamples,
-    prior: Prior,
-    z: FloatArray,
-    noise: NoiseModel,
-    parts: list[IndexArray],
-    weighted: NoiseModel,
-    forward: bool = False,
-) -> LeftOut:
+def _left_out(found: CoefficientPosterior, parts: list[IndexArray], *, forward: bool = False) -> LeftOut:
     """Predict each of the `parts` from the others; and, `forward`, from the earlier ones."""
-    c = prior.coefficients(z)
+    samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
+    c = found.coefficients
     # Normal equations are sums over samples. Those without a part are the whole minus the part's, and one
     # Newton step from the common fit gives the coefficients without it: no fit is repeated.
-    normals = [_normal(samples, c, weighted, rows).reduced(prior.E) for rows in parts]
+    normals = [_normal(found, rows) for rows in parts]
     # at the minimum the whole gradient balances the prior, so the part's own gradient is missing
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
     every = max(len(samples.field) // TESTED, 1)
@@ -124,12 +102,12 @@ def _left_out(
             missing.append((k, np.sum([normal.hessian for normal in normals[:k]], axis=0), later))
     e, s2 = [], []
     for k, others, lacking in missing:
-        P = covariance_of(others / weighted.sigma**2 + prior.precision)
+        P = covariance_of(others / s2_fit + prior.precision)
         tested = samples.part(parts[k][counted[parts[k]]][::every])
         off, g = residuals(tested, c)
         J = jacobian(tested.phi, g) @ prior.E
         # prediction error, and its variance: noise plus J P J^T
-        e.append(off + J @ (P @ lacking / weighted.sigma**2))
+        e.append(off + J @ (P @ lacking / s2_fit))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
     # as many independent errors as the noise's memory allows
     count = len(samples.field) * effective_fraction(*noise.shape)
@@ -139,69 +117,39 @@ def _left_out(
     return replace(_judged(np.concatenate(e), np.concatenate(s2), count), rms=among.rms)
 
 
-def error_between(
-    samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel, runs: NDArray[np.generic]
-) -> float:
+def error_between(found: CoefficientPosterior, runs: NDArray[np.generic]) -> float:
     """Return the RMS error of the parts left out, nT, each predicted by a fit without it.
 
-    Of n `samples`, the fit z (q,), the labels `runs` (n,): as :func:`leave_out` takes them. Prior and noise
-    stay those of the fit to all. An outlier counts as five robust sigmas.
+    The labels `runs` (n,) as for :func:`leave_out`. Prior and noise stay those of the fit to all. An outlier
+    counts as five robust sigmas.
     """
-    rows = np.arange(len(samples.field))
-    splits = [(np.delete(rows, part), part) for part in _parts(runs)]
-    return _refitted_error(samples, prior, z, noise, splits)
+    rows = np.arange(len(found.samples.field))
+    return _refitted_error(found, [(np.delete(rows, part), part) for part in _parts(runs)])
 
 
-def error_forward(samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel) -> float:
+def error_forward(found: CoefficientPosterior) -> float:
     """Return the RMS error, nT, of parts of a log that a fit to the earlier parts alone is carried to.
 
     Forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
     :data:`FORWARD_PARTS` parts predict the next one. Coefficients that the beginning of a log does not
     determine count here, and so do later changes; neither counts where parts between others are held out.
-    Arguments as for :func:`error_between`.
     """
-    parts = np.array_split(thinned_rows(len(samples.field)), FORWARD_PARTS)
-    splits = [(np.concatenate(parts[:k]), parts[k]) for k in range(1, FORWARD_PARTS)]
-    return _refitted_error(samples, prior, z, noise, splits)
+    parts = np.array_split(thinned_rows(len(found.samples.field)), FORWARD_PARTS)
+    return _refitted_error(found, [(np.concatenate(parts[:k]), parts[k]) for k in range(1, FORWARD_PARTS)])
 
 
-def _refitted_error(
-    samples: ResidualSamples,
-    prior: Prior,
-    z: FloatArray,
-    noise: NoiseModel,
-    splits: list[tuple[IndexArray, IndexArray]],
-) -> float:
+def _refitted_error(found: CoefficientPosterior, splits: list[tuple[IndexArray, IndexArray]]) -> float:
     """Return the RMS error, nT, of the second rows of each split, predicted by a fit to the first ones."""
+    samples, prior, noise = found.samples, found.prior, found.weighted
     weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
     errors = []
     for fitted, tested in splits:
-        kept = samples.part(fitted)
-        # neighbours across the gap are not successive
-        kept.steps[1:][np.diff(fitted) > 1] = np.inf
-        found = gauss_newton(kept, prior, replace(noise, weight=weight[fitted]), z, steps=REFIT_STEPS)
-        errors.append(residuals_of(samples.part(tested), prior.coefficients(found.z)))
+        kept, own = _rows_of(samples, fitted), replace(noise, weight=weight[fitted])
+        again = gauss_newton(kept, prior, own, found.z, steps=REFIT_STEPS)
+        errors.append(residuals_of(samples.part(tested), prior.coefficients(again.z)))
     e = np.concatenate(errors)
     limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
-
-
-def thinned_rows(n: int) -> IndexArray:
-    """Return the rows (k,) of blocks of neighbours, spread evenly over n samples; all rows if n is small."""
-    if n <= ENOUGH:
-        return np.arange(n)
-    first = np.linspace(0, n // BLOCK - 1, ENOUGH // BLOCK).astype(int) * BLOCK
-    return (first[:, None] + np.arange(BLOCK)).ravel()
-
-
-def thinned(samples: ResidualSamples) -> ResidualSamples:
-    """Return blocks of neighbours, spread evenly over all samples, to choose a start."""
-    n = len(samples.field)
-    if n <= ENOUGH:
-        return samples
-    part = samples.part(thinned_rows(n))
-    part.steps[::BLOCK] = np.inf
-    return part
 
 
 def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
@@ -240,9 +188,16 @@ def _alike(samples: ResidualSamples) -> list[IndexArray]:
     return [rows for k in range(ATTITUDES) if len(rows := np.flatnonzero(group == k))]
 
 
-def _normal(samples: ResidualSamples, c: FloatArray, noise: NoiseModel, rows: IndexArray) -> NormalEquations:
+def _normal(found: CoefficientPosterior, rows: IndexArray) -> NormalEquations:
+    weight = None if found.weighted.weight is None else found.weighted.weight[rows]
+    part = _rows_of(found.samples, rows)
+    normal = normal_equations(part, found.coefficients, weight, *found.weighted.shape)
+    return normal.reduced(found.prior.E)
+
+
+def _rows_of(samples: ResidualSamples, rows: IndexArray) -> ResidualSamples:
+    """Return these samples; neighbours across a gap are not successive."""
     part = samples.part(rows)
     part.steps[0] = np.inf
     part.steps[1:][np.diff(rows) > 1] = np.inf
-    weight = None if noise.weight is None else noise.weight[rows]
-    return normal_equations(part, c, weight, *noise.shape)
+    return part

@@ -122,6 +122,15 @@ class Observations:
         picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
         return replace(self, **picked)
 
+    def thinned(self, most: int) -> Observations:
+        """Return every second, third ... sample, so that there are at most so many."""
+        step = -(-len(self) // most)
+        return self if step <= 1 else self.part(np.arange(len(self)) % step == 0)
+
+    def without_parameters(self) -> Observations:
+        """Return the same samples as those of a vehicle without moving masses."""
+        return replace(self, parameters=self.parameters[:, :0], names=(), units=())
+
     def channels(self, calibration: Calibration) -> FloatArray:
         """Return the channels (n, c), in order, that a calibration of these data needs for correction.
 

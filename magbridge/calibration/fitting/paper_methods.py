@@ -23,22 +23,25 @@ into H_h, 400 nT of 46,000 nT.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import polar
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.nominal import check_scales, nominal, nominal_samples
-from magbridge.calibration.fitting.observations import Observations, polynomial_samples
+from magbridge.calibration.fitting.auto import ellipsoid
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.pose import Posed, pose
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.terms import full_order
+from magbridge.calibration.fitting.solve import CoefficientPosterior, check_scales, settle
 from magbridge.errors import CalibrationError
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import NoiseModel, estimate_noise
-from magbridge.estimation.optimise import gauss_newton
+from magbridge.estimation.optimise import Solution
 from magbridge.estimation.priors import SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
-from magbridge.estimation.residual import residuals_of
+from magbridge.estimation.residual import ResidualSamples, residuals_of
 from magbridge.wording import counted
 
 __all__ = ["ANYTHING", "fit_cubic", "fit_horizontal", "fit_per_run"]
@@ -52,36 +55,34 @@ ANYTHING = 1e4
 
 
 def fit_cubic(data: Observations, order: int = 3) -> Fit:
-    """Fit all coefficients by damped least squares on the scalar residual.
-
-    `data`: the calibration runs. `order`: highest total degree; the paper's is 3.
-    """
-    ranges = data.ranges()
-    exponents = full_order(len(ranges), order)
+    """Fit all coefficients by damped least squares on the scalar residual; the paper's order is 3."""
     # eq. 8: each of the nine coefficients is a polynomial in the positions; start with the nominal ones
-    samples = polynomial_samples(data, exponents, PLAIN)
-    start = np.zeros(9 * len(exponents))
+    posed = pose(data, order)
+    samples = replace(posed.samples, kappa=PLAIN)
+    size = 9 * len(posed.exponents)
+    start = np.zeros(size)
     start[:9] = _start(data)
-    prior = Prior(np.eye(len(start)) / ANYTHING**2, np.eye(len(start)))
-    noise = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
-    for _ in range(2):  # once far from the answer, once with the noise found there
-        found = gauss_newton(samples, prior, noise, start, steps=200)
-        start = found.z
+    prior = Prior(np.eye(size) / ANYTHING**2, np.eye(size))
+
+    def estimate(_: Prior, found: Solution, __: NoiseModel) -> tuple[NoiseModel, NoiseModel]:
         # the data cannot have determined more numbers than half the samples
-        free = min(float(len(start)), len(data) / 2)
-        noise = NoiseModel(estimate_noise(residuals_of(samples, start), samples.steps, free).sigma)
-    check_scales(samples, start)
-    covariance = covariance_of(found.normal.hessian / noise.sigma**2 + prior.precision)
-    # report residuals in the sensor's units, as of every other method
-    plain = polynomial_samples(data, exponents)
-    as_magnitude = NoiseModel(noise.sigma * PLAIN)  # A is near I, so the sensor's noise is the magnitude's
-    return assemble(data, plain, ranges, exponents, start, covariance, as_magnitude, "cubic")
+        free = min(float(size), len(data) / 2)
+        noise = NoiseModel(estimate_noise(residuals_of(samples, found.z), samples.steps, free).sigma)
+        return noise, noise
+
+    # once far from the answer, once with the noise found there
+    wide = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
+    found = settle(samples, prior, start, estimate, wide, rounds=2, steps=200)
+    check_scales(samples, found.z)
+    # report residuals in the sensor's units; A is near I, so the sensor's noise is the magnitude's
+    as_magnitude = NoiseModel(found.noise.sigma * PLAIN)
+    return assemble(data, posed, replace(found, samples=posed.samples, noise=as_magnitude), "cubic")
 
 
 def _start(data: Observations) -> FloatArray:
     """Return the nominal fit with the paper's constraints, or zeros if that fails."""
     try:
-        return nominal(data, axes_fixed=True, equal_xz=True).coefficients
+        return ellipsoid(data, axes_fixed=True, equal_xz=True)[1].coefficients
     except CalibrationError:
         return np.zeros(9)
 
@@ -101,14 +102,11 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
 
     CalibrationError: fewer runs than the order plus one.
     """
-    ranges = data.ranges()
-    exponents = full_order(len(ranges), order)
-    samples = polynomial_samples(data, exponents)
-    single = nominal_samples(data)
-    one = nominal(data)
-    middle, noise = one.coefficients, one.noise
-    prior = Prior(np.diag((WIDTHS * samples.F_0) ** -2.0), np.eye(9), middle)
-    size = 9 * len(exponents)
+    posed = pose(data, order)
+    samples = posed.samples
+    single, one, _ = ellipsoid(data)
+    prior = Prior(np.diag((WIDTHS * samples.F_0) ** -2.0), np.eye(9), one.coefficients)
+    size = 9 * len(posed.exponents)
     # Information form: a run at monomials m says Lambda (C m) = Lambda c_run, so the polynomial's precision
     # is the sum of (m m^T) x Lambda, and its vector the sum of m x Lambda c_run.
     precision, right, runs = np.eye(size) / ANYTHING**2, np.zeros(size), 0
@@ -120,26 +118,44 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         if rows.sum() < MIN_RUN_SAMPLES:
             continue
         runs += 1
-        part, z, scatter = single.part(rows), np.zeros(9), NoiseModel(noise.sigma)
-        # alternate the ellipsoid and the noise of its residuals
-        for _ in range(3):
-            found = gauss_newton(part, prior, scatter, z)
-            z = found.z
-            scatter = estimate_noise(residuals_of(part, prior.coefficients(z)), part.steps, 5.0)
-        Lambda = found.normal.hessian / scatter.sigma**2 + prior.precision
+        found = _one_run(single.samples.part(rows), prior, one.noise.sigma)
+        Lambda = np.linalg.inv(found.spread)
         precision += np.kron(np.outer(typical, typical), Lambda)
-        right += np.kron(typical, Lambda @ prior.coefficients(z))
+        right += np.kron(typical, Lambda @ found.coefficients)
     if runs <= order:
         raise CalibrationError(
             f"method runs: {runs} runs with {MIN_RUN_SAMPLES} samples or more at one position of the masses; "
-            "order "
-            f"{order} needs {order + 1}: fly runs with the masses at rest"
+            f"order {order} needs {order + 1}: fly runs with the masses at rest"
         )
     covariance = covariance_of(precision)
-    coefficients = covariance @ right
+    return _assembled(data, posed, covariance @ right, covariance, "runs")
+
+
+def _one_run(part: ResidualSamples, prior: Prior, sigma: float) -> CoefficientPosterior:
+    """Return the ellipsoid of one run: alternate it and the noise of its residuals."""
+
+    def estimate(prior: Prior, found: Solution, _: NoiseModel) -> tuple[NoiseModel, NoiseModel]:
+        noise = estimate_noise(residuals_of(part, prior.coefficients(found.z)), part.steps, 5.0)
+        return noise, noise
+
+    return settle(part, prior, np.zeros(9), estimate, NoiseModel(sigma), rounds=3)
+
+
+def _assembled(
+    data: Observations,
+    posed: Posed,
+    coefficients: FloatArray,
+    covariance: FloatArray,
+    method: str,
+    details: dict[str, float] | None = None,
+) -> Fit:
+    """Return a fit whose coefficients were found without a common posterior."""
+    samples, free = posed.samples, 0.0 if method == "runs" else 9.0
     check_scales(samples, coefficients)
-    left = estimate_noise(residuals_of(samples, coefficients), samples.steps, 0.0)
-    return assemble(data, samples, ranges, exponents, coefficients, covariance, left, "runs")
+    noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, free)
+    none = Prior(np.zeros_like(covariance), np.eye(len(coefficients)))
+    found = CoefficientPosterior(samples, none, coefficients, covariance, noise, noise, settled=True)
+    return assemble(data, posed, found, method, details=details)
 
 
 # ---- The horizontal fit ----
@@ -167,8 +183,8 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     data = data.part(np.asarray(known))
     assert data.attitude is not None
     assert data.reference_ned is not None
-    samples = nominal_samples(data)
-    F_0 = samples.F_0
+    posed = pose(data.without_parameters(), 0)
+    F_0 = posed.samples.F_0
     # Turn the reading by pitch and roll alone: its horizontal and vertical parts are then those of the Earth,
     # whatever the heading. B = R A takes in the mounting; the polar decomposition separates it from A.
     level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
@@ -194,13 +210,9 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     J = np.array([_coefficients(x + h, F_0) - _coefficients(x - h, F_0) for h in steps]).T / (
         2.0 * DIFFERENCE_STEP
     )
-    coefficients = _coefficients(x, F_0)
-    check_scales(samples, coefficients)
-    noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 9.0)
-    return assemble(
-        data, samples, (), ((),), coefficients, J @ covariance @ J.T, noise, "horizontal",
-        details={"attitude_noise_nT": sigma},
-    )  # fmt: skip
+    return _assembled(
+        data, posed, _coefficients(x, F_0), J @ covariance @ J.T, "horizontal", {"attitude_noise_nT": sigma}
+    )
 
 
 def _coefficients(x: FloatArray, F_0: float) -> FloatArray:

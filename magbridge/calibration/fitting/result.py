@@ -12,13 +12,13 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.left_out import LeftOut
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep
-from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference, Run
+from magbridge.calibration.fitting.pose import Posed
+from magbridge.calibration.fitting.solve import CoefficientPosterior
+from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Reference, Run
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnostics import Diagnostic
 from magbridge.estimation.information import GaussianInformation
-from magbridge.estimation.noise import NoiseModel
-from magbridge.estimation.priors import Prior
-from magbridge.estimation.residual import ResidualSamples, residuals_of, rms, scales_and_offsets
+from magbridge.estimation.residual import ResidualSamples, rms, scales_and_offsets
 from magbridge.version import __version__
 from magbridge.wording import counted
 
@@ -81,37 +81,31 @@ class Fit:
 
 def assemble(
     data: Observations,
-    samples: ResidualSamples,
-    parameters: tuple[Parameter, ...],
-    exponents: tuple[tuple[int, ...], ...],
-    coefficients: FloatArray,
-    covariance: FloatArray,
-    noise: NoiseModel,
+    posed: Posed,
+    found: CoefficientPosterior,
     method: str,
     left_out: LeftOut | None = None,
-    prior: Prior | None = None,
     details: dict[str, Any] | None = None,
+    *,
+    informative: bool = False,
 ) -> Fit:
     """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
 
-    `data`, `samples`: the calibration runs, and the samples used from them. `parameters`, `exponents`: the
-    positions that the coefficients depend on, and the m monomials in them. `coefficients` (9 m,): nT,
-    monomial by monomial. `covariance` (9 m, 9 m): nT². `noise`, `method`, `details`: as :class:`Fit` and its
-    calibration have them. `left_out`: what the fit is worth on parts left out: the sigmas grow by its ratio.
-    `prior`: of all coefficients, as they were fitted with it.
+    `left_out`: what the fit is worth on parts left out: the sigmas grow by its ratio. `informative`: keep
+    what the data alone say of the coefficients, without the prior.
     """
     # sigma and covariance grow by the ratio of held-out errors to claimed ones
-    e = residuals_of(samples, coefficients)
-    information = None if prior is None else _without_prior(prior, coefficients, covariance)
+    e, samples, noise, covariance = found.residual, found.samples, found.noise, found.covariance
+    information = _without_prior(found) if informative else None
     if left_out is not None:
         information = information and information.divided(left_out.ratio)
         noise, covariance = replace(noise, sigma=noise.sigma * left_out.ratio), covariance * left_out.ratio**2
         details = {**(details or {}), "left_out_nT": left_out.rms, "left_out_ratio": left_out.ratio}
     steps = np.diff(data.time)
     calibration = Calibration(
-        parameters=parameters,
-        terms=(Polynomial(exponents=exponents),),
-        coefficients=coefficients,
+        parameters=posed.ranges,
+        terms=(Polynomial(exponents=posed.exponents),),
+        coefficients=found.coefficients,
         covariance=covariance,
         noise=Noise(
             noise.sigma,
@@ -130,12 +124,13 @@ def assemble(
     return Fit(calibration, e, (), details or {}, samples, information=information)
 
 
-def _without_prior(prior: Prior, coefficients: FloatArray, covariance: FloatArray) -> GaussianInformation:
-    """Return the information of the data alone, from the posterior (K,), (K, K) and its prior."""
+def _without_prior(found: CoefficientPosterior) -> GaussianInformation:
+    """Return the information of the data alone, from the posterior and its prior."""
     # information of the data = posterior's minus the prior's
+    prior, coefficients = found.prior, found.coefficients
     before = prior.E @ np.linalg.inv(prior.precision) @ prior.E.T
     centre = np.broadcast_to(prior.offset, coefficients.shape)
-    return GaussianInformation.from_posterior(coefficients, covariance, centre, before)
+    return GaussianInformation.from_posterior(coefficients, found.covariance, centre, before)
 
 
 def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:

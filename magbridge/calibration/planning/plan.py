@@ -17,25 +17,31 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import forward
 from magbridge.calibration.fitting.boresight import field_body
-from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations, monomials
-from magbridge.calibration.forward import forward
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.columns import require_units
 from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import effective_fraction
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 __all__ = [
-    "Design", "Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "plan", "settled",
-    "trim_of",
+    "Design", "Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "facts", "flight_plan",
+    "mission_samples", "plan", "settled", "summary", "trim_of",
 ]  # fmt: skip
 
 SLACK = 3.0
@@ -291,3 +297,67 @@ def plan(
             if not changed:
                 break
         return evaluate_runs(calibration, mission, field_ned, [candidates[i] for i in chosen])
+
+
+# ---- From a log that flies as the mission will ----
+
+
+def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
+    """Choose runs for a mission.
+
+    `calibration`: calibration so far. `mission`: Attitude, position and masses as the mission will have
+    them; magnetometer columns are not needed. `runs`: how many to choose. `roll`: deg, the largest bank
+    either way.
+
+    CalibrationError: the mission has no attitude or position. FormatError: it lacks a parameter of the
+    calibration, or has it in another unit.
+    """
+    require_units(mission, calibration.units)
+    names = tuple(calibration.units)
+    data = mission_samples(mission, names)
+    if data.reference_ned is None:
+        raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
+    # runs at trims that the vehicle can fly: those that the mission shows
+    flown = settled(data, calibration.parameters) if names else None
+    limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
+    return plan(
+        calibration,
+        Mission.from_observations(data),
+        np.nanmean(data.reference_ned, axis=0),
+        limits,
+        runs=runs,
+    )
+
+
+def mission_samples(mission: xr.Dataset, names: tuple[str, ...]) -> Observations:
+    """Return a mission's samples; what the magnetometer will read is of no account."""
+    some = ("time", np.ones(mission.sizes["time"]))  # zeros would count as missing
+    return observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
+
+
+def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
+    """Return a plan as plain values."""
+    names = [parameter.name for parameter in calibration.parameters]
+    return {
+        "expected_rms_nT": found.rms,
+        "expected_worst_nT": found.worst,
+        "runs": [
+            {"pitch": run.pitch, "roll": run.roll, **dict(zip(names, run.parameters, strict=True))}
+            for run in found.runs
+        ],
+    }
+
+
+def summary(found: Plan, calibration: Calibration) -> str:
+    """Return a plan as a table: the runs in order of worth, and the error expected after each."""
+    names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
+    header = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
+    lines = [
+        f"{header}  {'error over the mission afterwards, nT: RMS':>40} {'worst':>8}",
+        f"{'none yet':>{len(header)}}  {found.rms[0]:40.2f} {found.worst[0]:8.2f}",
+    ]
+    for number, run in enumerate(found.runs, 1):
+        positions = " ".join(f"{value:14.3f}" for value in run.parameters)
+        flown = f"{number:4} {run.pitch:7.1f} {run.roll:7.1f} {positions}"
+        lines.append(f"{flown}  {found.rms[number]:40.2f} {found.worst[number]:8.2f}")
+    return "\n".join([*lines, "each run covers all headings, as a spiral does; angles in degrees"])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,10 +18,11 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
 from magbridge.calibration.fitting.field_search import nodes_for
-from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.planning.plan import Design
+from magbridge.calibration.planning.plan import Design, expected_calibration, mission_samples
+from magbridge.columns import require_units
 from magbridge.errors import CalibrationError
 from magbridge.estimation.elimination import LinearisedRows, eliminate_field, sum_rows
 from magbridge.estimation.gaussian_field import GaussianField
@@ -29,7 +30,10 @@ from magbridge.estimation.information import covariance_of
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.estimation.residual import jacobian
 
-__all__ = ["Proposal", "facts", "propose", "summary"]
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Proposal", "facts", "propose", "summary", "survey_plan"]
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
 """Amplitude (nT), length (m) and power of the expected crustal field, as the place is unmapped."""
@@ -52,6 +56,30 @@ class Proposal:
     crossings: int
     """Places met again on another course."""
     open: tuple[str, ...]
+
+
+def survey_plan(
+    calibration: Calibration | None,
+    mission: xr.Dataset,
+    parameters: tuple[str, ...] = (),
+    *,
+    hours: float,
+    roll: float = 10.0,
+) -> list[Proposal]:
+    """Propose self-calibrating surveys of `hours`; arguments as for :func:`flight_plan`.
+
+    Without a calibration they are for an unknown vehicle, whose masses' positions are `parameters`.
+
+    CalibrationError, FormatError: as :func:`flight_plan`.
+    """
+    if calibration is not None:
+        require_units(mission, calibration.units)
+        parameters = tuple(calibration.units)
+    data = mission_samples(mission.drop_vars("reference_field", errors="ignore"), parameters)
+    # an unknown vehicle has the expected calibration, with the uncertainty of its prior
+    if calibration is None:
+        calibration = expected_calibration(data.ranges(), float(np.median(data.reference)))
+    return propose(calibration, data, hours=hours, roll=roll)
 
 
 def propose(

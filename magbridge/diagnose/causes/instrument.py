@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.instrument_effects import ResponseEffect, TimeEffect
+from magbridge.calibration.effects import ResponseEffect, TimeEffect
 from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.problem import Problem

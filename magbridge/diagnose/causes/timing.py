@@ -8,8 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.effects import ClockEffect
-from magbridge.calibration.instrument_effects import RateEffect
+from magbridge.calibration.effects import ClockEffect, RateEffect
 from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, cached_per_problem, rates

@@ -1,0 +1,373 @@
+"""The loop of every fit: coefficients, widths of the prior and noise in turn, from several starts.
+
+Notes
+-----
+A fit is a problem: samples, a family of priors, and what its residuals say of the noise. :func:`settle`
+alternates coefficients (Gauss-Newton at fixed widths) and noise; :func:`climb` chooses the widths, too, by
+the evidence of the quadratic that it finds. Residuals are outliers, white noise and an AR(1) process once the
+model has converged; until then they are the model's error, and look correlated for long.
+
+The error of a model that cannot describe the vehicle lasts. It is not whitened, but so many residuals in a
+row count as one (:func:`lasting_noise`; Newey & West 1987, Econometrica 55:703).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.errors import NoSolutionError
+from magbridge.estimation.hyperparameters import Hyperparameters, is_maximum, maximise_evidence
+from magbridge.estimation.information import GaussianInformation, covariance_of
+from magbridge.estimation.noise import (
+    CLIP_SIGMA,
+    OUTLIER_SIGMA,
+    NoiseModel,
+    Whitening,
+    estimate_noise,
+    fit_slow_and_white,
+    samples_per_independent,
+)
+from magbridge.estimation.optimise import Solution, gauss_newton
+from magbridge.estimation.priors import Prior, PriorFamily
+from magbridge.estimation.residual import (
+    ResidualSamples,
+    jacobian,
+    residuals,
+    residuals_of,
+    robust_scale,
+    scales_and_offsets,
+)
+
+__all__ = [
+    "Climbed", "CoefficientPosterior", "approach", "best_climb", "check_scales", "flown", "lasting_noise",
+    "settle", "starts", "thinned", "thinned_rows", "with_slow_noise",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CoefficientPosterior:
+    """The answer of a fit."""
+
+    samples: ResidualSamples
+    prior: Prior
+    z: FloatArray
+    """(q,): the unknowns behind the coefficients."""
+    spread: FloatArray
+    """(q, q): covariance of z."""
+    noise: NoiseModel
+    """Noise of a sample."""
+    weighted: NoiseModel
+    """Noise with which the samples are weighed: larger where many residuals in a row count as one."""
+    settled: bool
+    """True if the last step found a minimum."""
+
+    @property
+    def coefficients(self) -> FloatArray:
+        """(9 m,) nT."""
+        return self.prior.coefficients(self.z)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(9 m, 9 m) of the coefficients, nT²."""
+        return np.asarray(self.prior.E @ self.spread @ self.prior.E.T)
+
+    @property
+    def residual(self) -> FloatArray:
+        """(n,), nT in the sensor's units."""
+        return residuals_of(self.samples, self.coefficients)
+
+
+@dataclass(frozen=True, eq=False)
+class Climbed(CoefficientPosterior):
+    """A posterior whose prior's widths maximise the evidence."""
+
+    family: PriorFamily
+    widths: Hyperparameters
+    quadratic: GaussianInformation
+    log_evidence: float
+
+
+# ---- Coefficients and noise at fixed widths ----
+
+MAX_START_ITERATIONS = 16
+"""Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
+MIN_APPROACH = 0.2
+"""Relative decrease of the residuals by a step, below which the answer is near."""
+Estimate = Callable[[Prior, Solution, NoiseModel], tuple[NoiseModel, NoiseModel]]
+"""Prior, solution, noise so far -> noise of a sample, and that with which the samples are weighed next."""
+
+
+def settle(
+    samples: ResidualSamples,
+    prior: Prior,
+    z: FloatArray,
+    estimate: Estimate,
+    noise: NoiseModel,
+    *,
+    rounds: int = MAX_START_ITERATIONS,
+    change: float = 0.0,
+    steps: int = 50,
+    tolerance: float = 1e-3,
+) -> CoefficientPosterior:
+    """Alternate coefficients and noise from z (q,) until the noise's size changes by less than `change`.
+
+    At most `rounds` of Gauss-Newton with at most so many `steps` and this `tolerance`.
+    """
+    weighted = noise
+    for _ in range(rounds):
+        found = gauss_newton(samples, prior, weighted, z, steps=steps, tolerance=tolerance)
+        z = found.z
+        last, (noise, weighted) = weighted, estimate(prior, found, weighted)
+        if abs(weighted.sigma - last.sigma) < change * last.sigma:
+            break
+    spread = covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision)
+    return CoefficientPosterior(samples, prior, z, spread, noise, weighted, found.settled)
+
+
+def approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> CoefficientPosterior:
+    """Approach the solution from z (q,): after each step, set the noise to the bulk of the residuals."""
+    # far from the solution a small noise would make steps that overshoot
+    white = np.full(len(samples.field), np.inf)
+
+    def bulk(z: FloatArray) -> NoiseModel:
+        return estimate_noise(residuals_of(samples, prior.coefficients(z)), white, 0.0)
+
+    def estimate(_: Prior, found: Solution, __: NoiseModel) -> tuple[NoiseModel, NoiseModel]:
+        noise = bulk(found.z)
+        return noise, noise
+
+    return settle(samples, prior, z, estimate, bulk(z), change=MIN_APPROACH, steps=1, tolerance=0.1)
+
+
+def lasting_noise(
+    samples: ResidualSamples, prior: Prior, found: Solution, weighted: NoiseModel
+) -> tuple[NoiseModel, NoiseModel]:
+    """Return the noise of a sample, and the noise with which each is weighed where model errors last.
+
+    The noise of a sample is the sum of white noise and of an AR(1) process: together they have as many
+    independent samples, and the autocorrelation of neighbours that the residuals show.
+    """
+    e, g = residuals(samples, prior.coefficients(found.z))
+    noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
+    limit = CLIP_SIGMA * noise.sigma
+    # scale the gradient by the posterior's root, so that all coefficients have equal weight
+    root = np.linalg.cholesky(covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision))
+    pulls = np.clip(e, -limit, limit)[:, None] * (g @ (prior.E @ root))
+    repeats = samples_per_independent(pulls, samples.steps)
+    neighbours = estimate_noise(e, samples.steps, len(found.z)).autocorrelation
+    rho, white = _slow_and_white(0.5 * (repeats - 1.0), neighbours)
+    one = replace(noise, autocorrelation=rho, white=white)
+    return one, replace(noise, sigma=noise.sigma * np.sqrt(repeats))
+
+
+def _slow_and_white(lasting: float, neighbours: float) -> tuple[float, float]:
+    """Return autocorrelation rho and white fraction w of white noise and an AR(1) process.
+
+    `lasting` is the sum of the autocorrelations at all lags, ``(1 - w) rho / (1 - rho)``, and `neighbours` is
+    the autocorrelation of neighbours, ``(1 - w) rho``.
+    """
+    if not 0.0 < neighbours < lasting:  # no slow part, or none that lasts beyond the next sample
+        return max(lasting / (1.0 + lasting), 0.0), 0.0
+    rho = 1.0 - neighbours / lasting
+    return (rho, 1.0 - neighbours / rho) if neighbours < rho else (lasting / (1.0 + lasting), 0.0)
+
+
+# ---- Widths by the evidence ----
+
+
+def climb(
+    samples: ResidualSamples,
+    family: PriorFamily,
+    z: FloatArray,
+    eta: FloatArray,
+    noise: NoiseModel | None = None,
+    *,
+    shaped: bool = False,
+) -> Climbed:
+    """Alternate coefficients, widths and noise until the evidence converges; give `noise` if z is near that.
+
+    `z` (q,) and `eta` (h,) are where it begins. `shaped`: the memory of `noise` is kept.
+    """
+    score, white = -np.inf, noise is None
+    shape = noise.shape if noise is not None and shaped else None
+    if noise is None:
+        near = approach(samples, family.prior(eta), z)
+        z, noise = near.z, near.noise
+    for step in range(MAX_START_ITERATIONS):
+        if family.renew is not None and step:
+            family = family.renew(z)
+        # the first widths are a guess, and not worth settling at
+        solution = gauss_newton(samples, family.prior(eta), noise, z, steps=50 if step else 3)
+        kept = len(samples.field) - noise.rejected
+        quadratic = GaussianInformation.from_derivatives(solution.z, *solution.normal, kept)
+        widths = maximise_evidence(quadratic, family, eta, noise.sigma)
+        eta, z = widths.eta, solution.z
+        last, score = score, _score(widths, noise, samples)
+        noise = replace(noise, sigma=widths.sigma)
+        still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
+        if still and not white:
+            break
+        # residuals of a wrong model look correlated for long, so the autocorrelation waits for convergence
+        white = white and not still and step < MAX_START_ITERATIONS // 2
+        # at last the noise's autocorrelation and outliers are kept, so that the rest converges
+        if step < MAX_START_ITERATIONS - 4:
+            prior = family.prior(eta)
+            e = residuals_of(samples, prior.coefficients(z))
+            absorbed = (0.0, 0.0) if white or shape else _absorbed(samples, prior, solution, noise)
+            steps = np.where(white, np.inf, samples.steps)
+            found = estimate_noise(e, steps, widths.determined, absorbed, shape)
+            noise = replace(found, sigma=widths.sigma)
+    prior = family.prior(eta)
+    spread = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
+    return Climbed(
+        samples, prior, z, spread, noise, noise, solution.settled, family, widths, quadratic, score
+    )
+
+
+def _absorbed(
+    samples: ResidualSamples, prior: Prior, solution: Solution, noise: NoiseModel
+) -> tuple[float, float]:
+    """Return variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
+    few = thinned(samples)
+    _, g = residuals(few, prior.coefficients(solution.z))
+    J = jacobian(few.phi, g)
+    P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
+    JP = J @ (prior.E @ P @ prior.E.T)
+    next_one = few.steps[1:] == 1
+    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
+
+
+def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
+    """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
+    outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
+    variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
+    whitening = 0.5 * np.log(variance).sum()
+    return float(widths.log_evidence - noise.rejected * outlier - whitening)
+
+
+def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
+    """Return the answer with the largest evidence among several starts.
+
+    NoSolutionError: no start reached a maximum.
+    """
+    # climb from each start with a part of the samples, at narrow and at wide priors; then the best with all
+    few = thinned(samples)
+    answers = []
+    for start in starts(few):
+        z = family.nearest_latent(start)
+        answers += [climb(few, family, z, family.centre + shift * family.spread) for shift in (0.0, 1.5)]
+    for answer in sorted(answers, key=lambda answer: -answer.log_evidence):
+        last = answer
+        if few is not samples:
+            noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation, answer.noise.white)
+            last = climb(samples, answer.family, answer.z, answer.widths.eta, noise)
+        if last.settled and is_maximum(last.quadratic, last.family, last.widths):
+            return last
+    raise NoSolutionError("auto: no start reached a maximum of the evidence; the data contradict themselves")
+
+
+def with_slow_noise(answer: Climbed) -> Climbed:
+    """Return the answer with slow and white noise if the residuals have both."""
+    for _ in range(2):
+        noise = fit_slow_and_white(answer.residual, answer.samples.steps, answer.noise)
+        if noise is answer.noise:
+            break
+        answer = climb(answer.samples, answer.family, answer.z, answer.widths.eta, noise, shaped=True)
+    return answer
+
+
+# ---- Where a fit begins, and with which samples ----
+
+ENOUGH, BLOCK = 6000, 50
+"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
+MIN_END_SAMPLES = 20
+"""Number of samples: fewer outliers at an end are outliers as any others."""
+MIN_OUTLIER_FRACTION = 0.7
+"""Share of an end's samples that are outliers."""
+
+
+def starts(samples: ResidualSamples) -> list[FloatArray]:
+    """Return two starts (9,), nT: without iron, and the best sphere by linear least squares.
+
+    ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
+    """
+    h = samples.field
+    design = np.column_stack([2.0 * h, np.full(len(h), samples.F_0)])
+    scale = np.abs(design).max(axis=0) + 1e-300
+    right = (h * h).sum(axis=1) - samples.reference**2
+    # a weak ridge holds the directions that the samples do not determine
+    damp = np.diag(np.full(4, 1e-2 * np.sqrt(len(h))))
+    solved = np.linalg.lstsq(np.vstack([design / scale, damp]), np.append(right, np.zeros(4)), rcond=None)[0]
+    sphere = np.concatenate([np.zeros(6), (solved / scale)[:3]])
+    return [np.zeros(9), sphere]
+
+
+def thinned_rows(n: int) -> IndexArray:
+    """Return the rows (k,) of blocks of neighbours, spread evenly over n samples; all rows if n is small."""
+    if n <= ENOUGH:
+        return np.arange(n)
+    first = np.linspace(0, n // BLOCK - 1, ENOUGH // BLOCK).astype(int) * BLOCK
+    return (first[:, None] + np.arange(BLOCK)).ravel()
+
+
+def thinned(samples: ResidualSamples) -> ResidualSamples:
+    """Return blocks of neighbours, spread evenly over all samples, to choose a start."""
+    n = len(samples.field)
+    if n <= ENOUGH:
+        return samples
+    part = samples.part(thinned_rows(n))
+    part.steps[::BLOCK] = np.inf
+    return part
+
+
+def flown(residual: FloatArray) -> BoolArray:
+    """Return a mask (n,) without samples at an end of the log that contradict the others.
+
+    `residual` (n,): of a robust fit, in the order of the log, nT.
+    """
+    # an end is cut where most of its samples are outliers
+    off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
+    kept = np.ones(len(off), bool)
+    kept[: _end(off)] = False
+    kept[len(off) - _end(off[::-1]) :] = False
+    return kept if kept.sum() > len(kept) / 2 else np.ones(len(off), bool)
+
+
+def _end(outlier: BoolArray) -> int:
+    """Return the number of samples at the start that are mostly outliers; 0 if they are few."""
+    share = np.cumsum(outlier) / np.arange(1, len(outlier) + 1)
+    until = np.flatnonzero((share > MIN_OUTLIER_FRACTION) & outlier)
+    return int(until[-1]) + 1 if until.size and until[-1] + 1 >= MIN_END_SAMPLES else 0
+
+
+# ---- A fit that collapsed ----
+
+ALL_AROUND = 0.05
+"""Least variance of the field along any axis, over its square: 1/3 where all attitudes are seen, and 1 % on a
+glider that never rolls."""
+
+
+def check_scales(samples: ResidualSamples, coefficients: FloatArray) -> None:
+    """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
+
+    NoSolutionError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,
+    where the attitudes do not separate it from a scale. With all attitudes, the noise alone limits T.
+    """
+    seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
+    scales, T = scales_and_offsets(seen, coefficients)
+    # the sample with the most unlikely scale or offset
+    departure = np.abs(np.log2(np.maximum(scales, 1e-3))).max(axis=1)
+    worst = int(np.argmax(np.maximum(departure, T / (2.0 * samples.F_0))))
+    narrow = float(np.linalg.eigvalsh(np.cov(seen.field.T))[0]) < ALL_AROUND * samples.F_0**2
+    if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or (narrow and T[worst] / samples.F_0 > 2.0):
+        listed = ", ".join(f"{value:.3g}" for value in scales[worst])
+        alike = scales[worst, 2] < 1.2 * scales[worst, 0]
+        counts = f"a reading counts {scales[worst].mean():.3g} nT, or " if alike else ""
+        raise NoSolutionError(
+            f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
+            f"{samples.F_0:.0f} nT; {counts}there are too few attitudes to separate scale and offset"
+        )

@@ -1,0 +1,212 @@
+"""How good a calibration is: on data, over a mission, and the part of its sigma that is its level.
+
+Notes
+-----
+A part of a corrected sample's variance is common to all samples: the mean of the field at a site is only as
+certain as its reference. A survey determines the rest. With j the mean slope of the corrected field by the
+coefficients and P their covariance, the level's sigma is ``sqrt(j^T P j)``, and the coefficients move with it
+by ``P j / sqrt(j^T P j)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import correct, forward, vector_covariance
+from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG, heading, published_covariance
+from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Noise, Reference
+from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
+
+__all__ = [
+    "Mission", "apart_from_level", "contradicts", "expected_error", "expected_heading_sigma",
+    "in_sensor_units", "level_of", "nearby_mission", "sizes", "with_level",
+]  # fmt: skip
+
+
+CONTRADICTS = 2.0
+"""Largest departure of an estimated level from the reference's, in its 1-sigma, that is accepted."""
+LEVEL_ROWS = 5_000
+"""Samples that the mean is taken over, at most."""
+
+
+def with_level(
+    calibration: Calibration, samples: ResidualSamples, bias: float, bias_sigma: float
+) -> Calibration:
+    """Compute how much of a calibration's covariance is level.
+
+    A level beyond :data:`CONTRADICTS` sigmas of its prior does not come from the log: a fit that claims to
+    determine it has absorbed another effect, such as crustal anomalies that a long log's nodes leave out. The
+    level is then the reference's, with the sigma of its prior: the coefficients move back by as much.
+
+    `calibration`: as fitted. `samples`: those it was fitted to, without what its effects explain. `bias`,
+    `bias_sigma`: nT, of the reference's level, as found and as expected.
+    """
+    part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
+    own = calibration.coefficients[: 9 * part.phi.shape[1]]
+    # j: mean slope of the corrected field by the coefficients (the residual is over its size)
+    _, g = residuals(part, own)
+    j = np.zeros(len(calibration.coefficients))
+    j[: len(own)] = (jacobian(part.phi, g) * sizes(part, own)[:, None]).mean(axis=0)
+    Pj = calibration.covariance @ j
+    sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
+    # w: how the coefficients move together when the mean moves by its sigma
+    w, covariance = Pj / max(sigma, 1e-300), calibration.covariance
+    coefficients = calibration.coefficients
+    if sigma and contradicts(bias, bias_sigma):
+        # a step of w changes the mean of the corrected field by sigma
+        coefficients = coefficients - w * (bias / sigma)
+        wider = max(bias_sigma / sigma, 1.0)
+        covariance = covariance + (wider**2 - 1.0) * np.outer(w, w)
+        w, sigma, bias = w * wider, sigma * wider, 0.0
+    known = calibration.reference
+    reference = Reference(known.field, known.model, bias, bias_sigma, sigma)
+    return replace(
+        calibration, coefficients=coefficients, reference=reference, covariance=covariance,
+        level=tuple(w.tolist()),
+    )  # fmt: skip
+
+
+def contradicts(bias: float, bias_sigma: float) -> bool:
+    """Return True if a level found by a fit (nT) contradicts the reference's prior, of `bias_sigma` nT."""
+    return abs(bias) > CONTRADICTS * bias_sigma
+
+
+def apart_from_level(calibration: Calibration) -> Calibration:
+    """Return the calibration with the covariance that is left where the level is known."""
+    if not calibration.level:
+        return calibration
+    w = np.zeros(len(calibration.coefficients))
+    w[: len(calibration.level)] = calibration.level
+    return replace(calibration, covariance=calibration.covariance - np.outer(w, w))
+
+
+def level_of(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """Return the part of each sample's sigma (n,), nT, that is level; arguments as for ``correct``."""
+    if not calibration.level:
+        return np.zeros(len(field))
+    up, here = (correct(one, field, channels, time).total for one in (calibration.at_level(), calibration))
+    return np.abs(up - here) / LEVEL_STEP_SIGMA
+
+
+def sizes(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
+    """Return ``sqrt(kappa^2 + |A u|^2)`` (n,): nT of the corrected field in one of the sensor's."""
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
+    b = np.matmul(A, (samples.field - theta[:, 6:])[:, :, None])
+    w = np.matmul(A, b)[:, :, 0] / np.linalg.norm(b[:, :, 0], axis=1)[:, None]
+    return np.asarray(np.sqrt(samples.kappa**2 + (w * w).sum(axis=1)))
+
+
+MISSION_SAMPLES = 600
+"""Samples that represent a mission."""
+ROLL = 10.0
+"""deg either way, by which a survey rolls further than the runs did."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mission:
+    """The fields and positions that a mission meets."""
+
+    field_body: FloatArray
+    """(n, 3), nT, the true field in body axes."""
+    parameters: FloatArray
+    """(n, k): Actuator positions at the same samples, in their units."""
+
+    @classmethod
+    def from_observations(cls, data: Observations) -> Mission:
+        """Return the mission with the attitudes and positions of a deployment.
+
+        CalibrationError: attitude or place is missing.
+        """
+        # the true field in body axes needs attitude and direction
+        known, attitude, reference_ned = data.directed()
+        if not known.any():
+            raise CalibrationError(
+                "the mission has no sample with all of roll, pitch, heading, latitude and longitude"
+            )
+        part = slice(None, None, max(len(attitude) // MISSION_SAMPLES, 1))
+        return cls(field_body(attitude[part], reference_ned[part]), data.parameters[known][part])
+
+
+def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
+    """Return the calibration's own attitudes and positions, rolled a little further, on all headings.
+
+    A survey after these runs meets at least those. Rolling needs only the corrected vectors. Turning to other
+    headings needs the vertical, which attitude telemetry gives: without it, only the runs' headings are used.
+    """
+    rows = np.arange(0, len(data), max(3 * len(data) // MISSION_SAMPLES, 1))
+    k = len(calibration.parameters)
+    positions = data.parameters[rows, :k]
+    b = correct(calibration, data.field[rows], positions, data.time[rows]).vector
+    # roll a little further each way
+    met = [Rotation.from_euler("X", angle, degrees=True).apply(b) for angle in (-ROLL, 0.0, ROLL)]
+    places = [positions] * len(met)
+    if data.attitude is not None:
+        known = np.isfinite(data.attitude[rows]).all(axis=1)
+        attitude = Rotation.from_euler("ZYX", data.attitude[rows[known], ::-1])
+        # and turn about the vertical, by attitude
+        down = attitude.apply([0.0, 0.0, 1.0], inverse=True)
+        met += [
+            Rotation.from_rotvec(np.radians(angle) * down).apply(b[known]) for angle in range(60, 360, 60)
+        ]
+        places += [positions[known]] * (len(met) - len(places))
+    return Mission(np.concatenate(met), np.concatenate(places))
+
+
+def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
+    """Return the 1-sigma (nT) of the corrected total field from the position terms alone, without noise.
+
+    The result is (n,).
+    """
+    # forward to the reading and back: the sigma of the way back is that of the position terms
+    model = replace(calibration.without_effects(), noise=Noise(0.0), boresight=None)
+    truth = mission.field_body
+    if calibration.boresight is not None:
+        truth = truth @ calibration.boresight.matrix()
+    time = np.zeros(len(truth))
+    reading = forward(model, truth, mission.parameters, time)
+    return correct(model, reading, mission.parameters, time).sigma
+
+
+def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return the error of the total field over ``|A^T u|`` (n,), nT of the sensor; and over its sigma (n,).
+
+    A fit that shrinks A shrinks every error of the corrected field, but gains nothing in the sensor's units.
+    """
+    got = correct(calibration, data.field, data.channels(calibration), data.time)
+    A, T = calibration.matrices(data.parameters[:, : len(calibration.parameters)])
+    b = np.matmul(A, (data.field - T)[:, :, None])
+    # |A^T u|: nT of the corrected field for one of the sensor
+    size = np.linalg.norm(np.matmul(A, b)[:, :, 0], axis=1) / got.total
+    error = got.total - data.reference
+    return error / size, error / got.sigma
+
+
+def expected_heading_sigma(calibration: Calibration, data: Observations) -> float:
+    """Return the RMS over the samples of the magnetic heading's standard deviation, deg.
+
+    Roll and pitch count as known to :data:`~magbridge.calibration.heading.DEFAULT_TILT_SIGMA_DEG`. The
+    declination is not part of it. NaN without a boresight, or without roll and pitch.
+    """
+    if calibration.boresight is None or data.attitude is None:
+        return float("nan")
+    channels, turn = data.channels(calibration), np.array(calibration.boresight.covariance)
+    corrected = correct(calibration, data.field, channels, data.time)
+    stated = vector_covariance(calibration, data.field, channels, data.time)
+    covariance = published_covariance(stated, turn, corrected.vector, (corrected.vector_sigma**2).sum(axis=1))
+    roll, pitch = data.attitude[:, 0], data.attitude[:, 1]
+    found = heading(
+        corrected.vector, roll, pitch, covariance=covariance, boresight_covariance=turn,
+        tilt_sigma_deg=DEFAULT_TILT_SIGMA_DEG,
+    )  # fmt: skip
+    known = found.sigma[np.isfinite(found.sigma)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
