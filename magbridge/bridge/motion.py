@@ -16,6 +16,7 @@ from typing import Any
 from magbridge.field.geodesy import separation
 from magbridge.link.component import Component
 from magbridge.link.estimates import Pose, quaternion
+from magbridge.link.telemetry import AIRCRAFT
 from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
@@ -112,6 +113,10 @@ MIN_EQUAL = 5
 """Number of such speeds in a row until that is reported."""
 VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
 """Flags of EKF_STATUS_REPORT, and of ESTIMATOR_STATUS: the velocity holds; the position is only held."""
+ARMED = 128
+"""Flag of HEARTBEAT.base_mode: the vehicle is armed."""
+STATE_UNKNOWN, ON_GROUND = 0, 1
+"""Values of EXTENDED_SYS_STATE.landed_state (MAV_LANDED_STATE)."""
 JUMP = 10.0
 """Step of a position beyond its own velocity that is a reset, m."""
 
@@ -166,14 +171,17 @@ class Motion:
         self._unvouched_us = (
             -MAX_SOURCE_AGE_US
         )  # when the autopilot last reported that its velocity does not hold
+        self._is_aircraft = self._armed = self._grounded = False
+        self._landed_state = STATE_UNKNOWN
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
         self._jumps = 0.0, 0.0
         self._measured: set[tuple[int, int]] = set()  # streams with a velocity that is not always zero
         self._handlers = by_id(
             ATTITUDE=self._attitude, EKF_STATUS_REPORT=self._vouch, ESTIMATOR_STATUS=self._vouch,
-            GLOBAL_POSITION_INT=self._global, GPS_RAW_INT=self._gps, LOCAL_POSITION_NED=self._local,
-            ODOMETRY=self._odometry, VFR_HUD=self._speed,
+            EXTENDED_SYS_STATE=self._extended, GLOBAL_POSITION_INT=self._global, GPS_RAW_INT=self._gps,
+            HEARTBEAT=self._heartbeat, LOCAL_POSITION_NED=self._local, ODOMETRY=self._odometry,
+            VFR_HUD=self._speed,
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
@@ -205,6 +213,28 @@ class Motion:
         ):
             self._pass(time_us, heading=self._heading, speed=self._last)
 
+    def _heartbeat(self, message: Message, time_us: int) -> None:
+        if message.component == self._component.peer[1]:
+            self._is_aircraft, self._armed = message["type"] in AIRCRAFT, bool(message["base_mode"] & ARMED)
+            self._take_off_or_land(time_us)
+
+    def _extended(self, message: Message, time_us: int) -> None:
+        if message.component == self._component.peer[1]:
+            self._landed_state = message["landed_state"]
+            self._take_off_or_land(time_us)
+
+    def _take_off_or_land(self, time_us: int) -> None:
+        """Notice whether an aircraft stands on the ground, where the wind does not move it.
+
+        What dead reckoning by airspeed has learned there is not the wind, so it is forgotten at the take-off.
+        """
+        known = self._landed_state != STATE_UNKNOWN
+        resting = self._landed_state == ON_GROUND if known else not self._armed
+        grounded = self._is_aircraft and resting
+        if self._grounded and not grounded:
+            self._navigator.new_motion(time_us)
+        self._grounded = grounded
+
     def _speed(self, message: Message, time_us: int) -> None:
         speed = message["airspeed"]  # 0 of a vehicle that does not measure it
         is_ground = min(abs(speed - message["groundspeed"]), abs(speed - self._ground_speed)) < EQUAL_M_S
@@ -219,6 +249,7 @@ class Motion:
             # a source that is followed already has the heading, from the time of its report
             heading = nan if self.source is MotionSource.SPEED else self._heading
             if self._use(MotionSource.SPEED, time_us, "heading and speed through the water or air"):
+                speed = message["groundspeed"] if self._grounded else speed
                 self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
 
     def _gps(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers

@@ -269,6 +269,7 @@ def needed_rates(
         names["ATTITUDE"] = (10.0, 4.0)
     if navigation:
         names |= {"VFR_HUD": (5.0, 2.0), "GPS_RAW_INT": (2.0, 1.0), "EKF_STATUS_REPORT": (1.0, 1.0)}
+        names["EXTENDED_SYS_STATE"] = (1.0, 0.0)  # whether an aircraft stands on the ground
     return rates | {(autopilot, spec(name).id): pair for name, pair in names.items()}
 
 

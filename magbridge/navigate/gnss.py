@@ -190,6 +190,11 @@ class GnssMonitor:
         else:
             self._reported = GnssReason.JAMMING if jamming == DETECTED_STATE else GnssReason.NONE
 
+    def new_motion(self) -> None:
+        """Forget earlier positions: the error of dead reckoning is another from now on."""
+        self._history.clear()
+        self._trusted = None
+
     def fused_sigma(self, time_us: int, sigma: float) -> float:
         """Return the sigma (m) with which a position is fused, given the time since the previous one.
 

@@ -150,6 +150,7 @@ class Navigator:
         self._reckoning.advance(time_us * 1e-6)
         self._reckoning.forget()
         self.estimate.other_motion()
+        self.gnss.new_motion()
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
         """Add a corrected sample; return the update that it completes, or None."""

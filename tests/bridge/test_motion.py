@@ -6,11 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from passages import PLACE
+from passages import AIRCRAFT, PLACE, hills
 from vehicle import ARDUPILOT, PX4, Bench
 
 from magbridge.bridge.motion import MotionSource, rotate
-from magbridge.field.geodesy import separation
+from magbridge.field.geodesy import offset, separation
+from magbridge.field.igrf import total_field
+from magbridge.navigate.gnss import GnssState
+from magbridge.records import Corrected
 
 
 def made(kind: str = "GLOBAL_POSITION_SENSOR", stack: int = PX4) -> Bench:
@@ -199,3 +202,33 @@ def test_a_turn_between_two_reports_is_averaged_and_uncertain() -> None:
     noise = bench.navigation.navigator._reckoning.noise
     assert 1.0 < noise.nn + noise.ee < 50.0
     assert noise.turns == pytest.approx(2.0 * 22.0**2, rel=0.7)
+
+
+@pytest.mark.parametrize("reports", [True, False])
+def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool) -> None:
+    """An aircraft measures 6 m/s of wind, rolls for 10 s, and flies in a cross wind from then on.
+
+    Without a report of its landed state, it counts as flying when it is armed, before it rolls.
+    """
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT)
+    north, east = -1500.0, -1500.0
+    for k in range(1, 181):
+        flying, speed = k > 70, 22.0 * min(max(k - 60, 0) / 10.0, 1.0)
+        bench.to(k)
+        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128 * (k > 50))
+        if reports:
+            bench.receive("EXTENDED_SYS_STATE", landed_state=2 if flying else 1)
+        bench.receive("ATTITUDE", yaw=np.pi / 2)
+        bench.receive("VFR_HUD", airspeed=speed or 6.0, groundspeed=speed + 0.1)
+        north, east = north + 5.0 * flying, east + speed
+        latitude, longitude = offset(*PLACE, north, east)
+        place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
+        bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
+        now_s = bench.now_us * 1e-6
+        field = total_field(longitude, latitude, 0.0, now_s).item()
+        field += hills().look_up(longitude, latitude, 0.0).anomaly
+        bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))
+        if reports or k > 140:
+            assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
+    assert bench.navigation.navigator.gnss.state is GnssState.GOOD
+    assert bench.navigation.navigator.gnss.deviation < 10.0

@@ -11,6 +11,7 @@ from magbridge.config import Link
 from magbridge.link.component import Component
 from magbridge.link.estimates import FIX_MESSAGES
 from magbridge.mavlink import Codec, Message
+from magbridge.navigate import NavigationOptions
 from magbridge.navigate.record import Reckoned
 
 START_US = 1_780_000_000_000_000
@@ -21,12 +22,12 @@ ACK = {"command": 43003, "target_system": 1, "target_component": 191}
 class Bench:
     """A bridge's navigation without its ports."""
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, options: NavigationOptions = OPTIONS) -> None:
         self.component = Component(
             Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=START_US
         )
         self.navigation = NavigationService(
-            hills(), OPTIONS, FIX_MESSAGES[kind]._replace(rate=0.0), self.component
+            hills(), options, FIX_MESSAGES[kind]._replace(rate=0.0), self.component
         )
         self.texts: list[str] = []
         self._autopilot = {number: Codec(1, number) for number in (1, 197)}

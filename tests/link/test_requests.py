@@ -130,4 +130,7 @@ def test_what_is_needed_depends_on_the_task() -> None:
     plain = needed_rates(1, telemetry, attitude=False, navigation=False)
     assert sorted(spec(number).name for _, number in plain) == ["GLOBAL_POSITION_INT", "SYS_STATUS"]
     full = {spec(number).name for _, number in needed_rates(1, attitude=True, navigation=True)}
-    assert full == {"ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "EKF_STATUS_REPORT", "GLOBAL_POSITION_INT"}
+    assert full == {
+        *("ATTITUDE", "EKF_STATUS_REPORT", "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+        "VFR_HUD",
+    }

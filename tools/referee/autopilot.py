@@ -22,6 +22,8 @@ FIX_3D, NO_FIX = 3, 1
 HEARTBEAT_HZ = 1.0
 EARLY_US = 1_000
 """µs by which a message may be early, so that steps of the time that are rounded do not skip one."""
+ARMED, IN_AIR = 128, 2
+"""Flag of HEARTBEAT.base_mode, and value of EXTENDED_SYS_STATE.landed_state."""
 OPTIONAL = frozenset(("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY"))
 """Messages that are sent only if they are named."""
 Place = tuple[float, float]
@@ -118,7 +120,7 @@ class Autopilot:
             "HEARTBEAT": self._heartbeat, "ATTITUDE": self._attitude, self.STATUS: self._status,
             "GPS_RAW_INT": self._gps_raw, "GLOBAL_POSITION_INT": self._global_position,
             "VFR_HUD": self._vfr_hud, "LOCAL_POSITION_NED": self._local_position,
-            "ODOMETRY": self._own_odometry,
+            "ODOMETRY": self._own_odometry, "EXTENDED_SYS_STATE": self._extended_state,
         }  # fmt: skip
 
     @property
@@ -250,7 +252,10 @@ class Autopilot:
         return (self._now_us - self._start_us) // 1000
 
     def _heartbeat(self, _: Truth) -> bytes:
-        return self._codec.pack("HEARTBEAT", type=self._vehicle, autopilot=self.STACK)
+        return self._codec.pack("HEARTBEAT", type=self._vehicle, autopilot=self.STACK, base_mode=ARMED)
+
+    def _extended_state(self, _: Truth) -> bytes:
+        return self._codec.pack("EXTENDED_SYS_STATE", landed_state=IN_AIR)
 
     def _attitude(self, truth: Truth) -> bytes:
         angles = {"yaw": radians(truth.heading), "pitch": radians(truth.pitch)}
