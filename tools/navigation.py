@@ -35,19 +35,17 @@ from studies import Column, Row, Study, percentile, study_options, table
 from voyages import (
     AIRCRAFT,
     GLIDER,
-    LEFT,
     PLACE,
     ROUGH,
-    SPEEDS,
     START,
     SURVEYOR,
     WAVELENGTHS,
     Map,
-    Score,
     blocks,
     calibrated,
     carried,
     dived,
+    drawn_track,
     half,
     level,
     located,
@@ -97,32 +95,14 @@ SCORES = {
 }
 
 
-def score_row(score: Score) -> Row:
-    """Return the columns of a run's score."""
-    row: Row = score._asdict()
-    row["milliseconds"] = 1e3 * row.pop("seconds")
-    return row
-
-
-def one(kind: Map, slow: float, start: float, seed: int) -> Score:
-    """Navigate a glider over a map; `slow` in nT, `start` in correlation lengths."""
-    grid = synthetic(kind, seed % 10)
-    options = with_options(GLIDER, bias_sigma=slow, start_sigma=start * grid.correlation_length)
-    return sail(track_over(grid, options, 1000 + seed, speed=SPEEDS[seed % 3]), grid, options).score()
-
-
 def run_accuracy(kind: Map, start: str, seed: int) -> list[Row]:
     """Navigate with the errors of an auto calibration."""
-    return [{"map": str(kind), "start": start} | score_row(one(kind, LEFT["auto"], STARTS[start], seed))]
+    return [{"map": str(kind), "start": start} | sail(*drawn_track(kind, seed, STARTS[start])).score()]
 
 
 def run_calibrations(kinds: tuple[Map, ...], seed: int) -> list[Row]:
     """Calibrate a glider by each method, and navigate its survey over each map."""
-    return [
-        {"map": str(kinds[k]), "calibration": method, "error": found.error, "claimed": found.claimed}
-        | score_row(found.score)
-        for (k, method), found in calibrated(kinds, seed).items()
-    ]
+    return list(calibrated(kinds, seed))
 
 
 def run_watch(case: str, kind: Map, seed: int) -> list[Row]:
@@ -143,25 +123,18 @@ def run_misinformed(case: str, kind: Map, seed: int) -> list[Row]:
 def run_dived(seed: int) -> list[Row]:
     """Navigate a glider that dives under a map."""
     names = "as it was flown", "at the glider's depth"
-    return [{"map": name} | found._asdict() for name, found in zip(names, dived(seed), strict=True)]
+    return [{"map": name} | found for name, found in zip(names, dived(seed), strict=True)]
 
 
 def run_smoothed(seed: int) -> list[Row]:
     """Navigate one flight on a rough map and on smoothed ones."""
-    return [
-        {"map": f"without wavelengths below {length:.0f} m" if length else str(ROUGH)} | score_row(score)
-        for length, score in zip(WAVELENGTHS, on_smoothed(seed), strict=True)
-    ]
+    names = [f"without wavelengths below {one:.0f} m" if one else str(ROUGH) for one in WAVELENGTHS]
+    return [{"map": name} | score for name, score in zip(names, on_smoothed(seed), strict=True)]
 
 
 def run_unmapped(name: str, kind: Map, seed: int) -> list[Row]:
     """Localise a survey without a map."""
-    found = located(VEHICLES[name], kind, seed)
-    worse = found.error > found.reckoned
-    beyond = worse and found.error > 2.0 * found.sigma
-    return [
-        {"vehicle": name, "map": str(kind), "worse": float(worse), "beyond": float(beyond)} | found._asdict()
-    ]
+    return [{"vehicle": name, "map": str(kind)} | located(VEHICLES[name], kind, seed)]
 
 
 def run_stone_soup(python: str, kind: Map, start: str, seed: int) -> list[Row]:
@@ -194,13 +167,8 @@ def run_stone_soup(python: str, kind: Map, start: str, seed: int) -> list[Row]:
     when = np.array([b.time_us for b, _ in found]) * 1e-6
     second_half = when > 0.5 * (when[0] + when[-1])
     away = np.stack([np.interp(when, ds["time"], ds[f"away_{axis}"]) for axis in ("north", "east")], axis=1)
-    row: Row = {
-        "map": str(kind),
-        "start": start,
-        "bound": score.bound,
-        "ours": score.drms,
-        "ours_nees": score.nees,
-    }
+    row: Row = {"map": str(kind), "start": start, "bound": score["bound"]}
+    row |= {"ours": score["drms"], "ours_nees": score["nees"]}
     for name in ("ekf", "particles"):
         error = (theirs[f"{name}_x"][:, :2] - away)[second_half]
         spread = theirs[f"{name}_P"][second_half, :2, :2] + 1e-6 * np.eye(2)
@@ -322,7 +290,9 @@ def show_speed(console: Console) -> None:
         begun = clock.process_time()
         navigate(ds, grid, with_options(options, interval=interval), start=PLACE)
         console.print(f"100,000 samples, interval {interval:.0f} s: {clock.process_time() - begun:.1f} s")
-    console.print(f"wide start: {1e3 * one(MAPS[0], 1.0, 1.0, 7).seconds:.2f} ms a sample")
+    console.print(
+        f"wide start: {1e3 * sail(*drawn_track(MAPS[0], 7, 1.0, bias_sigma=1.0)).seconds:.2f} ms a sample"
+    )
 
 
 def show_magnav(folder: Path, console: Console) -> None:

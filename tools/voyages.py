@@ -1,7 +1,4 @@
-"""Simulated voyages over magnetic maps and their navigation: gliders, dives, wrong maps, and no map.
-
-``tools/navigation.py`` tabulates them; tests use them as well.
-"""
+"""Simulated voyages over magnetic maps, and their navigation. ``tools/navigation.py`` tabulates them."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ from dataclasses import dataclass
 from functools import cache
 from math import inf
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -101,26 +97,9 @@ def track_over(
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> xr.Dataset:
-    """Return a deployment drawn from the options' own model: legs of 45 minutes at random headings.
+    """Return a deployment of a vehicle that goes 45 minutes at a time at random headings.
 
-    A sample has 1 nT of white noise.
-
-    Parameters
-    ----------
-    grid : AnomalyGrid
-        The true anomaly, of which the filter's map differs by the options' map error.
-    options : Options
-        The filter's.
-    seed : int
-        Of everything that is drawn.
-    hours : float
-        How long it lasts.
-    speed : float
-        m/s through the water.
-    every : float
-        s between samples.
-    jump : (hour, north, east)
-        Metres by which the vehicle is displaced at once, unnoticed by its dead reckoning.
+    All errors are drawn from the options' own model; a sample has 1 nT of white noise in addition.
     """
     rng = np.random.default_rng(seed)
     n = int(hours * HOUR / every)
@@ -143,20 +122,11 @@ def adrift(
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> xr.Dataset:
-    """Return the measurements of a vehicle that moves through water with a current, over a map with errors.
+    """Return the measurements of a vehicle in water with a current, over a map with errors.
 
-    Parameters
-    ----------
-    grid, options
-        As for :func:`track_over`.
-    rng : Generator
-        Of current, drift, start and the map's error.
-    velocity : FloatArray, (n, 2)
-        m/s north and east through the water, each `every` s up to its sample.
-    errors, sigma : FloatArray, (n,)
-        nT: errors of the corrected total field, and the 1-sigma that the calibration claims.
-    every, jump
-        As for :func:`track_over`.
+    `velocity` (n, 2), m/s, is the motion through the water up to each sample, every `every` s. `errors` (n,),
+    nT, are those of the corrected total field, `sigma` (n,), nT, what the calibration claims. A `jump` (hour,
+    metres north and east) displaces the vehicle at once, unnoticed by its dead reckoning.
     """
     o, n = options, len(velocity)
     time = START + every * np.arange(1, n + 1)
@@ -205,35 +175,36 @@ class Run:
         """Records of the second half."""
         return np.asarray(self.hours > 0.5 * self.hours[-1])
 
-    def score(self) -> Score:
-        """Return what the tables need."""
+    def score(self) -> dict[str, float]:
+        """Return the run in numbers: errors in m over the second half, NEES over its degrees of freedom.
+
+        A run is *lost* if the truth lay outside for half an hour on end. An alarm is *false* if the truth was
+        never outside for more than 6 minutes. *waited* is the time until the position was first valid, h.
+        """
         half = self.second_half
-        away = longest(self.nees > OUTSIDE, self.hours)
-        return Score(
-            drms=rms(self.error[half]),
-            bound=self.bound,
-            unaided=self.unaided,
-            lost=longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5,
-            nees=float(np.mean(self.nees[half])) / 2,
-            false_alarm=bool((self.state == NavigationState.LOST).any()) and away <= 0.1,
-            valid=float(np.mean(self.valid)),
-            waited=float(self.hours[self.valid][0]) if self.valid.any() else inf,
-            seconds=self.seconds,
-        )
+        lost = bool((self.state == NavigationState.LOST).any())
+        return {
+            "drms": rms(self.error[half]), "bound": self.bound, "unaided": self.unaided,
+            "lost": float(longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5),
+            "nees": float(np.mean(self.nees[half])) / 2,
+            "false_alarm": float(lost and longest(self.nees > OUTSIDE, self.hours) <= 0.1),
+            "valid": float(np.mean(self.valid)),
+            "waited": float(self.hours[self.valid][0]) if self.valid.any() else inf,
+            "milliseconds": 1e3 * self.seconds,
+        }  # fmt: skip
 
+    @property
+    def outside(self) -> BoolArray:
+        """Records outside the filter's ellipse and over a quarter correlation length away."""
+        return (self.nees > OUTSIDE) & (self.error > 0.25 * self.length)
 
-class Score(NamedTuple):
-    """One run in numbers: errors in m over the second half; NEES over its two degrees of freedom."""
+    def silence(self) -> tuple[float, float]:
+        """Return the longest spells (h) in which a wrong position counted as valid, and of being wrong."""
+        return longest(self.outside & self.valid, self.hours), longest(self.outside, self.hours)
 
-    drms: float
-    bound: float
-    unaided: float
-    lost: bool  # the truth lay outside for half an hour on end, in the second half
-    nees: float
-    false_alarm: bool  # said to be lost, and the truth was never outside for more than 6 minutes
-    valid: float  # share of the time
-    waited: float  # hours, until its position was first valid
-    seconds: float  # of a processor, a sample
+    def standing(self) -> tuple[float, float]:
+        """Return the shares of the time in which a right position counted as valid, and a wrong one."""
+        return float(np.mean(self.valid & ~self.outside)), float(np.mean(self.valid & self.outside))
 
 
 def longest(flags: BoolArray, hours: FloatArray) -> float:
@@ -310,7 +281,28 @@ def telemetry(ds: xr.Dataset) -> Iterator[tuple[float, dict[str, float], float, 
         yield t, dict(zip(motion, moved, strict=True)), field, sigma
 
 
-# ---- wrong positions and wrong maps ------------------------------------------------------------------------
+# ---- the runs of the studies -------------------------------------------------------------------------------
+
+
+def drawn_track(
+    kind: Map,
+    seed: int,
+    start: float,
+    *,
+    first: int = 1000,
+    over: AnomalyGrid | None = None,
+    jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    **changes: float,
+) -> tuple[xr.Dataset, AnomalyGrid, NavigationOptions]:
+    """Return a glider's track, its map and its options, as :func:`sail` takes them.
+
+    `start` is the 1-sigma of the first position in correlation lengths of the map; the track is flown `over`
+    another field if one is given.
+    """
+    grid = synthetic(kind, seed % 10)
+    options = with_options(GLIDER, start_sigma=start * grid.correlation_length, **changes)
+    speed = SPEEDS[seed % 3]
+    return track_over(over or grid, options, first + seed, speed=speed, jump=jump), grid, options
 
 
 LEVEL = 60.0
@@ -318,84 +310,52 @@ LEVEL = 60.0
 
 
 def carried(kind: Map, seed: int) -> tuple[float, float]:
-    """Displace a tracking vehicle by 1.5 correlation lengths at 2 h; return as :func:`silence`."""
-    grid = synthetic(kind, seed % 10)
-    length, angle = 1.5 * grid.correlation_length, np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
-    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
+    """Displace a tracking vehicle by 1.5 correlation lengths at 2 h; return as :meth:`Run.silence`."""
+    length = 1.5 * synthetic(kind, seed % 10).correlation_length
+    angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     away = (2.0, float(length * np.cos(angle)), float(length * np.sin(angle)))
-    return silence(
-        sail(track_over(grid, options, 5000 + seed, speed=SPEEDS[seed % 3], jump=away), grid, options)
-    )
+    return sail(*drawn_track(kind, seed, 0.2, first=5000, jump=away)).silence()
 
 
 def misled(kind: Map, seed: int) -> tuple[float, float]:
-    """Start a filter with a tenth of its true start error, 1-sigma one length; return as :func:`silence`."""
-    grid = synthetic(kind, seed % 10)
-    options = with_options(GLIDER, start_sigma=grid.correlation_length)
-    ds = track_over(grid, options, 7000 + seed, speed=SPEEDS[seed % 3])
-    return silence(sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)))
+    """Claim a tenth of the true 1-sigma of the start, one length; return as :meth:`Run.silence`."""
+    ds, grid, options = drawn_track(kind, seed, 1.0, first=7000)
+    return sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)).silence()
 
 
 def level(kind: Map, seed: int) -> tuple[float, float]:
-    """Measure 60 nT too much all along, where 0.5 nT is claimed; return as :func:`standing`."""
-    grid = synthetic(kind, seed % 10)
-    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
-    ds = track_over(grid, options, 9000 + seed, speed=SPEEDS[seed % 3])
-    return standing(sail(ds.assign(total_field=ds["total_field"] + LEVEL), grid, options))
+    """Measure 60 nT too much all along, where 0.5 nT is claimed; return as :meth:`Run.standing`."""
+    ds, grid, options = drawn_track(kind, seed, 0.2, first=9000)
+    return sail(ds.assign(total_field=ds["total_field"] + LEVEL), grid, options).standing()
 
 
 def half(kind: Map, seed: int) -> tuple[float, float]:
-    """Sail on a field of which the map holds half the variance; return as :func:`standing`."""
+    """Sail on a field of which the map holds half the variance; return as :meth:`Run.standing`."""
     grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
     field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
-    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
-    return standing(sail(track_over(field, options, 9000 + seed, speed=SPEEDS[seed % 3]), grid, options))
+    return sail(*drawn_track(kind, seed, 0.2, first=9000, over=field)).standing()
 
 
-def outside(run: Run) -> BoolArray:
-    """Return when the vehicle is outside the filter's ellipse and over a quarter correlation length away."""
-    return (run.nees > OUTSIDE) & (run.error > 0.25 * run.length)
+def dived(seed: int) -> Iterator[dict[str, float]]:
+    """Fly the demo's spirals and survey over its own world, in the true field; without and with depth.
 
-
-def silence(run: Run) -> tuple[float, float]:
-    """Return the longest spells (hours) in which a wrong position counted as valid, and of being wrong."""
-    return longest(outside(run) & run.valid, run.hours), longest(outside(run), run.hours)
-
-
-def standing(run: Run) -> tuple[float, float]:
-    """Return the share of the time in which a right position counted as valid, and a wrong one."""
-    return float(np.mean(run.valid & ~outside(run))), float(np.mean(run.valid & outside(run)))
-
-
-# ---- maps at another altitude, and smoothed maps -----------------------------------------------------------
-
-
-class Dived(NamedTuple):
-    """RMS error (m), mean squared error over covariance of two axes, share of the time it is valid."""
-
-    error: float
-    nees: float
-    valid: float
-
-
-def dived(seed: int) -> tuple[Dived, Dived]:
-    """Fly the demo's spirals and survey over its own world, in the true field; without and with depth."""
+    Yield RMS error (m), NEES over its two degrees of freedom, and the share of the time it is valid.
+    """
     scenario = load("demo")
     grid, log = Twin.draw(scenario, seed).anomaly_map(), simulate(scenario, seed)
     log = log.assign(total_field=log["truth_total_field"])
-    found = [
-        navigate(log, *how)
-        for how in ((grid, NavigationOptions()), at_depth(grid, NavigationOptions(), log["depth"].to_numpy()))
-    ]
-    return _score(found[0]), _score(found[1])
+    options = NavigationOptions()
+    for map_, used in ((grid, options), at_depth(grid, options, log["depth"].to_numpy())):
+        yield track_score(navigate(log, map_, used))
 
 
-def _score(track: xr.Dataset) -> Dived:
-    error = np.stack([track["error_north"], track["error_east"]], axis=-1)
+def track_score(track: xr.Dataset) -> dict[str, float]:
+    """Return RMS error (m), NEES over its two degrees of freedom, and the share of the time it is valid."""
+    north, east = track["error_north"].to_numpy(), track["error_east"].to_numpy()
     nn, ne, ee = (track[f"covariance_{axes}"].to_numpy() for axes in ("nn", "ne", "ee"))
-    P = np.stack([nn, ne, ne, ee], axis=-1).reshape(-1, 2, 2)
-    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
-    return Dived(rms(np.hypot(*error.T)), float(squared.mean()) / 2, float(track["valid"].mean()))
+    nees = (ee * north**2 - 2.0 * ne * north * east + nn * east**2) / (nn * ee - ne**2)
+    valid = float(track["valid"].mean())
+    return {"error": rms(np.hypot(north, east)), "nees": float(nees.mean()) / 2, "valid": valid}
 
 
 ROUGH = Map(40, 1000, rough=True)
@@ -403,47 +363,36 @@ WAVELENGTHS = (0.0, 1_000.0, 2_000.0)
 """m, of which half the amplitude stays; 0: all of it."""
 
 
-def on_smoothed(seed: int) -> tuple[Score, ...]:
-    """Return one flight's score on the map of every wavelength."""
-    raw = synthetic(ROUGH, seed % 10)
-    options = with_options(GLIDER, start_sigma=0.2 * raw.correlation_length)
-    flown = track_over(raw, options, 1000 + seed, speed=SPEEDS[seed % 3])
-    maps = (smoothed(raw, length) if length else raw for length in WAVELENGTHS)
-    return tuple(sail(flown, grid, options).score() for grid in maps)
+def on_smoothed(seed: int) -> Iterator[dict[str, float]]:
+    """Yield one flight's score on the map of every wavelength."""
+    ds, raw, options = drawn_track(ROUGH, seed, 0.2)
+    for length in WAVELENGTHS:
+        yield sail(ds, smoothed(raw, length) if length else raw, options).score()
 
 
-# ---- calibrated gliders ------------------------------------------------------------------------------------
+def calibrated(kinds: tuple[Map, ...], seed: int) -> Iterator[dict[str, object]]:
+    """Yield how a glider navigates on each map with each calibration, all else the same.
 
-
-class Flown(NamedTuple):
-    """RMS error (nT) of the corrected field on the survey, the median claimed sigma, the navigation."""
-
-    error: float
-    claimed: float
-    score: Score
-
-
-def calibrated(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
-    """Return how a glider navigates on each map (by number) with each calibration, all else the same."""
+    *error* is the RMS error (nT) of the corrected field on the survey, *claimed* the median claimed sigma.
+    """
     parts = segments(simulate(load("random_glider"), seed))
     runs, survey = at_rest(parts["calibration"], MASSES), parts["survey"]
     places = separation(*PLACE, *(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")))
     every = float(survey["time"][1] - survey["time"][0])
     velocity = np.gradient(np.column_stack(places), every, axis=0)
-    found = {}
     for method, options in METHODS.items():
         fitted = fit(observations(runs, () if method == "nominal" else MASSES), method, **options).calibration
         corrected = correct_rows(Correction(fitted), survey)
         error = corrected["total_field"].to_numpy() - true_field(survey)
         sigma = corrected["total_field_sigma"].to_numpy()
         claimed = float(np.median(sigma))
-        for k, kind in enumerate(kinds):
+        for kind in kinds:
             grid = synthetic(kind, seed % 10)
             known = with_options(GLIDER, start_sigma=grid.correlation_length)
             known = informed(known, fitted, claimed)
             ds = adrift(grid, known, np.random.default_rng(seed), velocity, error, sigma, every=every)
-            found[k, method] = Flown(rms(error), claimed, sail(ds, grid, known).score())
-    return found
+            row = {"map": str(kind), "calibration": method, "error": rms(error), "claimed": claimed}
+            yield row | sail(ds, grid, known).score()
 
 
 # ---- without a map -----------------------------------------------------------------------------------------
@@ -451,29 +400,15 @@ def calibrated(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A vehicle that flies a survey that crosses itself.
-
-    Attributes
-    ----------
-    options : Options
-        Those its errors are drawn from, and that localisation is given.
-    hours, speed, every : float
-        h, m/s, and s between samples.
-    leg : (float, float)
-        s, shortest and longest leg of a survey.
-    star : bool
-        Whether every leg turns by 125 to 150 degrees; else they zigzag out along an axis, and back.
-    extent : float
-        Half the side of the map, m.
-    """
+    """A vehicle that flies a survey that crosses itself, its errors drawn from the options."""
 
     options: NavigationOptions
     hours: float
-    speed: float
-    every: float
-    leg: tuple[float, float]
-    star: bool
-    extent: float
+    speed: float  # m/s
+    every: float  # s between samples
+    leg: tuple[float, float]  # s, shortest and longest leg
+    star: bool  # every leg turns by 125 to 150 degrees; else they zigzag out along an axis, and back
+    extent: float  # half the side of the map, m
 
 
 SURVEYOR = Vehicle(
@@ -503,37 +438,19 @@ AIRCRAFT = Vehicle(
 """100 minutes with an inertial platform that drifts by a nautical mile an hour."""
 
 
-class Located(NamedTuple):
-    """One survey: RMS in m over the whole track, NEES over its two degrees of freedom, processor seconds."""
-
-    error: float
-    reckoned: float  # of dead reckoning alone
-    sigma: float
-    bound: float
-    nees: float
-    valid: float  # share of the time
-    seconds: float
-
-
-def located(vehicle: Vehicle, kind: Map, seed: int) -> Located:
-    """Fly a survey and localise it."""
+def located(vehicle: Vehicle, kind: Map, seed: int) -> dict[str, float]:
+    """Fly a survey and localise it; return RMS in m over the whole track, and processor seconds."""
     flown = survey(vehicle, kind, seed)
     begun = clock.process_time()
     track = localise(flown, vehicle.options, start=PLACE)
     seconds = clock.process_time() - begun
-    off, reckoned = (one.to_numpy() for one in track_errors(track))
-    nn, ne, ee = (track[f"covariance_{axes}"].to_numpy() for axes in ("nn", "ne", "ee"))
-    north, east = track["error_north"].to_numpy(), track["error_east"].to_numpy()
-    nees = (ee * north**2 - 2.0 * ne * north * east + nn * east**2) / (nn * ee - ne**2)
-    return Located(
-        rms(off),
-        rms(reckoned),
-        rms(np.sqrt(nn + ee)),
-        rms(track["bound_sigma"].to_numpy()),
-        float(nees.mean()) / 2,
-        float(track["valid"].mean()),
-        seconds,
-    )
+    error, reckoned = (rms(one.to_numpy()) for one in track_errors(track))
+    sigma = rms(np.sqrt(track["covariance_nn"].to_numpy() + track["covariance_ee"].to_numpy()))
+    return track_score(track) | {
+        "error": error, "reckoned": reckoned, "sigma": sigma, "bound": rms(track["bound_sigma"].to_numpy()),
+        "worse": float(error > reckoned), "beyond": float(error > max(reckoned, 2.0 * sigma)),
+        "seconds": seconds,
+    }  # fmt: skip
 
 
 def survey(vehicle: Vehicle, kind: Map, seed: int) -> xr.Dataset:

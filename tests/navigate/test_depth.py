@@ -47,9 +47,9 @@ def test_a_level_is_reported_on_its_side_of_the_surface(
 def test_a_glider_that_dives_under_it_is_found() -> None:
     """Taken for the field below it, the map leads the filter away; continued to the depth, it does not."""
     flown, below = dived(2)
-    assert below.error < 0.2 * flown.error
-    assert below.nees < 2.0
-    assert below.valid > 0.5
+    assert below["error"] < 0.2 * flown["error"]
+    assert below["nees"] < 2.0
+    assert below["valid"] > 0.5
 
 
 def test_what_lies_between_nodes_counts_as_map_error() -> None:

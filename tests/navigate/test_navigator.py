@@ -61,8 +61,8 @@ def test_it_holds_the_position(
 ) -> None:
     records, error = followed
     score = sail(ds, grid, options).score()
-    assert score.drms < 2.0 * score.bound  # one track: errors follow each other
-    assert score.drms < 0.5 * score.unaided
+    assert score["drms"] < 2.0 * score["bound"]  # one track: errors follow each other
+    assert score["drms"] < 0.5 * score["unaided"]
     assert sum(r.state is NavigationState.TRACKING for r in records) > 0.7 * len(records)
     sigma = np.array([np.sqrt(r.covariance_nn + r.covariance_ee) for r in records])
     assert np.mean(error < 3 * sigma) > 0.95
@@ -80,7 +80,7 @@ def test_a_wide_start_is_found(grid: AnomalyGrid, options: NavigationOptions) ->
     wide = replace(options, start_sigma=1500.0)
     run = sail(track_over(grid, wide, 4, hours=4.0), grid, wide)
     assert run.error[0] > 300.0
-    assert run.score().drms < 200.0
+    assert run.score()["drms"] < 200.0
     assert run.state[0] == NavigationState.SEARCHING or run.state[0] == NavigationState.DEAD_RECKONING
     assert run.state[-1] == NavigationState.TRACKING
     assert NavigationState.LOST not in run.state
