@@ -75,20 +75,11 @@ class Instrument(Table, frozen=True):
     def measure(
         self, field: FloatArray, water: FloatArray, step: float, time: FloatArray, rng: np.random.Generator
     ) -> Samples:
-        """Measure a field given on a uniform grid.
+        """Measure a `field` (n, 3), nT in body axes at the sensor, given every `step` s.
 
-        Parameters
-        ----------
-        field : array (n, 3)
-            nT at the sensor, body axes.
-        water : array (n,)
-            degC around the instrument.
-        step : float
-            s between the grid's points.
-        time : array (m,)
-            s after the first point at which triples are taken; inside the grid, channel delays included.
-        rng : Generator
-            Of the offsets at power-on and of the noise.
+        `water` (n,), degC, is around the instrument; triples are taken at `time` (m,), s after the first
+        point, inside the grid with channel delays included. `rng` is that of the offsets at power-on and of
+        the noise.
         """
         temperature = self.temperature(water, step)
         warm = (temperature - self.reference_temperature)[:, None]

@@ -25,22 +25,13 @@ POINTS = 8
 def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Dataset:
     """Simulate what the scenario's vehicle and instrument would have measured in a logged deployment.
 
-    Parameters
-    ----------
-    log : Dataset (time)
-        A deployment with attitude, position, depth and the position of every moving mass of the scenario. A
-        lacking value is interpolated in time; before the first and after the last one it is held.
-    scenario : Scenario
-        Its mission, place and start are not used.
-    seed : int
-        Of what the scenario leaves open, and of the noise.
+    The `log` has attitude, position, depth and the position of every moving mass of the scenario. A lacking
+    value is interpolated in time; before the first and after the last one it is held. The scenario's mission,
+    place and start are not used. `seed` is that of what the scenario leaves open, and of the noise.
 
-    Returns
-    -------
-    Dataset (time)
-        The log's rows and columns, with ``mag_*``, ``sensor_temperature``, ``power_cycle``, ``truth_*``
-        and, as the scenario asks, ``reference_field`` simulated. The log's own attitude and position
-        are the truth.
+    The result has the log's rows and columns, with ``mag_*``, ``sensor_temperature``, ``power_cycle``,
+    ``truth_*`` and, as the scenario asks, ``reference_field`` simulated; the log's attitude and position are
+    the truth.
 
     Raises
     ------

@@ -57,14 +57,8 @@ ENDING = 10.0
 def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> Iterator[str]:
     """Fly the glider of a seed while the context lasts; give the link at which a ground station receives it.
 
-    Parameters
-    ----------
-    folder : Path
-        For the deployment, its calibration, its world's map, the bridge's configuration and its log.
-    seed : int
-        Which random glider.
-    notify : callable
-        Called with a line about the present step.
+    `folder` is for the deployment, its calibration, its world's map, the bridge's configuration and its log.
+    `notify` is called with a line about each step.
     """
     notify("simulating a glider and fitting its calibration to the spirals")
     survey = _prepare(folder, seed)

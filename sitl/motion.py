@@ -14,17 +14,9 @@ __all__ = ["with_motion"]
 def with_motion(deployment: xr.Dataset) -> xr.Dataset:
     """Return the deployment with the columns that the autopilot sends to a navigator.
 
-    Parameters
-    ----------
-    deployment : Dataset (time)
-        With a first position and one of :data:`~magbridge.navigate.batch.MOTIONS`, which are tried
-        in that order.
-
-    Returns
-    -------
-    Dataset (time)
-        ``gps_latitude gps_longitude`` (deg): the log's, or its first position; ``local_north local_east`` (m)
-        of a track or a velocity. From a speed or a glide the bridge dead-reckons itself.
+    These are ``gps_latitude gps_longitude`` (deg), the log's or its first position, and ``local_north
+    local_east`` (m) of a track or a velocity. From a speed or a glide the bridge dead-reckons itself. The
+    motions :data:`~magbridge.navigate.batch.MOTIONS` are tried in that order.
 
     Raises
     ------

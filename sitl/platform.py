@@ -70,19 +70,9 @@ class Mass(Table, frozen=True):
     """m³, apparent susceptibility times volume along each axis: the induced moment is ``volume * B / µ0``."""
 
     def field(self, ambient: FloatArray, position: FloatArray) -> FloatArray:
-        r"""Return the mass's field at the sensor.
+        r"""Return the mass's field at the sensor (n, 3), nT in body axes.
 
-        Parameters
-        ----------
-        ambient : array (n, 3)
-            nT, the Earth's field in body axes.
-        position : array (n,)
-            The parameter.
-
-        Returns
-        -------
-        array (n, 3)
-            nT, body axes.
+        `ambient` (n, 3), nT, is the Earth's field in body axes, `position` (n,) the parameter.
 
         Notes
         -----
@@ -117,14 +107,8 @@ class Vehicle(Table, frozen=True):
     ) -> FloatArray:
         """Return the field at the sensor, (n, 3) nT in body axes.
 
-        Parameters
-        ----------
-        ambient : array (n, 3)
-            nT, the Earth's field in body axes.
-        channels : mapping of array (n,)
-            Where the masses are; every mass must be among them.
-        time : array (n,), optional
-            Not used: iron does not depend on time.
+        `ambient` (n, 3), nT, is the Earth's field in body axes; `channels` (n,) each has the position of
+        every mass. Iron does not depend on the time.
         """
         fixed = ambient + np.asarray(self.hard_iron) + ambient @ np.asarray(self.soft_iron).T
         moving = (mass.field(ambient, channels[name]) for name, mass in self.mass.items())

@@ -137,7 +137,7 @@ def load(path: str | Path) -> Scenario:
 
 
 def _check_hidden(hidden: tuple[Hidden, ...], path: Path) -> None:
-    from sitl.inject.catalogue import EFFECTS  # noqa: PLC0415 - the effects simulate scenarios
+    from sitl.inject import EFFECTS  # noqa: PLC0415 - the effects simulate scenarios
 
     for one in hidden:
         if one.effect not in EFFECTS:

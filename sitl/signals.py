@@ -13,20 +13,9 @@ __all__ = ["autoregressive", "correlated", "first_order", "first_order_at"]
 def first_order(
     u: FloatArray, step: float, time_constant: float, start: FloatArray | float | None = None
 ) -> FloatArray:
-    r"""Return the output of a first-order lag on a uniform grid.
+    r"""Return the output of a first-order lag for an input u (n,) or (n, k), every `step` s, of its shape.
 
-    Parameters
-    ----------
-    u : array (n,) or (n, k)
-        Input on a uniform grid; linear between the points.
-    step, time_constant : float
-        s. A time constant of 0 passes the input through.
-    start : array (k,) or float, optional
-        Output at the first point; without it the lag begins at ``u[0]``.
-
-    Returns
-    -------
-    array, shape of `u`
+    The output begins at `start` (k,), or at ``u[0]``. A time constant of 0 s passes the input through.
 
     Notes
     -----
@@ -51,20 +40,10 @@ def first_order(
 def first_order_at(
     u: FloatArray, y: FloatArray, step: float, time_constant: float, time: FloatArray
 ) -> FloatArray:
-    r"""Return a first-order lag's output between the points of its grid.
+    r"""Return a first-order lag's output (m,) between the points of its grid.
 
-    Parameters
-    ----------
-    u, y : array (n,)
-        Input, and output of :func:`first_order`, on the grid.
-    step, time_constant : float
-        s.
-    time : array (m,)
-        s after the first point; inside the grid.
-
-    Returns
-    -------
-    array (m,)
+    Input u and output y (n,) are those of :func:`first_order`; `time` (m,) is s after the first point, inside
+    the grid.
 
     Notes
     -----

@@ -93,22 +93,10 @@ def fly(
     motion: Motion = STEADY,
     limits: Mapping[str, Limit] = LIMITS,
 ) -> Track:
-    """Fly `legs` one after the other.
+    """Fly `legs` one after the other, from a `start` (s since 1970, latitude and longitude in deg).
 
-    Parameters
-    ----------
-    legs : sequence of Leg
-        In the order in which they are flown.
-    start : tuple of 3 float
-        s since 1970, latitude and longitude in deg.
-    step : float
-        s between the points of the track.
-    rng : Generator
-        Of the wander.
-    motion : Motion
-        How the vehicle moves.
-    limits : mapping of Limit
-        For every moving mass. One that no leg moves stays in the middle of its travel.
+    The track has a point every `step` s; `rng` is that of the wander. `limits` has every moving mass; one
+    that no leg moves stays in the middle of its travel.
 
     Raises
     ------

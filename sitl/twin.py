@@ -100,19 +100,9 @@ class Twin:
         return fly(legs, start, step, rng, self.scenario.motion, limits)
 
     def measure(self, track: Track, time: FloatArray) -> xr.Dataset:
-        """Measure along a track.
+        """Measure along a track at `time` (n,), s after its start; channel delays end inside it.
 
-        Parameters
-        ----------
-        track : Track
-            As :meth:`fly` returns it.
-        time : array (n,)
-            s after the track's start of each triple; channel delays must end inside the track.
-
-        Returns
-        -------
-        Dataset (time)
-            The contract's columns and ``truth_*``.
+        The deployment has the contract's columns and ``truth_*``.
         """
         ambient = self.ambient(track)
         samples = self.scenario.instrument.measure(
@@ -135,16 +125,9 @@ class Twin:
         return _stream(self.seed, 3)
 
     def log(self, track: Track, time: FloatArray, earth: FloatArray, samples: Samples) -> xr.Dataset:
-        """Return the deployment of an instrument's samples, as :meth:`measure` does.
+        """Return the deployment of an instrument's samples at `time` (m,), as :meth:`measure` does.
 
-        Parameters
-        ----------
-        track, time
-            As for :meth:`measure`.
-        earth : array (n, 3)
-            As :attr:`Ambient.earth`.
-        samples : Samples
-            What the instrument gave for `time`.
+        `earth` (n, 3) is that of :class:`Ambient`.
         """
         true = track.pose_at(time)
         field_ned = np.column_stack([np.interp(time, track.elapsed, b) for b in earth.T])
@@ -222,13 +205,10 @@ class Twin:
 
 
 def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
-    """Simulate a deployment.
+    """Simulate a deployment, with ``truth_*`` in addition to the columns of any deployment.
 
-    Returns
-    -------
-    Dataset (time)
-        Columns as in any deployment, ``truth_*`` in addition. ``attrs["segments"]`` lists the parts of the
-        mission (JSON: name, first and last time in s since 1970); :func:`sitl.segments` splits them.
+    ``attrs["segments"]`` lists the parts of the mission (JSON: name, first and last time in s since 1970);
+    :func:`sitl.segments` splits them.
     """
     twin = Twin.draw(scenario, seed)
     track = twin.fly()

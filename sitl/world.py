@@ -19,19 +19,7 @@ MU_0_OVER_4_PI = 100.0
 
 
 def dipole_field(r: FloatArray, m: FloatArray) -> FloatArray:
-    r"""Return the field of point dipoles.
-
-    Parameters
-    ----------
-    r : array (..., 3)
-        m, from the dipole to the point of observation.
-    m : array (..., 3)
-        A m², moments in the same axes.
-
-    Returns
-    -------
-    array (..., 3)
-        nT.
+    r"""Return the field (..., 3), nT, of point dipoles m (..., 3), A m², at r (..., 3), m from them.
 
     Notes
     -----
@@ -153,16 +141,10 @@ class World:
     def anomaly_map(
         self, time: float, altitude: float = 90.0, extent: float = 8_000.0, spacing: float = 150.0
     ) -> AnomalyGrid:
-        """Return the map an aeromagnetic survey would have made, upward-continued to `altitude`.
+        """Return the map of an aeromagnetic survey at an `altitude`, m, at a `time`, s since 1970.
 
-        Bodies of this world seen from higher up, without the fine structure that a vehicle under water meets.
-
-        Parameters
-        ----------
-        time : float
-            s since 1970, of the main field.
-        altitude, extent, spacing : float
-            m above the surface; half the side of the square; between nodes.
+        It shows the bodies of this world from higher up, without the fine structure that a vehicle under
+        water meets. `extent` is half the side of the square, m, `spacing` the distance between nodes, m.
         """
         side = np.arange(-extent, extent + spacing / 2, spacing)
         latitude, longitude = offset(*self.origin, side, side)

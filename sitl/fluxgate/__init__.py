@@ -38,12 +38,8 @@ def open_encoder(
 ) -> Encoder:
     """Return the emulated instrument that the driver called `name` reads.
 
-    Parameters
-    ----------
-    name, options, source
-        As for :func:`magbridge.sensors.open_driver`.
-    rate : float
-        Hz of the readings, for an instrument that gives a reading's number in place of its time.
+    Arguments are those of :func:`magbridge.sensors.open_driver`; `rate` is that of the readings, Hz, for an
+    instrument that gives a reading's number in place of its time.
 
     Raises
     ------

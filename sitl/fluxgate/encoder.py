@@ -11,21 +11,11 @@ __all__ = ["Encoder", "clip"]
 
 
 class Encoder(ABC):
-    """An instrument, switched on.
+    """An instrument, switched on, with the options of the driver that reads it.
 
-    Parameters
-    ----------
-    options
-        Of the driver that reads it.
-    rate : float
-        Hz of the readings, for an instrument that gives a reading's number in place of its time.
-
-    Attributes
-    ----------
-    streaming : bool
-        Whether it sends readings now; some wait for a command.
-    power_cycle : int
-        How many times it was switched on.
+    `rate` is that of the readings, Hz, for an instrument that gives a reading's number in place of its time.
+    It is `streaming` while it sends readings; some wait for a command. `power_cycle` is how many times it was
+    switched on.
     """
 
     Options: ClassVar[Any]

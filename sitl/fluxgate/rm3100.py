@@ -27,20 +27,11 @@ def results(reading: Reading, cycle_count: int) -> bytes:
 
 
 class Rm3100Registers:
-    """The part's register map, which answers as the part does.
+    """The part's register map, which answers as the part does in a `field` (nT) at its coils.
 
-    Attributes
-    ----------
-    field : tuple of 3 float
-        nT, present at the coils.
-    is_frozen : bool
-        No measurement completes until the registers are written again.
-    has_failed : bool
-        The bus does not answer.
-    is_absent : bool
-        Nobody is on the bus: an SPI bus then reads zeros.
-    broken_axes : int
-        Bits 4 to 6: coils that fail the self-test.
+    If it `is_frozen`, no measurement completes until the registers are written again. If it `has_failed`, the
+    bus does not answer; if it `is_absent`, an SPI bus reads zeros. `broken_axes` (bits 4 to 6) are the coils
+    that fail the self-test.
     """
 
     def __init__(self) -> None:

@@ -15,16 +15,8 @@ from sitl.signals import autoregressive, first_order
 from sitl.trajectory import Track
 
 __all__ = [
-    "Array",
-    "Effect",
-    "Generator",
-    "HiddenEffect",
-    "Scene",
-    "direction",
-    "furnish",
-    "relays",
-    "soaked",
-]
+    "Array", "Effect", "Generator", "HiddenEffect", "Scene", "direction", "furnish", "relays", "soaked",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -73,7 +65,7 @@ Effect = Callable[[Scene, float, Generator], None]
 
 
 class HiddenEffect(msgspec.Struct, frozen=True):
-    """One hidden effect: its name, as in :data:`~.catalogue.EFFECTS`, size, seed."""
+    """One hidden effect: its name, as in :data:`~.effects.EFFECTS`, size, seed."""
 
     name: str
     size: float

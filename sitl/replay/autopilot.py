@@ -28,14 +28,9 @@ LARGEST = 2e6
 
 
 class Autopilot:
-    """Turns rows of a deployment into MAVLink frames.
+    """Turns rows of a deployment into MAVLink frames, as the bridge's configuration expects them.
 
-    Parameters
-    ----------
-    config : Config
-        The bridge's: whose telemetry is emulated, under which system id.
-    boot_us : int
-        µs since 1970 UTC at which the vehicle booted.
+    The vehicle booted at `boot_us`, µs since 1970 UTC.
     """
 
     def __init__(self, config: Config, boot_us: int) -> None:

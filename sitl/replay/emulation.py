@@ -38,14 +38,9 @@ def start_us(deployment: xr.Dataset) -> int:
 
 
 def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
-    """Yield the events of a deployment, in order of time.
+    """Yield the events of a deployment with ``mag_x mag_y mag_z``, in order of time.
 
-    Parameters
-    ----------
-    deployment : Dataset (time)
-        With ``mag_x mag_y mag_z``, and whatever telemetry it has.
-    config : Config
-        The bridge's: which instrument is emulated, and which messages carry the telemetry.
+    The bridge's configuration states which instrument is emulated, and which messages carry the telemetry.
 
     Raises
     ------

@@ -29,16 +29,9 @@ SENSOR_ID = FIELD.fields["sensor_id"]
 
 
 class Listener:
-    """Counts messages, and keeps the corrected field and the texts.
+    """Counts messages, and keeps the corrected field and the `texts`, STATUSTEXTs in order.
 
-    Attributes
-    ----------
-    counts : Counter
-        Messages by name.
-    texts : list of str
-        The STATUSTEXTs, in order.
-    navigation : Counter
-        Number of navigation updates by the filter's state.
+    `navigation` counts the position updates by the filter's state.
     """
 
     def __init__(self) -> None:

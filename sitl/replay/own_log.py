@@ -43,23 +43,11 @@ def runs(paths: Sequence[Path]) -> list[list[Path]]:
 class Recorded:
     """The log of one run of a bridge, in one file or in the several that it was rotated into.
 
-    Parameters
-    ----------
-    paths : sequence of path
-        In order.
-
-    Attributes
-    ----------
-    start : StartEvent
-        What the run started from.
-    late : float
-        s of the run before the log begins; above 0 if the log was restarted after a loss. The bridge's
-        state at that time is not in the log, so the replay starts without it, at a multiple of the time
-        synchronisation's interval: its requests to the autopilot are then those that the log answers.
-    config_digest : str
-        Digest of the configuration that it ran with.
-    published : bytearray
-        Bytes that it published, as far as :meth:`events` has been read.
+    `start` is what the run started from, `config_digest` the digest of its configuration. `late` is the time,
+    s, of the run before the log begins; above 0 if the log was restarted after a loss. The bridge's state at
+    that time is not in the log, so the replay starts without it, at a multiple of the time synchronisation's
+    interval: its requests to the autopilot are then those that the log answers. `published` are the bytes
+    that it published, as far as :meth:`events` has been read.
 
     Raises
     ------

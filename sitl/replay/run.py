@@ -42,19 +42,10 @@ def replay(
 ) -> Result:
     """Replay `files` through the bridge; return the results, as the command prints them.
 
-    Parameters
-    ----------
-    files : sequence of path
-        A bridge's own log (all its files, in order), which is published again bit for bit; or any other logs,
-        whose magnetometer and telemetry two emulated devices send.
-    config : path, optional
-        The ``bridge.toml``; without one, a nominal calibration is fitted on all but the last file.
-    speed : float
-        Times real time; ``inf`` is as fast as it goes.
-    log : path, optional
-        Folder for the bridge's log of the replay.
-    options : Options
-        How to read other logs.
+    A bridge's own log (all its files, in order) is published again bit for bit; of any other logs, two
+    emulated devices send magnetometer and telemetry. Without a `config`, a nominal calibration is fitted on
+    all but the last file. `speed` is in times real time, `log` the folder for the bridge's log of the replay,
+    `options` how to read other logs.
 
     Raises
     ------

@@ -40,14 +40,9 @@ PATIENCE = 1.0
 class Stage:
     """Sets the stage, plays events to a bridge, and hands on what the bridge publishes.
 
-    Parameters
-    ----------
-    config : path
-        The bridge's own ``bridge.toml``; only its sensor port and its link are replaced by the stage's.
-    listener : callable
-        Takes the bytes that the bridge sends to the autopilot, as they come, on a thread of its own.
-    log : path or None
-        Folder for the bridge's own log of the replay.
+    Of the bridge's own ``bridge.toml``, only the sensor port and the link are replaced by the stage's. The
+    `listener` takes the bytes that the bridge sends to the autopilot, as they come, on a thread of its own.
+    The bridge writes its own log of the replay to the folder `log`.
     """
 
     def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
@@ -118,16 +113,7 @@ class Stage:
         return PortError("replay", words or otherwise or f"the bridge ended with {self._bridge.returncode}")
 
     def play(self, start: StartEvent, events: Iterable[Event], speed: float = float("inf")) -> None:
-        """Play events in order, and wait until the bridge has dealt with all of them.
-
-        Parameters
-        ----------
-        start : StartEvent
-            The bridge's own.
-        events : iterable of Event
-            Input from sensor and link, in order of time.
-        speed : float
-            How many times faster than they happened.
+        """Play events in order, `speed` times faster than they happened, until the bridge has dealt with all.
 
         Raises
         ------

@@ -51,12 +51,8 @@ def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int,
 def pace(events: Iterable[Event], speed: float) -> Iterator[tuple[float, Event]]:
     """Yield how long to wait before each event, in s (negative: it is late), and the event.
 
-    Parameters
-    ----------
-    events : iterable of Event
-        In order of time.
-    speed : float
-        How many times faster than they happened; ``inf`` waits for nothing.
+    The events, in order of time, are played `speed` times faster than they happened; ``inf`` waits for
+    nothing.
     """
     begun = time.monotonic()
     first_us: int | None = None

@@ -87,6 +87,6 @@ def test_what_was_smoothed_away_is_a_map_error_that_lasts_and_a_flight_holds_its
     assert lasting_errors(raw, known) == (raw, known)
     options = replace(GLIDER, start_sigma=150.0)
     flown = sail(track_over(raw, options, 1000, hours=3.0), less, options).score()
-    assert not flown.lost
-    assert flown.drms < 2.0 * flown.bound < flown.unaided
-    assert flown.nees < 3.0
+    assert not flown["lost"]
+    assert flown["drms"] < 2.0 * flown["bound"] < flown["unaided"]
+    assert flown["nees"] < 3.0

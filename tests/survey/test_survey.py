@@ -305,7 +305,7 @@ def test_a_vehicle_finds_itself_on_the_map_that_its_own_survey_drew() -> None:
     drawn = anomaly_map(survey(samples).gridded, samples)
     assert np.mean(drawn.anomaly_at(longitude, latitude)) == pytest.approx(np.mean(value), abs=0.3)
     found = sail(flown, drawn, structs.replace(GLIDER, start_sigma=50.0)).score()
-    assert not found.lost
-    assert found.drms < 0.4 * found.unaided
-    assert found.nees < 2.0
-    assert found.valid > 0.5
+    assert not found["lost"]
+    assert found["drms"] < 0.4 * found["unaided"]
+    assert found["nees"] < 2.0
+    assert found["valid"] > 0.5
