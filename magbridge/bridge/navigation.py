@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import hypot, inf
+from math import cos, hypot, inf, radians, sin
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.config import Navigation as Wanted
 from magbridge.errors import ConfigError
-from magbridge.field.geodesy import separation
+from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid
 from magbridge.link.component import Component
@@ -307,6 +307,11 @@ class Fixing:
 
 
 GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
+GPS_AGE_S, GPS_AGE_SIGMA_S = 0.15, 0.1
+"""s between a receiver's measurement and the arrival of GPS_RAW_INT, and its 1-sigma: 0.1 to 0.2 s in the
+receiver (ArduPilot's and PX4's defaults for its delay), and up to 0.2 s until the autopilot sends it."""
+UNKNOWN_MOTION = 65535
+"""Value of GPS_RAW_INT.vel and .cog that means 'unknown'."""
 STATE_TEXTS = {
     NavigationState.OFF: "waiting for a first position",
     NavigationState.SEARCHING: "searching",
@@ -384,6 +389,12 @@ class NavigationService:
             return
         latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
         accuracy = message["h_acc"] * 1e-3
+        if UNKNOWN_MOTION not in (message["vel"], message["cog"]):
+            # the vehicle has moved on since the receiver's measurement
+            speed, course = message["vel"] * 1e-2, radians(message["cog"] * 1e-2)
+            moved = GPS_AGE_S * speed
+            latitude, longitude = offset(latitude, longitude, moved * cos(course), moved * sin(course))
+            accuracy = hypot(accuracy, GPS_AGE_SIGMA_S * speed) if accuracy > 0.0 else accuracy
         sigma = accuracy if accuracy > 0.0 else None
         self._notify(self.navigator.gnss_position(time_us, latitude, longitude, sigma))
         gnss = self.navigator.gnss

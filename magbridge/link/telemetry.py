@@ -18,8 +18,8 @@ from magbridge.mavlink.messages import MESSAGE_IDS, Field, split_index
 from magbridge.wording import suggestion
 
 __all__ = [
-    "MIN_RATE_FRACTION", "Sources", "Stream", "StreamRequests", "TelemetryMap", "is_possible", "needed_rates",
-    "own_time", "sent_us",
+    "AIRCRAFT", "MIN_RATE_FRACTION", "Sources", "Stream", "StreamRequests", "TelemetryMap", "is_possible",
+    "needed_rates", "own_time", "sent_us",
 ]  # fmt: skip
 
 Value = tuple[str, float, int]

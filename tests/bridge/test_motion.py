@@ -12,6 +12,7 @@ from vehicle import ARDUPILOT, PX4, Bench
 from magbridge.bridge.motion import MotionSource, rotate
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.igrf import total_field
+from magbridge.navigate import Record
 from magbridge.navigate.gnss import GnssState
 from magbridge.records import Corrected
 
@@ -232,3 +233,25 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
             assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
     assert bench.navigation.navigator.gnss.deviation < 10.0
+
+
+def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:
+    """At 40 m/s a position is about 6 m old when it arrives, and the error of that age is counted."""
+    bench = made()
+    seen: list[tuple[float, float, float | None]] = []
+    navigator = bench.navigation.navigator
+    use = navigator.gnss_position
+
+    def record(time_us: int, latitude: float, longitude: float, sigma: float | None = None) -> Record | None:
+        seen.append((latitude, longitude, sigma))
+        return use(time_us, latitude, longitude, sigma)
+
+    navigator.gnss_position = record  # type: ignore[method-assign]
+    where = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7), "h_acc": 1000, "fix_type": 3}
+    bench.receive("GPS_RAW_INT", vel=4000, cog=9000, **where)
+    bench.receive("GPS_RAW_INT", vel=65535, cog=65535, **where)
+    moved_on, as_measured = seen
+    assert separation(*PLACE, *moved_on[:2]) == pytest.approx((0.0, 6.0), abs=0.05)
+    assert moved_on[2] == pytest.approx(np.hypot(1.0, 4.0))
+    assert separation(*PLACE, *as_measured[:2]) == pytest.approx((0.0, 0.0), abs=0.05)
+    assert as_measured[2] == 1.0
