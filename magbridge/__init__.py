@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from magbridge.errors import MagbridgeError
     from magbridge.field.read import read_grid
     from magbridge.logs import read
-    from magbridge.logs.frames import from_frame, to_frame
+    from magbridge.logs.deployment import from_frame, to_frame
     from magbridge.version import __version__
 
 __all__ = [
@@ -84,7 +84,7 @@ _HOMES = {
     "correct_rows": "api",
     "diagnose": "api",
     "fit": "calibration.fitting.fit",
-    "from_frame": "logs.frames",
+    "from_frame": "logs.deployment",
     "heading": "calibration.heading",
     "load": "calibration.file",
     "navigate": "api",
@@ -95,7 +95,7 @@ _HOMES = {
     "reference_field": "api",
     "save": "calibration.file",
     "survey": "api",
-    "to_frame": "logs.frames",
+    "to_frame": "logs.deployment",
     "write": "api",
 }
 

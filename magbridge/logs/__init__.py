@@ -10,15 +10,13 @@ magnetometer sample; every other column holds the values known at that time:
   across gaps.
 
 :mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.reading` and
-:mod:`.writing` are for all formats; :mod:`.options` is what a user can say about a log. The formats are
-:mod:`.text` (CSV), :mod:`.netcdf` (with :mod:`.seaglider` and :mod:`.cf`), :mod:`.parquet`, :mod:`.telemetry`
-(with its ``telemetry_*``), :mod:`.ardupilot`, :mod:`.px4` and :mod:`.slocum`. They share :mod:`.fields`
-(telemetry brought to the rows; :mod:`.autopilot` does so for both autopilots), :mod:`.deployment` (what they
-return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one stream of several. :mod:`.tlog`
-is separate: it writes the bridge's log.
+:mod:`.writing` are for all formats; :mod:`.mapping` is what a user can say about a log. The formats share
+:mod:`.fields` (telemetry brought to the rows; :mod:`.autopilot` does so for autopilots and robots),
+:mod:`.deployment` (what they return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one
+stream of several. :mod:`.tlog` is separate: it writes the bridge's log.
 """
 
-from magbridge.logs.options import Options
+from magbridge.logs.mapping import Options
 from magbridge.logs.reading import read, read_chunks, read_each
 from magbridge.logs.registry import FORMATS, suffixes
 from magbridge.logs.writing import Writer, write

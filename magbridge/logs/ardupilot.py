@@ -33,14 +33,14 @@ from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
 from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
 from magbridge.logs.checks import boots
+from magbridge.logs.clocks import GPS_EPOCH, WEEK, leap_seconds
 from magbridge.logs.compasses import LogCompass, rate
 from magbridge.logs.dataflash import OWN_SCALE, Flash, Records, read_binary, read_text
 from magbridge.logs.deployment import NOTES
 from magbridge.logs.fields import DEG_PER_RAD, FieldMap, by_record, fields_of
-from magbridge.logs.stamps import GPS_EPOCH, WEEK, leap_seconds
 
 if TYPE_CHECKING:
-    from magbridge.logs.options import Options
+    from magbridge.logs.mapping import Options
 
 __all__ = ["WANTED", "chunks"]
 

@@ -1,15 +1,22 @@
 """Times as text files write them, in seconds since 1970-01-01 UTC.
 
-A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date (:mod:`.stamps`).
-Where the heading does not state the kind, the size decides: an Excel serial of today is 46,000, a Julian date
-2.46 million, a Unix time 1.8e9. GPS time and Unix time have the same size: GPS time must be named. Where
-several columns are the time (date and time of day, GPS week and second), they come joined by blanks.
+A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date. Where the heading
+does not state the kind, the size decides: an Excel serial of today is 46,000, a Julian date 2.46 million, a
+Unix time 1.8e9. GPS time and Unix time have the same size: GPS time must be named. It has no leap seconds
+and is ahead of UTC by :func:`leap_seconds`. Where several columns are the time (date and time of day, GPS
+week and second), they come joined by blanks.
+
+The pattern of a date is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. A
+second's fraction is not part of it: behind the seconds, after a point, a comma or a colon, it is read
+whatever the pattern.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from datetime import datetime
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +24,35 @@ import pandas as pd
 
 from magbridge.arrays import FloatArray
 from magbridge.logs.checks import MEDIAN_ROWS, boots
-from magbridge.logs.stamps import DAY, GPS_EPOCH, HOURS, SECONDS_SUFFIX, WEEK, epoch, leap_seconds, patterns
 
-__all__ = ["SECONDS_OF_DAY", "CountState", "TimeFormat", "clock_of", "date_order", "seconds"]
+__all__ = [
+    "DAY", "GPS_EPOCH", "SECONDS_OF_DAY", "WEEK", "CountState", "TimeFormat", "clock_of", "date_order",
+    "epoch", "leap_seconds", "seconds",
+]  # fmt: skip
 
+DAY = 86_400.0
+HOURS = ("%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S")
+DATES = (
+    *("%d.%m.%Y", "%d.%m.%y"),  # with dots, the day comes first
+    *(f"%{day}{sign}%{month}{sign}%{year}" for year in "Yy" for sign in "/-" for day, month in ("dm", "md")),
+    *("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%Y-%j", "%d-%b-%Y", "%d %b %Y"),
+    *("%Y%m%d", "%d%m%y", "%y%m%d", "%m%d%y"),
+)
+WHOLE_MOMENTS = ("%a %b %d %H:%M:%S %Y", "%Y%m%d%H%M%S", "%Y %m %d %H %M %S", "%Y %j %H %M %S")
+"""Patterns of date and time together; the last are columns of numbers, joined."""
+SECONDS_SUFFIX = " s"
+YEAR_1900 = -2_208_988_800.0
+"""s since 1970 of the year that times of day without a date are given; no log is older."""
+FRACTION = r"(?:(?P<clock>\d:\d\d:\d\d)[.,:]|(?P<digits>\d{6}| \d\d?)\.)(?P<fraction>\d+)(?=(?: ?[AP]M)?$)"
+GPS_EPOCH = 315_964_800.0
+"""s since 1970 of 1980-01-06, where GPS weeks begin."""
+WEEK = 604_800.0
+"""Length of a GPS week, s."""
+LEAPS = (
+    *((0, 13), (1_136_073_600, 14), (1_230_768_000, 15)),
+    *((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18)),
+)
+"""From when on (s since 1970) GPS time is ahead of UTC by how many s; IERS Bulletin C 52, from 1999 on."""
 EPOCHS = {
     "s": (0.0, 1.0),
     "ms": (0.0, 1e-3),
@@ -269,3 +301,78 @@ def _numbers(cells: pd.Series) -> FloatArray:
     if not pd.api.types.is_numeric_dtype(cells):
         cells = cells.astype("str").str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
     return np.asarray(pd.to_numeric(cells, errors="coerce"), np.float64)
+
+
+def patterns(texts: Sequence[str]) -> list[str]:
+    """Return the patterns that fit all of these texts, one of each set of equivalent patterns."""
+    whole, _ = _plain(pd.Series(list(texts), dtype="string"))
+    candidates = [
+        *WHOLE_MOMENTS,
+        *map(" ".join, product(DATES, (*HOURS, SECONDS_SUFFIX.strip()))),
+        *DATES,
+        *HOURS,
+    ]
+    found: dict[tuple[float, ...], str] = {}
+    for pattern in candidates:
+        if _fits(whole.iloc[0], pattern):
+            times = epoch(whole, pattern)
+            if (times >= YEAR_1900).all():
+                found.setdefault(tuple(times.tolist()), pattern)
+    return list(found.values())
+
+
+def _fits(text: str, pattern: str) -> bool:
+    """Return True if a pattern may have written a text; much faster than parsing all texts."""
+    if pattern.endswith(SECONDS_SUFFIX):
+        text, pattern = text.rpartition(" ")[0], pattern.removesuffix(SECONDS_SUFFIX)
+    try:
+        datetime.strptime(text, pattern)
+    except ValueError:
+        return False
+    return True
+
+
+def _plain(texts: pd.Series) -> tuple[pd.Series, FloatArray]:
+    """Return the texts (n,), a blank between date and time, without fractions of a second, and these (n,)."""
+    texts = texts.astype("string").str.strip().str.replace(r"(?<=\d)[T_](?=\d)", " ", regex=True)
+    digits = texts.str.extract(FRACTION)["fraction"]
+    fraction = pd.to_numeric("0." + digits, errors="coerce").to_numpy(np.float64, na_value=0.0)
+    return texts.str.replace(FRACTION, r"\g<clock>\g<digits>", regex=True), fraction
+
+
+def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray:
+    """Return the texts in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
+
+    Parameters
+    ----------
+    texts : (n,) Series
+        As they are written.
+    pattern : str
+        One of :func:`patterns`, ``iso``, or one with a fraction of its own, ``%f``.
+    zone : str or None
+        Zone of times that do not say theirs; UTC if None.
+    """
+    seconds: FloatArray = np.zeros(len(texts))
+    texts = texts.astype("string").str.strip()
+    if pattern != "iso" and "%f" not in pattern:
+        texts, seconds = _plain(texts)
+    if pattern.endswith(SECONDS_SUFFIX):
+        parts = texts.str.rpartition(" ")
+        texts, pattern = parts[0], pattern.removesuffix(SECONDS_SUFFIX)
+        seconds = seconds + pd.to_numeric(parts[2], errors="coerce").to_numpy(np.float64, na_value=np.nan)
+    form = "ISO8601" if pattern == "iso" else pattern
+    stamps = pd.to_datetime(texts, format=form, errors="coerce", utc=zone is None)
+    if zone is not None and stamps.dt.tz is None:
+        stamps = stamps.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
+    counts = stamps.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy("datetime64[us]")
+    whole = counts.astype("datetime64[s]")  # separately, so that no digit is lost
+    times = whole.astype(np.int64) + ((counts - whole).astype(np.int64) * 1e-6 + seconds)
+    return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)
+
+
+def leap_seconds(gps: FloatArray) -> FloatArray:
+    """Return by how many s GPS time `gps` (n,), s since 1970, is ahead of UTC, (n,)."""
+    leap = np.zeros(len(gps))
+    for since, ahead in LEAPS:
+        leap[gps - ahead >= since] = ahead
+    return leap

@@ -1,4 +1,4 @@
-"""A deployment in memory: build and join ``xarray.Dataset`` objects on ``time``."""
+"""A deployment in memory: build and join ``xarray.Dataset`` objects on ``time``, also from data frames."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.columns import COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, usual
+from magbridge.columns import COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, in_seconds, usual
 from magbridge.errors import FormatError
+from magbridge.logs.mapping import split
 from magbridge.records import Quality
 
 __all__ = [
     "CHANGES_SETTING", "COUNTERS", "GUESSED_ATTRIBUTE", "HISTORY_ATTRIBUTE", "LOSSES_ATTRIBUTE",
-    "MEANING", "NOTES", "SETTINGS", "deployment",
+    "MEANING", "NOTES", "SETTINGS", "deployment", "from_frame",
     "join", "join_attrs", "lasting", "merged", "named_losses", "noted", "passed_over", "plain_attrs",
-    "same_columns", "sliced", "uncounted", "with_losses",
+    "same_columns", "sliced", "to_frame", "uncounted", "with_losses",
 ]  # fmt: skip
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
@@ -286,3 +288,54 @@ def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
     if "heading_reference" in headed[0]:
         joined["heading_reference"] = headed[0]["heading_reference"]
     return joined | {"source": ", ".join(sources)}
+
+
+FRAME_NAME = "the data frame"
+
+
+def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **attrs: Any) -> xr.Dataset:
+    """Return a data frame as a deployment; every function that accepts a log accepts it.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        A column of ours is called as ours; others are telemetry. A heading may hold a unit: ``mag_x [uT]``.
+        Time is the column ``time`` or the index: moments (UTC where they do not say), or s since 1970.
+    units : mapping of str to str, optional
+        Units of columns; those of our table are converted to the table's.
+    **attrs
+        Of the whole, as ``heading_reference="magnetic"``.
+
+    Raises
+    ------
+    FormatError
+        It has no time; a column does not hold numbers; a unit does not fit.
+    """
+    named = dict(split(str(name)) for name in frame.columns)
+    frame = frame.set_axis(list(named), axis=1)
+    if "time" not in frame and isinstance(frame.index, pd.RangeIndex):
+        raise FormatError(FRAME_NAME, "expected a column or an index of times", column="time")
+    time = frame.pop("time") if "time" in frame else frame.index.to_series()
+    columns = {}
+    for name in map(str, frame):
+        if not pd.api.types.is_numeric_dtype(frame[name]):
+            raise FormatError(FRAME_NAME, f"expected numbers, not {frame[name].dtype}", column=name)
+        columns[name] = frame[name].to_numpy(float)
+    return deployment(FRAME_NAME, _seconds(time), columns, {**named, **(units or {})}, attrs)
+
+
+def to_frame(log: xr.Dataset) -> pd.DataFrame:
+    """Return a deployment as a data frame, indexed by moments in UTC; units are in ``frame.attrs``."""
+    log = in_seconds(log)
+    frame = log.to_dataframe()
+    frame.index = pd.to_datetime(log["time"].to_numpy(), unit="s", utc=True).rename("time")
+    frame.attrs = {str(name): log[name].attrs.get("units", "") for name in log}
+    return frame
+
+
+def _seconds(time: pd.Series) -> Any:
+    """Return moments as s since 1970 UTC; numbers are such already."""
+    if pd.api.types.is_numeric_dtype(time):
+        return time.to_numpy(float)
+    moments = pd.to_datetime(time, utc=True)
+    return ((moments - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)).to_numpy(float)

@@ -22,8 +22,7 @@ from typing import NamedTuple
 
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
-from magbridge.logs.headings import CELL_NUMBER, is_unit
-from magbridge.logs.mapping import ColumnMapping, declared_by_maker
+from magbridge.logs.mapping import CELL_NUMBER, ColumnMapping, declared_by_maker, is_unit
 from magbridge.logs.validity import Validity
 from magbridge.wording import counted
 

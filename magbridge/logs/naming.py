@@ -14,10 +14,9 @@ import pandas as pd
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usual
 from magbridge.errors import FormatError
-from magbridge.logs.clocks import SECONDS_OF_DAY
-from magbridge.logs.headings import CELL_NUMBER, WITH_UNIT, aliases, bare, is_unit, split
+from magbridge.logs.clocks import DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import Layout, Rows
-from magbridge.logs.stamps import DAY
+from magbridge.logs.mapping import CELL_NUMBER, WITH_UNIT, aliases, bare, is_unit, split
 
 __all__ = ["HEMISPHERES", "READING_RANGE_NT", "name_columns", "on_side", "units_of_angles"]
 

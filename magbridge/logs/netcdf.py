@@ -4,30 +4,42 @@ A file is written along the dimension ``time`` with the documented names of the 
 ``xarray.open_dataset`` gives the same names as :func:`magbridge.logs.read`. With the vocabulary of
 OceanGliders OG1.0 it is written along ``N_MEASUREMENTS`` in capitals instead: ``TIME LATITUDE LONGITUDE DEPTH
 ROLL PITCH HEADING TEMP PRES`` are names of OG1.0, the others the documented names in capitals (``MAG_X``).
-The attribute ``column`` keeps the documented name in both. Any trajectory is read, by
-:mod:`magbridge.logs.trajectory`; a basestation's Seaglider file is recognised by its dimensions and read by
-:mod:`magbridge.logs.seaglider`.
+The attribute ``column`` keeps the documented name in both.
+
+Any trajectory is read. pyglider, the IOOS Glider DAC, EGO, OG1.0, seagliderOG1, VOTO and Argo differ in the
+names of dimensions and variables; `standard_name`, units and flags are common to them. The time is the
+variable with the standard name ``time`` (or in a unit ``... since ...``) along which most variables lie; a
+dimension of length 1, as of a file with one trajectory, does not count. Every numeric variable along that
+time becomes a column: by the attribute ``column`` (ours), by its standard name, by a name that is known to
+mean the same, else under its own name in small letters. A value that a flag of its own calls bad or missing
+is not known. A basestation's Seaglider file is recognised by its dimensions (:mod:`.seaglider`).
 
 References
 ----------
+CF Conventions 1.11, sections 2.5.1 (missing data), 3.3 (standard names), 3.5 (flags), 4.4 (time) and 8.1
+(packed data), https://cfconventions.org
 OceanGliders format 1.0, https://oceangliderscommunity.github.io/OG-format-user-manual/OG_Format.html
 """
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.columns import COLUMNS, factor
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
-from magbridge.logs import seaglider, trajectory
-from magbridge.logs.cf import EPOCH
-from magbridge.logs.deployment import sliced
+from magbridge.logs import seaglider
+from magbridge.logs.deployment import deployment, sliced, with_losses
+from magbridge.logs.mapping import aliases
 from magbridge.logs.validity import known
 from magbridge.records import Quality
 from magbridge.version import __version__
@@ -37,8 +49,11 @@ try:
 except ImportError:
     raise MissingExtra("netCDF4", "analysis") from None
 
-__all__ = ["FileWriter", "chunks"]
+__all__ = ["EPOCH", "floats"]
 
+EPOCH = "seconds since 1970-01-01T00:00:00Z"
+NANOSECONDS = re.compile(r"(nanosecond|nanosec|nsec|ns)s?(?= since)")
+WHOLE_AXIS = slice(None)
 OG1_DIMENSION = "N_MEASUREMENTS"
 OG1_NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
 """Columns whose OG1.0 name is not simply our name in capitals."""
@@ -58,26 +73,326 @@ NO_FLAGS = -1
 """Stands for flags that are not known."""
 STORED_ROWS = 8192
 """Rows stored together."""
+STANDARD_NAMES = {
+    **{str(attrs["standard_name"]): column for column, attrs in CF_ATTRIBUTES.items() if column != "time"},
+    **dict.fromkeys(("platform_roll_angle", "platform_roll_starboard_down"), "roll"),
+    **dict.fromkeys(("platform_pitch_angle", "platform_pitch_fore_up"), "pitch"),
+    **dict.fromkeys(("platform_yaw_angle", "platform_yaw_fore_starboard"), "heading"),
+    **dict.fromkeys(("platform_orientation", "platform_heading"), "heading"),
+}
+"""Standard name to column; the unit is the variable's."""
+OPPOSITE_NAMES = {"platform_roll_starboard_up": "roll", "platform_pitch_fore_down": "pitch"}
+"""Standard name to the column that has the opposite sign."""
+KNOWN_NAMES = {name.lower(): column for column, name in OG1_NAMES.items()}
+FLAG_VARIABLE = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
+"""Name of a variable with the flags of another."""
+BAD = re.compile(r"bad|fail|missing|reject|erroneous|not_used")
+BAD_CODES = (3, 4, 9)
+"""Flags of a bad or missing value where the file does not say what they mean (OceanSITES, Argo, IODE)."""
+GENERATED = ("Conventions", "featureType", "title", "start_date", "time_coverage_start", "time_coverage_end")
+"""Attributes of a file that are written again for each."""
 
 
-def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file as deployments of at most `rows` rows, each with their numbers.
+def chunks(path: Path, rows: int) -> Iterator[xr.Dataset | tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the file as deployments of at most `rows` rows, those of a trajectory with their numbers.
 
     FormatError: not netCDF or cut short, or no time in it.
     """
     try:
         with netCDF4.Dataset(path) as file:
             if seaglider.DIMENSION in file.dimensions:
-                whole = seaglider.dive(path, seaglider.read_netcdf(path, file))
-                for k, part in enumerate(sliced(whole, rows)):
-                    yield part, range(k * rows + 1, k * rows + 1 + part.sizes["time"])
+                yield from sliced(seaglider.dive(path, _seaglider(path, file)), rows)
             else:
                 ours = any("column" in variable.ncattrs() for variable in file.variables.values())
-                for part, numbers in trajectory.chunks(path, file, rows):
+                for part, numbers in _trajectory(path, file, rows):
                     yield (part, numbers) if ours else known(path, part, numbers)
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None
+
+
+class CfColumn(NamedTuple):
+    """A variable as a column; `flags` is the variable with its flags."""
+
+    variable: Any
+    name: str
+    factor: float
+    flags: Any | None
+
+
+def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
+    """Yield the rows of an open file in pieces of at most `rows`, each with their numbers.
+
+    FormatError: nothing in it is a time, or no rows.
+    """
+    clock = _clock(path, file)
+    dimension = _along(clock)
+    total = len(file.dimensions[dimension])
+    if not total:
+        raise FormatError(path, "expected rows, there are none")
+    start, scale = _epoch(path, clock)
+    columns, left_out = _columns(path, file, dimension, clock)
+    units = {one.name: _unit(one.variable) for one in columns}
+    meanings = {one.name: str(getattr(one.variable, "long_name", "")) for one in columns}
+    try:
+        attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
+    except AttributeError as error:  # netCDF4's, of a damaged attribute
+        raise FormatError(path, f"its attributes cannot be read: {error}") from None
+    if "heading_reference" not in attrs and any(_is_magnetic(one) for one in columns):
+        attrs["heading_reference"] = "magnetic"
+    for row in range(0, total, rows):
+        part = slice(row, row + rows)
+        time = _values(clock, part) * scale + start
+        values = {one.name: _sound(one, part) for one in columns}
+        piece = deployment(path, time, values, units, attrs, meanings)
+        yield with_losses(piece, {}, () if row else left_out), range(row + 1, row + 1 + len(time))
+
+
+def _along(variable: Any) -> str | None:
+    """Return the one dimension of a variable that is longer than 1, or its last; None: there are several."""
+    sizes = dict(zip(variable.dimensions, variable.shape, strict=True))
+    long = [name for name, size in sizes.items() if size != 1]
+    return (
+        long[0] if len(long) == 1 else variable.dimensions[-1] if variable.dimensions and not long else None
+    )
+
+
+def _is_number(variable: Any) -> bool:
+    return variable.dtype != str and getattr(variable.dtype, "kind", "") in "iuf"
+
+
+def _clock(path: Path, file: Any) -> Any:
+    """Return the variable that is the time of the trajectory."""
+    numbers = [one for one in file.variables.values() if _is_number(one) and _along(one) is not None]
+    lying = Counter(_along(one) for one in numbers)
+    candidates = [one for one in numbers if _is_time(one)]
+    if not candidates:
+        there = ", ".join(file.variables) or "none"
+        raise FormatError(path, f"expected a variable with the standard_name time; there are: {there}"[:300])
+
+    def rank(variable: Any) -> tuple[int, bool, bool, int]:
+        named = variable.name.lower() == "time"
+        standard = getattr(variable, "standard_name", "") == "time"
+        return lying[_along(variable)], named, standard, variable.size
+
+    return max(candidates, key=rank)
+
+
+def _is_time(variable: Any) -> bool:
+    standard, units = (str(getattr(variable, name, "")) for name in ("standard_name", "units"))
+    return standard == "time" or " since " in units or variable.name.lower() == "time"
+
+
+def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[list[CfColumn], list[str]]:
+    """Return the columns along a dimension, and a line for each whose unit is not that of its meaning."""
+    found: dict[str, CfColumn] = {}
+    lying = {
+        name: one
+        for name, one in file.variables.items()
+        if one is not clock and _is_number(one) and _along(one) == dimension
+    }
+    flags = {name: _flags(file, name) for name in lying}
+    of_others = {one.name for one in flags.values() if one is not None}
+    left_out = []
+    names = [name for name in lying if name not in of_others]
+    called = {names[k]: ours for k, ours in aliases(names).items()}
+    # of several with one meaning, the one that has its name, or comes first, is it
+    for name in sorted(names, key=lambda name: not _is_ours(lying[name])):
+        variable = lying[name]
+        column, sign = _meaning(variable, called.get(name, name.lower()))
+        if column in found:
+            column, sign = name.lower(), 1.0
+        unit = str(getattr(variable, "units", ""))
+        if factor(unit, column) is None:
+            left_out.append(
+                f"{path}: column {name!r}: expected {COLUMNS[column].units}, not {unit}: left out"
+            )
+            continue
+        while column in found or column == "time":
+            column += "_"
+        found[column] = CfColumn(variable, column, sign, flags[name])
+    order = {name: k for k, name in enumerate(file.variables)}
+    return sorted(found.values(), key=lambda one: order[one.variable.name]), left_out
+
+
+def _is_ours(variable: Any) -> bool:
+    """Return True if a variable has the name of one of our columns, whatever its standard name."""
+    return hasattr(variable, "column") or variable.name.lower() in COLUMNS
+
+
+def _meaning(variable: Any, called: str) -> tuple[str, float]:
+    """Return the column that a variable is, and the factor that its sign needs; `called` goes by its name."""
+    if hasattr(variable, "column"):
+        return str(variable.column), 1.0
+    standard, sign = str(getattr(variable, "standard_name", "")), 1.0
+    if standard in OPPOSITE_NAMES:
+        column, sign = OPPOSITE_NAMES[standard], -1.0
+    else:
+        column = STANDARD_NAMES.get(standard) or KNOWN_NAMES.get(called, called)
+    if _is_ours(variable):
+        column = variable.name.lower()
+    if column == "depth" and str(getattr(variable, "positive", "down")).lower() == "up":
+        sign = -1.0
+    return column, sign
+
+
+def _is_magnetic(column: CfColumn) -> bool:
+    """Return True if a heading is stated to be measured from magnetic north."""
+    text = " ".join(str(column.variable.getncattr(name)) for name in column.variable.ncattrs())
+    return column.name == "heading" and "magnetic" in text.lower()
+
+
+def _flags(file: Any, name: str) -> Any | None:
+    """Return the variable with the flags of another; None where there is none."""
+    ancillary = str(getattr(file[name], "ancillary_variables", "")).split()
+    for other in (*ancillary, f"{name}_QC", f"{name}_qc"):
+        one = file.variables.get(other)
+        if one is None or one.shape != file[name].shape:
+            continue
+        if FLAG_VARIABLE.fullmatch(other) or hasattr(one, "flag_meanings"):
+            return one
+    return None
+
+
+def _sound(column: CfColumn, rows: slice) -> FloatArray:
+    """Return rows of a column, NaN where its own flags call the value bad."""
+    values = column.factor * _values(column.variable, rows)
+    return values if column.flags is None else np.where(_bad(column.flags, rows), np.nan, values)
+
+
+def _values(variable: Any, rows: slice) -> FloatArray:
+    return floats(variable, _index(variable, rows)).ravel()
+
+
+def _index(variable: Any, rows: slice) -> tuple[slice, ...]:
+    """Return the index of rows along the one dimension of a variable that is not 1."""
+    along = _along(variable)
+    return tuple(rows if name == along else WHOLE_AXIS for name in variable.dimensions)
+
+
+def _bad(flags: Any, rows: slice) -> BoolArray:
+    """Return the rows that are flagged as bad or missing."""
+    flags.set_auto_maskandscale(False)
+    stored = np.asarray(flags[_index(flags, rows)]).ravel()
+    if stored.dtype.kind in "SU":
+        stored = np.array([int(one) if one.isdigit() else 0 for one in stored.astype("U1")])
+    codes: Sequence[Any] = BAD_CODES
+    if hasattr(flags, "flag_meanings") and hasattr(flags, "flag_values"):
+        text = zip(np.atleast_1d(flags.flag_values), str(flags.flag_meanings).split(), strict=False)
+        codes = [int(value) for value, meaning in text if BAD.search(meaning.lower())]
+    return np.isin(stored, codes)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _unit(variable: Any) -> str:
+    """Return the unit, which a file of ours spells as UDUNITS does where it is an angle's."""
+    unit = str(getattr(variable, "units", "1"))
+    return "deg" if unit == "degree" else unit
+
+
+def _seaglider(path: Path, file: Any) -> seaglider.Dive:
+    """Return the dive in a basestation's file; variables of another length than their times are left out.
+
+    FormatError: it has no time.
+    """
+    rows = file.dimensions[seaglider.DIMENSION].size
+    if (time := _numbers(file, "time", rows)) is None:
+        raise FormatError(path, "expected this variable, as of a Seaglider", column="time")
+    sampled = {
+        name.removeprefix("eng_"): values
+        for name in file.variables
+        if (name.startswith("eng_") and name != "eng_depth") or name == "depth"
+        if (values := _numbers(file, name, rows)) is not None
+    }
+    names = [name for name in file.variables if name.startswith("gc_")]
+    size = file["gc_end_secs"].size if "gc_end_secs" in names else 0
+    manoeuvres = {
+        name.removeprefix("gc_"): values
+        for name in names
+        if (values := _numbers(file, name, size)) is not None
+    }
+    settings = {
+        name.removeprefix("log_"): float(floats(variable))
+        for name, variable in file.variables.items()
+        if (name.startswith("log_") or name == "magnetic_variation")
+        if variable.shape == () and variable.dtype != str and variable.dtype.kind in "iuf"
+    }
+    elsewhere = {}
+    if "ctd_time" in file.variables:
+        ctd_time = floats(file["ctd_time"])
+        elsewhere = {
+            one.field: (ctd_time, values)
+            for one in seaglider.CTD_FIELDS
+            if (values := _numbers(file, one.field, ctd_time.size)) is not None
+        }
+    return seaglider.Dive(time, sampled, settings, manoeuvres, elsewhere)
+
+
+def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
+    """Return a variable (size,), or None if it has another size or no numbers."""
+    if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
+        return None
+    return floats(file[name]) if file[name].dtype.kind in "iuf" else None
+
+
+def _epoch(path: Path, variable: Any) -> tuple[float, float]:
+    """Return the s since 1970 at which a time variable is 0, and the s in one of its units.
+
+    FormatError: its unit is not a time since a date.
+    """
+    units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
+    unit = 1.0
+    if nano := NANOSECONDS.match(units):  # which the library does not know
+        units, unit = f"seconds{units[nano.end() :]}", 1e-9
+    days = [datetime(1970, 1, 1), datetime(1970, 1, 2)]
+    try:
+        numbers: Any = netCDF4.date2num(days, units, calendar or "standard")
+    except ValueError:
+        raise FormatError(path, f"expected {EPOCH!r}, not {units!r}", column=variable.name) from None
+    zero, day = numbers
+    scale = 86_400.0 / (day - zero)
+    return float(-zero * scale), float(scale) * unit
+
+
+def floats(variable: Any, rows: slice | tuple[slice, ...] = WHOLE_AXIS) -> FloatArray:
+    """Return rows of a variable in its shape; a missing value is NaN.
+
+    Missing are the values that the variable declares as missing, compared as stored, before unpacking, and
+    rounded to the variable's type where they are of another; and those never written, which the library fills
+    with a number of its own. ``valid_range`` is ignored: one that begins at 0 would discard a depth of -2 cm.
+    FormatError: packed by something other than a number.
+    """
+    variable.set_auto_maskandscale(False)
+    stored = np.asarray(variable[rows])
+    attributes = variable.ncattrs()
+    nothing = [variable.getncattr("missing_value")] if "missing_value" in attributes else []
+    fill = variable.get_fill_value()
+    # any byte may be meant: of bytes, only a fill value that is declared counts
+    if "_FillValue" in attributes or (fill is not None and stored.dtype.itemsize > 1):
+        nothing.append(fill)
+    try:
+        scale, offset = float(getattr(variable, "scale_factor", 1)), float(getattr(variable, "add_offset", 0))
+    except (TypeError, ValueError):
+        expected = "expected numbers as scale_factor and add_offset"
+        raise FormatError(variable.group().filepath(), expected, column=variable.name) from None
+    values = stored.astype(np.float64) * scale + offset
+    missing = [number for one in nothing for number in _as_stored(one, stored.dtype)]
+    return np.where(np.isin(stored, missing), np.nan, values)
+
+
+def _as_stored(declared: Any, kind: np.dtype[Any]) -> list[Any]:
+    """Return the numbers that an attribute declares, in a variable's type; none that this cannot hold."""
+    try:
+        numbers = np.atleast_1d(np.asarray(declared)).astype(np.float64)  # also from text
+    except ValueError:
+        return []
+    with np.errstate(all="ignore"):
+        stored = numbers.astype(kind)
+    exact = stored.astype(np.float64) == numbers
+    return [one for one, same in zip(stored, exact, strict=True) if same or kind.kind == "f"]
 
 
 class FileWriter:

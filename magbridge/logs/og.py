@@ -18,7 +18,7 @@ import netCDF4
 import numpy as np
 
 from magbridge.errors import ConfigError, FormatError
-from magbridge.logs.cf import EPOCH, floats
+from magbridge.logs.netcdf import EPOCH, floats
 from magbridge.toml import Table, convert, load_toml
 
 __all__ = ["OgMetadata", "complete", "read_metadata"]

@@ -39,7 +39,7 @@ except ImportError:
     raise MissingExtra("pyulog", "formats") from None
 
 if TYPE_CHECKING:
-    from magbridge.logs.options import Options
+    from magbridge.logs.mapping import Options
 
 __all__ = ["chunks"]
 

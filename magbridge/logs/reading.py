@@ -19,7 +19,7 @@ from magbridge.columns import CHANNEL_TIMES, counts_from_boot, decoded, require
 from magbridge.errors import FormatError
 from magbridge.files import existing
 from magbridge.guard import Guarded, GuardedJob, guarded
-from magbridge.logs.options import Options
+from magbridge.logs.mapping import Options
 from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_of, is_bag
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ in the group ``magbridge.formats``: the suffix without its dot, and the module (
 package).
 
 A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
-:class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows` rows
+:class:`~magbridge.logs.mapping.Options` make a difference to it. It yields deployments of at most `rows` rows
 in the order of the file, or pairs of a deployment and the numbers of its rows in the file. Faults in their
 times and values are found by :mod:`magbridge.logs.checks`. A format that can be written also has
 ``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``; where its file has no room for
@@ -55,6 +55,8 @@ class Format(NamedTuple):
     signature: bytes | None = None
     """Regular expression that the first bytes of a file match; None: by its suffix only."""
     writes: bool = False
+    writer: str = "FileWriter"
+    """Class of the module that writes it."""
     guarded: bool = False
     """True if another library reads it, which damage may hang or crash: it is read in a child process."""
     compasses: bool = False
@@ -116,7 +118,9 @@ FORMATS: dict[str, Format] = {
     ),
     "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002", packed=True),
     "seaglider": Format("magbridge.logs.seaglider", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
-    "geosoft": Format("magbridge.logs.geosoft", (".xyz",), writes=True, maps_columns=True, packed=True),
+    "geosoft": Format(
+        "magbridge.logs.text", (".xyz",), writes=True, writer="GeosoftWriter", maps_columns=True, packed=True
+    ),
     "text": Format(
         "magbridge.logs.text",
         (".txt", ".tsv", ".dat", ".asc", ".m77t", ".jsonl", ".ndjson"),

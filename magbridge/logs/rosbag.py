@@ -47,7 +47,7 @@ except ImportError:
     raise MissingExtra("rosbags", "ros") from None
 
 if TYPE_CHECKING:
-    from magbridge.logs.options import Options
+    from magbridge.logs.mapping import Options
 
 __all__ = ["chunks"]
 

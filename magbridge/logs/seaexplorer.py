@@ -27,11 +27,11 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
+from magbridge.logs.clocks import epoch
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
 from magbridge.logs.fields import FieldMap, degrees, linear
-from magbridge.logs.headings import aliases
+from magbridge.logs.mapping import aliases
 from magbridge.logs.registry import opened
-from magbridge.logs.stamps import epoch
 
 __all__ = ["chunks"]
 

@@ -38,11 +38,10 @@ from magbridge.columns import CHANNELS
 from magbridge.errors import FormatError
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import sphere_radius
-from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.fields import FieldMap, Track, degrees, fields_of, interpolated, linear
 
-__all__ = ["DIMENSION", "chunks", "dive", "read_netcdf"]
+__all__ = ["CTD_FIELDS", "DIMENSION", "Dive", "chunks", "dive"]
 
 DIMENSION = "sg_data_point"
 COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
@@ -188,51 +187,6 @@ def _current(known: Dive, motor: str) -> FloatArray | None:
     for start, end, ampere in zip(each["st_secs"], each["end_secs"], each[f"{motor}_i"], strict=True):
         current[(known.time >= start) & (known.time <= end)] = ampere
     return current
-
-
-def read_netcdf(path: Path, file: Any) -> Dive:
-    """Return the dive in a basestation's file; variables of another length than their times are left out.
-
-    FormatError: it has no time.
-    """
-    rows = file.dimensions[DIMENSION].size
-    if (time := _numbers(file, "time", rows)) is None:
-        raise FormatError(path, "expected this variable, as of a Seaglider", column="time")
-    sampled = {
-        name.removeprefix("eng_"): values
-        for name in file.variables
-        if (name.startswith("eng_") and name != "eng_depth") or name == "depth"
-        if (values := _numbers(file, name, rows)) is not None
-    }
-    names = [name for name in file.variables if name.startswith("gc_")]
-    size = file["gc_end_secs"].size if "gc_end_secs" in names else 0
-    manoeuvres = {
-        name.removeprefix("gc_"): values
-        for name in names
-        if (values := _numbers(file, name, size)) is not None
-    }
-    settings = {
-        name.removeprefix("log_"): float(floats(variable))
-        for name, variable in file.variables.items()
-        if (name.startswith("log_") or name == "magnetic_variation")
-        if variable.shape == () and variable.dtype != str and variable.dtype.kind in "iuf"
-    }
-    elsewhere = {}
-    if "ctd_time" in file.variables:
-        ctd_time = floats(file["ctd_time"])
-        elsewhere = {
-            one.field: (ctd_time, values)
-            for one in CTD_FIELDS
-            if (values := _numbers(file, one.field, ctd_time.size)) is not None
-        }
-    return Dive(time, sampled, settings, manoeuvres, elsewhere)
-
-
-def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
-    """Return a variable (size,), or None if it has another size or no numbers."""
-    if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
-        return None
-    return floats(file[name]) if file[name].dtype.kind in "iuf" else None
 
 
 HEADER_LINE = re.compile(r"%?(\w+):\s*(.*)")

@@ -15,10 +15,9 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
 from magbridge.logs.checks import Faults
-from magbridge.logs.clocks import CountState, TimeFormat, clock_of, date_order, seconds
+from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
-from magbridge.logs.stamps import DAY
 from magbridge.logs.validity import EXPECTED_VALUE, Validity, invalid, unknown
 from magbridge.records import Quality
 from magbridge.wording import counted

@@ -45,7 +45,7 @@ from magbridge.mavlink.tlog import RecordBlock, blocks
 from magbridge.records import Channel
 
 if TYPE_CHECKING:
-    from magbridge.logs.options import Options
+    from magbridge.logs.mapping import Options
 
 __all__ = ["FileWriter", "chunks"]
 

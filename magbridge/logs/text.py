@@ -12,7 +12,7 @@ change a value's meaning stands in the file itself: ``heading [deg magnetic]``.
 
 Files of other programs are read by :mod:`.layout` (separator, decimal commas, headings, units) and
 :mod:`.clocks` (times); what other programs capture without headings by :mod:`.captures`. Assumptions are in
-the attributes ``guessed`` and ``history``; :class:`~magbridge.logs.options.Options` declare instead.
+the attributes ``guessed`` and ``history``; :class:`~magbridge.logs.mapping.Options` declare instead.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import io
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain, groupby, islice
 from math import isnan, nan
 from pathlib import Path
 from typing import TextIO
@@ -38,15 +38,12 @@ from magbridge.errors import FormatError
 from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, lasting, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout, cells, header_of, is_remark, rows_among
-from magbridge.logs.mapping import ColumnMapping
+from magbridge.logs.mapping import ColumnMapping, Options
 from magbridge.logs.naming import name_columns, units_of_angles
-from magbridge.logs.options import Options
 from magbridge.logs.registry import metadata_path, opened
 from magbridge.logs.table import TextTable
 from magbridge.logs.validity import validity_of
 from magbridge.records import Quality
-
-__all__ = ["FileWriter", "chunks"]
 
 DEFAULTS = Options()
 FURTHER = 3_000
@@ -274,3 +271,22 @@ def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> l
     if name == "quality":  # a row that was not corrected is never taken for a good one
         return ["uncalibrated" if isnan(v) else Quality(int(v)).names() for v in values.tolist()]
     return ["" if isnan(v) else repr(v) for v in values.tolist()]
+
+
+class GeosoftWriter(FileWriter):
+    """Write Geosoft's XYZ: headings in a comment, ``LINE 100`` before a survey line's rows, ``*`` for NaN."""
+
+    def append(self, dataset: xr.Dataset, *, first: bool) -> None:
+        """Write the rows, before each survey line its mark, and before the first ones the headings."""
+        lines = dataset["line"].to_numpy().tolist() if "line" in dataset else []
+        table = dataset.drop_vars("line", errors="ignore")
+        if first:
+            self._file.write("/ ")
+            super().append(table.isel(time=slice(0)), first=True)
+        rows = [tuple(cell or "*" for cell in row) for row in self.texts(table)]
+        if not lines:
+            self._csv.writerows(rows)
+            return
+        for line, part in groupby(np.arange(len(rows)).tolist(), key=lambda row: lines[row]):
+            self._file.write(f"LINE {line:.12g}\n")
+            self._csv.writerows(rows[row] for row in part)

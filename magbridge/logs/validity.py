@@ -25,7 +25,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import CHANNELS
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import with_losses
-from magbridge.logs.headings import bare
+from magbridge.logs.mapping import bare
 
 __all__ = ["EXPECTED_VALUE", "Validity", "invalid", "known", "states_validity", "unknown", "validity_of"]
 

@@ -58,7 +58,8 @@ class Writer:
         self, path: str | os.PathLike[str], finish: Callable[[Path], None] | None = None, **options: Any
     ) -> None:
         self._path, self._finish = Path(path), finish
-        self._open = partial(format_of(self._path, write=True).load().FileWriter, **options)
+        form = format_of(self._path, write=True)
+        self._open = partial(getattr(form.load(), form.writer), **options)
         self._columns: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Self:

@@ -12,7 +12,7 @@ from magbridge import logs
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import compasses_of
 from magbridge.logs.deployment import noted, passed_over
-from magbridge.logs.options import Options
+from magbridge.logs.mapping import Options
 
 UTC = 1_700_000_000
 

@@ -14,7 +14,7 @@ from magbridge import logs
 from magbridge.logs import telemetry
 from magbridge.logs.compasses import compasses_of
 from magbridge.logs.deployment import noted
-from magbridge.logs.options import Options
+from magbridge.logs.mapping import Options
 from magbridge.mavlink import Codec, pack_record
 from magbridge.mavlink.tlog import blocks
 
