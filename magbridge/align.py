@@ -12,16 +12,127 @@ meanwhile.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from math import inf, isfinite, isnan, nan
-from typing import Final
+from typing import Final, NamedTuple
+
+import msgspec
 
 from magbridge.config import Align
 from magbridge.one_time import OneTime
 from magbridge.records import Quality, Reading, Vector
-from magbridge.track import NEVER, Input, Track
 
-__all__ = ["Aligner", "Sample", "nearest"]
+__all__ = ["NEVER", "Aligner", "Input", "Sample", "Track", "nearest"]
+
+
+NEVER: Final = -(1 << 62)
+TRACK_LENGTH: Final = 1024
+"""Telemetry values kept for each parameter: enough for 20 s at 50 Hz."""
+
+
+class Input(NamedTuple):
+    """A parameter that the calibration needs: name, calibrated range, and age (s) from which it is stale.
+
+    `is_mass` is False where a change is not a motion: a current, a temperature.
+    """
+
+    name: str
+    low: float
+    high: float
+    max_age: float
+    is_mass: bool = True
+
+
+class Track:
+    """The recent telemetry of one parameter.
+
+    The parameter is moving when it differs from an anchor, an earlier value, by more than ``moving_rate``
+    (fraction of its calibrated range per second) times the time elapsed, which counts as at least 1 s: over
+    shorter times the noise of the telemetry would look like motion. The first value that comes 1 s or more
+    after the anchor becomes the next anchor.
+    """
+
+    __slots__ = (
+        "anchor", "before", "first_us", "guess", "guess_us", "history", "input", "lacking", "last", "last_us",
+        "max_age", "moved_us",
+    )  # fmt: skip
+
+    def __init__(self, quantity: Input) -> None:
+        self.input, self.max_age = quantity, quantity.max_age
+        self.history: deque[tuple[int, float]] = deque(maxlen=TRACK_LENGTH)
+        self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
+        self.first_us = NEVER
+        # between these times its values are guessed, and lie between these
+        self.guess_us, self.guess = (NEVER, NEVER), (nan, nan)
+        self.lacking = True
+        self.anchor: tuple[int, float] | None = None
+        self.moved_us = NEVER
+
+    def update(self, time_us: int, value: float, moving_rate: float, since_us: int = 0) -> None:
+        """Take a telemetry value; NaN means unknown from now on. One older than the last is ignored.
+
+        One that was true at an unknown time since `since_us` (µs, if not 0) is taken as of `time_us`.
+        """
+        self.lacking = not isfinite(value)
+        if self.lacking:
+            return
+        if time_us < self.last_us:
+            return
+        if since_us:
+            low, high = self.guess if self.guess_us[0] == since_us else (self.last, self.last)
+            self.guess_us = since_us, time_us
+            self.guess = (min(low, value), max(high, value)) if isfinite(low) else (value, value)
+        if time_us == self.last_us:  # of several that came at once, the newest
+            self.history.pop()
+        else:
+            self.before = self.last if self.history else value
+        self.last_us, self.last = time_us, value
+        self.history.append((time_us, value))
+        self.first_us = self.history[0][0]
+        if self.anchor is None:
+            self.anchor = time_us, value
+        anchor_us, anchor = self.anchor
+        elapsed = (time_us - anchor_us) * 1e-6
+        if abs(value - anchor) > moving_rate * (self.input.high - self.input.low) * max(elapsed, 1.0):
+            self.moved_us = time_us
+        if elapsed >= 1.0:
+            self.anchor = time_us, value
+
+    def stale(self, time_us: int) -> bool:
+        """Return True if the value is unknown, or older than ``max_age``, at `time_us`."""
+        return self.lacking or time_us - self.last_us > self.max_age * 1e6
+
+    @property
+    def reported_before_us(self) -> int:
+        """Time of the report before the last one, µs."""
+        return self.history[-2][0] if len(self.history) > 1 else self.last_us
+
+    def extremes_since(self, begin_us: int) -> tuple[float, float]:
+        """Return the least and the greatest value since `begin_us`, including the value held then."""
+        low = high = self.last
+        for then_us, value in reversed(self.history):
+            low, high = min(low, value), max(high, value)
+            if then_us <= begin_us:
+                break
+        return low, high
+
+    def value_at(self, time_us: int) -> tuple[float, float, float, float]:
+        """Return the value at `time_us`, its age in s, and two values between which a moving mass is.
+
+        Between two values it is interpolated (age 0); after the last it is held; before the first, the first
+        is taken, and the age is the time until then.
+        """
+        after_us, after = self.last_us, self.last
+        if after_us <= time_us:
+            return after, (time_us - after_us) * 1e-6, self.before, after
+        for then_us, value in reversed(self.history):
+            if then_us <= time_us:
+                weight = (time_us - then_us) / (after_us - then_us)
+                return value + weight * (after - value), 0.0, value, after
+            after_us, after = then_us, value
+        return after, (after_us - time_us) * 1e-6, after, after
+
 
 STALE_FLAG: Final = int(Quality.STALE_TELEMETRY)
 MOVING: Final = int(Quality.MOVING)
@@ -33,79 +144,38 @@ WHOLE: Final = 1.5 * 2.0**52
 """Adding and then subtracting it rounds a number below 2^51."""
 
 
-class Sample:
-    """Three channels and the telemetry at one time.
+class Sample(msgspec.Struct, frozen=True, gc=False):
+    """Three channels and the telemetry at one time."""
 
-    Attributes
-    ----------
-    reading : Reading
-        As the instrument sent it.
-    reading_us : int
-        µs, our time at the reading's ``device_time``.
-    time_us : int
-        µs, common to all channels.
-    field : tuple of 3 float
-        nT, sensor axes, uncorrected.
-    values : tuple of float
-        The parameters at `time_us`, in the order of the calibration.
-    age : float
-        s, of the oldest telemetry used.
-    quality : int
-        :class:`~magbridge.records.Quality` bits.
-    sigma : float
-        nT, 1-sigma that the flags add in quadrature to the uncertainty of the corrected field.
-    spans : tuple of (int, float, float)
-        Parameters that are not known exactly: index in `values`, and the two ends of the interval in which
-        the value lies.
-    """
-
-    __slots__ = ("age", "field", "quality", "reading", "reading_us", "sigma", "spans", "time_us", "values")
-
-    def __init__(
-        self,
-        reading: Reading,
-        reading_us: int,
-        time_us: int,
-        field: Vector,
-        values: tuple[float, ...],
-        age: float,
-        quality: int,
-        sigma: float,
-        spans: tuple[tuple[int, float, float], ...],
-    ) -> None:
-        self.reading: Final = reading
-        self.reading_us: Final = reading_us
-        self.time_us: Final = time_us
-        self.field: Final = field
-        self.values: Final = values
-        self.age: Final = age
-        self.quality: Final = quality
-        self.sigma: Final = sigma
-        self.spans: Final = spans
+    reading: Reading
+    """As the instrument sent it."""
+    reading_us: int
+    """Our time at the reading's ``device_time``, µs."""
+    time_us: int
+    """Time that is common to all channels, µs."""
+    field: Vector
+    """Raw field, sensor axes, nT."""
+    values: tuple[float, ...]
+    """The parameters at `time_us`, in the order of the calibration."""
+    age: float
+    """Age of the oldest telemetry used, s."""
+    quality: int
+    """:class:`~magbridge.records.Quality` bits."""
+    sigma: float
+    """1-sigma that the flags add in quadrature to the uncertainty of the corrected field, nT."""
+    spans: tuple[tuple[int, float, float], ...]
+    """Parameters that are not known exactly: index in `values`, and the two ends of the interval in which the
+    value lies."""
 
 
 class Aligner:
     """Joins readings and telemetry into samples.
 
-    Parameters
-    ----------
-    inputs : sequence of Input
-        The parameters that the calibration needs, in the calibration's order.
-    settings : Align
-    power_cycle : int or None
-        The instrument's power-on counter at the time of its calibration; None where unknown.
-
-    Attributes
-    ----------
-    tracks : tuple of Track
-        Of the inputs.
-    by_name : dict of str to Track
-        Of the inputs, and of what else is watched.
-    channels : OneTime
-    late_since_us : int
-        Start of the stall, µs, or 0: inputs may have waited at most since then.
-    motion_since_us : int
-        Time of the last report before the motion of the last sample, µs.
+    `inputs` are the parameters that the calibration needs, in its order; `tracks` has their telemetry,
+    `by_name` that of these and of all else that is watched. `power_cycle` is the instrument's power-on
+    counter at the time of its calibration, None where unknown. During a stall, inputs may have waited since
+    `late_since_us` (µs, 0: no stall). `motion_since_us` is the time of the last report before the motion of
+    the last sample.
     """
 
     def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
@@ -137,16 +207,8 @@ class Aligner:
     def telemetry(self, name: str, time_us: int, value: float, *, guessed: bool = False) -> None:
         """Take a telemetry value; a name that the calibration does not need is ignored.
 
-        Parameters
-        ----------
-        name : str
-            Of the parameter.
-        time_us : int
-            µs, when it was true.
-        value : float
-            NaN where it is not known.
-        guessed : bool
-            `time_us` is its arrival, but it had waited.
+        The value was true at `time_us` (µs) and is NaN where it is not known. If `guessed`, that is the time
+        of its arrival, but it had waited.
         """
         track = self.by_name.get(name)
         if track is not None:
@@ -156,16 +218,8 @@ class Aligner:
     def reading(self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0) -> Sample:
         """Turn a reading into a sample.
 
-        Parameters
-        ----------
-        reading : Reading
-            As the driver returned it.
-        time_us : int
-            µs, host time of ``reading.device_time``.
-        restarted : bool
-            The instrument's clock restarted: it was powered on again.
-        missing : int
-            Number of readings lost just before this one.
+        `time_us` (µs) is the host's time of ``reading.device_time``. If `restarted`, the instrument was
+        powered on again. `missing` is the number of readings lost just before this one.
         """
         settings = self.settings
         cycle, delay = reading.power_cycle, reading.channel_delay

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from math import inf, isfinite, nan, sqrt
 from typing import TYPE_CHECKING, Any
 
-from magbridge.align import Aligner, Sample
+from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
 from magbridge.columns import TEMPERATURE
@@ -23,7 +23,6 @@ from magbridge.health.consistency import MASS_FRACTION
 from magbridge.parts import OptionalParts
 from magbridge.records import MAX_MEASURED_NT, Corrected, Quality, Reading, Vector
 from magbridge.toml import convert
-from magbridge.track import Input
 
 if TYPE_CHECKING:
     from magbridge.learning import Learner  # imported by those who learn
@@ -134,16 +133,9 @@ class Correction:
     ) -> tuple[Sample, Corrected]:
         """Align and correct one reading, and check the result.
 
-        Parameters
-        ----------
-        reading, time_us, restarted, missing
-            As for :meth:`magbridge.align.Aligner.reading`.
-        main_field : float
-            nT, the main field's total where the sample was taken; NaN where that is not known.
-        position : tuple of 2 float or None
-            deg, latitude and longitude; None where not known.
-        depth : float
-            m; NaN where not known.
+        Arguments are those of :meth:`magbridge.align.Aligner.reading`; `main_field` is the main field's total
+        (nT) where the sample was taken, `position` the latitude and longitude (deg), `depth` in m; NaN or
+        None where not known.
         """
         if self.learner is not None and self.learner.calibration is not self.corrector.calibration:
             self._use(self.learner.calibration)

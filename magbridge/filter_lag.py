@@ -37,19 +37,10 @@ MAX_INTERVAL_RATIO: Final = 10.0
 
 
 class LagCorrection:
-    """Undo the lag of a first-order filter.
+    """Undo the lag of a first-order filter of the cutoff frequency `cutoff_hz`.
 
-    Parameters
-    ----------
-    cutoff_hz : float
-        Cutoff frequency of the filter, Hz.
-
-    Attributes
-    ----------
-    time_constant : float
-        Time constant of the filter, s.
-    variance : float
-        Variance of each component of the last vector from what is not known of the lag, nT².
+    `time_constant` is that of the filter, s; `variance` that of each component of the last vector from what
+    is not known of the lag, nT².
     """
 
     def __init__(self, cutoff_hz: float) -> None:
@@ -63,16 +54,10 @@ class LagCorrection:
         self._rate: Vector = (0.0, 0.0, 0.0)
 
     def undo(self, time_us: int, field: Vector, delay_s: float = 0.0) -> Vector:
-        """Return the vector (nT) at `time_us` (µs) without lag; `field` itself if it is not finite.
+        """Return the corrected vector `field` (nT) at `time_us` (µs) without lag.
 
-        Parameters
-        ----------
-        time_us : int
-            Time of the sample, µs.
-        field : tuple of 3 float
-            Corrected vector, nT.
-        delay_s : float
-            Part of the filter's delay that `time_us` is corrected for already, s.
+        It is `field` itself if that is not finite. `delay_s` is the part of the filter's delay that `time_us`
+        is corrected for already.
         """
         x, y, z = field
         length2 = x * x + y * y + z * z

@@ -76,25 +76,13 @@ class GuardedJob(NamedTuple):
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     """Yield what ``read()`` yields, run in a child process that ends where the file lets it run away.
 
-    Parameters
-    ----------
-    path : Path
-        The file that `read` reads: its size sets the limits.
-    read : callable
-        Returns an iterable of objects that can be pickled.
+    The objects must be such as can be pickled. The size of the file `path` sets the limits. Without fork
+    (Windows), or where a process may not have children (a worker of a pool), this process reads the file:
+    then a crash ends the process, and nothing limits the time.
 
-    Raises
-    ------
-    FormatError
-        The file makes its reader fail in an unexpected way, crash, need more than 8 s of processor
-        time and 0.2 s a MB, or more than 500 MB of memory and 50 times its size.
-    MagbridgeError, OSError
-        As `read` raises them.
-
-    Notes
-    -----
-    Without fork (Windows), or where a process may not have children (a worker of a pool), this process reads
-    the file: then a crash ends the process, and nothing limits the time.
+    FormatError: the file makes its reader fail in an unexpected way, crash, need more than 8 s of processor
+    time and 0.2 s a MB, or more than 500 MB of memory and 50 times its size. MagbridgeError, OSError: as
+    `read` raises them.
     """
     one = Guarded([GuardedJob(path, read)])
     try:

@@ -95,12 +95,8 @@ def interpolate_to_rows(
 class OneTime:
     """Brings reading after reading to one time.
 
-    Attributes
-    ----------
-    variance : float
-        Variance of the last reading's total field from the lag of its slopes, nT².
-    settled : tuple of 3 float or None
-        The last but one reading without that lag, nT; None if it is unchanged.
+    `variance` is the variance (nT²) of the last reading's total field from the lag of its slopes; `settled`
+    is the last but one reading without that lag (nT), None if it is unchanged.
     """
 
     def __init__(self) -> None:
@@ -111,16 +107,10 @@ class OneTime:
         self._out, self._slope, self._lever = (nan, nan, nan), (nan, nan, nan), (nan, nan, nan)
 
     def bring(self, field: Vector, delay: Vector, time_us: int) -> tuple[Vector, float]:
-        """Return a reading's channels at one time, and how long after `time_us` that is, s.
+        """Return a reading's channels at one time, and how long after `time_us` (µs) that is, s.
 
-        Parameters
-        ----------
-        field : tuple of 3 float
-            nT; one that is not all numbers tells nothing of those before and after.
-        delay : tuple of 3 float
-            s after `time_us`, when each was sampled.
-        time_us : int
-            µs.
+        `field` (nT) tells nothing of the readings before and after if one is not a number; `delay` has the s
+        after `time_us` when each was sampled.
         """
         x_late, y_late, z_late = delay
         earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - two numbers need no call

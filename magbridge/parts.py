@@ -14,17 +14,8 @@ class OptionalParts:
     """Call checks, navigation, learning and position; switch a part off when it raises.
 
     An exception of such a part is a fault of the program. The sample is published from the remaining parts,
-    because a vehicle under way is better served by a field without a check than by none.
-
-    Parameters
-    ----------
-    report : callable
-        Receives the text of the message for the operator.
-
-    Attributes
-    ----------
-    failures : dict of str to str
-        The exception of each part that is switched off.
+    because a vehicle under way is better served by a field without a check than by none. `report` receives
+    the text for the operator; `failures` has the exception of each part that is switched off.
     """
 
     propagate: ClassVar[bool] = False

@@ -124,22 +124,10 @@ def _headings(
 ) -> dict[str, FloatArray]:
     """Return the columns of :data:`~magbridge.columns.HEADINGS`.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        With a boresight.
-    samples : tuple of (n, 3), (n, k) and (n,) array
-        Aligned field (nT) and channels, and the sum of the three components' variances (nT^2) as published.
-    vector : (n, 3) array
-        nT, corrected field in body axes.
-    tilt : (n, 2) array
-        rad, roll and pitch.
-    main : (n, 3) array
-        nT, main field, north-east-down; NaN where unknown.
-    crustal_sigma : float
-        nT, 1-sigma of the crustal field that the main-field model lacks.
-    deployment : Dataset
-        For its time.
+    `samples` are the aligned field (nT) and channels, and the sum of the three components' variances (nT^2)
+    as published; `vector` (n, 3) is the corrected field in body axes and `main` (n, 3) the main field in
+    north-east-down, nT; `tilt` (n, 2) is roll and pitch, rad; `crustal_sigma` (nT) is the 1-sigma of the
+    crustal field that the main-field model lacks.
     """
     field, channels, published = samples
     time = np.asarray(deployment["time"].to_numpy(), float)

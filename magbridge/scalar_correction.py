@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magbridge.align import Aligner, Sample
+from magbridge.align import Aligner, Input, Sample
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Noise
 from magbridge.calibration.scalar import (
@@ -28,7 +28,6 @@ from magbridge.config import Align
 from magbridge.health import HealthMonitor, Messages
 from magbridge.parts import OptionalParts
 from magbridge.records import Corrected, Quality, Reading, Vector
-from magbridge.track import Input
 
 __all__ = ["CorrectedReading", "ScalarCorrection"]
 

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magbridge.align import Aligner, Sample, nearest
+from magbridge.align import Aligner, Input, Sample, nearest
 from magbridge.config import Align
 from magbridge.records import Quality, Reading
-from magbridge.track import Input
 
 SECOND = 1_000_000
 START = 1_700_000_000 * SECOND

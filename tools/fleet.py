@@ -31,8 +31,8 @@ from magbridge.calibration.model import Calibration, Noise, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
+from magbridge.fleet.hierarchy import FLEET_LEVELS
 from magbridge.fleet.learn import Lesson, learn_fleet
-from magbridge.fleet.variances import FLEET_LEVELS
 from sitl import Twin, load, segments, simulate
 from sitl.dataset import at_rest
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle

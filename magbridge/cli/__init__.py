@@ -21,10 +21,7 @@ from magbridge.errors import MagbridgeError, MissingExtra
 
 __all__ = ["app", "main"]
 
-ROOMS = (
-    *("ashore", "attach", "bridge", "calibrate", "correct", "diagnose"),
-    *("export", "fleet", "info", "navigate", "plan", "survey"),
-)
+ROOMS = ("bridge", "calibrate", "correct", "diagnose", "fleet", "logs", "navigate", "survey")
 """Modules of commands: importing one makes its functions commands of `app`."""
 for _room in ROOMS:
     import_module(f"{__name__}.{_room}")

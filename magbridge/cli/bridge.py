@@ -1,4 +1,4 @@
-"""Commands that run the bridge, or listen to it: demo, run, replay, monitor."""
+"""Commands that run, attach or replay a bridge, or listen to one."""
 
 from __future__ import annotations
 
@@ -10,19 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    FailedResult,
-    Folder,
-    Json,
-    ReadingOptions,
-    Whole,
-    command,
-    complain,
-    folder_to_write,
-    logs_to_read,
-    print_result,
-)
+import magbridge as mb
+from magbridge.cli import common as cli
 from magbridge.errors import WrongUse
 from magbridge.files import new_folder
 from magbridge.wording import counted
@@ -30,19 +19,20 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     from magbridge.bridge.check import ConfigFault
 
+
 MIN_REPLAY_SPEED = 1e-3
 """Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
 
 
-@command("demo [OPTIONS]")
+@cli.command("demo [OPTIONS]")
 def demo(
     *,
-    out: Folder = Path("demo"),
-    seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 1,
+    out: cli.Folder = Path("demo"),
+    seed: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=0))] = 1,
     live: bool = False,
-    port: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
+    port: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
     show: Annotated[bool, Parameter(negative="--no-show")] = True,
-    json: Json = False,
+    json: cli.Json = False,
 ) -> None:
     """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
 
@@ -73,7 +63,7 @@ def demo(
 
     with new_folder(out):
         result = demonstration.demo(out, seed, notify=lambda text: print(text, file=sys.stderr))
-    print_result(result, demonstration.summary(result), json)
+    cli.print_result(result, demonstration.summary(result), json)
 
 
 def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
@@ -90,8 +80,8 @@ def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
             serve(link, 0, "127.0.0.1", port, grid=folder / MAP, show=show)
 
 
-@command("run --config bridge.toml [--check [--live] [--json]]")
-def run(*, config: Path, check: bool = False, live: bool = False, json: Json = False) -> None:
+@cli.command("run --config bridge.toml [--check [--live] [--json]]")
+def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json = False) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 
     magbridge init writes a configuration, magbridge ports shows which device sends on which serial port, and
@@ -132,12 +122,12 @@ def _check(config: Path, *, live: bool, json: bool) -> None:
         found += faults
     faults_of = [{"severity": "error" if one.fatal else "warning", "text": one.text} for one in found]
     for fault in faults_of:
-        complain(f"{fault['severity']}: {fault['text']}")
+        cli.complain(f"{fault['severity']}: {fault['text']}")
     warnings = counted(len(found) - errors, "warning")
     facts = {"file": str(config), "would_start": not errors, "findings": faults_of, **arriving}
-    print_result(facts, "" if errors else f"{config}: the bridge would start, {warnings}", json)
+    cli.print_result(facts, "" if errors else f"{config}: the bridge would start, {warnings}", json)
     if errors:
-        raise FailedResult(
+        raise cli.FailedResult(
             f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}",
             WrongUse.exit_code,
         )
@@ -164,14 +154,14 @@ def _listen(config: Path, *, quiet: bool) -> tuple[list[ConfigFault], dict[str, 
     return check.faults, {"readings_hz": check.readings_hz, "messages": arrived}
 
 
-@command("replay FILE... [--config bridge.toml] [OPTIONS]")
+@cli.command("replay FILE... [--config bridge.toml] [OPTIONS]")
 def replay(
     *files: Path,
     config: Path | None = None,
     speed: str = "max",
-    log: Annotated[Path | None, Parameter(validator=folder_to_write)] = None,
-    reading: ReadingOptions = AS_THEY_SAY,
-    json: Json = False,
+    log: Annotated[Path | None, Parameter(validator=cli.folder_to_write)] = None,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
 
@@ -194,20 +184,22 @@ def replay(
     reading
         How to read logs that are not a bridge's own.
     """
-    logs_to_read(files, None, config)
+    cli.logs_to_read(files, None, config)
 
     from sitl.replay.run import replay as played
     from sitl.replay.summary import summary
 
     with new_folder(log) if log else nullcontext():
         result = played(files, config, speed_of(speed), log, reading.options)
-    print_result(result, summary(result), json)
+    cli.print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
-        raise FailedResult("the replay did not publish what the log holds")
+        raise cli.FailedResult("the replay did not publish what the log holds")
 
 
-@command("dialect -o DIR")
-def dialect(*, output: Annotated[Folder, Parameter(name=["--output", "-o"])], json: Json = False) -> None:
+@cli.command("dialect -o DIR")
+def dialect(
+    *, output: Annotated[cli.Folder, Parameter(name=["--output", "-o"])], json: cli.Json = False
+) -> None:
     """Write the MAVLink dialect for other programs: the XML with all that it includes, modules for pymavlink.
 
     magbridge.xml holds the common messages and ours; magbridge_ardupilotmega.xml ArduPilot's as well.
@@ -221,17 +213,17 @@ def dialect(*, output: Annotated[Folder, Parameter(name=["--output", "-o"])], js
 
     with new_folder(output):
         files = [str(path) for path in write_definitions(output)]
-    print_result({"files": files}, "\n".join(files), json)
+    cli.print_result({"files": files}, "\n".join(files), json)
 
 
-@command("monitor [LINK] [OPTIONS]")
+@cli.command("monitor [LINK] [OPTIONS]")
 def monitor(
     link: str = "udpin:0.0.0.0:14550",
     /,
     *,
     host: str = "127.0.0.1",
-    port: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
-    baudrate: Annotated[Whole, Parameter(validator=validators.Number(gt=0))] = 57600,
+    port: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
+    baudrate: Annotated[cli.Whole, Parameter(validator=validators.Number(gt=0))] = 57600,
     signing_key: Path | None = None,
     map: Annotated[Path | None, Parameter(name="--map")] = None,  # noqa: A002 - as the other commands name it
     show: bool = False,
@@ -272,3 +264,213 @@ def speed_of(text: str) -> float:
     if not speed >= MIN_REPLAY_SPEED:
         raise WrongUse(f"--speed {text}: expected a positive number, {MIN_REPLAY_SPEED:g} or more, or max")
     return speed
+
+
+@cli.command("init [-o bridge.toml] [OPTIONS]")
+def init(
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o"], validator=cli.file_to_write(".toml"))] = Path(
+        "bridge.toml"
+    ),
+    driver: str | None = None,
+    port: str | None = None,
+    baudrate: Annotated[cli.Whole, Parameter(validator=validators.Number(gt=0, lte=20_000_000))] = 9600,
+    link: str | None = None,
+    system: Annotated[cli.Whole | None, Parameter(validator=validators.Number(gte=1, lte=255))] = None,
+    parameter: tuple[str, ...] = (),
+    option: tuple[str, ...] = (),
+    calibration: Path | None = None,
+    json: cli.Json = False,
+) -> None:
+    """Write a commented bridge.toml, from five questions or from options.
+
+    On a terminal it asks for each value without an option: sensor, port, link, system id, moving masses.
+
+    Parameters
+    ----------
+    output
+        The configuration to write; one that is there is not overwritten.
+    driver
+        The sensor's driver; magbridge drivers lists them.
+    port
+        The sensor's port: a device, a pattern (/dev/ttyUSB*) or a pyserial URL.
+    baudrate
+        The sensor's baud rate.
+    link
+        The MAVLink URL, as udpout:192.0.2.1:14550, or a serial device.
+    system
+        The vehicle's system id.
+    parameter
+        A moving mass, as "battpos [in]"; may be repeated. Those of a calibration need not be named.
+    option
+        An option of the driver, as sensitivity=5e-5; may be repeated.
+    calibration
+        The calibration (cal.json) to correct with.
+    """
+    if output.exists():
+        raise WrongUse(f"{output}: is there already; choose another with -o")
+
+    from magbridge.bridge.check import findings
+    from magbridge.bridge.init import PLACEHOLDER, Answers, bridge_toml
+    from magbridge.files import atomic_path
+
+    known = _loaded(calibration)
+    asks = not json and sys.stdin.isatty() and sys.stdout.isatty()
+    driver = driver or _ask("1. Which sensor?", _drivers_help(), "digitizer", asks, "--driver")
+    port = port or _ask("2. On which port?", _ports_listed(), "/dev/ttyUSB*", asks, "--port")
+    default = "udpout:127.0.0.1:14550"
+    link = link or _ask("3. Where is the autopilot or the ground station?", "", default, asks, "--link")
+    number = system or _system(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))
+    names = parameter
+    if not names and known is None and asks:
+        hint = "as: battpos [in], ballast [cm3]; none: press Enter"
+        names = tuple(name.strip() for name in _ask("5. Which masses move?", hint, "", asks, "").split(","))
+        names = tuple(name for name in names if name)
+    options, file = _options(option, driver), _relative(calibration, output)
+    answers = Answers(driver, port, baudrate, link, number, names, options, file)
+    text = bridge_toml(answers, known)
+    with atomic_path(output) as path:
+        path.write_text(text, encoding="utf-8")
+        fatal = [one.text for one in findings(path) if one.fatal]
+        if fatal and PLACEHOLDER not in text:  # a setting to fill in is an error only when it is run
+            raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
+    found = [one.text for one in findings(output)]
+    for finding in found:
+        cli.complain(finding)
+    sentence = f"{output}: written; next: magbridge run --check --config {output}"
+    cli.print_result({"file": str(output), "findings": found}, sentence, json)
+
+
+def _loaded(calibration: Path | None) -> mb.Calibration | None:
+
+    return mb.load(calibration) if calibration else None
+
+
+def _relative(file: Path | None, output: Path) -> str | None:
+    """Return how `output` is to name a file: paths in it are relative to it."""
+    if file is None:
+        return None
+    file, folder = file.absolute(), output.absolute().parent
+    return str(file.relative_to(folder) if file.is_relative_to(folder) else file)
+
+
+def _ask(question: str, hint: str, default: str, asks: bool, flag: str) -> str:
+    if not asks:
+        if not default:
+            raise WrongUse(f"expected {flag}")
+        return default
+    if hint:
+        print(hint)
+    try:
+        answer = input(f"{question} [{default}] " if default else f"{question} ").strip()
+    except EOFError:
+        raise WrongUse("no answer: nothing is written") from None
+    return answer or default
+
+
+def _system(answer: str) -> int:
+    if not (answer.isdecimal() and 1 <= int(answer) <= 255):
+        raise WrongUse(f"expected a system id from 1 to 255, not {answer!r}: nothing is written")
+    return int(answer)
+
+
+def _drivers_help() -> str:
+    from magbridge.sensors.options import driver_names
+
+    return f"drivers: {', '.join(driver_names())} (magbridge drivers NAME: its options)"
+
+
+def _ports_listed() -> str:
+    from magbridge.bridge.ports import ports as there
+
+    found = [f"  {one.device}  {one.description}" for one in there()]
+    return "\n".join(["ports of this computer:", *found]) if found else "no serial port is there now"
+
+
+def _options(texts: tuple[str, ...], driver: str) -> dict[str, Any]:
+    """Return the driver's options; WrongUse: the driver has no option of that name."""
+    from magbridge.sensors.options import options_of
+    from magbridge.wording import one_of
+
+    given, known = dict(map(_option, texts)), [one.name for one in options_of(driver)]
+    for name in given:
+        if name not in known:
+            raise WrongUse(f"--option {name}: {one_of(name, known)}")
+    return given
+
+
+def _option(text: str) -> tuple[str, Any]:
+    import tomllib
+
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise WrongUse(f"--option {text}: expected NAME=VALUE, as sensitivity=5e-5")
+    try:
+        return name.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name.strip(), value.strip()  # a word without quotes
+
+
+@cli.command("ports [PORT...] [OPTIONS]")
+def ports(
+    *names: str,
+    baudrate: tuple[int, ...] = (),
+    seconds: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=600))] = 1.5,
+    json: cli.Json = False,
+) -> None:
+    """Listen on serial ports, and show which device sends on each.
+
+    It is a sensor, an autopilot, a GPS, or a line that cannot be parsed, which is then shown. Nothing is
+    sent: a sensor that waits for a command stays silent here.
+
+    Parameters
+    ----------
+    names
+        The ports to listen on: devices or pyserial URLs; all of this computer's if none is given.
+    baudrate
+        A baud rate to listen at; may be repeated. If not given: the usual ones, until one is understood.
+    seconds
+        How long to listen at each baud rate.
+    """
+    from magbridge.bridge.ports import BAUDRATES, SerialDevice, listen
+    from magbridge.bridge.ports import ports as there
+    from magbridge.progress import track
+
+    asked = [SerialDevice(name, "") for name in names] or there()
+    found = []
+    for port in track(asked, "listening", len(asked)):
+        recognised, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
+        one = {"device": port.description, "who": recognised.who, "said": recognised.text, "baudrate": at}
+        found.append({"port": port.device, **one})
+        if not json:
+            speed = f" at {at} bit/s" if at and recognised.who else ""
+            about = f" ({port.description})" if port.description else ""
+            print(f"{port.device}{about}: {recognised.text}{speed}")
+    cli.print_result({"ports": found}, "" if asked else "no serial port is there", json)
+
+
+@cli.command("drivers [NAME] [OPTIONS]")
+def drivers(name: str | None = None, /, *, json: cli.Json = False) -> None:
+    """List the drivers of sensors, or the options of one, as they stand in [sensor.options] of a bridge.toml.
+
+    Parameters
+    ----------
+    name
+        The driver.
+    """
+    from magbridge.sensors.options import driver_names, options_of
+
+    facts = {}
+    for one in [name] if name else driver_names():
+        facts[one] = [
+            {"name": o.name, "type": o.kind, "required": o.required, "meaning": o.meaning.replace("``", "")}
+            | ({} if o.required else {"default": o.default})
+            for o in options_of(one)
+        ]
+    lines = []
+    for one, options in facts.items():
+        lines.append(f"{one}:")
+        for option in options:
+            default = "required" if option["required"] else f"default {option['default']!r}"
+            lines.append(f"  {option['name']} ({option['type']}; {default}): {option['meaning']}")
+    cli.print_result(facts, "\n".join(lines), json)

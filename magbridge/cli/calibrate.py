@@ -9,22 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    NO_SCALAR,
-    Base,
-    CalibrationOutput,
-    Heading,
-    Plot,
-    ReadingOptions,
-    ScalarOptions,
-    Whole,
-    command,
-    complain,
-    logs_to_read,
-    print_result,
-)
-from magbridge.cli.remarks import by_base_station, chosen_parameters, naming, note_losses, note_unused_grid
+import magbridge as mb
+from magbridge.cli import common as cli
 from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.files import digest
 from magbridge.progress import waiting
@@ -35,9 +21,8 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
-    from magbridge.calibration.model import Calibration
     from magbridge.field.grid import AnomalyGrid
-    from magbridge.fleet.calibrations import FleetPrediction
+    from magbridge.fleet.memory import FleetPrediction
 
 MAX_LISTED_CONTRIBUTIONS = 5
 """Contributions to a scalar's reading that the summary lists."""
@@ -84,7 +69,7 @@ class ModelOptions:
     """
 
     parameter: tuple[str, ...] = ()
-    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
+    order: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
     method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto"
     vehicle: str = ""
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
@@ -139,10 +124,10 @@ class ReferenceOptions:
     """
 
     grid: Path | None = None
-    base: Base = None
+    base: cli.Base = None
     reference: Literal["mean", "scalar"] | None = None
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None
-    heading_reference: Heading = None
+    heading_reference: cli.Heading = None
 
     def apply(self, deployment: xr.Dataset, scalar: str) -> tuple[xr.Dataset, float | None]:
         """Return a log with the reference that is asked for, and the 1-sigma of its level, nT."""
@@ -168,10 +153,10 @@ class _Request:
     output: Path
     model: ModelOptions
     truth: ReferenceOptions
-    scalar: ScalarOptions
+    scalar: cli.ScalarOptions
     plot: Path | None
     force: bool
-    reading: ReadingOptions
+    reading: cli.ReadingOptions
     anomalies: AnomalyGrid | None = field(default=None)
 
     def of_compass(self, number: int) -> _Request:
@@ -188,16 +173,16 @@ class _Request:
         )
 
 
-@command("calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
+@cli.command("calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
 def calibrate(
     *files: Path,
-    output: CalibrationOutput,
+    output: cli.CalibrationOutput,
     model: ModelOptions = PHYSICAL_MODEL,
     truth: ReferenceOptions = MAIN_FIELD,
-    scalar: ScalarOptions = NO_SCALAR,
-    plot: Plot = None,
+    scalar: cli.ScalarOptions = cli.NO_SCALAR,
+    plot: cli.Plot = None,
     force: bool = False,
-    reading: ReadingOptions = AS_THEY_SAY,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
     json: bool = False,
 ) -> None:
     """Fit a calibration to logs of calibration runs.
@@ -223,47 +208,52 @@ def calibrate(
     """
     model.check()
     scalar.check(is_reference=truth.reference == "scalar")
-    logs_to_read(files, output, model.masses, truth.grid, truth.base)
+    cli.logs_to_read(files, output, model.masses, truth.grid, truth.base)
 
-    from magbridge.field.read import read_grid
-
-    anomalies = read_grid(truth.grid) if truth.grid else None
+    anomalies = mb.read_grid(truth.grid) if truth.grid else None
     request = _Request(files, output, model, truth, scalar, plot, force, reading, anomalies)
     results = _each_compass(request) if reading.compass == ALL_COMPASSES else {"": _calibrate(request)}
     facts: dict[str, Any] = {number: found for number, (found, _) in results.items()}
     text = "\n".join(sentence for _, sentence in results.values())
-    print_result(facts.get("", {"compasses": facts}), text, json)
+    cli.print_result(facts.get("", {"compasses": facts}), text, json)
 
 
 def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
     """Read the logs, fit and write the calibration of one compass; return the result as facts and text."""
-    from magbridge.calibration.file import save
     from magbridge.columns import CHANNELS, require
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
     model, truth, scalar = request.model, request.truth, request.scalar.scalar
-    start = _fleet_start(model, request.files) if model.fleet else None
+    start = None
+    if model.fleet:
+        from magbridge.fleet.memory import start as predict
+
+        with waiting("learning"):
+            logs_digests = {digest(file) for file in request.files}
+            start = predict(model.fleet, model.vehicle, model.refit, logs_digests)
     with waiting("reading"):
-        logs = by_base_station(read_each(request.files, options=request.reading.options), truth.base)
+        logs = cli.by_base_station(read_each(request.files, options=request.reading.options), truth.base)
         deployment = join(logs)
     require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *model.named))
     deployment = with_true_heading(deployment, truth.heading_reference)
-    note_losses(deployment.attrs)
+    cli.note_losses(deployment.attrs)
     deployment, site_bias = truth.apply(deployment, scalar)
-    note_unused_grid(truth.grid, deployment)
+    cli.note_unused_grid(truth.grid, deployment)
     found, data, worth = _fit(request, logs, deployment, site_bias, start)
     if request.plot:
         from magbridge.calibration.fitting.draw import draw_fit
 
         draw_fit(found.calibration, data, request.plot)
-    _refuse_unsupported(request, found)
+    if not (found.supported or request.force):
+        why = found.warnings[0].text
+        raise DataError(f"{request.output}: not written, because {why}; --force writes it all the same")
     calibration, facts, text = found.calibration, _facts(found, data), ""
     if scalar and truth.reference != "scalar":
         with waiting("fitting the scalar"):
             calibration, text = _with_scalar(request, deployment, calibration, facts)
-    save(calibration, request.output)
+    mb.save(calibration, request.output)
     left_out = deployment.sizes["time"] - len(data)
     rows = f"; {counted(left_out, 'row')} without every value left out" if left_out else ""
     facts = {"file": str(request.output), "method": model.method, **facts, "left_out": left_out, **worth}
@@ -286,12 +276,14 @@ def _fit(
     model, anomalies = request.model, request.anomalies
     names = model.parameter or (start.names if start else ())
     options: dict[str, Any] = {"vehicle": read_vehicle(model.masses)} if model.masses else {}
-    with naming(deployment), waiting("fitting"):
-        names = chosen_parameters(names, deployment, grid=anomalies, order=model.order, site_bias=site_bias)
+    with cli.naming(deployment), waiting("fitting"):
+        names = cli.chosen_parameters(
+            names, deployment, grid=anomalies, order=model.order, site_bias=site_bias
+        )
         read = (*request.files, *request.reading.sensor_log, *filter(None, [request.truth.base]))
         data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
         for unused in unused_logs(logs, data):
-            complain(unused.text)
+            cli.complain(unused.text)
         data = unfiltered(data, model.filter_cutoff) if model.filter_cutoff else data
         if model.position_sigma:
             if not (data.lacks_rock and model.method in ("auto", "survey")):
@@ -308,30 +300,21 @@ def _fit(
     refused = not (found.supported or request.force)
     warnings = [warning.text for warning in found.warnings[refused:]]
     for line in (*warnings, *remarks, *_undeclared_columns(deployment, data, found)):
-        complain(line)
+        cli.complain(line)
     return found, data, worth
-
-
-def _refuse_unsupported(request: _Request, found: Fit) -> None:
-    """DataError: the data do not support the fit, and it is not to be written all the same."""
-    if not (found.supported or request.force):
-        raise DataError(
-            f"{request.output}: not written, because {found.warnings[0].text}; --force writes it all the same"
-        )
 
 
 def _fitted(
     logs: list[xr.Dataset], data: Observations, model: ModelOptions, **options: Any
 ) -> tuple[Fit, list[str]]:
     """Return the fit, and why several logs are not of one vehicle, if they are not."""
-    from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.sources import heterogeneous_logs
 
     def refitted(part: Observations) -> Fit:
-        return fit(part, model.method, model.order)
+        return mb.fit(part, model.method, model.order)
 
     try:
-        found = fit(data, model.method, model.order, **options)
+        found = mb.fit(data, model.method, model.order, **options)
     except CalibrationError as error:
         if reason := heterogeneous_logs(logs, data, None, refitted):
             raise CalibrationError(reason.text) from error
@@ -344,24 +327,15 @@ def _from_fleet(
     start: FleetPrediction, data: Observations, order: int, **options: Any
 ) -> tuple[Fit, list[str], dict[str, Any]]:
     """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
-    from magbridge.calibration.fitting.fit import fit
-    from magbridge.fleet.calibrations import gained
+    from magbridge.fleet.memory import gained
 
-    found = fit(data, order=order, known=start.known, **options)
+    found = mb.fit(data, order=order, known=start.known, **options)
     try:
-        alone = fit(data, order=order, **options)
+        alone = mb.fit(data, order=order, **options)
     except CalibrationError:
         alone = None
     facts, lines = gained(found, alone, start)
     return found, lines, {"fleet": facts}
-
-
-def _fleet_start(model: ModelOptions, files: tuple[Path, ...]) -> FleetPrediction:
-    """Return a fleet's prior for these logs."""
-    from magbridge.fleet.calibrations import start
-
-    with waiting("learning"):
-        return start(model.fleet, model.vehicle, model.refit, {digest(file) for file in files})
 
 
 def _undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) -> list[str]:
@@ -377,8 +351,8 @@ def _undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) 
 
 
 def _with_scalar(
-    request: _Request, deployment: xr.Dataset, calibration: Calibration, facts: dict[str, Any]
-) -> tuple[Calibration, str]:
+    request: _Request, deployment: xr.Dataset, calibration: mb.Calibration, facts: dict[str, Any]
+) -> tuple[mb.Calibration, str]:
     """Return the calibration with its scalar sensor, and a summary; add to the facts to print as JSON."""
     from magbridge.calibration.figure_of_merit import merit_text
     from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns
@@ -431,7 +405,7 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
         raise WrongUse(f"--reference mean: {source} tells what the field was; leave the option out")
     deployment = about_mean(deployment)
     mean = float(deployment["reference_field"][0])
-    complain(
+    cli.complain(
         f"{source}: fitted about a mean of {mean:.0f} nT, since nothing tells what the Earth's field was"
     )
     return deployment, GAIN_SIGMA * mean if site_bias is None else site_bias
@@ -451,7 +425,7 @@ def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
         try:
             results[str(number)] = _calibrate(request.of_compass(number))
         except DataError as error:
-            complain(f"compass {number}: {error}")
+            cli.complain(f"compass {number}: {error}")
     if not results:
         raise DataError(f"{request.files[0]}: not one of its compasses could be calibrated")
     return results
@@ -495,6 +469,6 @@ def _digests(files: tuple[Path, ...]) -> dict[str, str]:
     for file in files:
         first = seen.setdefault(digest(file), file)
         if first is not file:
-            complain(f"{file}: identical to {first}; its samples are counted once")
+            cli.complain(f"{file}: identical to {first}; its samples are counted once")
     names = [file.name for file in seen.values()]
     return {str(file) if names.count(file.name) > 1 else file.name: key for key, file in seen.items()}

@@ -1,4 +1,4 @@
-"""Correct a log."""
+"""Correct a log, and write a calibration for other programs."""
 
 from __future__ import annotations
 
@@ -6,28 +6,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    Json,
-    Log,
-    Plot,
-    ReadingOptions,
-    SavedCalibration,
-    command,
-    complain,
-    logs_to_read,
-    print_result,
-)
-from magbridge.cli.remarks import (
-    note_losses,
-    note_missing,
-    note_no_date,
-    note_settings,
-    refuse_unsuited,
-    warnings_of,
-)
+from cyclopts import Parameter, validators
+
+import magbridge as mb
+from magbridge.cli import common as cli
 from magbridge.columns import CHANNELS, CORRECTED
 from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.progress import track
@@ -37,10 +21,9 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magbridge.calibration.model import Calibration
     from magbridge.config import Config
-    from magbridge.correction import Correction
     from magbridge.learning import Learner
+
 
 COPIED_COLUMNS = (
     *("latitude", "longitude", "depth", "roll", "pitch", "heading", "run", "dive", "line", "line_type"),
@@ -51,17 +34,17 @@ COPIED_COLUMNS = (
 """Columns of a log that are copied to the output, with the calibration's parameters."""
 
 
-@command("correct FILE... --calibration cal.json -o FILE [OPTIONS]")
+@cli.command("correct FILE... --calibration cal.json -o FILE [OPTIONS]")
 def correct(
     *files: Path,
     calibration: Path | None = None,
-    output: Log,
+    output: cli.Log,
     learn: bool = False,
     config: Path | None = None,
-    save: SavedCalibration = None,
-    plot: Plot = None,
-    reading: ReadingOptions = AS_THEY_SAY,
-    json: Json = False,
+    save: cli.SavedCalibration = None,
+    plot: cli.Plot = None,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
 ) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
@@ -96,17 +79,17 @@ def correct(
         A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and the flagged samples.
     """
     source = _source(calibration, config, learn=learn)
-    logs_to_read(files, output, source, reading.columns)
+    cli.logs_to_read(files, output, source, reading.columns)
 
     from magbridge.logs import Writer, read_chunks
 
     known, settings = _known(calibration, config)
-    for doubt in warnings_of(known, source):
-        complain(doubt)
+    for doubt in cli.warnings_of(known, source):
+        cli.complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes the learned calibration: give --learn, too")
     tally = Tally()
-    correction: Correction | None = None
+    correction: mb.Correction | None = None
     pieces: list[dict[str, Any]] = []
     drawn: list[xr.Dataset] = []
     with Writer(output) as writer:
@@ -124,19 +107,19 @@ def correct(
         from magbridge.logs.draw import draw_corrected
 
         draw_corrected(join(drawn), plot)
-    note_losses(*pieces)
-    note_settings(*pieces)
+    cli.note_losses(*pieces)
+    cli.note_settings(*pieces)
     if doubt := tally.doubt():
-        complain(f"{source}: {doubt}")
+        cli.complain(f"{source}: {doubt}")
     facts, summary = tally.facts(), tally.summary()
     if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
-    print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+    cli.print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
 
 def _scalar_too(
-    pieces: Iterator[tuple[xr.Dataset, xr.Dataset, Correction]], known: Calibration
-) -> Iterator[tuple[xr.Dataset, xr.Dataset, Correction]]:
+    pieces: Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]], known: mb.Calibration
+) -> Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]]:
     """Yield the corrected pieces, with the compensated scalar where the calibration has one.
 
     The swing of a channel is that of the whole log: with a scalar the pieces are one.
@@ -162,13 +145,12 @@ def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Pa
     return source
 
 
-def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]:
+def _known(file: Path | None, config: Path | None) -> tuple[mb.Calibration, Config]:
     """Return the calibration to begin with, and a bridge's settings.
 
     ConfigError: the configuration has no calibration, and no ``[learning]`` that could do without.
     """
     from magbridge.bridge.learning import first_calibration
-    from magbridge.calibration.file import load
     from magbridge.config import Config, Learning, Link, Sensor
     from magbridge.config import load as load_config
 
@@ -180,26 +162,29 @@ def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]
         settings = load_config(config)
         if settings.learning is None:
             raise ConfigError(config, "learning", "missing")
-    known = load(file) if file is not None else first_calibration(settings)
+    known = mb.load(file) if file is not None else first_calibration(settings)
     assert known is not None
     return known, settings
 
 
 def _corrected(
-    parts: Iterable[xr.Dataset], files: tuple[Path, ...], known: Calibration, file: Path, learn: Config | None
-) -> Iterator[tuple[xr.Dataset, xr.Dataset, Correction]]:
+    parts: Iterable[xr.Dataset],
+    files: tuple[Path, ...],
+    known: mb.Calibration,
+    file: Path,
+    learn: Config | None,
+) -> Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]]:
     """Yield each piece of a log, its corrected samples, and the correction; DataError: it has no field."""
-    from magbridge.correction import Correction
     from magbridge.rows import correct_rows
 
     correction, whole = None, False
     for part in parts:
         if correction is None:
-            note_missing(known, part)
-            note_no_date(part)
-            correction = Correction(known, learner=_learner(known, part, learn) if learn else None)
+            cli.note_missing(known, part)
+            cli.note_no_date(part)
+            correction = mb.Correction(known, learner=_learner(known, part, learn) if learn else None)
         if not whole:
-            refuse_unsuited(known, part)
+            cli.refuse_unsuited(known, part)
         sampled = part[list(CHANNELS)].to_array().notnull()
         corrected = _with_log_columns(part, correct_rows(correction, part), known, file)
         yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
@@ -208,7 +193,7 @@ def _corrected(
         raise DataError(f"{', '.join(map(str, files))}: no row has all of {' '.join(CHANNELS)}")
 
 
-def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
+def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learner:
     """Return a learner with a bridge's settings, which knows of the currents in the log."""
     from magbridge.bridge.learning import open_learner
 
@@ -218,18 +203,18 @@ def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
     return learner
 
 
-def _notify(correction: Correction) -> None:
+def _notify(correction: mb.Correction) -> None:
     """Print the quality flags and the notifications of learning."""
     for text in correction.notices:
-        complain(text)
+        cli.complain(text)
     correction.notices.clear()
     if correction.learner is not None:
         for notice in correction.learner.notices:
-            complain(f"{notice.text}, {notice.date}")
+            cli.complain(f"{notice.text}, {notice.date}")
         correction.learner.notices.clear()
 
 
-def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], file: Path | None) -> str:
+def _keep_learned(learner: Learner, known: mb.Calibration, facts: dict[str, Any], file: Path | None) -> str:
     """Write the last published calibration, add to the facts to print as JSON, and return a summary."""
     from magbridge.calibration.file import calibration_id, save
 
@@ -245,7 +230,9 @@ def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], f
     return f"; {state.learned_samples} learned from, calibration {name} at last"
 
 
-def _with_log_columns(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:
+def _with_log_columns(
+    log: xr.Dataset, corrected: xr.Dataset, known: mb.Calibration, file: Path
+) -> xr.Dataset:
     """Return the corrected columns with those of the log that say where and in what state they were taken."""
     from magbridge.calibration.file import calibration_id
     from magbridge.logs.deployment import HISTORY_ATTRIBUTE, MEANING, lasting
@@ -314,3 +301,145 @@ class Tally:
         if self.left_out:
             text += f"; {counted(self.left_out, 'row')} without any of {' '.join(CHANNELS)} left out"
         return text
+
+
+SEAGLIDER_COUNT_NT = 100.0
+"""nT in a count of most of a Seaglider's compasses."""
+
+
+@cli.command(
+    "export cal.json --c DIR | --ardupilot F.param | --px4 F.params | --seaglider F.cal | --table F.csv"
+)
+def export(
+    calibration: Path,
+    /,
+    *,
+    c: Annotated[cli.Folder | None, Parameter(name="--c")] = None,
+    ardupilot: Annotated[Path | None, Parameter(validator=cli.file_to_write(".param", ".parm"))] = None,
+    px4: Annotated[Path | None, Parameter(validator=cli.file_to_write(".params"))] = None,
+    number: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=0, lte=3))] = 0,
+    seaglider: Annotated[Path | None, Parameter(validator=cli.file_to_write(".cal"))] = None,
+    nt_per_count: Annotated[
+        float, Parameter(validator=validators.Number(gt=0, lte=1e5))
+    ] = SEAGLIDER_COUNT_NT,
+    table: Annotated[Path | None, Parameter(validator=cli.file_to_write(".csv"))] = None,
+    parameter: str = "",
+    dip: Annotated[float, Parameter(validator=validators.Number(gt=-90, lt=90))] = 60.0,
+    json: cli.Json = False,
+) -> None:
+    """Write a calibration for other programs, and say what they cannot hold of it.
+
+    Parameters
+    ----------
+    calibration
+        The calibration (cal.json).
+    c
+        A folder for magbridge_calibration.h and .c: C99 without allocation, float or double. A scalar
+        magnetometer of the calibration is in magbridge_scalar.h and .c.
+    ardupilot
+        A .param file: offsets, diagonals, off-diagonals and the motors' current of a compass.
+    px4
+        A parameter file of QGroundControl: the same for PX4.
+    number
+        Which of the autopilot's compasses, from 0.
+    seaglider
+        The compass coefficients (tcm2mat.cal) of a Seaglider: one offset and one matrix, with the boresight.
+    nt_per_count
+        For --seaglider: nT in a count of its compass, 100 for most, 56 for type 4.
+    table
+        A table (.csv) of offset and matrix at positions of one mass, for loggers that can hold one.
+    parameter
+        For --table: the mass; by default the first parameter.
+    dip
+        For --seaglider: the inclination of the Earth's field in deg, on which the heading error depends.
+    """
+    if not any((c, ardupilot, px4, seaglider, table)):
+        raise WrongUse(
+            "expected --c DIR, --ardupilot F.param, --px4 F.params, --seaglider F.cal or --table F.csv"
+        )
+
+    from magbridge.calibration.export_seaglider import position_table
+    from magbridge.errors import CalibrationError
+    from magbridge.files import atomic_path, new_folder
+
+    known = mb.load(calibration)
+    for doubt in [*cli.warnings_of(known, calibration), *_filter_lag(known, calibration)]:
+        cli.complain(doubt)
+    texts: dict[Path, str] = {}
+    try:
+        if c is not None:
+            texts |= _in_c(known, c)
+        if seaglider is not None:
+            texts[seaglider] = _seaglider(calibration, known, nt_per_count, dip)
+        if table is not None:
+            first = known.parameters[0].name if known.parameters else ""
+            texts[table] = position_table(known, parameter or first)
+    except CalibrationError as error:
+        raise DataError(f"{calibration}: {error}") from error
+    texts |= _autopilot(calibration, known, ardupilot, px4, number)
+    for file, text in texts.items():
+        with new_folder(file.parent), atomic_path(file) as path:
+            path.write_text(text, encoding="utf-8")
+    files = [str(file) for file in texts]
+    cli.print_result({"files": files}, "\n".join(f"{file}: written" for file in files), json)
+
+
+def _autopilot(
+    file: Path, known: mb.Calibration, ardupilot: Path | None, px4: Path | None, number: int
+) -> dict[Path, str]:
+    """Return the autopilots' parameter files that are asked for; report what these cannot hold."""
+    from magbridge.calibration import export_autopilot
+
+    if ardupilot is None and px4 is None:
+        return {}
+    compass, texts = export_autopilot.compass_of(known), dict[Path, str]()
+    for lost in compass.lost:
+        cli.complain(f"{file}: the autopilot's model cannot hold {lost}")
+    if ardupilot is not None:
+        texts[ardupilot], warnings = export_autopilot.ardupilot(compass, number)
+        for warning in warnings:
+            cli.complain(warning)
+    if px4 is not None:
+        texts[px4] = export_autopilot.px4(compass, number)
+    return texts
+
+
+def _in_c(known: mb.Calibration, folder: Path) -> dict[Path, str]:
+    """Return the C files of a calibration, with those of its first scalar magnetometer."""
+    from magbridge.calibration.export_c import c_header, c_source
+    from magbridge.calibration.export_scalar import scalar_header, scalar_source
+
+    texts = {
+        folder / "magbridge_calibration.h": c_header(known),
+        folder / "magbridge_calibration.c": c_source(known),
+    }
+    for sensor in known.sensors[:1]:
+        texts[folder / "magbridge_scalar.h"] = scalar_header(sensor)
+        texts[folder / "magbridge_scalar.c"] = scalar_source(sensor)
+    return texts
+
+
+def _filter_lag(known: mb.Calibration, file: Path) -> list[str]:
+    """Return a warning if the exported files lack the sensor's filter."""
+    cutoff = known.sensor.filter_cutoff
+    return [f"{file}: no export undoes the sensor's filter of {cutoff:g} Hz"] if cutoff else []
+
+
+def _seaglider(file: Path, known: mb.Calibration, nt_per_count: float, dip: float) -> str:
+    """Return a Seaglider's coefficients; report on stderr what they cannot hold, and its cost in degrees."""
+    from magbridge.calibration.export_seaglider import heading_cost, seaglider
+
+    text = seaglider(known, nt_per_count)
+    for cost in heading_cost(known, dip):
+        names = ", ".join(one.name for one in known.parameters)
+        what = f"{cost.name} alone" if cost.name else f"the field of {names}"
+        cli.complain(
+            f"{file}: the file cannot hold {what}: heading error {cost.rms:.2f} deg RMS, up to "
+            f"{cost.largest:.2f} deg, at the ends of the range (dip {dip:g} deg)"
+        )
+    for effect in known.effects:
+        cli.complain(
+            f"{file}: the file cannot hold the effect {effect.kind} of {' '.join(effect.channels())}"
+        )
+    cli.complain(f"{file}: the file cannot hold uncertainties and flags")
+    return text

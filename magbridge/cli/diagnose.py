@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    Folder,
-    Json,
-    ReadingOptions,
-    command,
-    complain,
-    logs_to_read,
-    print_result,
-)
-from magbridge.cli.remarks import note_losses, note_unused_grid, warnings_of
+import magbridge as mb
+from magbridge.cli import common as cli
 from magbridge.files import digest
 from magbridge.progress import waiting
 
@@ -34,15 +25,15 @@ ITSELF = (
 )
 
 
-@command("diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
+@cli.command("diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
 def diagnose(
     *files: Path,
     calibration: Path,
-    output: Annotated[Folder, Parameter(name=["--output", "-o"])],
+    output: Annotated[cli.Folder, Parameter(name=["--output", "-o"])],
     training_logs: tuple[Path, ...] = (),
     grid: Path | None = None,
-    reading: ReadingOptions = AS_THEY_SAY,
-    json: Json = False,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
 ) -> None:
     """Find the errors of the calibration model and their causes, and measure how much an extension gains.
 
@@ -64,45 +55,44 @@ def diagnose(
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
     """
-    logs_to_read(files, output / "calibration.json", calibration, grid)
-
-    from magbridge.calibration.file import load
+    cli.logs_to_read(files, output / "calibration.json", calibration, grid)
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
-    from magbridge.field.read import read_grid
-    from magbridge.logs import read
     from magbridge.logs.sensor_log import combine
 
-    known = load(calibration)
+    known = mb.load(calibration)
     with waiting("reading") as step:
-        logs = [read(path, options=reading.without_sensor_logs) for path in files]
-        logs += [read(path, options=reading.without_sensor_logs) for path in reading.sensor_log]
+        logs = [mb.read(path, options=reading.without_sensor_logs) for path in files]
+        logs += [mb.read(path, options=reading.without_sensor_logs) for path in reading.sensor_log]
         named = [False] * len(files) + [True] * len(reading.sensor_log)
         combined = combine(logs, named, reading.clock_offset)
         own = [path for path in files if digest(path) in known.inputs.values()]
         own_logs = [log for path, log in zip(files, logs, strict=False) if path in own]
         if len(combined) < len(logs):
             logs, own_logs = combined, combined if own else []
-        note_losses(*(log.attrs for log in logs))
-        note_unused_grid(grid, *logs)
-        remarks = warnings_of(known, calibration)
+        cli.note_losses(*(log.attrs for log in logs))
+        cli.note_unused_grid(grid, *logs)
+        remarks = cli.warnings_of(known, calibration)
         others = [path for path in training_logs if path not in files]
         remarks += [f"{path}: {ITSELF}" for path in own]
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:
-            complain(remark)
+            cli.complain(remark)
         found = examine(
             logs,
             known,
             output,
-            training_logs=[*own_logs, *(read(path, options=reading.without_sensor_logs) for path in others)],
-            grid=read_grid(grid) if grid else None,
+            training_logs=[
+                *own_logs,
+                *(mb.read(path, options=reading.without_sensor_logs) for path in others),
+            ],
+            grid=mb.read_grid(grid) if grid else None,
             progress=step,
             remarks=remarks,
         )
     facts = findings(found, remarks)
     lines = summary(facts, "" if own else found.diagnosis.problem.survey.parts)
-    print_result(facts, f"{lines}\nreport: {output / 'report.html'}", json)
+    cli.print_result(facts, f"{lines}\nreport: {output / 'report.html'}", json)
 
 
 def summary(facts: dict[str, Any], parts: str) -> str:

@@ -9,31 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter, validators
 
-from magbridge.cli.common import (
-    CalibrationOutput,
-    Day,
-    FailedResult,
-    Json,
-    Whole,
-    app,
-    complain,
-    logs_to_read,
-    print_result,
-)
+import magbridge as mb
+from magbridge.cli import common as cli
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
-    from magbridge.calibration.model import Calibration
-    from magbridge.fleet.drift import History
+    from magbridge.fleet.learn import History
 
 fleet = App(
     name="fleet",
     help="Many vehicles, many logs, one memory: catalogue, process, learn from them, watch them.",
     help_format="markdown",
 )
-app.command(fleet)
+cli.app.command(fleet)
 Where = Annotated[str, Parameter(help="The catalogue: a folder, or postgresql://USER@HOST/DATABASE.")]
 HERE = "fleet"
 
@@ -47,9 +37,9 @@ def add(
     parameter: tuple[str, ...] = (),
     serial: str = "",
     sensor: str = "",
-    date: Day = None,
+    date: cli.Day = None,
     catalogue: Where = HERE,
-    json: Json = False,
+    json: cli.Json = False,
 ) -> None:
     """Put vehicles and logs on record, in a new catalogue if there is none; nothing is added twice.
 
@@ -73,8 +63,8 @@ def add(
     date
         When the deployment of a calibration began (YYYY-MM-DD).
     """
-    from magbridge.fleet.calibrations import add_calibration
     from magbridge.fleet.catalogue import open_catalogue
+    from magbridge.fleet.memory import add_calibration
     from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, logs_of, read_fleet
 
     if not files and not (vehicle and parameter):
@@ -83,7 +73,7 @@ def add(
     if (logs or made) and not (vehicle and deployment):
         raise WrongUse("logs: give --vehicle and --deployment, or put them into a fleet.toml")
     if logs:
-        logs_to_read(tuple(logs))
+        cli.logs_to_read(tuple(logs))
     plans = {file: read_fleet(file) for file in described}
     calibrations = _calibrations(made, date)
     there = open_catalogue(catalogue, create=True)
@@ -104,8 +94,8 @@ def add(
         for start, calibration in calibrations:
             given += add_calibration(there, vehicle, this, start, calibration)
     for line in lines:
-        complain(line)
-    print_result(
+        cli.complain(line)
+    cli.print_result(
         {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines},
         f"{there.name}: {counted(added, 'vehicle')}, {counted(new, 'log')} and "
         f"{counted(given, 'calibration')} added",
@@ -121,14 +111,12 @@ def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
     return kinds[".toml"], kinds[".json"], kinds[""]
 
 
-def _calibrations(files: Sequence[Path], date: dt.date | None) -> list[tuple[float, Calibration]]:
+def _calibrations(files: Sequence[Path], date: dt.date | None) -> list[tuple[float, mb.Calibration]]:
     """Return when each calibration's deployment began, s since 1970, and the calibration."""
-    from magbridge.calibration.file import load
-
     if files and date is None:
         raise WrongUse(f"{files[0]}: expected --date YYYY-MM-DD, the day on which its deployment began")
     start = dt.datetime.combine(date, dt.time(), dt.UTC).timestamp() if date else 0.0
-    return [(start, load(file)) for file in files]
+    return [(start, mb.load(file)) for file in files]
 
 
 @fleet.command
@@ -139,10 +127,10 @@ def process(
     diagnose: bool = False,
     maps: bool = False,
     retry: bool = False,
-    workers: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=1024))] = 2,
+    workers: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=1024))] = 2,
     memory: str = "4 GiB",
     scheduler: str = "",
-    json: Json = False,
+    json: cli.Json = False,
 ) -> None:
     """Read, check, calibrate and correct new logs; continue where it was interrupted.
 
@@ -168,10 +156,10 @@ def process(
         Address of a dask scheduler to use instead, as tcp://host:8786. Its workers see the same folders.
     """
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.job import jobs, new_jobs
     from magbridge.fleet.memory import remember
     from magbridge.fleet.process import client_of
     from magbridge.fleet.process import process as run
+    from magbridge.fleet.register import jobs, new_jobs
 
     there = open_catalogue(catalogue, results)
     every = jobs(there, diagnose=diagnose, maps=maps)
@@ -179,44 +167,46 @@ def process(
     failures: list[str] = []
     if todo:
         with client_of(scheduler, workers, memory) as client:
-            for outcome in track(run(there, todo, client), "deployments", len(todo), in_lines=True):
-                failures += outcome.failures
-                for line in outcome.failures:
-                    complain(line)
+            for lines in track(run(there, todo, client), "deployments", len(todo), in_lines=True):
+                failures += lines
+                for line in lines:
+                    cli.complain(line)
         with waiting("learning"):
             remember(there)
     result = {"deployments": len(every), "processed": len(todo), "failures": failures}
-    print_result(
+    cli.print_result(
         result,
         f"{there.name}: {counted(len(every), 'deployment')}, {len(todo)} of them new; "
         f"{counted(len(failures), 'failure')}",
         json,
     )
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
-        raise FailedResult(f"{there.name}: not one deployment could be calibrated")
+        raise cli.FailedResult(f"{there.name}: not one deployment could be calibrated")
 
 
 @fleet.command
-def status(*, catalogue: Where = HERE, json: Json = False) -> None:
+def status(*, catalogue: Where = HERE, json: cli.Json = False) -> None:
     """Print the catalogued logs, the finished work, and the failures."""
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.job import status as of
+    from magbridge.fleet.register import status as of
 
     there = open_catalogue(catalogue)
     found = of(there)
     for line in found["failures"]:
-        complain(line)
+        cli.complain(line)
     rows = "\n".join(
         f"  {one['vehicle']}: {counted(one['deployments'], 'deployment')}, {counted(one['logs'], 'log')}, "
         f"{one['calibrated']} calibrated, {one['failed']} failed, {one['new']} new"
         for one in found["vehicles"]
     )
-    print_result(found, f"{there.name}: {counted(len(found['vehicles']), 'vehicle')}\n{rows}".rstrip(), json)
+    cli.print_result(
+        found, f"{there.name}: {counted(len(found['vehicles']), 'vehicle')}\n{rows}".rstrip(), json
+    )
 
 
 @fleet.command
 def show(
-    vehicle: str = "", /, *, catalogue: Where = HERE, html: Path | None = None, json: Json = False
+    vehicle: str = "", /, *, catalogue: Where = HERE, html: Path | None = None, json: cli.Json = False
 ) -> None:
     """Print how a vehicle's coefficients went from deployment to deployment, and when they changed.
 
@@ -229,7 +219,7 @@ def show(
         and all numbers as fleet.json.
     """
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.drift import facts, history
+    from magbridge.fleet.learn import facts, history
     from magbridge.fleet.memory import findings, fleets, last_maps
     from magbridge.fleet.register import vehicles
 
@@ -239,18 +229,17 @@ def show(
     with waiting("learning"):
         for name, learnt in fleets(there, names).items():
             if isinstance(learnt, DataError):
-                complain(f"{name}: {learnt}")
+                cli.complain(f"{name}: {learnt}")
             else:
                 found[name] = history(learnt, name)
     if not found:
         raise DataError(f"{there.name}: no deployment has been calibrated; run magbridge fleet process")
     if html:
-        from magbridge.fleet.page import write_page, write_pages
+        from magbridge.fleet.page import write_pages
 
-        write = write_page if html.suffix == ".html" else write_pages
-        write(found, html, findings(there), last_maps(there))
+        write_pages(found, html, findings(there), last_maps(there))
     facts_of = {name: facts(one) for name, one in found.items()}
-    print_result({"vehicles": facts_of}, "\n".join(_lines(facts_of)), json)
+    cli.print_result({"vehicles": facts_of}, "\n".join(_lines(facts_of)), json)
 
 
 @fleet.command
@@ -258,10 +247,10 @@ def export(
     vehicle: str,
     /,
     *,
-    output: CalibrationOutput,
+    output: cli.CalibrationOutput,
     refit: str = "",
     catalogue: Where = HERE,
-    json: Json = False,
+    json: cli.Json = False,
 ) -> None:
     """Write the prediction for a vehicle's next deployment as a calibration, before any run is flown.
 
@@ -274,18 +263,16 @@ def export(
     refit
         The refit it will fly with; by default a new one.
     """
-    from magbridge.calibration.file import save
-    from magbridge.fleet.calibrations import unflown
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.memory import fleet_of
+    from magbridge.fleet.memory import fleet_of, unflown
 
     with waiting("learning"):
         learnt = fleet_of(open_catalogue(catalogue), vehicle)
         calibration = unflown(learnt, vehicle, refit)
-    save(calibration, output)
+    mb.save(calibration, output)
     count = sum(one.vehicle == vehicle for one in learnt.lessons)
     others = len(learnt.lessons) - count
-    print_result(
+    cli.print_result(
         {"file": str(output), "vehicle": vehicle, "deployments": count},
         f"{output}: as {counted(count, 'deployment')} of {vehicle} and {others} of its fleet predict",
         json,

@@ -8,46 +8,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    Heading,
-    Json,
-    Log,
-    Plot,
-    ReadingOptions,
-    command,
-    complain,
-    logs_to_read,
-    print_result,
-)
-from magbridge.cli.remarks import note_losses, note_missing, note_settings, refuse_unsuited, warnings_of
-from magbridge.errors import DataError
-from magbridge.progress import waiting
+import magbridge as mb
+from magbridge.cli import common as cli
+from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magbridge.calibration.model import Calibration
     from magbridge.field.grid import AnomalyGrid
     from magbridge.navigate import NavigationOptions
 
 __all__ = ["navigate"]
 
 
-@command("navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
+@cli.command("navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
 def navigate(
     *files: Path,
-    output: Log,
+    output: cli.Log,
     map: Path | None = None,  # noqa: A002 - the flag's name
     calibration: Path | None = None,
     config: Path | None = None,
     bound: bool = False,
     sample_interval: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lte=1e6))] = None,
-    plot: Plot = None,
-    heading_reference: Heading = None,
-    reading: ReadingOptions = AS_THEY_SAY,
-    json: Json = False,
+    plot: cli.Plot = None,
+    heading_reference: cli.Heading = None,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
 ) -> None:
     """Find the track by matching the corrected field to an anomaly map.
 
@@ -78,12 +65,10 @@ def navigate(
     plot
         A PNG, PDF or SVG to draw: the tracks, on the map if there is one, errors and sigma; or the bound.
     """
-    logs_to_read(files, output, map, calibration, config)
-
-    from magbridge.calibration.file import load
+    cli.logs_to_read(files, output, map, calibration, config)
     from magbridge.errors import WrongUse
 
-    known, options = load(calibration) if calibration else None, _options(config)
+    known, options = mb.load(calibration) if calibration else None, _options(config)
     if bound:
         if map is None:
             raise WrongUse(
@@ -92,8 +77,6 @@ def navigate(
             )
         _bound(files, map, output, options, known, sample_interval, plot, reading, json)
         return
-
-    from magbridge.field.read import read_grid
     from magbridge.logs import write
     from magbridge.navigate.batch import navigate as find_way
 
@@ -107,7 +90,7 @@ def navigate(
 
         grid, track = None, localise(deployment, options)
     else:
-        grid, options = _continued(read_grid(map), options, deployment)
+        grid, options = _continued(mb.read_grid(map), options, deployment)
         track = find_way(deployment, grid, options)
     if plot:
         from magbridge.navigate.draw import draw_navigation
@@ -115,12 +98,12 @@ def navigate(
         draw_navigation(track, grid, plot)
     write(track, output)
     for finding in track.attrs["findings"].splitlines():
-        complain(finding)
+        cli.complain(finding)
     facts, summary = _judged(track)
-    print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+    cli.print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
 
-def _options_for(deployment: xr.Dataset, known: Calibration | None) -> NavigationOptions:
+def _options_for(deployment: xr.Dataset, known: mb.Calibration | None) -> NavigationOptions:
     """Return the filter's options as the calibration, or else the log's own level, gives them."""
     from magbridge.navigate import NavigationOptions
     from magbridge.navigate.options import informed, with_level
@@ -131,44 +114,34 @@ def _options_for(deployment: xr.Dataset, known: Calibration | None) -> Navigatio
     return with_level(NavigationOptions(), level)
 
 
-def _scalar(files: tuple[Path, ...], heading_reference: Heading, reading: ReadingOptions) -> xr.Dataset:
+def _scalar(
+    files: tuple[Path, ...], heading_reference: cli.Heading, reading: cli.ReadingOptions
+) -> xr.Dataset:
     """Return logs that hold the total field; WrongUse: they hold what must be corrected first."""
-    from magbridge.errors import WrongUse
-    from magbridge.field.reference import with_true_heading
-    from magbridge.logs import read
-
-    with waiting("reading"):
-        whole = read(files, options=reading.options)
-    if "total_field" not in whole:
-        raise WrongUse(f"expected --calibration: {whole.attrs['source']} has no total_field")
-    note_losses(whole.attrs)
-    return with_true_heading(whole, heading_reference)
+    log = cli.read_log(files, reading, heading_reference)
+    if "total_field" not in log:
+        raise WrongUse(f"expected --calibration: {log.attrs['source']} has no total_field")
+    return log
 
 
 def _corrected(
     files: tuple[Path, ...],
-    known: Calibration,
+    known: mb.Calibration,
     calibration: Path,
-    heading_reference: Heading,
-    reading: ReadingOptions,
+    heading_reference: cli.Heading,
+    reading: cli.ReadingOptions,
 ) -> xr.Dataset:
     """Return the logs with their field corrected by the calibration `known`, which the file holds."""
     from magbridge.columns import CHANNELS
-    from magbridge.correction import Correction
-    from magbridge.field.reference import with_true_heading
-    from magbridge.logs import read
     from magbridge.rows import correct_rows
 
-    with waiting("reading"):
-        whole = read(files, required=CHANNELS, options=reading.options)
-    deployment = with_true_heading(whole, heading_reference)
-    note_losses(deployment.attrs)
-    for doubt in warnings_of(known, calibration):
-        complain(doubt)
-    note_missing(known, deployment)
-    note_settings(deployment.attrs)
-    refuse_unsuited(known, deployment)
-    return deployment.assign(correct_rows(Correction(known), deployment).data_vars)
+    deployment = cli.read_log(files, reading, heading_reference, CHANNELS)
+    for doubt in cli.warnings_of(known, calibration):
+        cli.complain(doubt)
+    cli.note_missing(known, deployment)
+    cli.note_settings(deployment.attrs)
+    cli.refuse_unsuited(known, deployment)
+    return deployment.assign(correct_rows(mb.Correction(known), deployment).data_vars)
 
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
@@ -196,26 +169,24 @@ def _bound(
     map: Path,  # noqa: A002
     output: Path,
     options: NavigationOptions | None,
-    calibration: Calibration | None,
+    calibration: mb.Calibration | None,
     sample_interval: float | None,
     plot: Path | None,
-    reading: ReadingOptions,
+    reading: cli.ReadingOptions,
     json: bool,
 ) -> None:
-    from magbridge.field.read import read_grid
-    from magbridge.logs import read, write
+    from magbridge.logs import write
     from magbridge.navigate import NavigationOptions
     from magbridge.navigate.bound import as_dataset, position_bound
 
     place = ["latitude", "longitude"]
-    with waiting("reading"):
-        plan = read(files, required=place, options=reading.options).dropna("time", subset=place)
+    plan = cli.read_log(files, reading, required=place).dropna("time", subset=place)
     if plan.sizes["time"] < 2:
         raise DataError(
             f"{plan.attrs['source']}: expected a plan of at least two rows with latitude and longitude, got "
             f"{plan.sizes['time']}; give the track's corners"
         )
-    grid, options = _continued(read_grid(map), options or NavigationOptions(), plan)
+    grid, options = _continued(mb.read_grid(map), options or NavigationOptions(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
     sample_interval = sample_interval or _sample_interval(plan, calibration)
@@ -228,10 +199,10 @@ def _bound(
         from magbridge.navigate.draw import draw_bound
 
         draw_bound(best, grid, plot)
-    print_result({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
+    cli.print_result({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
 
 
-def _sample_interval(plan: xr.Dataset, calibration: Calibration | None) -> float:
+def _sample_interval(plan: xr.Dataset, calibration: mb.Calibration | None) -> float:
     """Return the s between samples: those of a log, else those that a calibration was fitted to."""
     if plan.sizes["time"] > 2 and {"mag_x", "total_field"} & set(plan.variables):
         return float(plan["time"].diff("time").median())
@@ -249,7 +220,7 @@ def _continued(
     there, known = at_depth(grid, options, deployment.get("depth", 0.0))
     if there is not grid and known != options:
         side = "above" if there.altitude > 0.0 else "below"
-        complain(
+        cli.complain(
             f"{grid.name}: at {round(grid.altitude)} m; continued to {abs(there.altitude):.0f} m {side} the "
             f"surface; with what that leaves out, the map's error is typically {known.map_sigma:.1f} nT over "
             f"{known.map_length:.0f} m"
@@ -259,7 +230,6 @@ def _continued(
 
 def _options(config: Path | None) -> NavigationOptions | None:
     """Return the options of a bridge's configuration; None where it has none."""
-    from magbridge.errors import ConfigError
     from magbridge.navigate import NavigationOptions
     from magbridge.toml import convert, load_toml
 

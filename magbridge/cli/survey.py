@@ -1,4 +1,4 @@
-"""From a survey's logs to its anomaly map."""
+"""From a survey's logs to its anomaly map; and plan the next survey or calibration runs."""
 
 from __future__ import annotations
 
@@ -10,24 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    NO_SCALAR,
-    Base,
-    Json,
-    Output,
-    Plot,
-    ReadingOptions,
-    SavedCalibration,
-    ScalarOptions,
-    Whole,
-    command,
-    complain,
-    file_to_write,
-    logs_to_read,
-    print_result,
-)
-from magbridge.cli.remarks import by_base_station, chosen_parameters, naming, note_losses, warnings_of
+import magbridge as mb
+from magbridge.cli import common as cli
 from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.progress import waiting
 from magbridge.wording import counted
@@ -64,11 +48,11 @@ class CorrectionOptions:
     """
 
     parameter: tuple[str, ...] = ()
-    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
+    order: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
     calibration: tuple[Path, ...] = ()
-    save: SavedCalibration = None
+    save: cli.SavedCalibration = None
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
-    base: Base = None
+    base: cli.Base = None
 
 
 @Parameter(name="*")
@@ -98,25 +82,25 @@ class MapOptions:
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None
     predict: Path | None = None
-    geotiff: Annotated[Path | None, Parameter(validator=file_to_write(".tif", ".tiff"))] = None
-    tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None
-    crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None
-    plot: Plot = None
+    geotiff: Annotated[Path | None, Parameter(validator=cli.file_to_write(".tif", ".tiff"))] = None
+    tracks: Annotated[Path | None, Parameter(validator=cli.file_to_write(".geojson", ".json", ".kml"))] = None
+    crossovers: Annotated[Path | None, Parameter(validator=cli.file_to_write(".csv"))] = None
+    plot: cli.Plot = None
 
 
 SELF_CALIBRATED = CorrectionOptions()
 MAP_ONLY = MapOptions()
 
 
-@command("survey LOG... -o map.nc [OPTIONS]")
+@cli.command("survey LOG... -o map.nc [OPTIONS]")
 def survey(
     *logs: Path,
-    output: Output,
+    output: cli.Output,
     correction: CorrectionOptions = SELF_CALIBRATED,
-    scalar: ScalarOptions = NO_SCALAR,
+    scalar: cli.ScalarOptions = cli.NO_SCALAR,
     products: MapOptions = MAP_ONLY,
-    reading: ReadingOptions = AS_THEY_SAY,
-    json: Json = False,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
 ) -> None:
     """Make an anomaly map, with its sigma, from a survey's own logs: no calibration runs, no map.
 
@@ -137,7 +121,7 @@ def survey(
     from magbridge.survey.run import survey as make
     from magbridge.survey.write import write_crossovers, write_tracks
 
-    logs_to_read(logs, output, correction.base, products.predict, *correction.calibration)
+    cli.logs_to_read(logs, output, correction.base, products.predict, *correction.calibration)
     if products.predict is None and output.suffix.lower() != ".nc":
         raise WrongUse(f"{output}: a map's name must end in .nc")
     if (correction.calibration or scalar.scalar) and correction.save:
@@ -149,7 +133,7 @@ def survey(
         else:
             done = make(_samples(logs, correction, reading))
     for warning in done.warnings:
-        complain(warning.text)
+        cli.complain(warning.text)
     if products.predict:
         _predict(done, products.predict, output)
     else:
@@ -158,27 +142,29 @@ def survey(
         write_tracks(done.samples, products.tracks)
     if products.crossovers:
         write_crossovers(done.found, done.samples, done.before, done.after, products.crossovers)
-    print_result(facts(done, output), f"{output}: {summary(done)}", json)
+    cli.print_result(facts(done, output), f"{output}: {summary(done)}", json)
 
 
 def _scalar_survey(
-    files: tuple[Path, ...], scalar: ScalarOptions, correction: CorrectionOptions, reading: ReadingOptions
+    files: tuple[Path, ...],
+    scalar: cli.ScalarOptions,
+    correction: CorrectionOptions,
+    reading: cli.ReadingOptions,
 ) -> Result:
     """Return the survey of a scalar magnetometer."""
-    from magbridge.calibration.file import load
     from magbridge.calibration.fitting.scalar_log import telemetry_columns
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
     from magbridge.survey.run import scalar_survey
 
     column = scalar.scalar
-    logs = by_base_station(read_each(list(files), options=reading.options), correction.base)
+    logs = cli.by_base_station(read_each(list(files), options=reading.options), correction.base)
     logs = [with_true_heading(log) for log in logs]
-    note_losses(*(log.attrs for log in logs))
-    known = [load(path) for path in correction.calibration]
+    cli.note_losses(*(log.attrs for log in logs))
+    known = [mb.load(path) for path in correction.calibration]
     for path, found in zip(correction.calibration, known, strict=True):
         if all(sensor.column != column for sensor in found.sensors):
-            complain(
+            cli.complain(
                 f"{path}: has no scalar sensor {column!r}, which is not compensated; fit it with "
                 f"magbridge calibrate --scalar {column}"
             )
@@ -188,9 +174,8 @@ def _scalar_survey(
     return scalar_survey(logs, column, names, known, lag=scalar.lag_s, lever=scalar.lever_m)
 
 
-def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: ReadingOptions) -> Samples:
+def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cli.ReadingOptions) -> Samples:
     """Return the corrected samples of all files."""
-    from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
     from magbridge.field.reference import placed
     from magbridge.logs import read_each
@@ -202,16 +187,16 @@ def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: Re
     parts = [read_table(path) for path in tables]
     if not others:
         return joined(parts)
-    deployments = by_base_station(read_each(others, options=reading.options), correction.base)
-    note_losses(*(one.attrs for one in deployments))
+    deployments = cli.by_base_station(read_each(others, options=reading.options), correction.base)
+    cli.note_losses(*(one.attrs for one in deployments))
     raw = [one for one in deployments if all(name in one for name in CHANNELS)]
-    known = [load(path) for path in correction.calibration]
+    known = [mb.load(path) for path in correction.calibration]
     for log in deployments if known else []:
         if {"latitude", "longitude"} <= set(log.variables) and (holes := int((~placed(log)).sum())):
-            complain(f"{log.attrs['source']}: {counted(holes, 'sample')} without a position: left out")
+            cli.complain(f"{log.attrs['source']}: {counted(holes, 'sample')} without a position: left out")
     for path, one in zip(correction.calibration, known, strict=True):
-        for line in warnings_of(one, path):
-            complain(line)
+        for line in cli.warnings_of(one, path):
+            cli.complain(line)
     if raw and not known:
         found = _calibrated(raw, correction, strict=reading.strict)
         known = [found.calibration if found.creep is None else found.creep.calibration]
@@ -221,8 +206,6 @@ def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: Re
 
 def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict: bool) -> Fit:
     """Return the fit that the raw logs give themselves; write it where that is asked for."""
-    from magbridge.calibration.file import save
-    from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.observe import observations
     from magbridge.columns import require
     from magbridge.logs.deployment import join
@@ -231,22 +214,22 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
     options: dict[str, Any] = {}
     if correction.position_sigma:
         options["position_sigma"] = correction.position_sigma
-    parameters = chosen_parameters(correction.parameter, together, order=order, **options)
+    parameters = cli.chosen_parameters(correction.parameter, together, order=order, **options)
     require(together, parameters)
-    with naming(together):
+    with cli.naming(together):
         data = observations(together, parameters)
-        found = fit(data, order=order, **options)
+        found = mb.fit(data, order=order, **options)
     if not found.supported and data.lacks_rock and found.calibration.method == "auto":
         with suppress(CalibrationError):  # a map must not attribute the crustal field to the vehicle
-            found = fit(data, "survey", order=order, **options)
+            found = mb.fit(data, "survey", order=order, **options)
     for warning in found.warnings:
-        complain(warning.text)
+        cli.complain(warning.text)
     if strict and not found.supported:
         raise DataError(
             "the survey does not support a calibration (see the warnings), and --strict was given"
         )
     if correction.save:
-        save(found.calibration, correction.save)
+        mb.save(found.calibration, correction.save)
     return found
 
 
@@ -275,3 +258,57 @@ def _map(done: Result, output: Path, products: MapOptions) -> None:
 
         changes = done.before, done.after
         draw_survey(grid, done.samples, done.residual, done.found, changes, products.plot)
+
+
+@cli.command("plan --mission FILE [--calibration cal.json] [--survey HOURS] [OPTIONS]")
+def plan(
+    *,
+    mission: Path,
+    calibration: Path | None = None,
+    runs: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=100))] = 10,
+    survey: Annotated[float | None, Parameter(validator=validators.Number(gte=0.5, lte=1000))] = None,
+    parameter: tuple[str, ...] = (),
+    roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
+    heading_reference: cli.Heading = None,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
+) -> None:
+    """Choose the calibration runs to fly next: those that make the mission's worst error smallest.
+
+    With --survey: the patterns of a survey that calibrates itself, without runs and without a map, with the
+    expected accuracy of each.
+
+    Parameters
+    ----------
+    mission
+        A log, real or simulated, that flies as the mission will: attitude, position, moving masses.
+    calibration
+        The calibration so far (cal.json). A survey can be planned without one.
+    runs
+        Number of spirals.
+    survey
+        Hours that a survey may take.
+    parameter
+        With --survey and no calibration: a column that gives a moving mass's position; may be repeated.
+    roll
+        Largest bank angle in deg that the vehicle can fly, either way.
+    """
+    from magbridge.calibration.planning import plan as flights
+    from magbridge.calibration.planning import survey_patterns
+
+    if calibration is None and survey is None:
+        raise WrongUse("expected --calibration, or --survey HOURS to plan a survey without one")
+    cli.logs_to_read((mission,), None, calibration)
+    deployment = cli.read_log(mission, reading, heading_reference)
+    known = mb.load(calibration) if calibration else None
+    with cli.naming(deployment), waiting("planning"):
+        if survey is None:
+            assert known is not None
+            found = flights.flight_plan(known, deployment, runs=runs, roll=roll)
+            result = flights.facts(found, known), flights.summary(found, known)
+        else:
+            proposed = survey_patterns.survey_plan(known, deployment, parameter, hours=survey, roll=roll)
+            for line in proposed[0].open:
+                cli.complain(line)
+            result = survey_patterns.facts(proposed), survey_patterns.summary(proposed)
+    cli.print_result(*result, json)

@@ -1,9 +1,8 @@
 """Fleets: many vehicles, many logs, one memory.
 
-:mod:`.catalogue` is the catalogue, in a folder of Parquet files (:mod:`.folder`) or in a database
-(:mod:`.postgres`); :mod:`.register` puts vehicles and logs there, :mod:`.calibrations` calibrations.
-:mod:`.job` is what there is to do, and :mod:`.process` runs :mod:`.work` on each, in parallel.
-:mod:`.hierarchy` is the statistics of coefficients over vehicles, refits and power-ups (:mod:`.variances`,
-:mod:`.shapes`), :mod:`.learn` teaches it, :mod:`.memory` is a catalogue's, :mod:`.drift` tells what changed
-and when, and :mod:`.page` shows it.
+:mod:`.catalogue` keeps the tables, in a folder of Parquet files or in a database (:mod:`.postgres`);
+:mod:`.register` puts vehicles and logs there and lists the jobs, which :mod:`.process` runs in parallel.
+:mod:`.hierarchy` is the statistics of coefficients over vehicles, refits and power-ups; :mod:`.learn` applies
+it to calibrations and finds what changed and when; :mod:`.memory` is the fleet of a catalogue; :mod:`.page`
+shows it.
 """

@@ -2,14 +2,16 @@
 
 A row's key is the SHA-256 of its content, so a row is there once, by any writer, however often. No row
 holds the time at which it was written: a catalogue made in one go, and one whose making was killed and begun
-again, are the same.
+again, are the same. :class:`FolderCatalogue` keeps the tables in a folder, :mod:`.postgres` in a database.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,16 @@ import polars as pl
 
 from magbridge.arrays import plain
 from magbridge.errors import FormatError, MissingExtra
-
-__all__ = ["CATALOGUE_FORMAT", "CATALOGUE_TABLES", "TEXT", "Catalogue", "Row", "open_catalogue"]
+from magbridge.files import atomic_path
 
 Row = dict[str, Any]
 CATALOGUE_FORMAT = 1
 """Version of the written catalogues; newer ones are refused."""
 SERVERS = ("postgresql://", "postgres://")
+MARK = "catalogue.json"
+"""File that makes a folder a catalogue."""
+MANY, SMALL = 64, 1000
+"""Files of a table, of fewer rows than that, from which on they are made one."""
 TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
     pl.String(), pl.Float64(), pl.Int64(), pl.List(pl.String()), pl.List(pl.Float64()), pl.Binary(),
 )  # fmt: skip
@@ -85,21 +90,10 @@ class Catalogue(ABC):
     """Folder of corrected logs and maps."""
 
     def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:
-        """Return a table's rows, each once, in the order of their keys.
+        """Return the `columns` (none named: all) of a table, each row once, in the order of their keys.
 
-        Parameters
-        ----------
-        table : str
-            One of :data:`CATALOGUE_TABLES`.
-        columns : sequence of str
-            Those that are wanted; all, if none is named.
-
-        Raises
-        ------
-        FormatError
-            A file is damaged, or a value is not of its column's type.
-        PortError
-            The server does not answer.
+        FormatError: a file is damaged, or a value is not of its column's type. PortError: the server does not
+        answer.
         """
         wanted = columns or tuple(CATALOGUE_TABLES[table])
         found = self._rows(table, wanted)
@@ -139,37 +133,120 @@ class Catalogue(ABC):
             )
 
 
-def open_catalogue(location: str | Path, results: Path | None = None, *, create: bool = False) -> Catalogue:
-    """Open a catalogue.
+class FolderCatalogue(Catalogue):
+    """A folder of Parquet files; safe with several writers on a shared disk, without a server.
 
-    Parameters
-    ----------
-    location : str or Path
-        A folder, or the URL of a PostgreSQL database: ``postgresql://USER@HOST/DATABASE``.
-    results : Path, optional
-        Folder of corrected logs and maps; by default `results` in the catalogue's folder, and
-        `fleet-results` here for one on a server.
-    create : bool
-        Make it where there is none.
+    ::
 
-    Raises
-    ------
-    FormatError
-        There is none, or it is of a newer format.
-    PortError
-        The server does not answer.
-    MissingExtra
-        A server was named, and its client is not installed.
+        catalogue/
+          catalogue.json            {"format": 1}
+          TABLE/*.parquet           one file for each batch of rows
+          results/VEHICLE/DEPLOYMENT/     corrected logs and maps
+
+    A file's name is the hash of its rows' keys. So the same rows are the same file, different writers never
+    write to one file, and a reader takes each row once.
     """
-    if str(location).startswith(SERVERS):
-        try:
-            from magbridge.fleet.postgres import PostgresCatalogue  # noqa: PLC0415  an extra of its own
-        except ImportError:
-            raise MissingExtra("psycopg", "postgres") from None
-        return PostgresCatalogue(str(location), results or Path("fleet-results"), create=create)
-    from magbridge.fleet.folder import FolderCatalogue  # noqa: PLC0415  it builds on this module
 
-    return FolderCatalogue(Path(location), results, create=create)
+    def __init__(self, folder: Path, results: Path | None = None, *, create: bool = False) -> None:
+        self.folder, self.name, self.results = folder, str(folder), results or folder / "results"
+        self._keys_of: dict[Path, frozenset[str]] = {}  # a file's content never changes
+        mark = folder / MARK
+        if create and not mark.exists():
+            with atomic_path(mark) as temporary:
+                folder.mkdir(parents=True, exist_ok=True)
+                temporary.write_bytes(msgspec.json.encode({"format": CATALOGUE_FORMAT}))
+        if not mark.is_file():
+            raise FormatError(folder, "expected a fleet's catalogue (magbridge fleet add makes one)")
+        try:
+            self._check_format(msgspec.json.decode(mark.read_bytes(), type=dict[str, int])["format"])
+        except (msgspec.DecodeError, KeyError) as error:
+            raise FormatError(mark, f'expected {{"format": {CATALOGUE_FORMAT}}}') from error
+
+    def _rows(self, table: str, columns: Sequence[str]) -> list[Row]:
+        return self._read(table, columns).drop("key").to_dicts()
+
+    def compact(self) -> None:
+        """Make one file of each table's many small ones.
+
+        The removed rows are in the file just written, so rows are never lost, even if others do so.
+        """
+        for table, columns in CATALOGUE_TABLES.items():
+            with suppress(FileNotFoundError):  # another writer does the same
+                files = [path for path in self._files(table) if len(self._keys(path)) < SMALL]
+                if len(files) < MANY:
+                    continue
+                written = self._write(table, self._joined(table, files, tuple(columns)))
+                for path in files:
+                    if path != written:
+                        path.unlink(missing_ok=True)
+
+    def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
+        known = set[str]()
+        for path in self._files(table):
+            with suppress(FileNotFoundError):  # its rows are in another one now, or are written again
+                known |= keyed.keys() & self._keys(path)
+        fresh = [{"key": key, **row} for key, row in keyed.items() if key not in known]
+        if fresh:
+            self._write(table, pl.DataFrame(fresh, schema={"key": TEXT, **CATALOGUE_TABLES[table]}))
+        return len(fresh)
+
+    def _keys(self, path: Path) -> frozenset[str]:
+        if path not in self._keys_of:
+            self._keys_of[path] = frozenset(self._joined(path.parent.name, [path], ())["key"])
+        return self._keys_of[path]
+
+    def _read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
+        while True:
+            with suppress(FileNotFoundError):  # another writer has just made several files one
+                return self._joined(table, self._files(table), columns)
+
+    def _joined(self, table: str, files: Sequence[Path], columns: Sequence[str]) -> pl.DataFrame:
+        """Return the rows of files, each once, in the order of their keys."""
+        schema = {"key": TEXT, **{name: CATALOGUE_TABLES[table][name] for name in columns}}
+        parts = [pl.DataFrame(schema=schema)]
+        for path in files:
+            try:
+                part = pl.read_parquet(path, columns=list(schema))
+            except pl.exceptions.PolarsError as error:
+                raise FormatError(path, f"expected a catalogue's Parquet: {error}") from error
+            for name, kind in schema.items():
+                if part.schema[name] != kind:
+                    expected = f"expected a column of {kind}, got {part.schema[name]}"
+                    raise FormatError(path, expected, column=name)
+            parts.append(part)
+        return pl.concat(parts).unique(subset="key").sort("key")
+
+    def _files(self, table: str) -> list[Path]:
+        return sorted((self.folder / table).glob("[!.]*.parquet"))
+
+    def _write(self, table: str, frame: pl.DataFrame) -> Path:
+        name = sha256("".join(frame["key"]).encode()).hexdigest()[:40]
+        path = self.folder / table / f"{name}.parquet"
+        if not path.exists():
+            whole = BytesIO()  # polars hides why it cannot write to a file
+            frame.write_parquet(whole, compression="zstd")
+            with atomic_path(path) as temporary:
+                temporary.parent.mkdir(exist_ok=True)
+                temporary.write_bytes(whole.getbuffer())
+        return path
+
+
+def open_catalogue(location: str | Path, results: Path | None = None, *, create: bool = False) -> Catalogue:
+    """Open a catalogue: a folder, or a database (``postgresql://USER@HOST/DATABASE``).
+
+    `results` is the folder of corrected logs and maps: by default `results` in the catalogue's folder, and
+    `fleet-results` here for one on a server. With `create`, a catalogue that does not exist is made.
+
+    FormatError: there is none, or it is of a newer format. PortError: the server does not answer.
+    MissingExtra: a server was named, and its client is not installed.
+    """
+    if not str(location).startswith(SERVERS):
+        return FolderCatalogue(Path(location), results, create=create)
+    try:
+        from magbridge.fleet.postgres import PostgresCatalogue  # noqa: PLC0415  an extra of its own
+    except ImportError:
+        raise MissingExtra("psycopg", "postgres") from None
+    return PostgresCatalogue(str(location), results or Path("fleet-results"), create=create)
 
 
 def _key(row: Row) -> str:

@@ -9,23 +9,70 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.pose import Known, Mounting, rescaling
+from magbridge.calibration.fitting.pose import LATENT, Known, Mounting, mass_columns, mounted_prior, rescaling
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import DataError
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.priors import polynomial_prior
-from magbridge.fleet.hierarchy import Observed, Population, learn
-from magbridge.fleet.shapes import shape_groups, shapes_of
-from magbridge.fleet.variances import NO_SHAPES, Shapes, Variances
+from magbridge.fleet.hierarchy import NO_SHAPES, Observed, Population, Shapes, Variances, learn
 
-__all__ = ["Fleet", "Lesson", "learn_fleet", "packed", "unpacked"]
+SHAPE_ITERATIONS = 4
+SHAPE_KINDS = 3
+"""Of shapes of a mass: moment, susceptibility, place; three numbers each."""
+
+
+def shapes_of(
+    mounted: Mapping[str, Mounting],
+    exponents: tuple[Exponents, ...],
+    parameters: tuple[Parameter, ...],
+    field: float,
+    mean: FloatArray,
+    covariance: FloatArray,
+) -> FloatArray:
+    """Return the shapes (K, 9 n) along which refits move a vehicle's coefficients, nT, for its n masses.
+
+    A refit changes the moment of a mass, its susceptibility, and its place. Each moves the coefficients along
+    the derivative of the mass's polynomials, here for the usual width of the dipole's number. That by the
+    place needs the moment: so a dipole is first fitted to what the vehicle's deployments say together, N(m,
+    P), ``l = argmin (c(l) - m)^T P^-1 (c(l) - m) + l^T W^-1 l`` with W the dipole's usual widths, linearised
+    again in each iteration. `mean` (K,) is m and `covariance` (K, K) P; the others are as in :class:`.Known`.
+    """
+    free = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
+    family = mounted_prior(free, exponents, parameters, mounted)
+    weight = np.linalg.inv(covariance)
+    for _ in range(SHAPE_ITERATIONS):
+        prior = family.prior(family.centre)
+        pull = prior.E.T @ weight
+        z = np.asarray(np.linalg.solve(pull @ prior.E + prior.precision, pull @ (mean - prior.offset)))
+        assert family.renew is not None
+        family = family.renew(z)
+    size, order = len(mean), max(map(sum, exponents))
+    shapes = np.zeros((len(exponents), 9, len(mounted), 3 * SHAPE_KINDS))
+    latents = z[size:].reshape(-1, LATENT), family.widths(family.centre)[size:].reshape(-1, LATENT)
+    for i, (name, mass, latent, width) in enumerate(
+        zip(mounted.keys(), mounted.values(), *latents, strict=True)
+    ):
+        k = [one.name for one in parameters].index(name)
+        by = mass_columns(np.array(mass.at), np.array(mass.travel), parameters[k], order, latent) * width
+        for n in range(order + 1):
+            row = exponents.index(tuple(n * (j == k) for j in range(len(parameters))))
+            shapes[row, :, i] = by[n, :, : 3 * SHAPE_KINDS]
+    return shapes.reshape(size, -1)
+
+
+def shape_groups(masses: int) -> IndexArray:
+    """Return the number of the group of each shape (9 n,): kinds of a mass have a variance each."""
+    return np.repeat(np.arange(SHAPE_KINDS * masses), 3)
+
 
 REST = 0.01
 """Share of the physical widths that a refit of a mounted mass moves besides what a dipole does."""
@@ -54,12 +101,8 @@ class Lesson(NamedTuple):
     def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> GaussianInformation:
         """Return the information of z: with ``c_own = B z``, ``J = B^T I B`` and ``h = B^T i``.
 
-        Parameters
-        ----------
-        parameters : tuple of Parameter
-            The scales of the positions to bring it to; the F_0 is :data:`REFERENCE_FIELD_NT`.
-        basis : (9 m, q) array
-            nT, coefficients there of z.
+        It is brought to the scales of `parameters` and the F_0 of :data:`REFERENCE_FIELD_NT`; `basis` (9 m,
+        q), nT, are coefficients there of z.
         """
         B = rescaling(self.exponents, parameters, self.parameters, REFERENCE_FIELD_NT, self.field) @ basis
         return GaussianInformation(B.T @ self.information.precision @ B, B.T @ self.information.vector)
@@ -98,16 +141,10 @@ class Fleet:
     """Information of z."""
 
     def known(self, vehicle: str, refit: str, before_time: float = np.inf) -> Known:
-        """Return the prediction of a vehicle's next deployment.
+        """Return the prediction of the next deployment of a vehicle, which may be new to the fleet.
 
-        Parameters
-        ----------
-        vehicle : str
-            May be new to the fleet.
-        refit : str
-            The refit it flies with: one it had before, or a new one.
-        before_time : float
-            s since 1970: only its own deployments that began before count.
+        `refit` is one it had before, or a new one. Of its own deployments, those that began before
+        `before_time` (s since 1970) count.
         """
         past = [
             seen
@@ -126,19 +163,10 @@ def learn_fleet(
 ) -> Fleet:
     """Learn from deployments of vehicles whose masses have the same names, fitted to the same order.
 
-    Parameters
-    ----------
-    lessons : sequence of Lesson
-        One for each deployment.
-    mounted : mapping
-        Vehicle -> where its masses sit, of those of which all are known.
-    variances : Variances, optional
-        Those that the same lessons have given before.
+    `mounted` has the places of the masses of those vehicles of which all are known; `variances` are those
+    that the same lessons have given before.
 
-    Raises
-    ------
-    DataError
-        There is none.
+    DataError: there is no lesson.
     """
     if not lessons:
         raise DataError("nothing to learn from: no deployment of such a vehicle has been calibrated")
@@ -201,3 +229,137 @@ def _groups(exponents: Sequence[Exponents]) -> IndexArray:
         names += [(which, kind) for kind in kinds]
     order = {name: k for k, name in enumerate(dict.fromkeys(names))}
     return np.array([order[name] for name in names], np.intp)
+
+
+FIXED = "hard iron"
+ALARM = 1e-3
+"""Chance of a false alarm in a deployment, over all its coefficients."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One coefficient that left its band."""
+
+    what: str
+    """As a technician would say it."""
+    by: float
+    """Change of the coefficient, nT."""
+    sigmas: float
+    """Change divided by its standard deviation."""
+    chance: float
+    """Of one as large in any coefficient of a deployment like the others."""
+    cause: str
+    """What does such a thing, and whether a refit was on record."""
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """A vehicle's coefficients from deployment to deployment."""
+
+    names: tuple[str, ...]
+    """The k quantities: hard iron, and what each mass changes over half its range."""
+    lessons: tuple[Lesson, ...]
+    """In the order of time."""
+    expected: FloatArray
+    expected_sigma: FloatArray
+    """`expected`, `expected_sigma`, (n, k), nT, from the earlier value."""
+    found: FloatArray
+    found_sigma: FloatArray
+    """`found`, `found_sigma`, (n, k), nT, with its own data."""
+    changes: tuple[tuple[Change, ...], ...]
+    """Of each deployment."""
+
+
+def history(fleet: Fleet, vehicle: str) -> History:
+    """Return the history of a vehicle's coefficients, and where they left their bands.
+
+    A deployment is predicted as N(m, S), wider where the vehicle was refitted. With its own data the
+    coefficients move to N(m', P), and under the model the move has the covariance ``Cov(m' - m) = S - P``. So
+    each coefficient's move over its own sigma is a standard normal number, whatever the runs determine. A
+    change is reported where one exceeds :data:`ALARM` for as many coefficients as are looked at.
+    """
+    mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
+    names, places = _looked_at(fleet)
+    rows: list[tuple[FloatArray, ...]] = []
+    changes: list[tuple[Change, ...]] = []
+    for lesson in mine:
+        before = fleet.known(vehicle, lesson.refit, lesson.time)
+        evidence = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
+        S = before.covariance
+        gain = np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, S)  # (S^-1 + J)^-1
+        P = 0.5 * (gain + gain.T)
+        after = P @ evidence.vector + np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, before.mean)
+        moved = np.maximum(np.diag(S) - np.diag(P), 0.0)[places]
+        rows.append(
+            (before.mean[places], np.sqrt(np.diag(S))[places], after[places], np.sqrt(np.diag(P))[places])
+        )
+        if len(rows) == 1:  # it has no past
+            changes.append(())
+            continue
+        refitted = lesson.refit not in {one.refit for one in mine[: len(rows) - 1]}
+        changes.append(
+            tuple(_significant_changes(names, (after - before.mean)[places], np.sqrt(moved), refitted))
+        )
+    expected, sigma, found, left = np.array(rows).reshape(len(mine), 4, len(places)).swapaxes(0, 1)
+    return History(names, mine, expected, sigma, found, left, tuple(changes))
+
+
+def facts(history: History) -> dict[str, Any]:
+    """Return a history as a dictionary that JSON can hold; nT."""
+    columns = history.expected, history.expected_sigma, history.found, history.found_sigma
+    keys = "expected_nT", "expected_sigma_nT", "found_nT", "found_sigma_nT"
+    return {
+        "coefficients": list(history.names),
+        "deployments": [
+            {
+                "deployment": lesson.deployment, "refit": lesson.refit,
+                "date": datetime.fromtimestamp(lesson.time, UTC).date().isoformat(),
+                **{key: column[k].tolist() for key, column in zip(keys, columns, strict=True)},
+                "changes": [
+                    {
+                        "what": one.what, "by_nT": one.by, "sigmas": one.sigmas, "chance": one.chance,
+                        "cause": one.cause,
+                    }
+                    for one in history.changes[k]
+                ],
+            }
+            for k, lesson in enumerate(history.lessons)
+        ],
+    }  # fmt: skip
+
+
+def _significant_changes(
+    names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool
+) -> list[Change]:
+    """Return the moves (k,) beyond their sigmas (k,), the farthest first."""
+    found = []
+    for name, move, sigma in zip(names, moves, sigmas, strict=True):
+        z = abs(move) / max(sigma, 1e-12)
+        chance = min(2.0 * float(norm.sf(z)) * len(names), 1.0)
+        if chance < ALARM:
+            found.append(Change(name, float(move), float(z), chance, _cause(name, refitted)))
+    return sorted(found, key=lambda one: -one.sigmas)
+
+
+def _cause(name: str, refitted: bool) -> str:
+    """Return the likely cause, for a technician."""
+    mass, _, _ = name.rpartition(",")
+    what = (
+        "iron that was magnetised, fitted or removed"
+        if mass == FIXED
+        else f"another pack, moment or place of what {mass} moves"
+    )
+    return f"{what}, {'more than refits do' if refitted else 'and no refit is on record'}"
+
+
+def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
+    """Return names and places among the coefficients of those that a technician can do something about."""
+    names, places = [], []
+    for m, powers in enumerate(fleet.exponents):
+        if sum(powers) > 1:
+            continue
+        mass = next((one.name for one, power in zip(fleet.parameters, powers, strict=True) if power), "")
+        for k, axis in enumerate("xyz"):
+            names.append(f"{mass or FIXED}, {axis}")
+            places.append(9 * m + 6 + k)
+    return tuple(names), places

@@ -19,8 +19,6 @@ from psycopg.rows import dict_row
 from magbridge.errors import FormatError, PortError
 from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, Catalogue, Row
 
-__all__ = ["PostgresCatalogue"]
-
 SCHEMA = sql.Identifier("magbridge_fleet")
 CONNECT_TIMEOUT_S = 10
 """s until a server that does not answer is given up."""

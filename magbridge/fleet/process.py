@@ -1,22 +1,211 @@
-"""Process deployments of a catalogue, each a task, on dask.distributed."""
+"""Process deployments of a catalogue, each a task, on dask.distributed.
+
+A worker (:func:`work`) writes corrected logs and maps, nothing else; the rows of the catalogue are written by
+the process that asked. A fault of a log is a failure on record, and the deployment's others go on. A fault of
+the moment (a file that is gone or has changed, a full disk) is reported, not recorded, and the deployment is
+tried again.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import dask
+import numpy as np
+import xarray as xr
 from distributed import Client, KilledWorker, LocalCluster, as_completed
+from threadpoolctl import threadpool_limits
 
-from magbridge.errors import PortError
-from magbridge.fleet.catalogue import Catalogue
-from magbridge.fleet.job import Job
-from magbridge.fleet.work import Done, work
+from magbridge.calibration.file import encode_calibration
+from magbridge.calibration.fitting.fit import Fit, fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration
+from magbridge.columns import CHANNELS, counts_from_boot, require
+from magbridge.correction import Correction
+from magbridge.diagnose.run import diagnose
+from magbridge.errors import DataError, FormatError, MagbridgeError, PortError, WriteError
+from magbridge.files import digest
+from magbridge.fleet.catalogue import Catalogue, Row
+from magbridge.fleet.learn import packed
+from magbridge.fleet.register import Job
+from magbridge.logs import Writer, read
+from magbridge.logs.deployment import join, passed_over, sliced
+from magbridge.logs.info import INFO_GAP_INTERVALS
+from magbridge.records import Quality
+from magbridge.rows import correct_rows
+from magbridge.survey.maps import anomaly_map
+from magbridge.survey.run import samples_of, survey
 
-__all__ = ["Outcome", "client_of", "process"]
+PIECE_ROWS = 20_000
+"""Rows that are corrected at a time."""
+
+
+class Done(NamedTuple):
+    """Rows for each table, and what stood in the way at the moment (empty: nothing)."""
+
+    tables: dict[str, list[Row]]
+    hindrance: str = ""
+
+
+def work(job: Job, results: Path) -> Done:
+    """Read, check, calibrate, correct and, where that is asked for, diagnose a deployment.
+
+    Corrected logs and maps are written to the folder `results`.
+    """
+    tables: dict[str, list[Row]] = defaultdict(list)
+    try:
+        with threadpool_limits(1, "blas"):
+            _deployment(job, results, tables)
+    except (WriteError, OSError, MemoryError) as error:
+        return Done({}, f"{_named(job)}: {error}")
+    except MagbridgeError as error:
+        tables["failures"].append(_failure(job, str(error)))
+    return Done(tables)
+
+
+def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
+    """Fill `tables`, one after the other, until something is in the way."""
+    logs: dict[str, xr.Dataset] = {}
+    for row in {row["sha256"]: row for row in job.files}.values():
+        path = Path(row["path"])
+        if digest(path) != row["sha256"]:
+            raise OSError(f"{path} has changed since it was catalogued: add it again")
+        try:
+            logs[row["sha256"]] = log = _checked(path, job)
+        except MagbridgeError as error:
+            tables["failures"].append(_failure(job, str(error)))
+            continue
+        tables["logs"].append(_log(log, row["sha256"]))
+        if sensor := str(log.attrs.get("sensor", "")) or job.sensor:
+            one = {"sensor": sensor, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment}
+            tables["sensors"].append(one)
+    if not logs:
+        raise DataError("none of its logs can be used")
+    together = join(list(logs.values()))
+    require(together, (*CHANNELS, *job.vehicle["parameters"]))
+    data = observations(together, tuple(job.vehicle["parameters"]))
+    inputs = {Path(row["path"]).name: row["sha256"] for row in job.files if row["sha256"] in logs}
+    found = fit(replace(data, inputs=inputs), order=job.vehicle["order"])
+    start = float(together["time"][0])
+    tables["calibrations"] = [_calibration(job, found, start)]
+    folder = results / job.vehicle["vehicle"] / job.deployment
+    stems = {row["sha256"]: Path(row["path"]).stem for row in job.files}
+    for sha, log in logs.items():
+        path = folder / f"{stems[sha]}-{sha[:8]}.nc"
+        row = _correct(job, found.calibration, log, path)
+        tables["corrected"].append({**row, "sha256": sha, "path": path.relative_to(results).as_posix()})
+    if job.diagnose:
+        tables["findings"], tables["improvements"] = _findings(job, together, found.calibration)
+    if job.map:
+        path = folder / f"map-{job.name[:8]}.nc"
+        row = _map(job, list(logs.values()), found.calibration, path)
+        tables["maps"] = [{**row, "path": path.relative_to(results).as_posix()}]
+
+
+def _checked(path: Path, job: Job) -> xr.Dataset:
+    """Read a log; refuse one of no date, or of another sensor."""
+    log = read(path, required=CHANNELS)
+    if counts_from_boot(log):
+        first = str(np.datetime64(int(log["time"][0]), "s"))
+        raise FormatError(path, f"its clock says {first}: give it a date (magbridge convert --date)")
+    sensor, expected = str(log.attrs.get("sensor", "")), job.sensor
+    if "" not in (sensor, expected) and sensor != expected:
+        raise FormatError(path, f"sensor {sensor!r}, but {_named(job)} carries {expected!r}")
+    return log
+
+
+def _log(log: xr.Dataset, sha: str) -> Row:
+    time = log["time"].to_numpy()
+    steps = np.diff(time)
+    middle = {
+        name: float(np.nanmedian(log[name])) if name in log and log[name].notnull().any() else None
+        for name in ("latitude", "longitude")
+    }
+    return {
+        "sha256": sha, "start": float(time[0]), "end": float(time[-1]), "rows": len(time),
+        "samples": int(log[list(CHANNELS)].to_array().notnull().all("variable").sum()),
+        "gaps": int((steps > INFO_GAP_INTERVALS * np.median(steps)).sum()) if len(steps) else 0,
+        "losses": sum(passed_over(log.attrs).values()), "sensor": str(log.attrs.get("sensor", "")), **middle,
+    }  # fmt: skip
+
+
+def _calibration(job: Job, found: Fit, start: float) -> Row:
+    calibration = found.calibration
+    return {
+        **job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment, "refit": job.refit,
+        "start": start, "sensor": calibration.sensor.name or job.sensor, "method": calibration.method,
+        "rms": found.rms, "noise": calibration.noise.sensor,
+        "expected": found.details["expected_over_noise"] * calibration.noise.sensor,
+        "supported": found.supported, "warnings": [warning.text for warning in found.warnings],
+        "calibration": encode_calibration(calibration).decode(),
+        **packed(found.information),
+    }  # fmt: skip
+
+
+def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) -> Row:
+    """Write a log's corrected field; return its row."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    correction = Correction(calibration)
+    samples, flagged, variances = 0, 0, 0.0
+    with Writer(path) as writer:
+        for piece in sliced(log, PIECE_ROWS):
+            fixed = correct_rows(correction, piece)
+            writer.append(fixed)
+            doubtful = fixed["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0
+            sigma = fixed["total_field_sigma"].to_numpy()
+            good = ~doubtful & np.isfinite(sigma)
+            samples, flagged = samples + len(sigma), flagged + int(doubtful.sum())
+            variances += float((sigma[good] ** 2).sum())
+    return {
+        **job.mark, "samples": samples, "flagged": flagged,
+        "sigma": float(np.sqrt(variances / max(samples - flagged, 1))),
+    }  # fmt: skip
+
+
+def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list[Row], list[Row]]:
+    """Return a row for each cause found, or one that says that there is none; and their improvements."""
+    found = diagnose([log], calibration, training_logs=[log]).diagnosis
+    nothing: Row = {**job.mark, "verdict": found.verdict}
+    if not found.findings:
+        return [{**nothing, "cause": "", "channel": "", "signal_to_noise": None}], []
+    rows, improvements = [], []
+    for one in found.findings:
+        name = {"cause": one.candidate.cause, "channel": one.candidate.channel or ""}
+        rows.append({**nothing, **name, "signal_to_noise": one.signal_to_noise})
+        low, high = one.improvement.interval
+        improvements.append({**job.mark, **name, "ratio": one.improvement.ratio, "low": low, "high": high})
+    return rows, improvements
+
+
+def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path) -> Row:
+    """Write the anomaly map of a deployment's corrected field; return its row."""
+    made = survey(samples_of(logs, [calibration]))
+    grid = anomaly_map(made.gridded, made.samples, name=path.name)
+    grid.save(path)
+    return {
+        **job.mark, "rms": float(np.sqrt(np.mean(made.residual**2))),
+        "sigma": float(np.nanmedian(grid.sigma)),
+    }  # fmt: skip
+
+
+def _failure(job: Job, line: str) -> Row:
+    whole = line if line.startswith("/") else f"{_named(job)}: {line}"
+    return {
+        **job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment,
+        "line": " ".join(whole.split()),
+    }  # fmt: skip
+
+
+def _named(job: Job) -> str:
+    return f"{job.vehicle['vehicle']} {job.deployment}"
+
 
 START = "120s"
 """Until processes of this machine are up: they import much, and it may be busy."""
@@ -26,31 +215,11 @@ SCHEDULER_TIMEOUT = "20s"
 """Until a scheduler that does not answer is given up."""
 
 
-class Outcome(NamedTuple):
-    """Result of a deployment: rows added, failures in a line each."""
-
-    job: Job
-    added: int
-    failures: tuple[str, ...]
-
-
 @contextmanager
 def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
-    """Connect to a scheduler, or start workers here.
+    """Connect to a dask scheduler; without its address, start `workers` processes here.
 
-    Parameters
-    ----------
-    scheduler : str
-        Its address; empty for a cluster of processes on this machine.
-    workers : int
-        How many processes that has.
-    memory : str
-        What each may use at most, as ``4 GiB``.
-
-    Raises
-    ------
-    PortError
-        Nothing answers there.
+    Each of these may use `memory` at most, as ``4 GiB``. PortError: nothing answers there.
     """
     for name in ("distributed", "distributed.client"):  # what matters is raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -76,8 +245,8 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
         yield client
 
 
-def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[Outcome]:
-    """Process deployments; yield each result as it is finished.
+def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[list[str]]:
+    """Process deployments; yield the failures of each, a line each, as it is finished.
 
     A task whose worker is lost is given to another; one that is killed leaves nothing but finished work.
 
@@ -96,15 +265,13 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
         except CancelledError as error:
             raise PortError(address, "the dask scheduler was lost: run again to do the rest") from error
         future.release()
-        yield _kept(catalogue, job, done)
+        for table, rows in done.tables.items():
+            catalogue.add(table, rows)
+        lines = [row["line"] for row in done.tables.get("failures", ())]
+        if done.hindrance:
+            lines.append(done.hindrance)
+        else:  # that it is done comes last
+            catalogue.add("done", [{**job.mark, "diagnosed": job.diagnose, "mapped": job.map}])
+        yield lines
         if number % PACE == 0 or number == len(futures):
             catalogue.compact()
-
-
-def _kept(catalogue: Catalogue, job: Job, done: Done) -> Outcome:
-    """Add a deployment's rows to the catalogue; that it is done comes last."""
-    added = sum(catalogue.add(table, rows) for table, rows in done.tables.items())
-    if not done.hindrance:
-        catalogue.add("done", [{**job.mark, "diagnosed": job.diagnose, "mapped": job.map}])
-    lines = [row["line"] for row in done.tables.get("failures", ())]
-    return Outcome(job, added, (*lines, *([done.hindrance] if done.hindrance else [])))

@@ -8,6 +8,29 @@ window.magbridge = {
     return value.toLocaleString("en", { maximumFractionDigits: digits }).replaceAll(",", "\u202f");
   },
 
+  // what a curve shows at the pointer: made of numbers alone, so that no name that somebody sent gets into the HTML
+  tip: (digits, unit) => (seen) => {
+    const number = (value) => `${magbridge.number(value, digits)} ${unit}`.trim();
+    const mean = seen.find((one) => one.seriesName === "mean" && one.value[1] !== null);
+    const mark = seen.find((one) => one.seriesName === "beyond");
+    const time = new Date(seen[0].value[0]).toISOString().slice(0, 19).replace("T", " ") + " UTC";
+    return [time, mean && number(mean.value[1]),
+      mean && mean.value[2] > 0 && `${magbridge.number(mean.value[3], digits)} to ${magbridge.number(mean.value[4], digits)} with 2σ`,
+      mark && "beyond the axis: " + number(mark.value[2])].filter(Boolean).join("<br>");
+  },
+
+  // latitude and longitude of a point of the track
+  place: (one) => one.value.slice(0, 2).reverse().map((value) => value.toFixed(5)).join(", "),
+
+  degrees: (value) => value.toFixed(4) + "°",
+
+  // the anomaly grid beneath the track
+  picture(params, api) {
+    const a = api.coord([api.value(0), api.value(3)]), b = api.coord([api.value(2), api.value(1)]);
+    const style = { image: magbridge.map, x: a[0], y: a[1], width: b[0] - a[0], height: b[1] - a[1], opacity: 0.75 };
+    return { type: "image", silent: true, style };
+  },
+
   chart(element) {
     const drawn = element.querySelector(".nicegui-echart") ?? element;
     return getElement(drawn.id.slice(1))?.chart;

@@ -2,35 +2,109 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import platform
 import time
+from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
+from io import BytesIO, StringIO
+from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 from nicegui import ui
 
-from magbridge.monitor.alarm_panel import AlarmPanel
-from magbridge.monitor.bundle import bundle
-from magbridge.monitor.charts import TelemetryChart, TotalField, TrackMap
+from magbridge.mavlink import spec
+from magbridge.monitor import words
+from magbridge.monitor.charts import Background, TelemetryChart, TotalField, TrackMap
 from magbridge.monitor.history import TIERS
-from magbridge.monitor.learning_panel import LearningPanel
 from magbridge.monitor.link import StationLink, monotonic_s
 from magbridge.monitor.panels import (
+    AlarmPanel,
+    CompassRose,
     Figures,
     Flags,
     Health,
+    LearningPanel,
     NavigationPanel,
     ParameterPanel,
     SensorPanel,
     Texts,
 )
-from magbridge.monitor.rose import CompassRose
 from magbridge.monitor.state import BridgeState
-from magbridge.monitor.track import Background
 from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, MONITOR_STYLE, RED, Changes, slanted
-from magbridge.monitor.words import measured, silence
+from magbridge.version import __version__
 from magbridge.wording import counted
 
-__all__ = ["Page"]
+LIBRARIES = ("nicegui", "numpy", "msgspec", "pyserial")
+
+
+def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
+    """Return a ZIP file of versions, condition, status texts, alarms, parameters and the last samples.
+
+    `now_s` is of the receiver's clock; `link` is where the bridge was heard.
+    """
+    wall = time.time() - now_s
+
+    def utc(moment: float) -> str:
+        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall + moment))
+
+    about: dict[str, Any] = {
+        "made": utc(now_s),
+        "magbridge": __version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "libraries": {name: _version(name) for name in LIBRARIES},
+        "link": link,
+        "bridge": state.bridge,
+        "measured": words.measured(state),
+        "health": {name: text for name, (text, _) in words.health(state, now_s).items()},
+        "navigation": {name: text for name, (text, _) in words.whereabouts(state, now_s).items()},
+        "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
+        "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
+    }
+    files = {
+        "about.json": json.dumps(about, indent=1, ensure_ascii=False),
+        "texts.csv": _table(
+            ["time", "severity", "text"],
+            [[utc(received.time), received.severity, received.text] for received in state.texts],
+        ),
+        "alarms.csv": _table(
+            ["since", "last", "active", "acknowledged", "count", "alarm"],
+            [
+                [utc(one.since), utc(one.last), one.active, one.acknowledged, one.count, one.text]
+                for one in state.alarms
+            ],
+        ),
+        "parameters.csv": _table(
+            ["name", "value", "error"],
+            [[name, repr(one.value), one.error] for name, one in sorted(state.parameters.items())],
+        ),
+        "samples.csv": _table(
+            list(spec("MAG_FIELD").fields), [list(sample.values()) for sample in state.samples]
+        ),
+    }
+    held = BytesIO()
+    with ZipFile(held, "w", ZIP_DEFLATED) as archive:
+        for name, text in files.items():
+            archive.writestr(name, text)
+    return held.getvalue()
+
+
+def _table(names: list[str], rows: list[list[Any]]) -> str:
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
 
 SCRIPT = files("magbridge.monitor").joinpath("page.js").read_text(encoding="utf-8")
 PERIOD = 0.5
@@ -150,7 +224,7 @@ class Page:
             self._show()
 
     def _show_stream(self, state: BridgeState, moment: float) -> None:
-        quiet = silence(state, moment)
+        quiet = words.silence(state, moment)
         if quiet and self._station.refused:
             quiet += f"; frames refused for their signature: {self._station.refused}"
         trouble = self._station.trouble or quiet
@@ -170,7 +244,7 @@ class Page:
     def _snapshot(self) -> None:
         """Have the browser draw one PNG of all charts."""
         with self._station.lock:
-            figures = [f"{name}: {' '.join(texts)} nT" for name, texts in measured(self._state).items()]
+            figures = [f"{name}: {' '.join(texts)} nT" for name, texts in words.measured(self._state).items()]
             flags = ", ".join(self._state.flags) or "none"
             who = self._from.text
         shown = [*figures[:2], ";  ".join(figures[2:]), f"Flags: {flags}", self._stream.text]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from math import nan
+from math import cos, isfinite, nan, radians, sin
+from typing import Any
 
 from nicegui import ui
 
@@ -11,6 +13,8 @@ from magbridge.config import Align, Telemetry
 from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
 from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS
 from magbridge.mavlink.enums import MAV_SEVERITY
+from magbridge.monitor import words
+from magbridge.monitor.history import AlarmGroup
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import (
@@ -21,15 +25,13 @@ from magbridge.monitor.widgets import (
     MUTED,
     RED,
     Changes,
+    button,
     card,
     clock,
     fact,
     nothing,
     slanted,
 )
-from magbridge.monitor.words import FLAG_TEXTS, duration, health, measured, sensor_rows, silence, whereabouts
-
-__all__ = ["Figures", "Flags", "Health", "NavigationPanel", "ParameterPanel", "SensorPanel", "Texts"]
 
 TUNABLES = {
     one.name: one
@@ -45,7 +47,7 @@ class Figures:
 
     def __init__(self, state: BridgeState) -> None:
         with card("Field, nT ± 2σ") as self.box:
-            self._labels = [self._quantity(name) for name in measured(state)]
+            self._labels = [self._quantity(name) for name in words.measured(state)]
 
     @staticmethod
     def _quantity(name: str) -> tuple[ui.label, ui.label]:
@@ -57,10 +59,10 @@ class Figures:
 
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show the present figures."""
-        for labels, texts in zip(self._labels, measured(state).values(), strict=True):
+        for labels, texts in zip(self._labels, words.measured(state).values(), strict=True):
             for label, text in zip(labels, texts, strict=True):
                 label.set_text(text)
-        self.box.style(slanted("no field" in silence(state, now_s)))
+        self.box.style(slanted("no field" in words.silence(state, now_s)))
 
 
 class Flags:
@@ -73,7 +75,9 @@ class Flags:
 
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show the flags that stand."""
-        flags = {name: f"since {clock(t)}, {duration(now_s - t)}" for name, (t, _) in state.flags.items()}
+        flags = {
+            name: f"since {clock(t)}, {words.duration(now_s - t)}" for name, (t, _) in state.flags.items()
+        }
         if not self._changes.new("flags", flags or bool(state.field), self._box):
             return
         with self._box:
@@ -82,7 +86,7 @@ class Flags:
             for name, since in flags.items():
                 color = AMBER if name == "no_boresight" else RED
                 with ui.column().classes("gap-0 border-l-4 pl-3").style(f"border-color: {color}"):
-                    ui.label(FLAG_TEXTS[name]).classes("leading-tight")
+                    ui.label(words.FLAG_TEXTS[name]).classes("leading-tight")
                     ui.label(f"{name}, {since}").classes(f"text-xs {MUTED}")
 
 
@@ -90,7 +94,7 @@ class Health:
     """The bridge's condition and its losses."""
 
     def __init__(self, state: BridgeState, now_s: float) -> None:
-        facts = list(health(state, now_s))
+        facts = list(words.health(state, now_s))
         with card("Bridge"):
             self._labels = [fact(name) for name in facts[:8]]
         with card("Losses"):
@@ -98,8 +102,8 @@ class Health:
 
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show the last status."""
-        old = "no status" in silence(state, now_s)
-        for label, (text, well) in zip(self._labels, health(state, now_s).values(), strict=True):
+        old = "no status" in words.silence(state, now_s)
+        for label, (text, well) in zip(self._labels, words.health(state, now_s).values(), strict=True):
             label.set_text(text if state.status else "–")
             label.style(slanted(old))
             if not old:
@@ -116,7 +120,7 @@ class SensorPanel:
 
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show what each measures, and how far it differs from the first."""
-        rows = sensor_rows(state, now_s)
+        rows = words.sensor_rows(state, now_s)
         self._box.set_visibility(bool(rows))
         if not self._changes.new("rows", rows, self._table):
             return
@@ -145,12 +149,12 @@ class NavigationPanel:
             card("Position by the field; innovation and bias in nT"),
             ui.element().classes(f"{GRID} md:grid-cols-3 gap-y-1"),
         ):
-            self._labels = [fact(name) for name in whereabouts(state, now_s)]
+            self._labels = [fact(name) for name in words.whereabouts(state, now_s)]
 
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show the last MAG_NAVIGATION."""
         self._box.set_visibility(bool(state.navigation))
-        for label, (text, well) in zip(self._labels, whereabouts(state, now_s).values(), strict=True):
+        for label, (text, well) in zip(self._labels, words.whereabouts(state, now_s).values(), strict=True):
             label.set_text(text)
             label.style(f"color: {INK if well else RED}")
 
@@ -223,3 +227,238 @@ class ParameterPanel:
                 self._changes.forget(name)  # so that the answer is shown, even if it is the same as before
                 value = self._inputs[name].value
                 self._state.set(name, nan if value is None else value)
+
+
+REPEAT = 5.0
+"""s between two sounds while an alarm is not acknowledged."""
+
+
+class Row:
+    """The alarms of one cause. Its elements stay as long as they do, so that a click finds its button."""
+
+    def __init__(self, acknowledge: Callable[[], None]) -> None:
+        self._acknowledge = acknowledge
+        with ui.row().classes("w-full items-center justify-between flex-nowrap border-l-4 pl-3") as self.box:
+            with ui.column().classes("gap-0"):
+                self._text = ui.label().classes("leading-tight text-sm")
+                self._times = ui.label().classes(f"text-xs {MUTED}")
+            self._seen: ui.button | None = None
+
+    def show(self, alarm: AlarmGroup) -> None:
+        """Show how it stands; the button is there until somebody has seen it."""
+        color = RED if alarm.active else AMBER
+        self.box.style(f"border-color: {'transparent' if alarm.acknowledged else color}")
+        self._text.set_text(alarm.text)
+        times = f", {alarm.count} times" if alarm.count > 1 else ""
+        over = "since" if alarm.active else "over; at"
+        self._times.set_text(f"{over} {clock(alarm.started_s)} UTC{times}")
+        if alarm.acknowledged and self._seen is not None:
+            self._seen.delete()
+            self._seen = None
+        elif not alarm.acknowledged:
+            if self._seen is None:
+                with self.box:
+                    self._seen = button("Seen", self._acknowledge)
+            label = f"Seen: {alarm.text}"
+            if self._seen.props.get("aria-label") != label:
+                self._seen.props["aria-label"] = label
+                self._seen.update()
+
+
+class AlarmPanel:
+    """The alarms of one vehicle."""
+
+    def __init__(self, station: StationLink, state: BridgeState, *, sound: bool) -> None:
+        self._station, self._state, self._changes = station, state, Changes()
+        self._sounded = -REPEAT
+        with card("Alarms"):
+            with ui.row().classes("w-full items-center gap-x-4"):
+                self._sound = ui.switch("Sound", value=sound, on_change=self._switched)
+                button("Acknowledge all", partial(self._acknowledge, None))
+            self._box = ui.column().classes("w-full max-h-60 gap-2 overflow-auto flex-nowrap")
+            self._box.props('tabindex=0 role=group aria-label="Alarms"')
+            self._none = nothing("None")
+        self._rows: dict[str, Row] = {}
+        self._spoken = ui.label().classes("sr-only").props("role=alert")
+
+    @property
+    def sound(self) -> bool:
+        """True if this browser sounds."""
+        return bool(self._sound.value)
+
+    def show(self, state: BridgeState, now_s: float) -> None:
+        """Show the alarms; sound while one was not acknowledged."""
+        alarms = state.alarms.groups
+        if state.alarms.unseen and self.sound and now_s - self._sounded >= REPEAT:
+            self._sounded = now_s
+            ui.run_javascript("magbridge.beep()")
+        if not self._changes.new(
+            "alarms", [(a.cause, a.text, a.active, a.acknowledged, a.count) for a in alarms]
+        ):
+            return
+        unseen = [alarm.text for alarm in alarms if not alarm.acknowledged]
+        self._spoken.set_text(f"Alarm: {unseen[0]}" if unseen else "")
+        self._none.set_visibility(not alarms)
+        for cause in self._rows.keys() - {alarm.cause for alarm in alarms}:
+            self._rows.pop(cause).box.delete()
+        for place, alarm in enumerate(alarms):
+            if alarm.cause not in self._rows:
+                with self._box:
+                    self._rows[alarm.cause] = Row(partial(self._acknowledge, alarm.cause))
+            row = self._rows[alarm.cause]
+            row.show(alarm)
+            if self._box.default_slot.children[place] is not row.box:
+                row.box.move(target_index=place)
+
+    def _acknowledge(self, cause: str | None) -> None:
+        with self._station.lock:
+            self._state.alarms.acknowledge(cause)
+
+    def _switched(self) -> None:
+        if self.sound:  # a browser sounds only once its reader has done something
+            ui.run_javascript("magbridge.beep()")
+
+
+TITLE = "Learning in flight"
+DO = "MB_LEARN_CMD"
+ACCEPT = "Accept"
+LEARNING_COMMANDS = {
+    ACCEPT: (1.0, "Use the learned calibration from now on, and acknowledge the alarm"),
+    "Forget": (2.0, "Return to the first calibration, and restart learning"),
+}
+
+
+class LearningPanel:
+    """What one bridge learns; hidden where it does not."""
+
+    def __init__(self, station: StationLink, state: BridgeState) -> None:
+        self._station, self._state = station, state
+        self._box = ui.element().classes("w-full").props(f'role=region aria-label="{TITLE}"')
+        with self._box, card(TITLE):
+            with ui.element().classes(f"{GRID} md:grid-cols-2 gap-x-12 gap-y-1"):
+                self._labels = [fact(name) for name in words.learnt(state)]
+            with ui.row().classes("gap-x-4"):
+                self._buttons = [
+                    button(name, partial(self._confirm, name)).tooltip(meaning)
+                    for name, (_, meaning) in LEARNING_COMMANDS.items()
+                ]
+            self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
+
+    def show(self, state: BridgeState, _now_s: float) -> None:
+        """Show the last MAG_LEARNING."""
+        self._box.set_visibility(bool(state.learning))
+        for label, (text, well) in zip(self._labels, words.learnt(state).values(), strict=True):
+            label.set_text(text)
+            label.style(f"color: {INK if well else RED}")
+        for one in self._buttons:
+            one.set_enabled(DO in state.parameters)
+        self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")
+
+    def _confirm(self, name: str) -> None:
+        """Ask before a command is sent; before the learned calibration is accepted, state its worth."""
+        value, meaning = LEARNING_COMMANDS[name]
+        text, good = words.learned_worth(self._state.learning) if name == ACCEPT else ("", True)
+
+        def answered(*, yes: bool) -> None:
+            dialog.close()
+            if yes:
+                self._order(value)
+
+        with ui.dialog() as dialog, ui.card():
+            ui.label(f"{meaning}?").classes("font-semibold")
+            ui.label(text).style(f"color: {INK if good else RED}").set_visibility(bool(text))
+            with ui.row():
+                button(f"{name} now" if good else f"{name} all the same", partial(answered, yes=True))
+                button("Cancel", partial(answered, yes=False))
+        dialog.on("hide", dialog.delete)
+        dialog.open()
+
+    def _order(self, value: float) -> None:
+        with self._station.lock:
+            if DO in self._state.parameters:
+                self._state.set(DO, value)
+
+
+RADIUS = 80.0
+"""Radius of the circle in units of the picture, which is 200 wide."""
+MAX_BAND_DEG = 180.0
+"""deg either side of the heading: the band is then the whole circle."""
+BLUE, GREY = "#3b82f6", "#778599"
+
+
+def current_heading(field: dict[str, Any]) -> tuple[float, float, str] | None:
+    """Return heading, 1-sigma (deg) and its reference; None where the last MAG_FIELD has no heading."""
+    sigma = field.get("heading_sigma", 0.0)
+    if not (isfinite(sigma) and sigma > 0.0):
+        return None
+    true, magnetic = field["heading"], field["magnetic_heading"]
+    if isfinite(true):
+        return true % 360.0, sigma, "true"
+    return (magnetic % 360.0, sigma, "magnetic") if isfinite(magnetic) else None
+
+
+def heading_text(field: dict[str, Any]) -> str:
+    """Return the heading with its 2-sigma in words."""
+    found = current_heading(field)
+    if found is None:
+        return "No heading: it needs a boresight and the autopilot's ATTITUDE"
+    heading, sigma, reference = found
+    return f"{round(heading, 1) % 360.0:05.1f}\N{DEGREE SIGN} {reference} ± {2.0 * sigma:.1f}\N{DEGREE SIGN}"
+
+
+def rose_picture(field: dict[str, Any]) -> str:
+    """Return the rose as an SVG: letters, the band of two standard deviations, and a needle.
+
+    The picture is made of numbers and fixed text alone, so that no text of a sender gets into the page.
+    """
+    parts = [f'<circle r="{RADIUS}" fill="none" stroke="{GREY}" stroke-width="1.5"/>']
+    for bearing in range(0, 360, 30):
+        (x, y), (u, v) = _point(bearing, RADIUS), _point(bearing, RADIUS - (10 if bearing % 90 == 0 else 5))
+        parts.append(f'<line x1="{x}" y1="{y}" x2="{u}" y2="{v}" stroke="{GREY}"/>')
+    for letter, bearing in zip("NESW", range(0, 360, 90), strict=True):
+        x, y = _point(bearing, RADIUS + 12.0)
+        parts.append(
+            f'<text x="{x}" y="{y}" fill="{GREY}" font-size="15" text-anchor="middle" '
+            f'dominant-baseline="central">{letter}</text>'
+        )
+    if found := current_heading(field):
+        heading, sigma, _ = found
+        x, y = _point(heading, RADIUS - 12.0)
+        parts.append(_band(heading, min(2.0 * sigma, MAX_BAND_DEG)))
+        parts.append(f'<line x1="0" y1="0" x2="{x}" y2="{y}" stroke="{BLUE}" stroke-width="3"/>')
+    label = f'role="img" aria-label="Compass rose. {heading_text(field)}"'
+    return f'<svg viewBox="-100 -100 200 200" {label} style="max-width: 14rem">{"".join(parts)}</svg>'
+
+
+def _band(heading: float, half: float) -> str:
+    """Return the sector `half` deg either side of the heading."""
+    if half >= MAX_BAND_DEG:
+        return f'<circle r="{RADIUS}" fill="{BLUE}" fill-opacity="0.25"/>'
+    (x, y), (u, v) = _point(heading - half, RADIUS), _point(heading + half, RADIUS)
+    is_large = int(half > 90.0)
+    path = f"M 0 0 L {x} {y} A {RADIUS} {RADIUS} 0 {is_large} 1 {u} {v} Z"
+    return f'<path d="{path}" fill="{BLUE}" fill-opacity="0.25"/>'
+
+
+def _point(bearing: float, radius: float) -> tuple[float, float]:
+    """Return x (right) and y (down) of a point at a bearing, deg clockwise from the top."""
+    angle = radians(bearing)
+    return round(radius * sin(angle), 2), round(-radius * cos(angle), 2)
+
+
+class CompassRose:
+    """The panel of the compass rose."""
+
+    def __init__(self) -> None:
+        self._changes = Changes()
+        with card("Heading ± 2σ") as self.box:
+            self._picture = ui.html("", sanitize=False).classes("w-full flex justify-center")
+            self._text = ui.label().classes(f"w-full text-center tabular-nums {MUTED}")
+
+    def show(self, state: BridgeState, now_s: float) -> None:
+        """Show the heading of the last sample."""
+        picture = rose_picture(state.field)
+        if self._changes.new("rose", picture):
+            self._picture.set_content(picture)
+            self._text.set_text(heading_text(state.field))
+        self.box.style(slanted("no field" in words.silence(state, now_s)))

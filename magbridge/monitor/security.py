@@ -17,8 +17,6 @@ from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
-__all__ = ["HEADERS", "Guard", "is_loopback", "new_token"]
-
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
@@ -65,20 +63,8 @@ def new_token() -> str:
 class Guard:
     """ASGI middleware: refuses what does not come from the page itself.
 
-    Parameters
-    ----------
-    app : callable
-        The application behind.
-    host : str
-        The address at which the page is served.
-    port : int
-    token : str
-        What a browser has to show once, as ``?token=`` in the address; then a cookie remembers it. Empty: no
-        token is required.
-
-    Notes
-    -----
-    A request is refused
+    The page is served at `host` and `port`. A browser has to show the `token` once, as ``?token=`` in the
+    address; then a cookie remembers it. Empty: no token is required. A request is refused
 
     * with 421 where ``Host`` is neither a name of this computer nor, where the page is served to others, an
       address: a name that somebody else owns may resolve to us, an address cannot;

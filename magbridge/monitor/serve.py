@@ -13,12 +13,10 @@ from nicegui import app, ui
 
 from magbridge.bridge.links import open_link
 from magbridge.errors import PortError
+from magbridge.monitor.charts import read_background
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.page import Page
 from magbridge.monitor.security import Guard, is_loopback, new_token
-from magbridge.monitor.track import read_background
-
-__all__ = ["serve"]
 
 
 def serve(
@@ -31,29 +29,14 @@ def serve(
     grid: Path | None = None,
     show: bool = False,
 ) -> None:
-    """Listen to `link` and serve the page until interrupted.
+    """Listen to `link` and serve the page at `host` and `port` until interrupted.
 
     Where `host` is not of this computer alone, a token is required; it is in the address that is printed.
+    With a `key` of 32 bytes, messages are signed and unsigned frames refused. The anomaly `grid` is shown
+    beneath the track.
 
-    Parameters
-    ----------
-    link, baudrate
-        The link to the bridges.
-    host, port
-        Where to serve the page.
-    key : bytes, optional
-        32 bytes: sign, and refuse unsigned frames.
-    grid : path, optional
-        An anomaly grid to be shown beneath the track.
-    show : bool
-        Open a browser.
-
-    Raises
-    ------
-    ConfigError, PortError
-        `link` is not an address, or it or the page's own port cannot be opened.
-    FormatError
-        `grid` is none.
+    ConfigError, PortError: `link` is not an address, or it or the page's own port cannot be opened.
+    FormatError: `grid` is none.
     """
     background = read_background(grid) if grid else None
     station = StationLink(open_link(link, baudrate, "magbridge monitor", "LINK"), key)

@@ -10,11 +10,8 @@ from typing import Any, NamedTuple
 
 from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.enums import MAG_NAVIGATION_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
-from magbridge.monitor.alarms import Alarms
-from magbridge.monitor.history import Series, TrackPoint, Trail
+from magbridge.monitor.history import Alarms, Series, TrackPoint, Trail
 from magbridge.records import Quality
-
-__all__ = ["TEMPERATURE_SERIES", "BridgeState", "RemoteParameter", "SensorState", "Text"]
 
 HOLD = 3.0
 """s for which a flag is still shown after it was last set."""
@@ -90,65 +87,34 @@ class SensorState:
 
 
 class BridgeState:
-    """All that a page shows of one bridge.
+    """All that a page shows of one bridge, by its system and component (None before any bridge was heard).
 
-    Times are the receiver's, s of a monotonic clock.
-
-    Parameters
-    ----------
-    bridge : tuple of 2 int, optional
-        Its system and component; before any bridge was heard, none.
-    sequence : int
-        The sequence number of its message before the first.
-
-    Attributes
-    ----------
-    began : float
-        When its first message came; inf before.
-    received_at, sampled, reported, navigated : float
-        When its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came; -inf before the first.
-    interval, report_interval : float
-        s between its last two MAG_FIELDs, and MAG_STATUSes; 0 before the second.
-    received, lost : int
-        Its messages received, and those missing by their sequence numbers.
-    field, status, navigation, learning : dict
-        The last MAG_FIELD, MAG_STATUS, MAG_NAVIGATION and MAG_LEARNING; empty before the first.
-    sensors : dict of int to SensorState
-        By sensor_id, as they are heard: with one sensor, that one.
-    flags : dict of str to tuple of 2 float
-        The flags of the first sensor, by their public names: since when, and when last set.
-    samples : deque of dict
-        The last MAG_FIELDs.
-    total : Series
-        The total field over a day, nT.
-    telemetry : dict of str to Series
-        What else is measured: the fluxgate's temperature, and named values of the same vehicle, among them
-        the positions of its masses.
-    estimated, reported_track : Trail
-        Where the vehicle is by the field (MAG_NAVIGATION), and by its own navigation.
-    alarms : Alarms
-    texts : deque of Text
-        STATUSTEXTs, the newest first.
-    parameters : dict of str to Parameter
+    Times are the receiver's, s of a monotonic clock; -inf before the first message of a kind.
     """
 
     def __init__(self, bridge: tuple[int, int] | None = None, sequence: int = -1) -> None:
         self.bridge = bridge
-        self.began = inf
+        self.began = inf  # when its first message came
+        # when its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came
         self.received_at = self.sampled = self.reported = self.navigated = -inf
+        # s between its last two MAG_FIELDs, and MAG_STATUSes; 0 before the second
         self.interval = self.report_interval = 0.0
-        self.received = self.lost = 0
+        self.received = self.lost = 0  # messages, and those missing by their sequence numbers
+        # the last MAG_FIELD, MAG_STATUS, MAG_NAVIGATION and MAG_LEARNING; empty before the first
         self.field: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
         self.navigation: dict[str, Any] = {}
         self.learning: dict[str, Any] = {}
         self.sensors: dict[int, SensorState] = {}
+        # flags of the first sensor, by their public names: since when, and when last set
         self.flags: dict[str, tuple[float, float]] = {}
-        self.samples: deque[dict[str, Any]] = deque(maxlen=SAMPLES)
+        self.samples: deque[dict[str, Any]] = deque(maxlen=SAMPLES)  # the last MAG_FIELDs
+        # the total field, nT; the fluxgate's temperature, and named values such as the positions of masses
         self.total, self.telemetry = Series(), dict[str, Series]()
+        # positions by the field (MAG_NAVIGATION), and by the vehicle's own navigation
         self.estimated, self.reported_track = Trail(), Trail()
         self.alarms = Alarms()
-        self.texts: deque[Text] = deque(maxlen=200)
+        self.texts: deque[Text] = deque(maxlen=200)  # STATUSTEXTs, the newest first
         self.parameters: dict[str, RemoteParameter] = {}
         self._count = self._lost_before = 0
         self._sequence = sequence

@@ -11,24 +11,6 @@ from nicegui import ui
 
 from magbridge.monitor.link import monotonic_s
 
-__all__ = [
-    "AMBER",
-    "FADED_COLOUR",
-    "GREEN",
-    "GRID",
-    "INK",
-    "MONITOR_STYLE",
-    "MUTED",
-    "RED",
-    "Changes",
-    "button",
-    "card",
-    "clock",
-    "fact",
-    "nothing",
-    "slanted",
-]  # fmt: skip
-
 MONITOR_STYLE = """
 :root, .q-header {--ink: #1e293b; --good: #15803d; --suspect: #b45309; --bad: #b91c1c; --faded: #64748b}
 body.body--dark {--ink: #e2e8f0; --good: #4ade80; --suspect: #fbbf24; --bad: #f87171; --faded: #94a3b8}

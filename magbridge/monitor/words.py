@@ -20,11 +20,6 @@ from magbridge.mavlink.enums import (
 from magbridge.monitor.state import BridgeState
 from magbridge.records import Quality
 
-__all__ = [
-    "FLAG_TEXTS", "SensorRow", "conditions", "duration", "health", "learned_worth", "learnt", "measured",
-    "sensor_rows", "silence", "whereabouts",
-]  # fmt: skip
-
 SILENT, SLOW = 3.0, 30.0
 """s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
 status three of their intervals, at least `SILENT` and at most `SLOW`."""

@@ -11,7 +11,7 @@ import pytest
 from commands import Command
 from scipy.spatial.transform import Rotation
 
-from magbridge.cli.remarks import by_base_station
+from magbridge.cli.common import by_base_station
 from magbridge.errors import DataError, WrongUse
 from magbridge.field.base_station import with_daily_variation
 from magbridge.field.igrf import igrf

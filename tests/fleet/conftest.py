@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from fleets import FLEET, catalogue_of, fly
 
-from magbridge.fleet.folder import FolderCatalogue as Catalogue
-from magbridge.fleet.job import jobs
+from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.process import client_of, process
+from magbridge.fleet.register import jobs
 
 
 @pytest.fixture(scope="session")
@@ -30,8 +30,8 @@ def done(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
     catalogue = catalogue_of(tmp_path_factory.mktemp("done"), flown)
     with client_of("", 2, "2 GiB") as client:
         victim = next(iter(client.run(os.getpid).values()))
-        for number, outcome in enumerate(process(catalogue, jobs(catalogue), client)):
-            assert not outcome.failures
+        for number, failures in enumerate(process(catalogue, jobs(catalogue), client)):
+            assert not failures
             if not number:
                 os.kill(victim, signal.SIGKILL)
     return catalogue

@@ -12,15 +12,15 @@ from fleets import fly
 from magbridge.calibration.fitting.pose import Mounting
 from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
-from magbridge.fleet import folder as room
-from magbridge.fleet.folder import FolderCatalogue as Catalogue
-from magbridge.fleet.job import jobs
+from magbridge.fleet import catalogue as room
+from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.register import (
     Deployment,
     Vehicle,
     add_logs,
     add_vehicle,
     current_files,
+    jobs,
     masses,
     read_fleet,
     vehicles,

@@ -10,11 +10,10 @@ from fleets import fly
 
 from magbridge.calibration.file import load
 from magbridge.cli import main
-from magbridge.fleet.folder import FolderCatalogue
-from magbridge.fleet.job import jobs, status
+from magbridge.fleet.catalogue import FolderCatalogue
 from magbridge.fleet.memory import fleet_of, lessons
-from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
-from magbridge.fleet.work import work
+from magbridge.fleet.process import work
+from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, jobs, status
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import pytest
 from magbridge.arrays import FloatArray
 from magbridge.estimation.information import GaussianInformation
 from magbridge.fleet import hierarchy
-from magbridge.fleet.hierarchy import Observed, Population, learn
-from magbridge.fleet.variances import NO_SHAPES, Shapes, Variances
+from magbridge.fleet.hierarchy import NO_SHAPES, Observed, Population, Shapes, Variances, learn
 
 
 def observed(

@@ -14,7 +14,7 @@ from pathlib import Path
 import xarray as xr
 from fleets import content
 
-from magbridge.fleet.folder import FolderCatalogue
+from magbridge.fleet.catalogue import FolderCatalogue
 
 PATIENCE = 120.0
 """Longest wait on a busy computer, s."""

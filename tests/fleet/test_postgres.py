@@ -17,8 +17,8 @@ from databases import program, server
 from magbridge.cli import main
 from magbridge.errors import FormatError, PortError
 from magbridge.fleet.catalogue import CATALOGUE_TABLES, Catalogue, open_catalogue
-from magbridge.fleet.job import jobs
-from magbridge.fleet.work import work
+from magbridge.fleet.process import work
+from magbridge.fleet.register import jobs
 
 pytestmark = pytest.mark.skipif(
     not (program("initdb") and program("pg_ctl")), reason="no PostgreSQL server is installed"

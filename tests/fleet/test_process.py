@@ -14,12 +14,11 @@ from magbridge.calibration.file import decode_calibration, load
 from magbridge.cli import main
 from magbridge.errors import WriteError
 from magbridge.field.grid import AnomalyGrid
-from magbridge.fleet.folder import FolderCatalogue as Catalogue
-from magbridge.fleet.job import jobs, new_jobs, status
+from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.memory import current, lessons
 from magbridge.fleet.page import PAGE_COLOURS
-from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
-from magbridge.fleet.work import work
+from magbridge.fleet.process import work
+from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, jobs, new_jobs, status
 from magbridge.logs import read, write
 
 MAY = Deployment("may", ())

@@ -8,7 +8,7 @@ import pytest
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.pose import LATENT, MOMENT, Mounting, mass_columns
 from magbridge.calibration.model import Parameter
-from magbridge.fleet.shapes import shape_groups, shapes_of
+from magbridge.fleet.learn import shape_groups, shapes_of
 
 AT, TRAVEL = np.array([-0.5, 0.02, 0.05]), np.array([0.0254, 0.0, 0.0])
 BATTPOS = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)

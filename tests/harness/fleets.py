@@ -10,7 +10,7 @@ from gliders import Glider, make
 
 from magbridge.cli import main
 from magbridge.fleet.catalogue import CATALOGUE_TABLES, Row
-from magbridge.fleet.folder import FolderCatalogue as Catalogue
+from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.logs import write
 from magbridge.logs.deployment import deployment
 

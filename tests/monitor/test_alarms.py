@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from magbridge.mavlink import Codec
-from magbridge.monitor.alarms import MAX_ALARMS, Alarms
-from magbridge.monitor.fleet import ReceivedBridges
+from magbridge.monitor.history import MAX_ALARMS, Alarms
+from magbridge.monitor.link import ReceivedBridges
 from magbridge.monitor.words import learned_worth
 from magbridge.records import Quality
 

@@ -8,9 +8,8 @@ from math import inf, nan
 import pytest
 
 from magbridge.field.geodesy import separation
-from magbridge.monitor.chart import axis_range, drawn, spikes
+from magbridge.monitor.charts import ASPECT, axis_range, drawn, ellipse, extent, spikes
 from magbridge.monitor.history import TIERS, TRAIL, Point, Series, TrackPoint, Trail
-from magbridge.monitor.track import ASPECT, ellipse, extent
 
 DAY = 86_400
 

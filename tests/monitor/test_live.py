@@ -11,8 +11,8 @@ import pytest
 from magbridge.bridge.links import open_link
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAG_PORT_STATE
-from magbridge.monitor.fleet import ReceivedBridges
-from magbridge.monitor.track import read_background
+from magbridge.monitor.charts import read_background
+from magbridge.monitor.link import ReceivedBridges
 
 live = pytest.importorskip("sitl.live", reason="the analysis extra is not installed")
 

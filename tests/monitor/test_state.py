@@ -15,13 +15,13 @@ from magbridge.config import Align, Link
 from magbridge.link.component import Component
 from magbridge.link.parameters import alignment
 from magbridge.mavlink import Codec, spec
-from magbridge.monitor.bundle import bundle
-from magbridge.monitor.chart import drawn
-from magbridge.monitor.fleet import MOST, ReceivedBridges
+from magbridge.monitor.charts import drawn
+from magbridge.monitor.charts import series as track_series
 from magbridge.monitor.history import TIERS
-from magbridge.monitor.rose import heading_text, rose_picture
+from magbridge.monitor.link import MOST, ReceivedBridges
+from magbridge.monitor.page import bundle
+from magbridge.monitor.panels import heading_text, rose_picture
 from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
-from magbridge.monitor.track import series as track_series
 from magbridge.monitor.words import (
     conditions,
     duration,

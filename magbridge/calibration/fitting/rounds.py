@@ -346,7 +346,7 @@ class Drift(NamedTuple):
 
 
 def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
-    """Return True for samples (n,) next to a motion of a mass, as defined in :mod:`magbridge.track`.
+    """Return True for samples (n,) next to a motion of a mass, as defined in :mod:`magbridge.align`.
 
     When a mass begins to move after its last report, no telemetry gives its position.
 

@@ -1,0 +1,310 @@
+"""Look at, convert and simulate logs, and merge anomaly grids: commands that need no calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import partial
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+from cyclopts import Parameter, validators
+
+import magbridge as mb
+from magbridge.cli import common as cli
+from magbridge.errors import WrongUse
+from magbridge.progress import track, waiting
+from magbridge.wording import counted
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+WIDE_TERMINAL = 110
+"""Characters of a terminal from which on the meanings are shown."""
+MAX_LISTED_LOGS = 3
+"""Largest number of logs whose names are listed above what they hold together."""
+
+
+@cli.command("info FILE... [OPTIONS]")
+def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.Json = False) -> None:
+    """Describe logs: columns, units, rates, gaps, ranges, and the commands that could use them.
+
+    Several logs are described one after the other; a sensor's own log and a vehicle's logs also together.
+
+    Parameters
+    ----------
+    files
+        The logs.
+    """
+    cli.logs_to_read(files)
+    from magbridge.logs.deployment import join
+    from magbridge.logs.info import info as facts_of
+    from magbridge.logs.reading import without_companions
+    from magbridge.logs.sensor_log import combine
+
+    logs = {}
+    with waiting("reading"):
+        for file in without_companions(list(dict.fromkeys((*files, *reading.sensor_log)))):
+            logs[str(file)] = mb.read(file, options=reading.without_sensor_logs)
+        named = [Path(name) in reading.sensor_log for name in logs]
+        combined = combine(list(logs.values()), named, reading.clock_offset)
+        if len(combined) < len(logs):
+            names = [Path(name).name for name in logs]
+            listed = " and ".join(names) if len(names) <= MAX_LISTED_LOGS else f"{len(names)} logs"
+            logs[f"{listed} together"] = join(combined)
+    found = {}
+    for name, log in logs.items():
+        found[name] = facts_of(log)
+        if not json:
+            cli.note_losses(log.attrs)
+            _show(name, found[name])
+    cli.print_result(found, "", json)
+
+
+def _show(file: str, facts: dict[str, Any]) -> None:
+    from msgspec import convert
+    from rich.console import Console
+
+    from magbridge.logs.compasses import LogCompass
+
+    console = Console(highlight=False, soft_wrap=False)
+    console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}", soft_wrap=True)
+    for compass in facts["compasses"]:
+        one = convert(compass, LogCompass)
+        console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
+    console.print(_columns(facts, meanings=console.width >= WIDE_TERMINAL))
+    console.print(_uses(facts))
+    for hint in facts["hints"]:
+        cli.complain(f"{file}: {hint}")
+
+
+def summary(facts: dict[str, Any]) -> str:
+    """Return a log's rows, its time, its rate and its gaps in a sentence."""
+    if not facts["rows"]:
+        return "no rows"
+    boot = facts["references"]["time_reference"] == "boot"
+    first, last = (f"{facts[end]:.1f} s" if boot else _utc(facts[end]) for end in ("start", "end"))
+    rate = f", {facts['rate_hz']:.4g} Hz" if facts["rate_hz"] else ""
+    gaps = ""
+    if facts["gaps"]:
+        gaps = f", {counted(facts['gaps'], 'gap')}, the longest of {facts['longest_gap_s']:.4g} s"
+    return f"{counted(facts['rows'], 'row')}, {first} to {last}{rate}{gaps}"
+
+
+def _utc(time: float) -> str:
+    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _columns(facts: dict[str, Any], *, meanings: bool) -> Table:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from magbridge.columns import CHANNEL_TIMES
+
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for name in ("column", "unit"):
+        table.add_column(name, overflow="fold")
+    for name in ("known", "lowest", "highest", "changes every"):
+        table.add_column(name, justify="right", no_wrap=True)
+    if meanings:
+        table.add_column("meaning")
+    for one in facts["columns"]:
+        every = one["changes_every_s"]
+        ends = ("", "") if one["name"] in CHANNEL_TIMES else (one["lowest"], one["highest"])
+        table.add_row(
+            _plain(one["name"]),
+            "" if one["unit"] == "1" else _plain(one["unit"]),
+            f"{one['known']:.0%}",
+            *(f"{end:.6g}" if isinstance(end, float) else "" for end in ends),
+            "" if every is None else f"{every:.3g} s",
+            *([_plain(one["meaning"])] if meanings and one["meaning"] != one["name"] else []),
+        )
+    return table
+
+
+def _uses(facts: dict[str, Any]) -> Table:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table("command", "could use it?", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for name, lacks in facts["uses"].items():
+        table.add_row(name, f"lacks {'; and '.join(lacks)}" if lacks else "yes")
+    return table
+
+
+def _plain(text: str) -> str:
+    """Return a text whose brackets are not taken for rich's markup."""
+    from rich.markup import escape
+
+    return escape(text)
+
+
+@cli.command("convert FILE... -o FILE [OPTIONS]")
+def convert(
+    *files: Path,
+    output: cli.Log,
+    heading_reference: cli.Heading = None,
+    metadata: Path | None = None,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    json: cli.Json = False,
+) -> None:
+    """Convert logs from any readable format to any writable one; several logs are merged in time order.
+
+    Parameters
+    ----------
+    files
+        The logs to convert.
+    output
+        The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
+    metadata
+        A metadata.toml that says of people, platform and sensor what OceanGliders OG1.0 demands: the netCDF
+        is then a file of OG1.0.
+    """
+    cli.logs_to_read(files, output, metadata)
+    if metadata and output.suffix.lower() != ".nc":
+        raise WrongUse(f"--metadata: goes with a netCDF (.nc), not with {output}")
+
+    from magbridge.logs import Writer, read_chunks
+
+    rows, pieces = 0, []
+    with Writer(output, _og(metadata), og1=True) if metadata else Writer(output) as writer:
+        for part in track(read_chunks(files, options=reading.options), "reading"):
+            pieces.append(part.attrs)
+            if heading_reference:
+                part.attrs["heading_reference"] = heading_reference
+            writer.append(part)
+            rows += part.sizes["time"]
+            names = [str(name) for name in part.data_vars]
+    cli.note_losses(*pieces)
+    cli.print_result(
+        {"file": str(output), "rows": rows, "columns": names}, f"{output}: {counted(rows, 'row')}", json
+    )
+
+
+def _og(metadata: Path) -> Callable[[Path], None]:
+    """Return a function that completes a netCDF file to one of OG1.0 with this metadata."""
+    from magbridge.logs.og import complete, read_metadata
+
+    return partial(complete, metadata=read_metadata(metadata))
+
+
+@cli.command("simulate SCENARIO -o FILE [OPTIONS]")
+def simulate(
+    scenario: Path,
+    /,
+    *,
+    output: cli.Log,
+    seed: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=0))] = 0,
+    trajectory_from: tuple[Path, ...] = (),
+    reference: Literal["none", "true", "map"] | None = None,
+    reading: cli.ReadingOptions = cli.AS_THEY_SAY,
+    map_output: Annotated[Path | None, Parameter(name="--map", validator=cli.file_to_write(".nc"))] = None,
+    json: cli.Json = False,
+) -> None:
+    """Simulate a deployment from the forward model.
+
+    Parameters
+    ----------
+    scenario
+        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider,
+        of which the last two need a log to drive them (--trajectory-from); or turn_on, warming, bolt, pump
+        and battery, in which the vehicle changes after its calibration.
+    output
+        The file to write.
+    seed
+        Determines everything that the scenario leaves open; the same seed gives the same deployment.
+    trajectory_from
+        A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
+        may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
+    reference
+        What reference_field holds, instead of what the scenario says: none leaves it out, as where the field
+        is not known; true is the true total field; map is the main field and an airborne survey's anomaly.
+    map_output
+        Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
+    """
+    from magbridge.logs import write
+    from sitl.like import placed_at, simulate_like
+    from sitl.scenario import load
+    from sitl.twin import Twin
+    from sitl.twin import simulate as simulate_scenario
+
+    cli.check_inputs((scenario, *trajectory_from), output)
+    cli.check_inputs((scenario, *trajectory_from, output), map_output)
+    if trajectory_from:
+        cli.logs_to_read(trajectory_from)
+    chosen = load(scenario)
+    if reference is not None:
+        telemetry = msgspec.structs.replace(chosen.telemetry, reference=reference)
+        chosen = msgspec.structs.replace(chosen, telemetry=telemetry)
+    with waiting("simulating"):
+        if trajectory_from:
+            log = mb.read(trajectory_from, options=reading.options)
+            cli.note_losses(log.attrs)
+            chosen = placed_at(log, chosen)
+            deployment = simulate_like(log, chosen, seed)
+        else:
+            deployment = simulate_scenario(chosen, seed)
+    write(deployment, output)
+    if map_output is not None:
+        Twin.draw(chosen, seed).anomaly_map().save(map_output)
+    rows = deployment.sizes["time"]
+    cli.print_result(
+        {"file": str(output), "rows": rows, "seed": seed}, f"{output}: {counted(rows, 'row')}", json
+    )
+
+
+@cli.command("map GRID... -o grid.nc [OPTIONS]")
+def map(  # noqa: A001 - the command's name
+    *grids: Path,
+    output: cli.Grid,
+    altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
+    survey_altitude: Annotated[
+        tuple[float, ...], Parameter(validator=validators.Number(gte=-1e6, lte=1e6))
+    ] = (),
+    smooth: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e4))] = 0.0,
+    mask: Path | None = None,
+    spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
+    plot: cli.Plot = None,
+    json: cli.Json = False,
+) -> None:
+    """Combine the grids of several surveys into one anomaly map: continue upward, merge, mask, smooth.
+
+    Parameters
+    ----------
+    grids
+        The grids: netCDF, Surfer, Geosoft, ESRI ASCII, GeoTIFF or XYZ.
+    output
+        The map to write, netCDF.
+    altitude
+        Altitude in m to which every grid is continued upward; by default that of the highest.
+    survey_altitude
+        Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
+    smooth
+        Wavelength in km: of shorter waves less than half stays, and the part that is removed counts as the
+        map's sigma. By default nothing is smoothed.
+    mask
+        A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
+    spacing
+        Node spacing in deg; by default that of the finest grid.
+    plot
+        A PNG, PDF or SVG to draw, with every step.
+    """
+    from magbridge.field.prepare import draw_steps, prepare, surveyed_at
+    from magbridge.field.read import read_grid, read_polygon
+
+    cli.check_inputs(grids, output, mask)
+    polygon = read_polygon(mask) if mask else None
+    with waiting("preparing"):
+        flown = [read_grid(path) for path in grids]
+        if survey_altitude:
+            flown = surveyed_at(flown, survey_altitude)
+        result, steps = prepare(flown, altitude, smooth, polygon, spacing)
+    result.save(output)
+    if plot:
+        draw_steps(steps, plot)
+    titles = [step.title for step in steps]
+    facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
+    cli.print_result(facts, f"{output}: {', '.join(titles)}", json)
