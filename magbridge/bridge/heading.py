@@ -21,7 +21,7 @@ from magbridge.errors import PortError
 from magbridge.link.component import Component
 from magbridge.link.estimates import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
 from magbridge.link.output import Rate
-from magbridge.link.telemetry import own_time, sent_us
+from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, is_contradicted, own_time, sent_us
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
 from magbridge.records import Corrected, Quality, Vector
@@ -35,6 +35,8 @@ COVARIANCE_INTERVAL_US: Final = 200_000
 """µs for which the covariance of the vector is used again: it changes with attitude and masses, slowly."""
 MAX_PITCH_RAD: Final = radians(89.0)
 """Largest pitch at which roll and heading are distinguished, rad."""
+CONTRADICTED_TILT_RAD: Final = radians(10.0)
+"""1-sigma of roll and pitch of an autopilot whose filter contradicts its sensors, rad."""
 MAX_SENT_SIGMA_DEG: Final = 30.0
 """Largest sigma of a heading that is sent to the autopilot, deg."""
 MAX_WAITING: Final = 8
@@ -71,6 +73,7 @@ class LiveHeading:
         self._rate = Rate(wanted.rate)
         self._nmea_rate = Rate(wanted.nmea_rate if wanted.nmea is not None else -1.0)
         self._tilt_sigma = radians(wanted.tilt_sigma)
+        self._is_contradicted = False
         self._read_time = own_time(ATTITUDE)
         self._attitude_us = -(1 << 62)
         self._roll = self._pitch = 0.0
@@ -83,9 +86,12 @@ class LiveHeading:
         self._declination = self._declination_sigma = nan
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Process an ATTITUDE or HEARTBEAT of the autopilot, received at `time_us`."""
+        """Process an ATTITUDE, HEARTBEAT or report of the filter of the autopilot, received at `time_us`."""
         if message.id == HEARTBEAT:
             self.stack = message["autopilot"]
+            return
+        if message.id in (EKF_STATUS, PX4_STATUS):
+            self._is_contradicted = is_contradicted(message)
             return
         clock = self._component.vehicle.clock
         self._attitude_us = sent_us(self._read_time, message.payload, time_us, clock)
@@ -137,12 +143,13 @@ class LiveHeading:
         ``dpitch/dt = q cos(roll) - r sin(roll)``.
         """
         roll, pitch, (p, q, r) = self._roll, self._pitch, self._rates
+        known = CONTRADICTED_TILT_RAD if self._is_contradicted else self._tilt_sigma
         if not (isfinite(p + q + r) and abs(pitch) < MAX_PITCH_RAD):
-            return roll, pitch, self._tilt_sigma
+            return roll, pitch, known
         roll_change = elapsed * (p + tan(pitch) * (q * sin(roll) + r * cos(roll)))
         pitch_change = elapsed * (q * cos(roll) - r * sin(roll))
         # half of the extrapolated change counts as its standard deviation
-        sigma = hypot(self._tilt_sigma, 0.5 * max(abs(roll_change), abs(pitch_change)))
+        sigma = hypot(known, 0.5 * max(abs(roll_change), abs(pitch_change)))
         return roll + roll_change, pitch + pitch_change, sigma
 
     def _decline(self, main: Vector, crustal: float) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from magbridge.field.geodesy import separation
 from magbridge.link.component import Component
 from magbridge.link.estimates import Pose, quaternion
-from magbridge.link.telemetry import AIRCRAFT
+from magbridge.link.telemetry import AIRCRAFT, is_contradicted
 from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
@@ -113,6 +113,8 @@ MIN_EQUAL = 5
 """Number of such speeds in a row until that is reported."""
 VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
 """Flags of EKF_STATUS_REPORT, and of ESTIMATOR_STATUS: the velocity holds; the position is only held."""
+HEADING_STEP_RAD, HEADING_STEP_US = 0.15, 10_000_000
+"""rad by which the heading of an autopilot whose filter contradicts its sensors may change in these µs."""
 ARMED = 128
 """Flag of HEARTBEAT.base_mode: the vehicle is armed."""
 STATE_UNKNOWN, ON_GROUND = 0, 1
@@ -171,6 +173,7 @@ class Motion:
         self._unvouched_us = (
             -MAX_SOURCE_AGE_US
         )  # when the autopilot last reported that its velocity does not hold
+        self._contradicted_us = -HEADING_STEP_US
         self._is_aircraft = self._armed = self._grounded = False
         self._landed_state = STATE_UNKNOWN
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
@@ -261,6 +264,10 @@ class Motion:
             flags = message["flags"]
             holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
             self._unvouched_us = -MAX_SOURCE_AGE_US if holds else time_us
+            # without a good heading, dead reckoning is wrong by a part of the speed
+            if is_contradicted(message) and time_us - self._contradicted_us >= HEADING_STEP_US:
+                self._contradicted_us = time_us
+                self._navigator.widen_heading(time_us, HEADING_STEP_RAD)
 
     def _global(self, message: Message, time_us: int) -> None:
         self._pass(time_us, depth=self._frame.depth(time_us))

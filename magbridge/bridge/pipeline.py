@@ -22,7 +22,7 @@ from magbridge.link.component import Component
 from magbridge.link.estimates import NO_ATTITUDE, Attitude
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.publish import Condition, check_publish
-from magbridge.link.telemetry import Sources, TelemetryMap, is_possible, needed_rates
+from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, Sources, TelemetryMap, is_possible, needed_rates
 from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
@@ -41,7 +41,7 @@ NOT_USED = "calibration is not of a {}: not used"
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
 ATTITUDE_ID: Final = spec("ATTITUDE").id
-HEADING_INPUTS: Final = frozenset((ATTITUDE_ID, spec("HEARTBEAT").id))
+HEADING_INPUTS: Final = frozenset((ATTITUDE_ID, EKF_STATUS, PX4_STATUS, spec("HEARTBEAT").id))
 """Messages from which the heading is computed and sent."""
 ANNOUNCED_FLAGS = int(
     Quality.STALE_TELEMETRY

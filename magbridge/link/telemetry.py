@@ -18,8 +18,8 @@ from magbridge.mavlink.messages import MESSAGE_IDS, Field, split_index
 from magbridge.wording import suggestion
 
 __all__ = [
-    "AIRCRAFT", "MIN_RATE_FRACTION", "Sources", "Stream", "StreamRequests", "TelemetryMap", "is_possible",
-    "needed_rates", "own_time", "sent_us",
+    "AIRCRAFT", "EKF_STATUS", "MIN_RATE_FRACTION", "PX4_STATUS", "Sources", "Stream", "StreamRequests",
+    "TelemetryMap", "is_contradicted", "is_possible", "needed_rates", "own_time", "sent_us",
 ]  # fmt: skip
 
 Value = tuple[str, float, int]
@@ -243,6 +243,15 @@ Stream = tuple[int, int]
 """Component that sends a message, and the message's id."""
 
 
+def is_contradicted(status: Message) -> bool:
+    """Return True if an EKF_STATUS_REPORT or ESTIMATOR_STATUS shows that the angles are uncertain.
+
+    An innovation of velocity, position or compass is beyond its limit: the filter contradicts a sensor. In a
+    real ArduPlane with a jammed receiver the heading was then wrong by 20 to 40 deg, and so was the tilt.
+    """
+    return bool(max(status[name] for name in INNOVATION_RATIOS[status.id]) > 1.0)
+
+
 def needed_rates(
     autopilot: int, telemetry: Iterable[Telemetry] = (), *, attitude: bool, navigation: bool
 ) -> dict[Stream, tuple[float, float]]:
@@ -402,6 +411,11 @@ class StreamRequests:
 HEARTBEAT: Final = spec("HEARTBEAT").id
 EKF_STATUS, PX4_STATUS = spec("EKF_STATUS_REPORT").id, spec("ESTIMATOR_STATUS").id
 """Messages with the flags of the estimator: ArduPilot's and PX4's."""
+INNOVATION_RATIOS: Final = {
+    EKF_STATUS: ("velocity_variance", "pos_horiz_variance", "compass_variance"),
+    PX4_STATUS: ("vel_ratio", "pos_horiz_ratio", "mag_ratio"),
+}
+"""Fields of these messages with the ratio of an innovation to its limit."""
 ACK: Final = spec("COMMAND_ACK").id
 
 

@@ -228,13 +228,13 @@ class Estimate:
         else:
             self._filter.predict(F, Q)
 
-    def other_motion(self) -> None:
-        """From now on dead reckoning follows other telemetry, so its error, the current, is another."""
+    def widen_current(self, sigma: float) -> None:
+        """Widen the current, the error of dead reckoning, by a 1-sigma of `sigma`, m/s, on each axis."""
         if self._filter is None:
             return
         banks = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
         Q = np.zeros_like(self.P)
-        Q[2, 2] = Q[3, 3] = self.options.current_sigma**2
+        Q[2, 2] = Q[3, 3] = sigma**2
         for one in (self._filter, *banks):
             one.predict(np.eye(len(Q)), Q)
         self.alone += Q[:4, :4]

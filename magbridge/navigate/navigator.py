@@ -149,8 +149,13 @@ class Navigator:
         """From now on the motion is known by other telemetry."""
         self._reckoning.advance(time_us * 1e-6)
         self._reckoning.forget()
-        self.estimate.other_motion()
+        self.estimate.widen_current(self.estimate.options.current_sigma)
         self.gnss.new_motion()
+
+    def widen_heading(self, time_us: int, sigma: float) -> None:
+        """Count an error of the heading of 1-sigma `sigma`, rad, that dead reckoning has from now on."""
+        self._reckoning.advance(time_us * 1e-6)
+        self.estimate.widen_current(sigma * self._reckoning.speed)
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
         """Add a corrected sample; return the update that it completes, or None."""

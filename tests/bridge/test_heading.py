@@ -269,3 +269,20 @@ def test_sentences_and_messages_through_real_sockets(tmp_path: Path) -> None:
     heading = float(sentences.split(b"$HCHDT,")[1].split(b",")[0])
     assert heading == pytest.approx(130.0, abs=0.3)
     assert hypot(*MAIN[:2]) > 10_000.0
+
+
+@pytest.mark.parametrize(
+    ("status", "field"), [("EKF_STATUS_REPORT", "velocity_variance"), ("ESTIMATOR_STATUS", "vel_ratio")]
+)
+def test_an_autopilot_that_contradicts_its_sensors_gives_no_good_heading(
+    status: str, field: str, tmp_path: Path
+) -> None:
+    """Roll and pitch of a real ArduPlane under a jammed receiver were wrong by tens of degrees."""
+    sigmas = []
+    for ratio in (0.1, 5.0):
+        bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
+        report = Event(START, Channel.LINK, Codec(1, 1).pack(status, **{field: ratio}))
+        sent = fly(bridge, [*begin(), report, *level_flight()])
+        sigmas.append(last(sent, "MAG_FIELD")["heading_sigma"])
+    assert sigmas[0] < 2.0
+    assert sigmas[1] > 20.0

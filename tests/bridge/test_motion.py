@@ -205,6 +205,13 @@ def test_a_turn_between_two_reports_is_averaged_and_uncertain() -> None:
     assert noise.turns == pytest.approx(2.0 * 22.0**2, rel=0.7)
 
 
+def sample(bench: Bench, latitude: float, longitude: float) -> None:
+    """Give the navigation the field of a place."""
+    field = total_field(longitude, latitude, 0.0, bench.now_us * 1e-6).item()
+    field += hills().look_up(longitude, latitude, 0.0).anomaly
+    bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))
+
+
 @pytest.mark.parametrize("reports", [True, False])
 def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool) -> None:
     """An aircraft measures 6 m/s of wind, rolls for 10 s, and flies in a cross wind from then on.
@@ -225,10 +232,7 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
         latitude, longitude = offset(*PLACE, north, east)
         place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
         bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
-        now_s = bench.now_us * 1e-6
-        field = total_field(longitude, latitude, 0.0, now_s).item()
-        field += hills().look_up(longitude, latitude, 0.0).anomaly
-        bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))
+        sample(bench, latitude, longitude)
         if reports or k > 140:
             assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
@@ -255,3 +259,24 @@ def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:
     assert moved_on[2] == pytest.approx(np.hypot(1.0, 4.0))
     assert separation(*PLACE, *as_measured[:2]) == pytest.approx((0.0, 0.0), abs=0.05)
     assert as_measured[2] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "field"), [("EKF_STATUS_REPORT", "velocity_variance"), ("ESTIMATOR_STATUS", "mag_ratio")]
+)
+def test_an_autopilot_that_contradicts_its_sensors_has_an_uncertain_heading(name: str, field: str) -> None:
+    """A real ArduPlane under a jammed receiver had headings wrong by 20 to 40 deg."""
+    sigma = {}
+    for ratio in (0.1, 5.0):
+        bench = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT)
+        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128)
+        bench.navigation.navigator.fix(bench.now_us, *PLACE, 5.0)
+        for k in range(1, 32):
+            bench.to(k)
+            bench.receive("ATTITUDE", yaw=np.pi / 2)
+            bench.receive("VFR_HUD", airspeed=20.0, groundspeed=24.0)
+            status: dict[str, Any] = {"flags": 831, field: ratio}
+            bench.receive(name, **status)
+            sample(bench, *offset(*PLACE, 0.0, 20.0 * k))
+        sigma[ratio] = float(np.sqrt(bench.navigation.navigator.estimate.P[2, 2]))
+    assert sigma[5.0] > 1.5 * sigma[0.1]
