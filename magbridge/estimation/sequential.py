@@ -29,6 +29,7 @@ The estimated amplitude is :math:`\hat a = (I + M)^{-1} y`, of covariance :math:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -60,8 +61,9 @@ class SequentialTest:
 
     Parameters
     ----------
-    kinds : int
-        Number of kinds of change; each has up to three components.
+    since_onset : sequence of bool
+        One for each kind of change: True if its effect is proportional to the regressor's change since the
+        onset, False if it is proportional to the regressor.
     states : int
         Number of states n of the filter.
     retention_samples : float
@@ -75,12 +77,14 @@ class SequentialTest:
         Kind of change of each row; each onset of a kind is a row.
     onset : (rows,) array
         Time of each row's onset, s.
-    count : (rows,) int array
-        Measurements since then.
-    statistic : (rows,) array
-        L.
+    start : (rows,) array
+        Regressor of each row at its onset; 0 where the effect is proportional to the regressor.
+    log_ratio, statistic : (rows,) array
+        L, and L less that of what the model itself allows.
     amplitude : (rows, 3) array
         Estimated amplitudes.
+    signature : (rows, 3) array
+        f, what one unit of each component adds to the last residual.
     squared_residual : float
         Square of what the likeliest change leaves of the last innovation, over S.
     absorbed : (n, rows, 3) array
@@ -88,10 +92,16 @@ class SequentialTest:
     """
 
     def __init__(
-        self, kinds: int, states: int, retention_samples: float = np.inf, noise_dof: float = 0.0
+        self,
+        since_onset: Sequence[bool],
+        states: int,
+        retention_samples: float = np.inf,
+        noise_dof: float = 0.0,
     ) -> None:
-        self.kind: IndexArray = np.repeat(np.arange(kinds), len(RESTART_PERIODS))
-        self._period = np.tile(RESTART_PERIODS, kinds)
+        onsets = len(RESTART_PERIODS)
+        self.kind: IndexArray = np.repeat(np.arange(len(since_onset)), onsets)
+        self._since_onset = np.repeat(np.array(since_onset, bool), onsets)
+        self._period = np.tile(RESTART_PERIODS, len(since_onset))
         self._states, self._keep = states, 1.0 - 1.0 / retention_samples
         self._excess, self._dof = 1.0, noise_dof
         self.squared_residual = 1.0
@@ -100,78 +110,85 @@ class SequentialTest:
     def restart(self) -> None:
         """Discard all evidence; the estimate of the excess noise stays."""
         rows = len(self.kind)
-        self._M = np.zeros((rows, 3, 3))
-        self._energy, self._mean = np.zeros((rows, 3, 3)), np.zeros((rows, 3))
+        self._M, self._energy = np.zeros((rows, 3, 3)), np.zeros((rows, 3, 3))
         self._y = np.zeros((rows, 3))
         self._squares, self._samples = np.zeros(rows), np.zeros(rows)
         self.absorbed = np.zeros((self._states, rows, 3))
-        self._phi = np.zeros((rows, 3))
-        self.onset = np.zeros(rows)
+        self._phi, self.signature = np.zeros((rows, 3)), np.zeros((rows, 3))
+        self.onset, self.start = np.zeros(rows), np.zeros(rows)
         self.count = self._period.copy()
-        self.statistic = np.zeros(rows)
+        self.log_ratio = self.statistic = np.zeros(rows)
         self.amplitude = np.zeros((rows, 3))
 
-    def begin(self, time: float, normalised_innovation: float) -> BoolArray:
-        """Restart the onsets whose period is over; return which rows those are (rows,).
-
-        `time`: time of the measurement, s. `normalised_innovation`: ``v / sqrt(S)``.
-        """
-        self.count += 1
-        # An onset is replaced after its period, unless its change is likely; an outstanding innovation begins
-        # a new onset at once in the shortest period.
-        unpromising = self.statistic < PROMISING_LOG_RATIO
-        begins = (self.count > self._period) & unpromising
-        if abs(normalised_innovation) > OUTSTANDING_SIGMA:
-            shortest = slice(None, None, len(RESTART_PERIODS))
-            begins[shortest] |= unpromising[shortest]
-        if begins.any():
-            self._M[begins] = self._energy[begins] = 0.0
-            self._y[begins] = self._mean[begins] = 0.0
-            self._squares[begins] = self._samples[begins] = 0.0
-            self.absorbed[:, begins] = 0.0
-            self.onset[begins], self.count[begins] = time, 1
-        return np.asarray(begins)
-
-    def test(self, estimator: KalmanFilter, signatures: FloatArray, null: FloatArray | None = None) -> float:
+    def test(
+        self,
+        estimator: KalmanFilter,
+        time: float,
+        regressors: FloatArray,
+        effects: FloatArray,
+        null: FloatArray | None = None,
+    ) -> float:
         """Test the filter's innovation and return the largest statistic.
 
-        `estimator`: the filter, after :meth:`.KalmanFilter.innovate` and before its update. `signatures`
-        (rows, 3): f, what one unit of each component adds to the residual. `null` (rows,): 1-sigma of the
-        amplitude that the model itself allows, in units of the change.
+        `estimator`: the filter, after :meth:`.KalmanFilter.innovate` and before its update. `time`: time of
+        the measurement, s. `regressors` (kinds,): regressor of each kind of change. `effects` (kinds, 3):
+        what one unit of each component adds to the residual where the regressor is 1. `null` (kinds,):
+        1-sigma of the amplitude that the model itself allows, in units of the change.
         """
-        S = estimator.variance
-        # Response of the innovation to a unit change: the signature less what the filter has absorbed.
-        phi = signatures + np.tensordot(estimator.row, self.absorbed, axes=1)
-        self._phi = phi
-        v = estimator.innovation
-        likeliest = int(self.statistic.argmax())
-        residual = v - float(phi[likeliest] @ self.amplitude[likeliest])
-        self.squared_residual = residual * residual / S
+        S, v = estimator.variance, estimator.innovation
+        regressor, effect = regressors[self.kind], effects[self.kind]
+        # response of the innovation to a unit change: the signature less what the filter has absorbed
+        absorbed = np.tensordot(estimator.row, self.absorbed, axes=1)
+        phi = (regressor - self.start)[:, None] * effect + absorbed
+        residual = v - np.sum(phi * self.amplitude, axis=1)
+        self.squared_residual = float(residual[self.log_ratio.argmax()]) ** 2 / S
+        begins = self._begin(time, residual / estimator.sigma)
+        self.start = np.where(begins & self._since_onset, regressor, self.start)
+        self.signature = (regressor - self.start)[:, None] * effect
+        self._phi = phi = np.where(begins[:, None], self.signature, phi)
         if self._dof:
             S = max(S, (v / MAX_INNOVATION_SIGMA) ** 2)
         else:
             squared = min(v * v / S, MAX_SQUARED_INNOVATION)
             self._excess += (squared - self._excess) / EXCESS_NOISE_SAMPLES
             S *= max(1.0, self._excess)
-        # Exponential forgetting of old evidence.
+        # exponential forgetting of old evidence
         if self._keep < 1.0:
             self._M *= self._keep
             self._y *= self._keep
             self._squares *= self._keep
             self._samples *= self._keep
-        # Information of each row's amplitude: M = sum phi phi^T / S, y = sum phi v / S.
+        # information of each row's amplitude: M = sum phi phi^T / S, y = sum phi v / S
         self._M += phi[:, :, None] * phi[:, None, :] / S
-        self._energy += signatures[:, :, None] * signatures[:, None, :]
-        self._mean += (signatures - self._mean) / self.count[:, None]
+        self._energy += self.signature[:, :, None] * self.signature[:, None, :]
         self._y += phi * (v / S)
         self._squares += v * v / S
         self._samples += 1.0
-        self.amplitude, self.statistic = self._mixture(np.ones(len(phi)))
+        self.amplitude, self.log_ratio = self._mixture(np.ones(len(phi)))
+        self.statistic = self.log_ratio
         if null is not None:
             # what the model allows of one kind may look like a change of another kind
-            allowed = self._mixture(null * null)[1].reshape(-1, len(RESTART_PERIODS)).max(axis=0)
-            self.statistic = self.statistic - np.tile(allowed, len(phi) // len(RESTART_PERIODS))
+            allowed = self._mixture(null[self.kind] ** 2)[1].reshape(len(null), -1).max(axis=0)
+            self.statistic = self.log_ratio - np.tile(allowed, len(null))
         return float(self.statistic.max())
+
+    def _begin(self, time: float, residual: FloatArray) -> BoolArray:
+        """Restart the onsets whose period is over; return which rows those are (rows,).
+
+        `residual` (rows,) is what each row leaves of the innovation, normalised.
+        """
+        self.count += 1
+        # an onset is replaced after its period, unless its change is likely; an innovation that no change
+        # explains begins a new onset at once in the shortest period
+        unpromising = self.log_ratio < PROMISING_LOG_RATIO
+        outstanding = (np.abs(residual) > OUTSTANDING_SIGMA) & (self._period == RESTART_PERIODS[0])
+        begins = ((self.count > self._period) | outstanding) & unpromising
+        if begins.any():
+            for evidence in (self._M, self._energy, self._y, self._squares, self._samples):
+                evidence[begins] = 0.0
+            self.absorbed[:, begins] = 0.0
+            self.onset[begins], self.count[begins] = time, 1
+        return np.asarray(begins)
 
     def _mixture(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return amplitudes (rows, 3) and L (rows,) for amplitudes of variance `prior` (rows,)."""
@@ -205,7 +222,12 @@ class SequentialTest:
         explained = float(self._y[row] @ self.amplitude[row])
         return (float(self._squares[row]) - explained) / max(float(self._samples[row]), 1.0)
 
-    def variation(self, row: int) -> float:
-        """Return the root mean square about its mean of what a row's change adds to the residual."""
-        constant = float(self._mean[row] @ self.amplitude[row])
-        return float(np.sqrt(max(self.rms(row) ** 2 - constant * constant, 0.0)))
+    def competing(self, distance: float) -> tuple[list[int], FloatArray]:
+        """Return the rows whose L is within `distance` of the largest, likeliest first, and their weights.
+
+        The weights are the posterior probabilities of these rows, if all were equally likely before.
+        """
+        order = np.argsort(-self.log_ratio, kind="stable")
+        rows = order[self.log_ratio[order] > self.log_ratio[order[0]] - distance]
+        weights = np.exp(self.log_ratio[rows] - self.log_ratio[rows[0]])
+        return rows.tolist(), np.asarray(weights / weights.sum())

@@ -19,15 +19,15 @@ that fit.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from math import exp, isfinite, nan
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Noise
 from magbridge.estimation.kalman import KalmanFilter
-from magbridge.estimation.sequential import RESTART_PERIODS, SequentialTest
+from magbridge.estimation.sequential import SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
 from magbridge.health.messages import Messages
 
@@ -72,6 +72,8 @@ MAX_LOG_ROUGHNESS: Final = 5.0
 """How the logarithm of the crust's roughness follows a normalised squared innovation; its bounds."""
 ERROR_KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
 DEGENERATE_NT: Final = 1e-6
+SCALE_GAIN: Final = 0.02
+"""Smallest scale of a mass's effect, nT, and by how much the scale follows a sample."""
 
 
 class TestedSample(NamedTuple):
@@ -121,7 +123,9 @@ class ConsistencyCheck:
         )  # fmt: skip
         self._noise2 = noise.sensor**2
         self._masses = masses
-        self._test = SequentialTest(4 + masses, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
+        # offset and gain act as they are; temperature and drift by their change since the onset
+        since_onset = [False, True, True, False] + [False] * masses
+        self._test = SequentialTest(since_onset, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
         self._log_roughness, self._straight_samples = 0.0, 0
         self._course = nan
         self._scale = np.full(masses, np.nan)
@@ -131,7 +135,6 @@ class ConsistencyCheck:
         """Discard all evidence, as with another calibration."""
         self._filter = KalmanFilter(np.zeros(TRACK_STATES), self._process.initial)
         self._test.restart()
-        self._start = np.zeros(len(self._test.kind))  # regressor of each row at its onset
         self._time_us, self._due_us, self._level = 0, 0, 0.0
         self._pending: deque[TestedSample] = deque(maxlen=MAX_PENDING)
         self._outliers = 0
@@ -187,15 +190,16 @@ class ConsistencyCheck:
         if 0 < self._outliers < AGREEING and not self.is_wrong:
             return
         # test the innovation before the filter absorbs it
-        begins = self._test.begin(1e-6 * time_us, normalised)
-        f = self._signatures(1e-6 * time_us, unit, mass_changes, begins)
-        systematic = max(sigma * sigma - self._noise2, 0.0) ** 0.5
-        largest = self._test.test(self._filter, f, self._null(systematic))
+        seconds_now = 1e-6 * time_us
+        regressors = np.array([1.0, self._temperature, seconds_now / 3600.0] + [1.0] * (1 + self._masses))
+        effects = self._effects(np.array(unit), np.array(mass_changes))
+        null = self._null(max(sigma * sigma - self._noise2, 0.0) ** 0.5)
+        largest = self._test.test(self._filter, seconds_now, regressors, effects, null)
         self._learn_roughness(self._test.squared_residual, np.array(unit))
         self._test.update(self._filter.update())
         self._decide(largest, sigma)
 
-    def _learn_roughness(self, squared: float, unit: Any) -> None:
+    def _learn_roughness(self, squared: float, unit: FloatArray) -> None:
         """Update the crustal field's curvature from the innovations while the attitude stays the same."""
         # straight legs alone: at a turn, an error of the calibration looks like roughness
         turned = float(np.abs(unit - self._last_unit).max())
@@ -205,42 +209,30 @@ class ConsistencyCheck:
             self._log_roughness += ADAPTATION * (min(squared, MAX_CONSISTENCY_SQUARE) - 1.0)
             self._log_roughness = min(max(self._log_roughness, -MAX_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
 
-    def _null(self, systematic: float) -> Any:
-        """Return the amplitude (rows,) that the calibration's own uncertainty (nT) allows."""
+    def _null(self, systematic: float) -> FloatArray:
+        """Return the amplitude (kinds,) that the calibration's own uncertainty (nT) allows."""
         # no drift and no temperature effect belong to the null hypothesis
         units = [OFFSET_NT, np.inf, np.inf, GAIN_NT, *np.maximum(np.nan_to_num(self._scale), DEGENERATE_NT)]
-        return np.repeat(np.minimum(systematic / np.array(units), 1.0), len(RESTART_PERIODS))
+        return np.minimum(systematic / np.array(units), 1.0)
 
-    def _signatures(
-        self, time: float, unit: tuple[float, float, float], mass_changes: Sequence[float], begins: Any
-    ) -> Any:
-        """Return the change of the total field with one unit of each row's error, (rows, 3), nT."""
-        x, y, z = unit
-        onsets = len(RESTART_PERIODS)
-        u = np.array([x, y, z])
-        f = np.zeros((len(self._start), 3))
-        regressors = np.repeat([0.0, self._temperature, time / 3600.0], onsets)
-        part = slice(0, 3 * onsets)
-        self._start[part] = np.where(begins[part], regressors, self._start[part])
-        since = regressors - self._start[part]
-        # signatures of the module, in the unit of each error
-        f[:onsets] = OFFSET_NT * u
-        f[onsets : 2 * onsets] = PER_DEGREE_NT * since[onsets : 2 * onsets, None] * u
-        f[2 * onsets : 3 * onsets] = DRIFT_NT_PER_H * since[2 * onsets :, None] * u
-        f[3 * onsets : 4 * onsets] = GAIN_NT * np.array([x * x, y * y, x * y])
-        for k, change in enumerate(mass_changes):
-            f[(4 + k) * onsets : (5 + k) * onsets, 0] = change
-            before = self._scale[k]
-            self._scale[k] = abs(change) if np.isnan(before) else 0.98 * before + 0.02 * abs(change)
-        self._last_signatures = f
-        return f
+    def _effects(self, u: FloatArray, mass_changes: FloatArray) -> FloatArray:
+        """Return the change of the total field with one unit of each kind's regressor, (kinds, 3), nT."""
+        effects = np.zeros((4 + self._masses, 3))
+        # effects of the module, in the unit of each error
+        effects[:3] = np.outer([OFFSET_NT, PER_DEGREE_NT, DRIFT_NT_PER_H], u)
+        effects[3] = GAIN_NT * np.array([u[0] * u[0], u[1] * u[1], u[0] * u[1]])
+        if self._masses:
+            effects[4:, 0] = mass_changes
+            size = np.abs(mass_changes)
+            self._scale += np.where(np.isnan(self._scale), np.nan, SCALE_GAIN * (size - self._scale))
+            self._scale = np.where(np.isnan(self._scale), size, self._scale)
+        return effects
 
     def _decide(self, largest: float, sigma: float) -> None:
         """Begin or end an alarm, and weigh the errors that fit."""
-        statistic = self._test.statistic
-        best = int(np.argmax(statistic))
-        # the part that does not vary is not distinguished from the reference's own error
-        size = self._test.variation(best)
+        test = self._test
+        rows, weights = test.competing(COMPETING_LOG_RATIO)
+        size = test.rms(rows[0])
         # an error that sigma covers is not an alarm, nor is one while the crust's roughness is not known
         matters = size > sigma and self._straight_samples >= MIN_STRAIGHT_SAMPLES
         if self.is_wrong:
@@ -250,23 +242,14 @@ class ConsistencyCheck:
         self._variance = 0.0
         if not self.is_wrong:
             return
-        # posterior weights of the errors and onsets that compete
-        rows = np.flatnonzero(statistic > largest - COMPETING_LOG_RATIO).tolist()
-        shares = [exp(float(statistic[row]) - largest) for row in rows]
-        self._variance = self._mixture_variance(rows, shares)
-        kind = ERROR_KINDS[min(int(self._test.kind[best]), len(ERROR_KINDS) - 1)]
+        # second moment of the error at the present attitude, over the errors and onsets that compete
+        for row, weight in zip(rows, weights.tolist(), strict=True):
+            f = test.signature[row]
+            error = float(f @ test.amplitude[row])
+            self._variance += weight * (error * error + float(f @ test.covariance(row) @ f))
+        kind = ERROR_KINDS[min(int(test.kind[rows[0]]), len(ERROR_KINDS) - 1)]
         text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind} wrong"
         self._messages.report("consistency", text)
-
-    def _mixture_variance(self, rows: list[int], shares: list[float]) -> float:
-        """Return the variance (nT²) of the error of the tested sample, over the errors that fit."""
-        variance, total = 0.0, sum(shares)
-        for row, share in zip(rows, shares, strict=True):
-            f = self._last_signatures[row]
-            # second moment of the error at the present attitude: mean squared and covariance
-            error = float(f @ self._test.amplitude[row])
-            variance += share / total * (error * error + float(f @ self._test.covariance(row) @ f))
-        return variance
 
     def variance(self) -> float:
         """Return the variance (nT²) to add to that of samples like the last one that was tested."""

@@ -31,9 +31,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import TEMPERATURE
-from magbridge.estimation.sequential import ALARM_LOG_RATIO, RESTART_PERIODS, SequentialTest
+from magbridge.estimation.sequential import ALARM_LOG_RATIO, SequentialTest
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.model import LearnedTerms
 from magbridge.learning.samples import Observation
@@ -141,25 +141,21 @@ class ChangeDetector:
             AlarmCause("clock_offset", "", None),
             AlarmCause("map_error", "", None),
         ]
-        # each cause has a row for each onset, in the order of the sequential test
-        self._causes = [cause for cause in causes for _ in RESTART_PERIODS]
-        names = [cause.name for cause in self._causes]
+        self._causes = causes
+        names = [cause.name for cause in causes]
         self._unit = np.array([CAUSE_UNITS[name] for name in names])
-        self._since_onset = np.array([name not in FROM_ZERO for name in names], float)
         self._no_vector = np.array([name in NO_COEFFICIENT for name in names])
-        self._test = SequentialTest(len(causes), self._states)
-        self.restart()
+        self._test = SequentialTest([name not in FROM_ZERO for name in names], self._states)
+        self._now = 0.0
 
     def restart(self) -> None:
         """Discard all evidence, but keep the estimate of the noise."""
         self._test.restart()
-        self._start = np.zeros(len(self._causes))  # of each row's regressor
-        self._now = 0.0
 
     @property
-    def statistic(self) -> FloatArray:
-        """Log-likelihood ratio L of each row (rows,)."""
-        return self._test.statistic
+    def strength(self) -> float:
+        """Log-likelihood ratio L of the likeliest cause."""
+        return float(self._test.log_ratio.max())
 
     def propagate(self, estimator: Estimator, F: FloatArray, seconds: float) -> None:
         """Propagate the absorbed part by `F` (4, 4), the transition of :meth:`.Estimator.propagate`."""
@@ -167,44 +163,30 @@ class ChangeDetector:
 
     def test(self, estimator: Estimator, signs: Signs) -> LearningAlarm | None:
         """Test the estimator's prediction; return an alarm if a cause exceeds the threshold."""
-        begins = self._test.begin(signs.time, estimator.residual / estimator.sigma)
-        largest = self._test.test(estimator.filter, self._signatures(signs, begins))
+        self._now = signs.time
+        now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
+        # each cause adds its regressor times the derivative by the offset of each axis; telemetry delay and
+        # level act on the total field alone, not on an axis
+        effects = np.outer(self._unit, signs.offset)
+        effects[self._no_vector] = 0.0
+        effects[self._no_vector, 0] = self._unit[self._no_vector]
+        largest = self._test.test(estimator.filter, signs.time, np.nan_to_num(np.array(now)), effects)
         return self._alarm() if largest > ALARM_LOG_RATIO else None
 
     def updated(self, gain: FloatArray) -> None:
         """Subtract the part that the estimator absorbed in its update with `gain` (n,)."""
         self._test.update(gain)
 
-    def _signatures(self, signs: Signs, begins: BoolArray) -> FloatArray:
-        """Return (rows, 3) residual of one unit of each cause, of which some begin now."""
-        self._now = signs.time
-        now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
-        # each cause adds its regressor times the derivative by the offset of each axis
-        regressor = np.repeat(np.nan_to_num(np.array(now)), len(RESTART_PERIODS))
-        self._start[begins] = regressor[begins]
-        amount = (regressor - self._since_onset * self._start) * self._unit
-        f = amount[:, None] * signs.offset
-        # telemetry delay and level act on the total field alone, not on an axis
-        f[self._no_vector] = 0.0
-        f[self._no_vector, 0] = amount[self._no_vector]
-        return np.asarray(f)
-
-    @property
-    def _fitting(self) -> list[int]:
-        """The rows that fit, the likeliest first."""
-        order = np.argsort(-self.statistic, kind="stable").tolist()
-        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - MAX_CAUSE_LOG_RATIO]
-
     def _alarm(self) -> LearningAlarm:
-        fits = self._fitting
-        best = fits[0]
-        named = list(dict.fromkeys(self._causes[row][:2] for row in fits))
+        test = self._test
+        rows = test.competing(MAX_CAUSE_LOG_RATIO)[0]
+        fitting = list(dict.fromkeys(self._causes[int(test.kind[row])][:2] for row in rows))
         return LearningAlarm(
-            causes=tuple(dict.fromkeys(cause for cause, _ in named)),
-            channels=tuple(channel for _, channel in named),
-            since=float(self._test.onset[best]),
-            size=self._test.rms(best),
-            strength=float(self.statistic[best]),
+            causes=tuple(dict.fromkeys(cause for cause, _ in fitting)),
+            channels=tuple(channel for _, channel in fitting),
+            since=float(test.onset[rows[0]]),
+            size=test.rms(rows[0]),
+            strength=self.strength,
         )
 
     def learned(self) -> tuple[FloatArray, FloatArray] | None:
@@ -212,17 +194,14 @@ class ChangeDetector:
 
         Return None if no coefficient can represent the likeliest cause.
         """
+        rows, weights = self._test.competing(MAX_CAUSE_LOG_RATIO)
         # the likeliest cause decides whether there is anything to learn
-        fits = self._fitting
-        if self._causes[fits[0]].states is None:
+        if self._states_of(rows[0]) is None:
             return None
-        # posterior weights of the causes that fit, all equally likely before
-        share = np.exp(self.statistic[fits] - self.statistic[fits[0]])
-        share /= share.sum()
         by, covariance = np.zeros(self._states), np.zeros((self._states, self._states))
         # moments of the mixture: mean and covariance about it
-        for weight, row in zip(share.tolist(), fits, strict=True):
-            if self._causes[row].states is None:  # it moves no coefficient
+        for weight, row in zip(weights.tolist(), rows, strict=True):
+            if self._states_of(row) is None:  # it moves no coefficient
                 continue
             G, a = self._moves(row), self._test.amplitude[row]
             V = self._test.covariance(row) + np.outer(a, a)
@@ -233,11 +212,15 @@ class ChangeDetector:
     @property
     def misfit(self) -> float:
         """Mean normalised square that the likeliest cause does not explain."""
-        return self._test.misfit(self._fitting[0])
+        return self._test.misfit(int(self._test.log_ratio.argmax()))
+
+    def _states_of(self, row: int) -> IndexArray | None:
+        return self._causes[int(self._test.kind[row])].states
 
     def _moves(self, row: int) -> FloatArray:
         """Return (n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
-        cause, unit, start = self._causes[row], float(self._unit[row]), float(self._start[row])
+        kind, start = int(self._test.kind[row]), float(self._test.start[row])
+        cause, unit = self._causes[kind], float(self._unit[kind])
         G = self._test.absorbed[:, row].copy()
         assert cause.states is not None
         # a drift has moved the offset since its onset, and goes on with its slope
@@ -247,7 +230,7 @@ class ChangeDetector:
             return np.asarray(G)
         # step or coefficient: what was absorbed (Xi), and the cause itself
         G[cause.states, range(3)] += unit
-        if self._since_onset[row]:
+        if cause.name not in FROM_ZERO:
             # the regressor counts from the onset, the coefficient from its origin
             G[self._offsets, range(3)] -= unit * (start - self._origin(cause.channel))
         return np.asarray(G)

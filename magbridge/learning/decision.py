@@ -387,7 +387,7 @@ class Decision:
     def _take_up(self, knowledge: Knowledge) -> None:
         """Learn the cause of the alarm, if coefficients can represent it, on trial."""
         bank, alarm = knowledge.bank, self._standing.alarm
-        strength = float(knowledge.detector.statistic.max())
+        strength = knowledge.detector.strength
         if strength < GONE:
             self.gone(knowledge)
             return
