@@ -156,6 +156,7 @@ def attempt(
             problem, model, fit, held_out(settled, blocks, fit, groups=day), dropped
         )
     calibration = with_map_error(settled, model, fit, calibration)
+    calibration = with_level_change(problem, calibration)
     calibration = _covering(problem, calibration, error, [counts, counts & (out.fold == out.fold.max())])
     if model and not any(isinstance(effect, TimeEffect) for c in model for effect in c.effects):
         # Forward chaining: the second half by a fit of the first, as a later log will be corrected
@@ -224,12 +225,7 @@ def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
     calibration's own coefficients alone: the effects of the causes are not limited.
     """
     calibration = problem.calibration
-    K = calibration.coefficients.size
-    own = replace(
-        calibration,
-        coefficients=extension.calibration.coefficients[:K],
-        covariance=extension.calibration.covariance[:K, :K],
-    )
+    own, K = _own_part(calibration, extension.calibration), calibration.coefficients.size
     step = max(1, len(problem) // (MAX_DOMAIN_SAMPLES // 7))
     samples, coefficients = samples_of(problem.survey, calibration)
     _, moved_coefficients = samples_of(problem.survey, own)
@@ -328,6 +324,34 @@ def _covering(
     if excess <= 0.0 or not s.any():
         return calibration
     return replace(calibration, covariance=calibration.covariance + excess * np.outer(s, s))
+
+
+def _own_part(given: Calibration, extended: Calibration) -> Calibration:
+    """Return the calibration as given with the coefficients that the extension moved, without new effects."""
+    K = given.coefficients.size
+    return replace(given, coefficients=extended.coefficients[:K], covariance=extended.covariance[:K, :K])
+
+
+def with_level_change(problem: Problem, extended: Calibration) -> Calibration:
+    r"""Return the extended calibration with the changes of the field's level between logs in its covariance.
+
+    Notes
+    -----
+    Where the calibration's own coefficients move the mean of the corrected field by m, beyond the sigma as
+    given, the level differs from log to log: a reference without the crustal field does that. With the
+    variance ``v = m^2 - sigma^2`` of each log, this log and a later one differ by 2 v,
+
+    .. math:: C \leftarrow C + 2 \max(0, m^2 - \overline{\sigma^2})\, s s^T
+    """
+    fresh = ~problem.survey.learned
+    given, moved = (
+        corrected(problem.survey, one)
+        for one in (problem.calibration, _own_part(problem.calibration, extended))
+    )
+    change = float(np.mean((moved.total - given.total)[fresh]))
+    variance = 2.0 * max(0.0, change**2 - float(np.mean(given.sigma[fresh] ** 2)))
+    s = isotropic(extended)
+    return replace(extended, covariance=extended.covariance + variance * np.outer(s, s))
 
 
 def fit_without(

@@ -9,8 +9,9 @@ import pytest
 from posed import calibrated, surveyed, walk
 from scipy.stats import multivariate_normal
 
+from magbridge.diagnose.improvement import corrected, with_level_change
 from magbridge.diagnose.joint import Joint, fit_joint, held_out
-from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.problem import Problem, isotropic, pose
 from magbridge.diagnose.survey import MAX_LAG
 
 DIVES = 5
@@ -82,3 +83,17 @@ def test_what_acts_in_one_dive_only_is_not_a_surprise_that_counts_against_it(pro
     with_it, without = (held_out(posed, some, fit_joint(posed, some, 1)) for some in (columns, []))
     assert with_it.score > without.score
     assert np.std(with_it.residual[once[:, 0] > 0]) < 3.0
+
+
+@pytest.mark.parametrize(("change", "sigma"), [(60.0, 2.0**0.5 * 60.0), (0.5, 0.0)])
+def test_a_level_that_moved_beyond_its_sigma_may_move_as_much_again(
+    problem: Problem, change: float, sigma: float
+) -> None:
+    given = problem.calibration
+    extended = replace(given, coefficients=given.coefficients + change * isotropic(given))
+    before, after = (
+        corrected(problem.survey, one) for one in (extended, with_level_change(problem, extended))
+    )
+    np.testing.assert_array_equal(before.total, after.total)
+    added = np.sqrt(np.mean(after.sigma**2 - before.sigma**2))
+    assert added == pytest.approx(sigma, rel=0.1)
