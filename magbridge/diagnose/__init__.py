@@ -9,7 +9,7 @@ calibration and the estimation library, and must not depend on the bridge or on 
    parameters.
 3. :mod:`.joint` fits calibration, effects and :mod:`.noise` together. :mod:`.evidence` weighs one candidate,
    :mod:`.state` all of them in a round, and :mod:`.search` adds cause after cause and exchanges them for
-   their :mod:`.alternatives`.
+   their competing hypotheses.
 4. :mod:`.leftover` describes the remaining signal, or all of it, without a name, by :mod:`.descriptions` and
    :mod:`.packets`; names must be likelier.
 5. :mod:`.extend` adds the named causes to a calibration; :mod:`.improvement` corrects held-out dives with it.

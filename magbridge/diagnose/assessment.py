@@ -13,7 +13,6 @@ from scipy.stats import chi2
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
@@ -28,6 +27,7 @@ from magbridge.diagnose.problem import (
     derivatives,
     samples_of,
 )
+from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.diagnose.texts import label, measured, names_of, series_of
 from magbridge.diagnostics import CONDITION_CODES, Diagnostic, number, write_text
 from magbridge.estimation.residual import residuals, residuals_of, rms
@@ -112,7 +112,7 @@ def delays(problem: Problem, fit: Joint) -> Delays | None:
     covariance = AXIS_DELAY_SIGMA_S**2 * to_x @ fit.covariance[np.ix_(places, places)] @ to_x.T
     if chi2.sf(later @ np.linalg.solve(covariance, later), later.size) >= FALSE_ALARM_RATE:
         return None
-    taken = float(np.std(problem.straight(fit.z) - problem.residual))
+    taken = float(np.std(problem.delay_jacobian @ fit.z[DELAYS]))
     return Delays(later, np.sqrt(np.diag(covariance)), taken)
 
 
@@ -395,10 +395,7 @@ def useful(diagnosis: Diagnosis) -> Diagnostic | None:
 
 
 def _against(
-    diagnosis: Diagnosis,
-    noted: Sequence[Sequence[Diagnostic]],
-    shift: Level | None,
-    track: Returns | None,
+    diagnosis: Diagnosis, noted: Sequence[Sequence[Diagnostic]], shift: Level | None, track: Returns | None
 ) -> Iterator[Diagnostic]:
     """Yield the reasons against use, which a reviewer must resolve; `noted` has the notes of each finding."""
     survey, rest = diagnosis.problem.survey, diagnosis.unexplained

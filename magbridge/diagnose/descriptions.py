@@ -252,18 +252,6 @@ def _heat(candidate: Candidate) -> Literal["offset", "scale"] | None:
     return next((effect.on for effect in soaked), None)
 
 
-def _soaks(*, scales: bool) -> Callable[[Candidate], bool]:
-    return lambda candidate: _heat(candidate) == ("scale" if scales else "offset")
-
-
-def _moves(masses: set[str]) -> Callable[[Candidate], bool]:
-    """Return the question whether a candidate adds to what the calibration's `masses` masses do."""
-    return lambda candidate: any(
-        isinstance(effect, LegendreEffect) or (isinstance(effect, PathEffect) and effect.channel in masses)
-        for effect in candidate.effects
-    )
-
-
 def _bends(candidate: Candidate) -> bool:
     return any(isinstance(effect, ResponseEffect) and effect.power for effect in candidate.effects)
 
@@ -275,60 +263,62 @@ def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) ->
     strongest, where tones are not among the causes.
     """
     return [
-        *_in_time(problem, fit),
+        *_in_time(problem, fit, tone),
         *_of_reading(problem),
         *_of_channels(problem),
         *_of_attitude(problem),
-        *_repeating(problem, fit, tone),
     ]
 
 
-def _in_time(problem: Problem, fit: Joint) -> list[Description]:
-    """Return slow curves in body axes and along the field, a constant, a passing source."""
-    time = problem.survey.time
-    whole = max(float(time[-1] - time[0]), 1.0)
-    constant = problem.reference_jacobian * ~problem.survey.learned
+def _in_time(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Description]:
+    """Return slow curves, a constant, passages, what each dive repeats, oscillations that end, a tone."""
+    time, dive, field = problem.survey.time, problem.survey.dive, problem.reference_jacobian
+    constant = field * ~problem.survey.learned
+    turn = np.exp(1j * np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1.0))
 
     def waves(count: int) -> Columns:
-        return lambda rows: (
-            np.stack(powers(np.exp(1j * np.pi * (time[rows] - time[0]) / whole), count)).real.T
-        )
+        return lambda rows: np.stack(powers(turn[rows], count)).real.T
 
     passing, times = passage(problem, fit)
-    return [
-        Description(_along_axes(problem, waves(BODY)), spectra(BODY, 3), turned=True),
+    listed = [
+        _in_body(problem, waves(BODY))._replace(widths=spectra(BODY, 3)),
         Description(
-            lambda rows: problem.reference_jacobian[rows, None] * waves(EARTH)(rows),
+            lambda rows: field[rows, None] * waves(EARTH)(rows),
             (*spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _description(
-            "drift", lambda rows: constant[rows, None], 1.0, holds=lambda one: one.about == "constant"
+        _described(
+            lambda rows: constant[rows, None], "drift", 1.0, holds=lambda one: one.about == "constant"
         ),
-        _description("transient", passing, look_elsewhere=times),
+        _described(passing, "transient", look_elsewhere=times),
     ]
+    if np.ptp(dive):
+        listed.append(_in_body(problem, repeated(problem)))
+    rings = packets(problem, fit)
+    if rings is not None:
+        count, period = rings.look_elsewhere, rings.period
+        listed.append(_described(rings.columns, "tone", look_elsewhere=count, period=period))
+    if tone is not None:
+        count, period = tone.look_elsewhere, tone.point.shape["period"][0]
+        listed.append(_described(tone.columns, "tone", 1.0, look_elsewhere=count, period=period))
+    return listed
 
 
 def _of_reading(problem: Problem) -> list[Description]:
     """Return functions of the field's direction, its rates and each axis' reading; one common delay."""
-    rates = field_rates(problem)
+    rate = field_rates(problem)
 
     def body(rows: slice) -> FloatArray:
         return -problem.jacobian[rows, 6:]
 
     listed = [
-        _description("broadband", direction(body), holds=_bends, wider=True),
-        _description(
-            "broadband", _along_axes(problem, lambda rows: rates[:, rows].T), 1.0,
-            holds=_is(RateEffect), turned=True,
-        ),
-        Description(
-            response(problem.reading, body), bends(), holds=_bends, wider=True
-        ),
-        _description("broadband", crossing(problem.reading, body)),
-    ]  # fmt: skip
+        _described(direction(body), holds=_bends, wider=True),
+        _in_body(problem, lambda rows: rate[:, rows].T, width=1.0, holds=_is(RateEffect)),
+        Description(response(problem.reading, body), bends(), holds=_bends, wider=True),
+        _described(crossing(problem.reading, body)),
+    ]
     if problem.calibration.parameters:
         late = effect_columns(problem, ClockEffect(), mass_rates(problem))
-        listed.append(_description("broadband", late, 1.0, holds=_is(ClockEffect)))
+        listed.append(_described(late, width=1.0, holds=_is(ClockEffect)))
     return listed
 
 
@@ -337,26 +327,31 @@ def _of_channels(problem: Problem) -> list[Description]:
 
     Late, as heat soaks into a hull: an offset, or a sensitivity.
     """
-    own = {parameter.name for parameter in problem.calibration.parameters}
-    listed = []
-    for name, channel in problem.survey.channels.items():
-        if name not in problem.survey.still:
-            held = _moves(own) if name in own else _is()
-            now, before = curve(channel.values), hysteresis(channel.values)
-            listed += [
-                _description("broadband", _along_axes(problem, now), channel=name, turned=True, holds=held),
-                _description(
-                    "broadband", _along_axes(problem, before), channel=name, turned=True, remembers=True
-                ),
-            ]
-            late = delayed(problem.survey.time, channel.values)
-            for scales in (False, True):
-                columns = _along_axes(problem, late, scales=scales)
-                held = _soaks(scales=scales) if "temperature" in channel.kinds else _is()
-                more = _description(
-                    "broadband", columns, channel=name, turned=True, scales=scales, holds=held
-                )
-                listed.append(more)
+    masses = {parameter.name for parameter in problem.calibration.parameters}
+    survey, listed = problem.survey, []
+
+    def moves(candidate: Candidate) -> bool:
+        """Return True if a candidate adds to what the calibration's masses do."""
+        return any(
+            isinstance(e, LegendreEffect) or (isinstance(e, PathEffect) and e.channel in masses)
+            for e in candidate.effects
+        )
+
+    for name, channel in survey.channels.items():
+        if name in survey.still:
+            continue
+        now, before = curve(channel.values), hysteresis(channel.values)
+        late, warm = delayed(survey.time, channel.values), "temperature" in channel.kinds
+        listed += [
+            _in_body(problem, now, channel=name, holds=moves if name in masses else _is()),
+            _in_body(problem, before, channel=name, remembers=True),
+            _in_body(problem, late, channel=name, holds=lambda c, w=warm: w and _heat(c) == "offset"),
+            _in_body(
+                problem, late, scales=True, channel=name, holds=lambda c, w=warm: w and _heat(c) == "scale"
+            ),
+        ]
+    if "depth" in survey.channels and "depth" not in survey.still:
+        listed.append(_in_body(problem, near_surface(survey.time, survey.channels["depth"].values)))
     return listed
 
 
@@ -368,39 +363,15 @@ def _of_attitude(problem: Problem) -> list[Description]:
     time, angles = problem.survey.time, np.unwrap(np.radians(problem.survey.attitude.T))
     roll, pitch = angles[:2]
     for down in (-np.sin(pitch), np.sin(roll) * np.cos(pitch)):
-        listed += [
-            _description("broadband", _along_axes(problem, curve(down)), turned=True),
-            _description("switching", _along_axes(problem, lower_end(down)), turned=True),
-        ]
-    for angle in angles:
-        swung = swings(time, rates(problem.survey, angle[None])[0])
-        listed.append(_description("broadband", _along_axes(problem, swung), turned=True))
-    return listed
+        listed += [_in_body(problem, curve(down)), _in_body(problem, lower_end(down), kind="switching")]
+    rate = rates(problem.survey, angles)
+    return [*listed, *(_in_body(problem, swings(time, one)) for one in rate)]
 
 
-def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Description]:
-    """List what the surface does, what each dive repeats, oscillations of limited duration, and a tone."""
-    survey, listed = problem.survey, []
-    if "depth" in survey.channels and "depth" not in survey.still:
-        above = near_surface(survey.time, survey.channels["depth"].values)
-        listed.append(_description("broadband", _along_axes(problem, above), turned=True))
-    if np.ptp(survey.dive):
-        listed.append(_description("broadband", _along_axes(problem, repeated(problem)), turned=True))
-    rings = packets(problem, fit)
-    if rings is not None:
-        listed.append(
-            _description("tone", rings.columns, look_elsewhere=rings.look_elsewhere, period=rings.period)
-        )
-    if tone is not None:
-        period = tone.point.shape["period"][0]
-        listed.append(
-            _description("tone", tone.columns, 1.0, look_elsewhere=tone.look_elsewhere, period=period)
-        )
-    return listed
-
-
-def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
-    """Return each function of `basis` along each body axis; with `scales`, times that axis' reading."""
+def _in_body(
+    problem: Problem, basis: Columns, *, scales: bool = False, kind: str = "broadband", **more: Any
+) -> Description:
+    """Describe a field by each function of `basis` along each body axis; with `scales`, times its reading."""
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)
@@ -409,8 +380,9 @@ def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Co
             axes = axes * problem.reading.T[:, rows] / problem.calibration.reference.field
         return (part.T[:, None] * axes).reshape(-1, len(part)).T
 
-    return columns
+    return _described(columns, kind, turned=True, scales=scales, **more)
 
 
-def _description(kind: str, columns: Columns, width: float = 30.0, **more: Any) -> Description:
+def _described(columns: Columns, kind: str = "broadband", width: float = 30.0, **more: Any) -> Description:
+    """Return a description whose coefficients are all as large."""
     return Description(columns, ((kind, np.full(size_of(columns), width)),), **more)

@@ -10,7 +10,6 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import ODDS, Hypothesis, Isolability
@@ -19,6 +18,7 @@ from magbridge.diagnose.leftover import Leftover, far_from_white
 from magbridge.diagnose.observed import Seen, memory, seen
 from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.search import Outliers, SearchOutcome
+from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.estimation.residual import rms
 
 MIN_RMS_REDUCTION = 0.01

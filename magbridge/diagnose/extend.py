@@ -203,11 +203,10 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
 
 
 def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list[int]]:
-    """Drop the rates of change and the delays that make the live correction worse.
+    """Drop the rates and delays that make the live correction worse; return the calibration and their places.
 
     In flight the next sample is not known yet, so a rate is a backward difference, which is mostly noise if
-    the vehicle sways from sample to sample. Returned are the calibration without those effects, and their
-    places among the effects that it was given with.
+    the vehicle sways from sample to sample.
     """
     dropped: list[int] = []
     # Greedy: each rate is dropped if the residual with live differences is smaller without it

@@ -276,26 +276,14 @@ def fit_joint(
     brief: bool = False,
     stride: int = 1,
 ) -> Joint:
-    """Maximise the joint likelihood of calibration, effects and noise.
+    """Maximise the joint likelihood of calibration, effects and noise in at most so many `rounds`.
 
-    Parameters
-    ----------
-    problem, columns, order, rounds
-        The comparison, the k columns of the effects, the order of the noise's autoregression, most rounds.
-    *starts : (q + k,) array
-        Starting points, of which the best is taken; without any, the prior mean.
-    plain : bool
-        Try the result of plain least squares as a starting point, too.
-    spectra : sequence of (l, k) array or None
-        For each of `columns` whose coefficients have one common size: l alternatives for their variances.
-    like : Joint, optional
-        A fit of similar noise, from which this one's begins: saves time.
-    blocks, brief : bool, optional
-        See :func:`~magbridge.diagnose.noise.fit_noise`.
-    ridge : float or (k,) array
-        Prior precision of the effects, in units of their widths.
-    stride : int
-        Pieces of the log of which one counts in the normal equations; the noise is that of every sample.
+    The best of the `starts` (q + k,) is taken, among them the result of plain least squares if `plain`. The k
+    columns of the effects have the prior precision `ridge`, in units of their widths; those with `spectra`
+    (l, k) have one common size and l alternatives for their variances. The noise is an autoregression of this
+    `order`, begins from that of a fit that it will be `like`, and has the `blocks` and the `brief` memory of
+    :func:`~magbridge.diagnose.noise.fit_noise`. Of the log's pieces, one in `stride` counts in the normal
+    equations; the noise is that of every sample.
     """
     # Coefficients c = (z, b): the calibration's, then the effects'. Prior precision 1 for z, `ridge` for b
     X = JointDesign(problem, precomputed(len(problem), columns))

@@ -18,7 +18,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.columns import Candidate, Columns, places
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
@@ -27,6 +26,7 @@ from magbridge.diagnose.noise import ResidualNoise, fit_noise
 from magbridge.diagnose.observed import Memory, memory
 from magbridge.diagnose.problem import Problem, row_blocks
 from magbridge.diagnose.search import Outliers
+from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.estimation.residual import rms, robust_scale
 
 MAX_TESTED_COEFFICIENTS = 6
@@ -173,18 +173,10 @@ def leftover(
     but: Sequence[Candidate] = (),
     also: Sequence[Description] = (),
 ) -> Leftover | None:
-    """Test whether `model` leaves anything unexplained; return the best description by evidence, or None.
+    """Test whether the fit of `model` leaves anything unexplained; return the best description, or None.
 
-    Parameters
-    ----------
-    problem, model, fit
-        The model that was found.
-    tone : Candidate, optional
-        The strongest tone, where tones are not among the causes.
-    but : sequence of Candidate
-        Causes whose own regressors the description may not contain.
-    also : sequence of Description
-        Further descriptions.
+    A description may not only repeat the regressors of the causes in `but`; those in `also` are tried as
+    well, and `tone`, the strongest one, where tones are not among the causes.
     """
     # Descriptions that only repeat an excluded cause's own regressors are no alternatives
     listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]

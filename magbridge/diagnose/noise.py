@@ -209,21 +209,15 @@ class Predictors:
 def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
     """Return (reach + 1,) C of an autoregression whose innovations have variance 1.
 
-    Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis
-    1991, sec. 5.2).
+    The first p + 1 solve Yule and Walker's equations ``C_i - sum_k a_k C_|i-k| = (i = 0)``, each later one
+    follows from the p before it (Brockwell & Davis 1991, sec. 3.3).
     """
-    # Levinson backwards: from the coefficients of order p to those of order 0
-    p, shorter, variance = len(ar), [ar], 1.0
-    while shorter[-1].size:
-        a = shorter[-1]
-        k = a[-1]
-        shorter.append((a[:-1] + k * a[-2::-1]) / (1.0 - k * k))
-        variance /= 1.0 - k * k
-    # Forwards: each autocovariance from those before it
+    p = len(ar)
+    i, k = np.arange(p + 1)[:, None], np.arange(1, p + 1)
+    A = np.eye(p + 1)
+    np.subtract.at(A, (i, np.abs(i - k)), ar)
     C = np.zeros(max(p, reach) + 1)
-    C[0] = variance
-    for m in range(1, p + 1):
-        C[m] = shorter[p - m] @ C[m - 1 :: -1][:m]
+    C[: p + 1] = np.linalg.solve(A, np.eye(p + 1)[0])
     if reach > p:
         tail = lfiltic([1.0], np.append(1.0, -ar), C[p:0:-1])
         C[p + 1 :] = lfilter([1.0], np.append(1.0, -ar), np.zeros(reach - p), zi=tail)[0]

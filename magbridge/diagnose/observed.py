@@ -80,18 +80,19 @@ class Seen(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """How far from white a residual is."""
+    """How far from white a residual is.
+
+    It has its RMS, and what of that changes from one sample to the next (`white`); the time after which its
+    autocorrelation has fallen to 1/e, s; and the share of its power that is left (`slow`) in so many `means`
+    over `samples` samples.
+    """
 
     rms: float
     white: float
-    """`rms`, `white`: RMS; and what of it changes from one sample to the next."""
     correlation_time: float
-    """Time after which its autocorrelation has fallen to 1/e, s."""
     slow: float
-    """Share of its power that is left in means over :attr:`samples` samples."""
     samples: int
     means: int
-    """`samples`, `means`: samples of a mean, and how many means there are."""
 
     @property
     def lasts(self) -> bool:
@@ -140,7 +141,10 @@ def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = No
     chance = _by_chance(share, q.shape[1] * len(FIELD_AND_AXES), (y - fitted(q, EVERY))[:, None] * axes)
     if min(share, apart) >= MIN_EXPLAINED_FRACTION and len(found) * chance < FALSE_ALARM_RATE:
         return Seen(name, lag, axis(q, share), size, share)
-    waves = _waves(problem.survey.time[part])
+    # Cosines of half waves over the log
+    time = problem.survey.time
+    phase = np.pi * (time[part] - time[0]) / max(float(time[-1] - time[0]), 1e-300)
+    waves = np.cos(phase[:, None] * np.arange(1, WAVES + 1))
     slow = explained(waves)
     return Seen(None, 0.0, axis(waves, slow) if slow * total >= SLOW * float(y @ y) else None, size, share)
 
@@ -165,12 +169,6 @@ def _remembered(e: FloatArray) -> int:
     return int(below[0]) if below.size else len(e)
 
 
-def _waves(time: FloatArray) -> FloatArray:
-    """Return (n, k) cosines of 1 to :data:`WAVES` half waves over the log."""
-    phase = np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1e-300)
-    return np.asarray(np.cos(phase[:, None] * np.arange(1, WAVES + 1)))
-
-
 def _series(problem: Problem, part: slice) -> Iterator[tuple[str, float, FloatArray]]:
     """Yield each series' name, lag, and functions (m, k), about their means."""
     survey = problem.survey
@@ -182,9 +180,8 @@ def _series(problem: Problem, part: slice) -> Iterator[tuple[str, float, FloatAr
                 yield name, lag, _scaled(lagged(survey.time, channel.values, lag)[part])
     yield "time", 0.0, _scaled(survey.time[part])
     if survey.attitude is not None:
-        for name, angle in zip(
-            ("roll", "pitch", "heading"), np.radians(survey.attitude[part].T), strict=True
-        ):
+        angles = np.radians(survey.attitude[part].T)
+        for name, angle in zip(("roll", "pitch", "heading"), angles, strict=True):
             yield name, 0.0, _scaled(np.cos(angle), np.sin(angle))
 
 
@@ -233,18 +230,15 @@ def returns(survey: Survey) -> Returns | None:
     order = np.lexsort((survey.time, cell))
     of, time = cell[order], survey.time[order]
     again = (np.diff(of) == 0) & (np.diff(time) > MIN_RETURN_TIME_S)
-    first, last = (
-        np.searchsorted(of, np.arange(of[-1] + 1)),
-        np.searchsorted(of, np.arange(of[-1] + 1), "right") - 1,
-    )
     passed = np.bincount(of[1:], again, of[-1] + 1) > 0
     x = (time - time.min()) / max(float(np.ptp(time)), 1.0)
     f = np.stack([x, x * x], axis=1)
     f -= f.mean(axis=0)
-    count = np.bincount(of)[:, None]
-    means = np.stack([np.bincount(of, column) for column in f.T], axis=1) / count
+    means = np.stack([np.bincount(of, column) for column in f.T], axis=1) / np.bincount(of)[:, None]
     # Smallest ratio of the power within places to the whole, over all slow curves (generalised eigenvalue)
     within = f - means[of]
     separable = float(eigh(within.T @ within, f.T @ f, eigvals_only=True)[0])
+    first = np.searchsorted(of, np.arange(of[-1] + 1))
+    last = np.append(first[1:], len(of)) - 1
     longest = float(np.max(np.where(passed, time[last] - time[first], 0.0)))
     return Returns(float(np.mean(passed[of])), longest, float(np.clip(separable, 0.0, 1.0)))

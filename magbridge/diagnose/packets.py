@@ -157,18 +157,10 @@ def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
 def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     r"""Find the most likely passage of a distant source, over all durations T, in steps of half a duration.
 
-    Returns
-    -------
-    Columns
-        Of three numbers.
-    look_elsewhere : float
-        Moments that were tried at this duration, times the durations.
-
-    Notes
-    -----
-    Along a straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s
-    the time from its nearest point in units of T, distance over speed (Anderson's functions: Ginzburg,
-    Frumkis & Kaplan 2002, Sens. Actuators A 102:67).
+    Returned are three columns, and the number of moments tried at this duration, times the durations. Along a
+    straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s the time
+    from its nearest point in units of T, distance over speed (Anderson's functions: Ginzburg, Frumkis &
+    Kaplan 2002, Sens. Actuators A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
     # Score and information of each quarter of a duration, then matched filters at all moments

@@ -373,10 +373,6 @@ class Problem:
         noise, J = self.calibration.noise, self.coefficient_jacobian
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J, dtype=float))
 
-    def straight(self, z: FloatArray) -> FloatArray:
-        """Return (n,) residual without what the axes' delays in z (q,) add to it."""
-        return np.asarray(self.residual - self.delay_jacobian @ z[DELAYS])
-
 
 def cached_per_problem(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
     """Cache a function's result for each problem: causes share regressors, of 50 MB for a month."""
@@ -411,18 +407,9 @@ def linearised(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Compute the residual and its derivatives at readings that are moved until the residual vanishes.
 
-    Parameters
-    ----------
-    samples : Samples
-        n samples, with m regressors.
-    coefficients : (9 m,) array
-        Coefficients of all regressors, nT.
-
-    Returns
-    -------
-    (n,), (n, 9), (n,), (n, 3) array
-        Residual (sensor nT), its derivative by the nine coefficients, its derivative by the true field, and
-        the moved readings (nT).
+    Returned are the residual (n,), in the sensor's nT, its derivatives by the nine coefficients (n, 9) and by
+    the true field (n,), and the moved readings (n, 3), nT. The `coefficients` (9 m,) are those of all m
+    regressors.
     """
     n = len(samples.field)
     e, g, reference_jacobian, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))

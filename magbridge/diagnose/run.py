@@ -14,7 +14,6 @@ from magbridge.arrays import BoolArray
 from magbridge.calibration.effects import TimeEffect
 from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.instrument import InterferenceTone
@@ -43,6 +42,7 @@ from magbridge.diagnose.noise import autoregressive_order
 from magbridge.diagnose.observed import memory
 from magbridge.diagnose.problem import Problem, pose, with_slow_noise
 from magbridge.diagnose.search import SearchOutcome, beside_slow_noise, outliers, search
+from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.diagnose.survey import Survey, days_of, load_survey
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid

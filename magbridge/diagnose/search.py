@@ -6,7 +6,7 @@ Candidates are scored (:mod:`.evidence`) under two noises: that of the model so 
 when the best candidate of every cause is fitted, because the former may have absorbed an effect. The best of
 each cause are then fitted jointly with noise and calibration. The best that passes the test is added, and so
 on while one does. A cause that is found again needs more than one regressor: these become one candidate. Then
-causes are exchanged for competing hypotheses (:mod:`.alternatives`). Last, causes that later findings have
+causes are exchanged for competing hypotheses. Last, causes that later findings have
 made needless are dropped.
 
 Slow noise may have absorbed the joint effect of several causes: then none is significant on its own.
@@ -33,7 +33,6 @@ from scipy.special import gammaln
 from scipy.stats import chi2, rankdata
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.diagnose.alternatives import CompetingHypothesis, exchanged, sets_of
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import (
     CONFOUNDED,
@@ -53,7 +52,14 @@ from magbridge.diagnose.evidence import (
 from magbridge.diagnose.joint import Joint, fit_joint, held_out
 from magbridge.diagnose.noise import BRIEFEST, TAILS, autoregressive_order
 from magbridge.diagnose.problem import Problem, with_slow_noise
-from magbridge.diagnose.state import SearchState, refined, sharpen
+from magbridge.diagnose.state import (
+    CompetingHypothesis,
+    SearchState,
+    competing_hypotheses,
+    exchanged,
+    refined,
+    sharpen,
+)
 from magbridge.estimation.residual import robust_scale
 
 Rival = Callable[[Problem, Sequence[Candidate], Joint, Candidate], float | None]
@@ -242,16 +248,10 @@ def search(
     rival: Rival = no_rival,
     plain: Joint | None = None,
 ) -> SearchOutcome:
-    """Find the causes that the data support under one noise model.
+    """Find the causes, of so many `causes`, that the data support under one noise model.
 
-    Parameters
-    ----------
-    problem, candidates, causes
-        The comparison, the candidates, and the number of causes that they belong to.
-    rival : callable
-        Free descriptions, one of which each further cause must beat on held-out dives.
-    plain : Joint, optional
-        The null without slow noise, where the problem has such.
+    Each further cause must beat a free description, the `rival`, on held-out dives. `plain` is the null
+    without slow noise, where the problem has such.
     """
     # Order of the noise, forward selection with exchanges, backward elimination, competing hypotheses
     rough = fit_joint(problem, [], 1, rounds=2)
@@ -264,7 +264,7 @@ def search(
     chosen, base = _backward_elimination(state, model, base, rival)
     model = [h.candidate for h in chosen]
     info = state.conditional_on(model, base)
-    competing = sets_of(state, info, model, base) if model else ()
+    competing = tuple(competing_hypotheses(state, info, model, base, k) for k in range(len(model)))
     # Akaike's price of the autoregression, which slow noise makes shorter. Coefficients that the residual
     # no longer needs, for example after a step, have each gained only half a unit of log-likelihood by chance
     needed = autoregressive_order(base.residual, problem.survey.slots)
@@ -281,8 +281,20 @@ def beside_slow_noise(
     """Repeat the search of the causes found, with slow noise; return the likelier outcome."""
     noisy, null = with_slow_noise(found.problem), found.null
     slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
-    if slow.log_likelihood <= null.log_likelihood:
+    gain = slow.log_likelihood - null.log_likelihood
+    if gain <= 0.0:
         return found
+    if len(found.chosen) == 1 and len(found.chosen[0].candidate.pieces) == 1 and gain < found.evidence:
+        # Slow noise in place of the one cause is less likely: is it likelier in addition to that cause?
+        fit, columns = found.fit, [candidate.columns for candidate in found.model]
+        start = np.append(np.insert(fit.z, noisy.slow.start, np.zeros(noisy.waves.size)), fit.coefficients)
+        both = fit_joint(
+            noisy, columns, fit.noise.past.order, start, plain=False, like=fit, blocks=fit.noise.uneven,
+            spectra=[candidate.spectra for candidate in found.model],
+            ridge=fit.prior[len(fit.z) :], rounds=2,
+        )  # fmt: skip
+        if both.log_likelihood <= fit.log_likelihood:
+            return found
     return max(found, search(noisy, candidates, causes, rival, null), key=lambda outcome: outcome.evidence)
 
 

@@ -1,4 +1,4 @@
-"""One round of a search: score every cause given a model, fit the likeliest, profile its parameters.
+"""The steps of a search: score every cause given a model, fit the likeliest, profile it, exchange it.
 
 Notes
 -----
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import partial, reduce
 
 import numpy as np
 from scipy.special import fdtrc
@@ -20,9 +20,11 @@ from scipy.special import fdtrc
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.columns import Candidate, Columns, Group, Mixture, join_columns, parts, slices
 from magbridge.diagnose.evidence import (
+    FALSE_ALARM_RATE,
     Best,
     Hypothesis,
     Information,
+    bayes_factor_threshold,
     certainty,
     evidence_of,
     information,
@@ -39,8 +41,11 @@ from magbridge.diagnose.problem import Problem
 
 MAX_SCREENED_SAMPLES = 65_536
 """Samples of a long log, in pieces spread evenly over it, by which a round chooses what it fits to all."""
-JOINTLY_FITTED_CAUSES = 9
-"""Causes that are fitted jointly in a round."""
+JOINTLY_FITTED_CAUSES, WORTH_FITTING = 9, 0.3
+"""Causes that are fitted jointly in a round, at most, and the least score of one, as a fraction of the best's
+log evidence."""
+MAX_EXCHANGES, TRIED = 6, 3
+"""Exchanges at most, and replacements tried in each."""
 COLUMNS, STAGES = 144, 2
 """Number of columns that all values tried within a nonlinear parameter's bracket may have, and number of
 stages: after each the bracket is narrowed to the neighbours of the best value."""
@@ -49,20 +54,10 @@ stages: after each the bracket is narrowed to the neighbours of the best value."
 class SearchState:
     """The problem of one search, its candidates, and quantities of the log.
 
-    Attributes
-    ----------
-    null : Joint
-        The fit without any cause.
-    look_elsewhere : dict
-        Cause -> number of independent hypotheses behind it.
-    certain : dict
-        Group -> degrees of freedom of the noise's level.
-    groups : dict
-        Cause and channel -> places of its candidates.
-    stride : int
-        Pieces of a long log of which one is used to choose what is fitted to all samples.
-    brief : bool
-        Whether noise may be correlated for a short time only: :meth:`with_brief_noise`.
+    `null` is the fit without any cause, `look_elsewhere` the number of hypotheses behind each cause,
+    `certain` the degrees of freedom of the noise's level for each group, and `groups` has the places of the
+    candidates of each cause and channel. One piece of a long log in `stride` chooses what is fitted to all
+    samples. If `brief`, noise is correlated for a short time only.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
@@ -147,8 +142,12 @@ class SearchState:
                 under.setdefault(group, []).append(best)
         # The likeliest of each group are fitted jointly with calibration and noise
         listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
+        least = WORTH_FITTING * max(best.score.evidence for best in listed[0])
+        listed = [
+            won for won in listed[:JOINTLY_FITTED_CAUSES] if max(best.score.evidence for best in won) >= least
+        ]
         # the largest, which take longest, first: then the threads end together
-        tried = sorted(listed[:JOINTLY_FITTED_CAUSES], key=lambda won: -self.candidates[won[0].place].size)
+        tried = sorted(listed, key=lambda won: -self.candidates[won[0].place].size)
         found = in_threads(len(self.problem), partial(self._joint, model, base), tried)
         return sorted(found, key=lambda h: -h.evidence)
 
@@ -334,3 +333,82 @@ def refined(
             best = sharpen(state, others, Hypothesis(own, ratio, 0.0, 0.0, base), rest)
             model, base = [*others, best.candidate], best.fit
     return model, base
+
+
+@dataclass(frozen=True)
+class CompetingHypothesis:
+    """A competing hypothesis, by the best candidate of its grid."""
+
+    candidate: Candidate
+    behind: float
+    """Log evidence by which it loses, averaged over the grid of its nonlinear parameters."""
+
+
+def competing_hypotheses(
+    state: SearchState, info: Information, model: list[Candidate], base: Joint, k: int
+) -> tuple[CompetingHypothesis, ...]:
+    """Return the competing hypotheses of the k-th cause of `model`, whose columns are the last of `info`."""
+    # Score every group in the place of the k-th cause
+    own = slices(model, state.at[-1].stop)[k]
+    alone = info.released(base, own)
+    standing = score(alone, own, model[k])
+    competing, best = [], state.best(alone)
+    paid = best[model[k].group].price if model[k].group in best else 0.0
+    taken = {other.cause for other in model if other is not model[k]}
+    pieces = {piece.group for piece in model[k].pieces} | {model[k].group}
+    for group, (member, price, s, _) in best.items():
+        candidate = state.candidates[member]
+        if group in pieces or group[0] in taken:
+            continue
+        # Log evidence of the grids' averages, with the look-elsewhere of both
+        cheaper = price - paid - float(np.log(candidate.look_elsewhere / model[k].look_elsewhere))
+        behind = standing.evidence - s.evidence - cheaper
+        if (
+            behind < bayes_factor_threshold(standing.ratio)
+            and state.p_value(candidate, s.ratio, s.freedom) < FALSE_ALARM_RATE
+        ):
+            competing.append(CompetingHypothesis(candidate, behind))
+    return tuple(sorted(competing, key=lambda hypothesis: hypothesis.behind))
+
+
+def exchanged(state: SearchState, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+    """Replace a regressor by another, or drop one, while the evidence of the whole model grows."""
+    pieces = [piece for candidate in model for piece in candidate.pieces]
+    # Steepest ascent over the neighbours of the model, each fitted with its noise
+    for _ in range(MAX_EXCHANGES):
+        best, better = state.value(pieces, base), (pieces, base)
+        for new, place in _changes(state, pieces, base):
+            changed = [*new, *pieces[:place], *pieces[place + 1 :]]
+            entry = refined(state, changed, state.fit(changed, like=base), len(new))
+            if state.value(*entry) > best:  # a month's fit is large: only one is kept
+                best, better = state.value(*entry), entry
+        if better[0] is pieces:
+            break
+        pieces, base = better
+    return _gathered(state, pieces, base)
+
+
+def _changes(state: SearchState, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], int]]:
+    """List replacements and the place they would take: first none in each place, then the likeliest."""
+    info = state.conditional_on(pieces, base)
+    found = [
+        (one.behind, [one.candidate], place)
+        for place in range(len(pieces))
+        for one in competing_hypotheses(state, info, pieces, base, place)
+    ]
+    found.sort(key=lambda entry: entry[0])
+    needless = range(len(pieces) if len(pieces) > 1 else 0)
+    return [*(([], place) for place in needless), *(entry[1:] for entry in found[:TRIED])]
+
+
+def _gathered(state: SearchState, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+    """Join the pieces of each cause into one candidate."""
+    # Pieces of one cause stand next to each other, so that one candidate can hold them
+    causes = list(dict.fromkeys(piece.cause for piece in pieces))
+    if len(causes) == len(pieces):
+        return pieces, base
+    at = slices(pieces)
+    order = sorted(range(len(pieces)), key=lambda n: causes.index(pieces[n].cause))
+    c = base.coefficients[np.r_[*(at[n] for n in order)]]
+    model = [reduce(Candidate.joined_with, [p for p in pieces if p.cause == cause]) for cause in causes]
+    return model, state.fit(model, np.append(base.z, c), plain=False, like=base, rounds=1)

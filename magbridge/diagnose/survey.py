@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.calibration.fitting.rounds import beside_motion
@@ -149,19 +150,15 @@ def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
             start = moment
             bounds.append(k)
         last = moment
-    for first, end in zip(bounds, [*bounds[1:], len(t)], strict=True):
-        if end - first >= MIN_SAMPLES_A_DAY or number < 0:
-            number += 1
-        day[fresh[first:end]] = number
+    for part in np.split(fresh, bounds[1:]):
+        number += part.size >= MIN_SAMPLES_A_DAY or number < 0
+        day[part] = number
     return day if number > 0 else None
 
 
 def held(values: FloatArray) -> FloatArray:
     """Fill the gaps of (n,) values with the last known one, and the beginning with the first."""
-    known = np.flatnonzero(np.isfinite(values))
-    # Index of the last known value at every sample
-    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
-    return np.asarray(values[np.maximum(last, known[0])])
+    return np.asarray(pd.Series(values).ffill().bfill(), float)
 
 
 def eighths(n: int) -> IntArray:
@@ -178,18 +175,10 @@ def _part(table: Table, rows: BoolArray) -> Table:
 class Past:
     """The p samples before each sample (`order` p), and their lags.
 
-    `steps` (n,) are the intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none.
-
-    Attributes
-    ----------
-    whole : (n,) bool array
-        True if no gap precedes: the p previous samples have the lags 1 to p.
-    rows : (m,) int array
-        Samples where a gap precedes.
-    lags : (l, p) int array
-        Patterns of lags at `rows`, in intervals; :data:`MAX_LAG` where a sample is too long ago.
-    pattern : (m,) int array
-        Pattern of each of `rows`.
+    `steps` (n,) are the intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none. A
+    sample is `whole` (n,) if the p samples before it have the lags 1 to p. The other `rows` (m,), after a
+    gap, share patterns of `lags` (l, p), :data:`MAX_LAG` where a sample is too long ago; `pattern` (m,) says
+    which.
     """
 
     def __init__(self, steps: IntArray, order: int) -> None:
@@ -294,11 +283,8 @@ class Survey:
             raise DataError(
                 f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing or empty"
             )
-        return (
-            np.stack([self.channels[name].values for name in names], axis=1)
-            if names
-            else np.empty((len(self), 0))
-        )
+        columns = [self.channels[name].values for name in names]
+        return np.array(columns).reshape(len(names), len(self)).T
 
 
 def assemble(
@@ -322,9 +308,15 @@ def assemble(
     cycles = np.empty(0)
     if "power_cycle" in table:
         cycles = time[1:][np.diff(table["power_cycle"]) > 0]
-    attitude = None
+    attitude = place = None
     if {"roll", "pitch", "heading"} <= set(table):
         attitude = np.stack([held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
+    if {"latitude", "longitude"} <= set(table):
+        # m from the middle of the track, on the sphere, also across the date line
+        latitude, longitude = table["latitude"], table["longitude"]
+        middle = float(np.median(latitude)), float(longitude[0] + np.median(wrap(longitude - longitude[0])))
+        down = held(table["depth"]) if "depth" in table else np.zeros(len(time))
+        place = np.stack([*separation(*middle, latitude, longitude), down], axis=1)
     return Survey(
         time=time,
         field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
@@ -333,7 +325,7 @@ def assemble(
         still=still,
         steps=steps,
         dive=dives_of(table),
-        place=_place(table),
+        place=place,
         attitude=attitude,
         fitted=table["fitted"] > 0.5,
         learned=table["learned"] > 0.5,
@@ -364,56 +356,32 @@ def _channels(
     return channels, tuple(still)
 
 
-def _place(table: dict[str, FloatArray]) -> FloatArray | None:
-    """Return (n, 3) m north and east of the middle, and below the surface; None without positions."""
-    if not {"latitude", "longitude"} <= set(table):
-        return None
-    latitude, longitude = table["latitude"], table["longitude"]
-    # m from the middle of the track, on the sphere
-    along = wrap(longitude - longitude[0])  # also across the date line
-    middle = float(np.median(latitude)), float(longitude[0] + np.median(along))
-    north, east = separation(*middle, latitude, longitude)
-    down = held(table["depth"]) if "depth" in table else np.zeros_like(north)
-    return np.stack([north, east, down], axis=1)
-
-
 def load_survey(
     datasets: Sequence[xr.Dataset],
     calibration: Calibration,
     training_logs: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
 ) -> Survey:
-    """Gather deployments.
+    """Gather the deployments to be diagnosed, and the logs that the calibration was fitted to.
 
-    Parameters
-    ----------
-    datasets : sequence of Dataset
-        To be diagnosed.
-    calibration : Calibration
-        Decides which channels a deployment must have.
-    training_logs : sequence of Dataset
-        The logs that the calibration was fitted to, if available; those of them that are among `datasets`,
-        too, are diagnosed.
-    grid : AnomalyGrid, optional
-        Added to the main field where a log has no reference of its own.
-
-    Raises
-    ------
-    DataError
-        A column is missing, too few samples are complete, or a parameter is out of all range: one line
-        that says which.
+    A log that is among both is diagnosed. The calibration decides which channels a deployment must have; the
+    `grid` is added to the main field where a log has no reference of its own. DataError: a column is missing,
+    too few samples are complete, or a parameter is out of all range; one line says which.
     """
     # A training log that is diagnosed as well is read once, as diagnosed
     own = [any(ds is one for one in training_logs) for ds in datasets]
     apart = [ds for ds in training_logs if not any(ds is one for one in datasets)]
     logs = (*datasets, *apart)
     source = _sources(logs)
-    table = _joined(
-        [
-            *(_columns(ds, calibration, grid, fitted) for ds, fitted in zip(datasets, own, strict=True)),
-            *(_columns(ds, calibration, grid, fitted=True, learned=True) for ds in apart),
-        ]
-    )
+    parts = [_columns(ds, calibration, grid, fitted) for ds, fitted in zip(datasets, own, strict=True)]
+    parts += [_columns(ds, calibration, grid, fitted=True, learned=True) for ds in apart]
+    # The columns of all logs in order of time; NaN where a log lacks one
+    table = {
+        name: np.concatenate([part.get(name, np.full(part["time"].size, np.nan)) for part in parts])
+        for name in {name for part in parts for name in part}
+    }
+    order = np.argsort(table["time"], kind="stable")
+    table = {name: column[order] for name, column in table.items()}
     twice = int(np.sum(np.diff(table["time"]) == 0.0))
     if twice > 0.1 * table["time"].size:
         raise DataError(
@@ -439,17 +407,6 @@ def _sources(logs: Sequence[xr.Dataset]) -> str:
     return ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
 
 
-def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
-    """Return the columns of all logs in order of time; NaN where a log lacks one."""
-    names = {name for part in parts for name in part}
-    table = {
-        name: np.concatenate([part.get(name, np.full(part["time"].size, np.nan)) for part in parts])
-        for name in names
-    }
-    order = np.argsort(table["time"], kind="stable")
-    return {name: column[order] for name, column in table.items()}
-
-
 def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
     """Return the rows that have field, reference and parameters, each instant once."""
     needed = [*CHANNELS, "reference_field", *calibration.units]
@@ -464,8 +421,7 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
         worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
         raise DataError(
             f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least "
-            f"{MIN_SURVEY_SAMPLES} "
-            f"needed (column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
+            f"{MIN_SURVEY_SAMPLES} needed (column {worst!r} has {np.isfinite(table[worst]).sum()} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}
     once = np.diff(table["time"], prepend=-np.inf) > 0.0  # a sample that two logs share is kept once
@@ -502,21 +458,14 @@ def _columns(
     marks = {"fitted": fitted, "learned": learned}
     table |= {"time": time} | {name: np.full(time.size, float(mark)) for name, mark in marks.items()}
     if in_turn:
+        # Next to a moving mass the axes saw it at different places and form no vector. Where they are sampled
+        # at once such samples are kept: only they reveal an offset of the clocks
+        parameters = calibration.parameters
+        values = np.array([table[one.name] for one in parameters]).reshape(len(parameters), time.size)
+        moving = beside_motion(time, values.T, np.array([one.high - one.low for one in parameters]))
         for axis in "xyz":
-            table[f"mag_{axis}"][_moving(table, calibration)] = np.nan
+            table[f"mag_{axis}"][moving] = np.nan
     table["reference_field"] = reference_field(ds, grid, calibration.reference.bias)
     if {"latitude", "longitude"} <= set(table):
         table["longitude"], table["latitude"], _ = positions(ds)
     return table
-
-
-def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray:
-    """Return (n,) samples next to which a mass moves, by the bridge's own criterion.
-
-    There the axes, sampled in turn, saw the mass at different places and form no vector. With
-    simultaneous sampling such samples are kept: only they reveal an offset of the clocks.
-    """
-    parameters = calibration.parameters
-    time = table["time"]
-    values = np.array([table[one.name] for one in parameters]).reshape(len(parameters), time.size)
-    return beside_motion(time, values.T, np.array([one.high - one.low for one in parameters]))

@@ -15,13 +15,13 @@ from jsonschema import Draft202012Validator
 from posed import candidate
 from reported import page_of
 
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import assess
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.findings import FINDINGS_FORMAT, findings_json
 from magbridge.diagnose.search import Outliers
+from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.diagnostics import number
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))

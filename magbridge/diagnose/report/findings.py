@@ -9,12 +9,13 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import plain
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import Assessment, DiagnosisResult, separation, telemetry_delay
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.joint import CONFIDENCE_LEVEL, Improvement, normal
 from magbridge.diagnose.observed import Seen
+from magbridge.diagnose.search import Outliers
+from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.diagnostics import Diagnostic
 
 FINDINGS_FORMAT = 3
@@ -26,7 +27,7 @@ def findings(result: DiagnosisResult, remarks: Sequence[str] = ()) -> dict[str, 
     diagnosis, assessment = result
     listed = [_finding(diagnosis, finding) for finding in diagnosis.findings]
     if diagnosis.wrong is not None:
-        listed.append(_wrong(diagnosis))
+        listed.append(_wrong(diagnosis, diagnosis.wrong))
     facts = {
         "format": FINDINGS_FORMAT,
         "verdict": diagnosis.verdict,
@@ -97,10 +98,8 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
     for name, members in parts.items():
         listed = {f"{name} ({i})": [k] for i, k in enumerate(members, 1)} if len(members) > 1 else {}
         for label, some in ({name: members} | listed).items():
-            sigma = float(np.sqrt(covariance[np.ix_(some, some)].sum()))
-            found[label] = {
-                "value": float(value[some].sum()), "sigma": sigma, "unit": candidate.units[members[0]],
-            }  # fmt: skip
+            sigma, unit = float(np.sqrt(covariance[np.ix_(some, some)].sum())), candidate.units[members[0]]
+            found[label] = {"value": float(value[some].sum()), "sigma": sigma, "unit": unit}
     for name, (shape, unit) in candidate.point.shape.items():
         found[name] = {"value": shape, "sigma": None, "unit": unit}
     return found
@@ -175,15 +174,10 @@ def _notes(notes: Sequence[Diagnostic]) -> list[dict[str, Any]]:
 
 def _follows(seen: Seen) -> dict[str, Any]:
     """Return the observed correlate, without its interpretation."""
-    return {
-        "channel": seen.channel, "lag_s": seen.lag, "axis": seen.axis, "amplitude_nT": seen.size,
-        "fraction": seen.share,
-    }  # fmt: skip
+    return dict(zip(("channel", "lag_s", "axis", "amplitude_nT", "fraction"), seen, strict=True))
 
 
-def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
-    wrong = diagnosis.wrong
-    assert wrong is not None
+def _wrong(diagnosis: Diagnosis, wrong: Outliers) -> dict[str, Any]:
     size = float(np.median(np.abs(diagnosis.residual[wrong.rows])))
     nothing = dict.fromkeys(("channel", "follows", "disambiguation", "configuration", "improvement"))
     return {

@@ -20,21 +20,13 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from magbridge.calibration.file import encode_calibration
-from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, Fitness, separation
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.evidence import CONFOUNDED, Visible
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.findings import findings_json, parameters
-from magbridge.diagnose.texts import (
-    MAX_UNFOLDED_NUMBERS,
-    chance,
-    label,
-    measured,
-    names_of,
-    series_of,
-    sizes,
-)
+from magbridge.diagnose.state import CompetingHypothesis
+from magbridge.diagnose.texts import MAX_UNFOLDED_NUMBERS, chance, label, measured, names_of, series_of, sizes
 from magbridge.diagnostics import number
 from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path, new_folder
@@ -53,15 +45,7 @@ KIND_SUBJECTS = {
 
 
 def report_html(result: DiagnosisResult, remarks: Sequence[str] = ()) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    result : DiagnosisResult
-        Diagnosis to show, with its assessment.
-    remarks : sequence of str
-        What a reader must know of the logs, each without its full stop.
-    """
+    """Return the page; `remarks` are what a reader must know of the logs, each without its full stop."""
     diagnosis, assessment = result
     content = _environment().get_template("report.html").render(
         d=diagnosis, a=assessment, remarks=remarks, survey=diagnosis.problem.survey,
