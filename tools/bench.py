@@ -22,13 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.row import Row
-from rich.console import Console
-from rich.table import Table
-from studies import command_line, table
+from studies import command_line
 
 from magbridge.version import __version__
-
-__all__ = ["BENCHMARKS"]
 
 BENCHMARKS: dict[str, tuple[str, int]] = {
     "processor": ("benchmarks.processor:processor", 15),
@@ -55,37 +51,14 @@ def measure(name: str, factor: float) -> dict[str, Any]:
     return {"name": name, "load": (before, os.getloadavg()[0]), "rows": rows}
 
 
-def show(results: list[dict[str, Any]]) -> Table:
-    """Return the table for people."""
-    machine = (
-        f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python "
-        f"{platform.python_version()}"
-    )
-    shown = table(machine, "what", "measured", "floor", "ratio", "asked", "", left=("what", ""))
-    for result in results:
-        for row in result["rows"]:
-            asked = f"<= {row.most:g}" if row.most is not None else f">= {row.least:g}" if row.least else ""
-            shown.add_row(
-                row.what,
-                f"{row.value:.3g} {row.unit}",
-                f"{row.floor:.3g} {row.unit} ({row.floor_is})" if row.floor is not None else "",
-                f"{row.ratio:.2f}" if row.ratio is not None else "",
-                asked,
-                {True: "holds", False: "FALLS SHORT", None: ""}[row.holds],
-            )
-        shown.add_row(
-            f"[dim]load average {result['load'][0]:.1f} to {result['load'][1]:.1f}", end_section=True
-        )
-    return shown
-
-
 def markdown(results: list[dict[str, Any]]) -> str:
-    """Return the table in Markdown, below date, commit, version and load."""
+    """Return the table in Markdown, below machine, date, commit, version and load."""
     git = ["git", "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "no commit"
     loads = [load for result in results for load in result["load"]]
     lines = [
         f"Version {__version__}, commit {commit}, {date.today()}, load {min(loads):.1f} to {max(loads):.1f}.",
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}.",
         "",
         "| quantity | magbridge | floor | target |",
         "|---|---|---|---|",
@@ -114,10 +87,13 @@ def main() -> int:
     for name in chosen.names or BENCHMARKS:
         print(f"{name} ...", file=sys.stderr)
         results.append(measure(name, chosen.factor))
+    text = markdown(results)
     if chosen.table:
-        chosen.table.write_text(markdown(results), encoding="utf-8")
-    Console(width=None if sys.stdout.isatty() else 160).print(show(results))
-    return int(any(row.holds is False for result in results for row in result["rows"]))
+        chosen.table.write_text(text, encoding="utf-8")
+    print(text)
+    missed = [row.what for result in results for row in result["rows"] if row.holds is False]
+    print(*(f"misses its target: {what}" for what in missed), sep="\n")
+    return int(bool(missed))
 
 
 if __name__ == "__main__":

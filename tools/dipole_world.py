@@ -16,20 +16,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.correction import Correction
 from magbridge.field.igrf import igrf
-from magbridge.records import Reading
-
-__all__ = [
-    "START_S",
-    "Crust",
-    "Published",
-    "Track",
-    "Vehicle",
-    "calibrate",
-    "correct_live",
-    "glider_track",
-]
 
 START_S = 1_780_000_000.0
 """Time of the first sample, s since 1970 UTC."""
@@ -188,61 +175,21 @@ def glider_track(
     )
 
 
-def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray, *, unit: str = "") -> Calibration:
-    """Fit a calibration to runs whose true total field is known."""
-    field, total = vehicle.field(track, np.zeros(len(track.time)), track.masses)
-    data: dict[str, Any] = {
-        f"mag_{axis}": ("time", (field + noise)[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")
+def as_log(track: Track, field: FloatArray, unit: str = "in") -> xr.Dataset:
+    """Return the log of a track: the channels of a `field` (n, 3), nT, and all telemetry."""
+    columns: dict[str, Any] = {
+        f"mag_{axis}": ("time", field[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")
     }
-    data |= {name: ("time", values, {"units": unit}) for name, values in track.masses.items()}
-    data["reference_field"] = "time", total, {"units": "nT"}
-    data["segment"] = "time", np.floor(10.0 * np.arange(len(total)) / len(total)).astype(int).astype(str)
-    log = xr.Dataset(data, coords={"time": track.time})
+    columns |= {name: ("time", values, {"units": unit}) for name, values in track.masses.items()}
+    columns |= {name: ("time", getattr(track, name)) for name in ("latitude", "longitude", "depth")}
+    columns["sensor_temperature"] = "time", track.temperature
+    return xr.Dataset(columns, coords={"time": track.time})
+
+
+def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray) -> Calibration:
+    """Fit a calibration to ten runs whose true total field is known."""
+    field, total = vehicle.field(track, np.zeros(len(track.time)), track.masses)
+    log = as_log(track, field + noise).drop_vars(["latitude", "longitude", "depth", "sensor_temperature"])
+    run = np.floor(10.0 * np.arange(len(total)) / len(total)).astype(int).astype(str)
+    log = log.assign(reference_field=("time", total, {"units": "nT"}), segment=("time", run))
     return fit(observations(log, vehicle.masses)).calibration
-
-
-@dataclass(frozen=True)
-class Published:
-    """Total field and sigma (n,), nT, and flags of each sample; the messages with their row."""
-
-    total: FloatArray
-    sigma: FloatArray
-    quality: FloatArray
-    notices: list[tuple[int, str]]
-
-
-def correct_live(
-    correction: Correction,
-    track: Track,
-    field: FloatArray,
-    reported: dict[str, FloatArray],
-    *,
-    interval_s: float = 1.0,
-) -> Published:
-    """Feed a correction with the readings of a track and its telemetry, in the order of time.
-
-    A row's telemetry comes just before its reading, if the row has any: a motion after a report is not known
-    until the next report.
-    """
-    n = len(track.time)
-    total, sigma = np.full((2, n), np.nan)
-    quality, notices = np.zeros(n), []
-    main_field = np.linalg.norm(igrf(track.longitude, track.latitude, track.depth, track.time), axis=1)
-    reports = max(round(interval_s / float(track.time[1] - track.time[0])), 1)
-    stamps = (np.rint(track.time * 1e6).astype(np.int64) & ~3).tolist()
-    fields, warmth, main = field.tolist(), track.temperature.tolist(), main_field.tolist()
-    where = list(zip(track.latitude.tolist(), track.longitude.tolist(), strict=True))
-    values = {name: column.tolist() for name, column in reported.items()}
-    for k in range(n):
-        if k % reports == 0:
-            for name, column in values.items():
-                correction.telemetry(name, column[k], stamps[k])
-        reading = Reading(tuple(fields[k]), temperature=warmth[k])
-        _, one = correction.reading(reading, stamps[k], main_field=main[k], position=where[k])
-        total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
-        notices += [(k, text) for text in correction.notices]
-        correction.notices.clear()
-        if correction.learner is not None:
-            notices += [(k, notice.text) for notice in correction.learner.notices]
-            correction.learner.notices.clear()
-    return Published(total, sigma, quality, notices)

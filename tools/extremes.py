@@ -31,8 +31,6 @@ from magbridge.mavlink.messages import MESSAGES
 from magbridge.parts import OptionalParts
 from magbridge.records import Channel
 
-__all__ = ["events", "feed", "make_bridge"]
-
 PART = 20_000
 """Events of one bridge."""
 

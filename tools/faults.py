@@ -37,8 +37,6 @@ from sitl.replay.setup import bridge_toml
 from sitl.scenario import load
 from sitl.twin import simulate
 
-__all__ = ["FAULTS", "Flight", "Score", "prepare", "score"]
-
 MASSES = ("battpos", "ballast")
 CHANNELS = ("mag_x", "mag_y", "mag_z")
 FAULT_AT = 0.27
@@ -57,17 +55,10 @@ class Flight:
 
 @dataclass(frozen=True)
 class Score:
-    """What a bridge made of a survey.
+    """What a bridge made of a survey: numbers of samples, the largest error (nT) without a flag, the texts.
 
-    Attributes
-    ----------
-    samples, flagged, wrong : int
-        `wrong`: without a flag, and beyond three sigmas.
-    worst : float
-        nT, the largest error without a flag.
-    sigma : float
-        nT, median of those without a flag.
-    reported : tuple of str
+    A sample is `wrong` if it has no flag and lies beyond three sigmas; `sigma` is the median of those without
+    a flag, nT.
     """
 
     samples: int

@@ -12,8 +12,6 @@ from sitl.instrument import rotation
 from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
-__all__ = ["FOREIGN"]
-
 
 def relay(scene: Scene, size: float, rng: Generator) -> None:
     """Add the field of an unlogged payload that switches on and off about a dozen times."""

@@ -238,8 +238,10 @@ def currents(log: xr.Dataset) -> tuple[str, ...]:
     return ("pump_current",) * ("pump_current" in log)
 
 
-def learn(learner: Learner, calibration: Calibration, log: xr.Dataset) -> Published:
-    """Correct a survey as the bridge does."""
+def learn(
+    learner: Learner | None, calibration: Calibration, log: xr.Dataset, age_s: float = AGE_S
+) -> Published:
+    """Correct a survey as the bridge does, with or without a learner; its telemetry is `age_s` old, s."""
     correction = Correction(calibration, learner=learner)
     n = log.sizes["time"]
     total, sigma, quality, alarms = np.empty(n), np.empty(n), np.empty(n, int), []
@@ -250,10 +252,12 @@ def learn(learner: Learner, calibration: Calibration, log: xr.Dataset) -> Publis
     fields, warmth = channels(log).tolist(), log["sensor_temperature"].to_numpy().tolist()
     for k in range(n):
         for key, values in telemetry.items():
-            correction.telemetry(key, values[k], stamps[k] - round(AGE_S * 1e6))
+            correction.telemetry(key, values[k], stamps[k] - round(age_s * 1e6))
         reading = Reading(tuple(fields[k]), temperature=warmth[k])
         _, one = correction.reading(reading, stamps[k], main_field=reference[k], position=where[k])
         total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
+        if learner is None:
+            continue
         if any(notice.text.startswith("unexplained") for notice in learner.notices):
             alarms.append((k, learner.state.causes))
         learner.notices.clear()

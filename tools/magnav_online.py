@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["online"]
-
 PERMANENT, INDUCED, EDDY = 20.0, 20.0, 5.0
 """nT, prior 1-sigma of the three kinds: a power-on's change of offset; an eddy term at a turn of 1 deg/s."""
 WALK = 3.0 / 86_400.0**0.5
@@ -39,20 +37,9 @@ def online(
 ) -> np.ndarray:
     """Return the total field (n,), nT, as the filter would have corrected it sample by sample.
 
-    Parameters
-    ----------
-    vector, total : (n, 3), (n,) arrays
-        nT, corrected by the fixed calibration.
-    reference : (n,) array
-        nT.
-    time : (n,) array
-        s.
-    use : (n,) bool array
-        Samples to learn from.
-    noise : float
-        nT.
-    field : tuple of 2 float
-        nT and s: 1-sigma and time constant of the Gauss-Markov field.
+    `vector` (n, 3) and `total` (n,), nT, are corrected by the fixed calibration; `reference` (n,) is in nT,
+    `time` (n,) in s. Samples that the filter learns from are in `use` (n,); `noise` is in nT. `field` has the
+    1-sigma (nT) and the time constant (s) of the Gauss-Markov field.
     """
     A = features(vector, time)
     x = np.zeros(19)

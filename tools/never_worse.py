@@ -11,16 +11,15 @@ step on, else from the start.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 
 import numpy as np
-from dipole_world import START_S, Crust, Track, Vehicle, calibrate, correct_live, glider_track
-from rich.console import Console
-from studies import command_line, table
+from dipole_world import START_S, Crust, Track, Vehicle, as_log, calibrate, glider_track
+from live import learn
+from studies import Column, Row, Study, study_options
 
 from magbridge.arrays import FloatArray
-from magbridge.correction import Correction
+from magbridge.estimation.residual import rms
 from magbridge.learning import Learner
 
 Change = Callable[[Track, FloatArray], FloatArray]
@@ -65,51 +64,52 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def run(name: str, seed: int, hours: float) -> tuple[float, float, float, float, list[str]]:
-    """Return RMS fixed, RMS learned, its RMS about the mean, its standardised error, and the messages."""
+def run(name: str, seed: int, hours: float) -> list[Row]:
+    """Return the errors of the fixed calibration and of the one that is learned in flight."""
     vehicle, rng = Vehicle(seed), np.random.default_rng([seed, 21])
     runs = glider_track(seed, 5.0, 0.25, spirals=True)
-    calibration = calibrate(vehicle, runs, rng.normal(0.0, 1.0, (len(runs.time), 3)), unit="in")
+    calibration = calibrate(vehicle, runs, rng.normal(0.0, 1.0, (len(runs.time), 3)))
     track = glider_track(seed, hours, 0.25, start_s=START_S + 3.0 * 86_400.0)
     anomaly = Crust(seed, 7.0, 900.0).at_position(track.metres())
     field, truth = vehicle.field(track, anomaly, track.masses)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     field = field + CHANGES[name](track, direction) + rng.normal(0.0, 1.0, field.shape)
-    corrections = Correction(calibration), Correction(calibration, learner=Learner(calibration))
-    fixed, learned = (correct_live(one, track, field, track.masses, interval_s=4.0) for one in corrections)
-    moving = fixed.quality.astype(int) & 0b101 != 0
+    log = as_log(track, field)
+    fixed, learned = (learn(one, calibration, log, age_s=0.0) for one in (None, Learner(calibration)))
+    moving = fixed.quality & 0b101 != 0
     late = ~moving & (seconds(track) > 3600.0 if name.startswith("offset step") else True)
     errors = [(one.total - truth)[late] for one in (fixed, learned)]
-    rms = [float(np.sqrt(np.mean(error**2))) for error in errors]
-    standardised = float(np.sqrt(np.mean((errors[1] / learned.sigma[late]) ** 2)))
-    return rms[0], rms[1], float(errors[1].std()), standardised, [text for _, text in learned.notices]
+    row: Row = {"change": name, "vehicle": seed, "fixed": rms(errors[0]), "learned": rms(errors[1])}
+    row |= {"ratio": row["learned"] / row["fixed"], "about": float(errors[1].std())}
+    return [row | {"standardised": rms(errors[1] / learned.sigma[late]), "alarms": len(learned.alarms)}]
 
 
-def main() -> int:
+STUDY = Study(
+    run,
+    ("change", "vehicle"),
+    {
+        "fixed, nT": Column("fixed"),
+        "learned, nT": Column("learned"),
+        "about the mean": Column("about"),
+        "learned / fixed": Column("ratio", form=".3f"),
+        "standardised": Column("standardised"),
+        "alarms": Column("alarms", form=".0f"),
+    },
+)
+
+
+def main() -> None:
     """Print the table."""
-    parser = command_line(__doc__)
+    parser = study_options(__doc__)
     parser.add_argument("names", nargs="*", metavar="CHANGE", help="; ".join(CHANGES))
     parser.add_argument("--vehicles", type=int, nargs="+", default=[1, 2, 3, 4])
     parser.add_argument("--hours", type=float, default=12.0)
-    parser.add_argument("-v", action="store_true", help="print the messages")
     chosen = parser.parse_args()
-    shown = table(
-        f"vehicles {chosen.vehicles}, {chosen.hours:g} h",
-        "hidden change", "fixed, nT", "learned, nT", "about the mean", "standardised", "ratio, each",
-        left=("hidden change",),
-    )  # fmt: skip
-    for name in chosen.names or CHANGES:
-        rows = [run(name, seed, chosen.hours) for seed in chosen.vehicles]
-        if chosen.v:
-            for row in rows:
-                print(name, np.round(row[:4], 2), row[4], flush=True)
-        middle = np.median([row[:4] for row in rows], axis=0)
-        ratios = " ".join(f"{row[1] / row[0]:.3f}" for row in rows)
-        shown.add_row(name, *(f"{value:.2f}" for value in middle), ratios)
-    Console(width=None if sys.stdout.isatty() else 160).print(shown)
-    return 0
+    names = chosen.names or list(CHANGES)
+    cases = [(name, seed, chosen.hours) for name in names for seed in chosen.vehicles]
+    STUDY.main(f"{chosen.hours:g} h", cases, chosen)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

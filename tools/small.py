@@ -16,8 +16,6 @@ from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import load
 
-__all__ = ["START", "bridge_text", "small_bridge"]
-
 START = 1_780_000_000_000_000
 ASCII_OPTIONS = 'columns = ["x", "y", "z", "temperature", "time", "sequence"]'
 
@@ -34,24 +32,11 @@ def bridge_text(
     publish: Mapping[str, int] = MappingProxyType({}),
     more: str = "",
 ) -> str:
-    """Return the text of a ``bridge.toml``.
+    """Return the text of a ``bridge.toml`` with a sensor `driver`, its `options` in TOML, and its `port`.
 
-    Parameters
-    ----------
-    driver, options : str
-        Sensor driver, and its options in TOML.
-    port, url : str
-        Port of the sensor and URL of the link.
-    masses : mapping of str to str
-        Telemetry by name, with its unit.
-    calibration : bool
-        Whether the bridge has the calibration ``cal.json``.
-    log : bool
-        Whether it writes a log to the folder ``logs``.
-    publish : mapping of str to int
-        Rates of messages.
-    more : str
-        Further lines; first more keys of ``[publish]``, if any.
+    `masses` is the telemetry by name, with its unit. With `calibration` the bridge has the file ``cal.json``,
+    with `log` it writes to the folder ``logs``. `publish` has rates of messages; `more` are further lines,
+    first more keys of ``[publish]``, if any.
     """
     lines = ["[sensor]", f'driver = "{driver}"', f'port = "{port}"', f"options = {{{options}}}"]
     lines += ["[link]", f'url = "{url}"']
@@ -74,20 +59,9 @@ def small_bridge(
 ) -> Pipeline:
     """Return a bridge that is configured in a folder; events are fed by hand.
 
-    Parameters
-    ----------
-    folder : path
-        Where its files are written.
-    start : Start
-        The run's start.
-    battery : Parameter
-        The mass, telemetry column ``battpos``.
-    publish : sequence of str
-        Messages that are sent with every sample.
-    more : str
-        Further lines of the configuration; first more keys of ``[publish]``, if any.
-    boresight : Boresight or None
-        That of the calibration; with one, the bridge computes a heading.
+    The mass `battery` is the telemetry column ``battpos``; the messages `publish` are sent with every sample.
+    `more` is that of :func:`bridge_text`. With the `boresight` of its calibration the bridge computes a
+    heading.
     """
     size = 4 * 9
     cal = Calibration(

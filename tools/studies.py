@@ -25,19 +25,6 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
 
-__all__ = [
-    "Column",
-    "Study",
-    "add_engine",
-    "command_line",
-    "fraction",
-    "fraction_within",
-    "in_order",
-    "percentile",
-    "study_options",
-    "table",
-]
-
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
 REPORT_EVERY = 10
@@ -89,16 +76,9 @@ def in_order(function: Callable[..., Any], cases: Sequence[Any], options: argpar
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a study's table: a statistic of one column of its rows.
+    """A column of a study's table: a statistic of one or several columns of its rows.
 
-    Attributes
-    ----------
-    source : str or tuple of str
-        Column of the rows, or several.
-    statistic : callable
-        Takes the finite values, (n,) or (n, columns), and returns a number.
-    form : str
-        Format of the number.
+    The statistic takes the finite values, (n,) or (n, columns), and returns a number, which `form` formats.
     """
 
     source: str | tuple[str, ...]
@@ -139,15 +119,9 @@ def fraction_within(low: float, high: float) -> Statistic:
 class Study:
     """A study: how a case is run, and the table of its rows.
 
-    Attributes
-    ----------
-    run : callable
-        Takes the parts of a case and returns its rows, each a dictionary. A row whose ``failed`` is not
-        empty is counted and left out of the statistics.
-    by : tuple of str
-        Columns of the rows that distinguish the lines of the table.
-    columns : mapping of str to Column
-        Further columns of the table by heading.
+    `run` takes the parts of a case and returns its rows, each a dictionary. A row whose ``failed`` is not
+    empty is counted and left out of the statistics. `by` are the columns of the rows that distinguish the
+    lines of the table; `columns` are further columns of the table by heading.
     """
 
     run: Callable[..., list[Row]]

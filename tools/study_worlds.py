@@ -155,19 +155,10 @@ PAPER = {
 class Trials:
     """A simulated deployment of the paper, and each method's result on it.
 
-    Attributes
-    ----------
-    parts : dict of Dataset
-        Trial 1, survey, trial 2.
-    corrected : dict of array (n,)
-        By (part, trial of the coefficients, method), nT.
-    failed : dict of str
-        Reason of the failure, by (trial, method).
-    scales : dict of (float, float)
-        By (trial, method), the smallest and the largest scale of A on its runs: a fit can lower its
-        residual by shrinking them.
-    anomaly : AnomalyGrid
-        The map used as reference of the fit.
+    `parts` are trial 1, survey and trial 2; `corrected` (n,), nT, is by part, trial of the coefficients and
+    method. By trial and method, `failed` is the reason of a failure, and `scales` the smallest and the
+    largest scale of A on its runs: a fit can lower its residual by shrinking them. `anomaly` is the map used
+    as reference of the fit.
     """
 
     parts: dict[str, xr.Dataset]
@@ -248,27 +239,14 @@ def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
 class BestFit:
     r"""A fit that reaches the Cramér-Rao bound: the least error that the calibration data allow.
 
-    Parameters
-    ----------
-    vehicle : Vehicle
-        The truth: dipoles with a permanent moment, a three-axis induced moment and a position each. The prior
-        is the distribution that such vehicles are drawn from.
-    calibration, survey : Dataset (time)
-        Deployments of :func:`sitl.simulate`, of m and n samples.
-    sigma, memory : float
-        nT of a channel's noise, and samples over which its correlation falls by e.
-    at_sigma : float
-        m, how well the masses' positions are known beforehand.
-    widths : (k,) array, optional
-        1-sigma of the prior instead: soft iron (9), hard iron (3, nT), and of each mass moment
-        (3, A m²), volume (3, m³) and place (3, m).
+    `vehicle` is the truth: dipoles with a permanent moment, a three-axis induced moment and a position each.
+    The prior is the distribution that such vehicles are drawn from, or `widths` (k,): 1-sigma of soft iron
+    (9), hard iron (3, nT), and of each mass moment (3, A m²), volume (3, m³) and place (3, m). The masses'
+    positions are known to `at_sigma`, m. `sigma` is the noise of a channel, nT, and `memory` the samples over
+    which its correlation falls by e.
 
-    Attributes
-    ----------
-    bound : (n,) array
-        nT, standard deviation of the survey's corrected total field, noise included.
-    floor : (n,) array
-        nT, of the noise alone.
+    `bound` (n,), nT, is the standard deviation of the survey's corrected total field, noise included; `floor`
+    (n,), nT, that of the noise alone.
 
     Notes
     -----
@@ -327,20 +305,11 @@ class BestFit:
 
 
 class SurveyBound:
-    r"""The least errors after a survey alone: of the field on another one, and of the map.
+    """The least errors after a survey alone: of the field on another one, and of the map.
 
-    Parameters
-    ----------
-    vehicle : Vehicle
-        The truth, as for :class:`BestFit`.
-    survey : Dataset (time)
-        From which vehicle and crustal field are estimated, of n samples.
-    place : (n, 2) array
-        m, of its samples.
-    crust : tuple of 2 float
-        nT and m, of a Gaussian field with a Gaussian covariance, which is known.
-    noise : tuple of 2 float
-        nT of a channel, and its memory in samples.
+    Vehicle and crustal field are estimated from a `survey` of n samples at `place` (n, 2), m. `crust` are
+    amplitude (nT) and length (m) of a Gaussian field with a Gaussian covariance, which are known; `noise` is
+    that of a channel (nT), with its memory in samples.
 
     Notes
     -----

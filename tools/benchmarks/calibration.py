@@ -20,8 +20,6 @@ from magbridge.calibration.terms import full_order
 from magbridge.estimation.residual import residuals_of
 from sitl import load, segments, simulate
 
-__all__ = ["correcting", "fitting"]
-
 NAMES = ("battpos", "ballast")
 MANY = (100_000, 1_000_000)
 IN_ANOTHER = """

@@ -17,8 +17,6 @@ from magbridge.logs import write
 from sitl import load, segments, simulate
 from sitl.mission import CrissCross
 
-__all__ = ["diagnosing", "long_survey", "survey_in"]
-
 NIGHT, MONTH = 12.0, 720.0
 """Durations of the logs, h."""
 NIGHTLY, MONTHLY = 10.0, 1.0
@@ -80,14 +78,9 @@ def survey_in(folder: Path, hours: float, size: float) -> None:
 
 
 def long_survey(hours: float, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
-    """Return a glider's survey with its calibration.
+    """Return a glider's survey of some hours with its calibration.
 
-    Parameters
-    ----------
-    hours : float
-        How long it lasts.
-    size : float
-        nT/degC of an offset proportional to the logged temperature.
+    `size` (nT/degC) is that of an offset proportional to the logged temperature.
     """
     scenario = load("random_glider")
     survey = CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1)

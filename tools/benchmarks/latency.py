@@ -33,8 +33,6 @@ from magbridge.sensors import open_driver
 from sitl.scenario import load
 from sitl.twin import simulate
 
-__all__ = ["commands", "latency", "start"]
-
 ECHO = Path(__file__).with_name("echo.py")
 RATES = (100, 1000)
 SECONDS = 5.0

@@ -18,8 +18,6 @@ from pymavlink.generator import mavgen
 
 import magbridge.mavlink
 
-__all__ = ["Peer", "classes"]
-
 
 @cache
 def classes() -> ModuleType:

@@ -24,8 +24,6 @@ from magbridge.config import load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
 
-__all__ = ["learning", "processor"]
-
 HERTZ = 100
 SECONDS = 10
 """Simulated, in one repetition."""

@@ -10,24 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Row", "in_own_process", "processor_time"]
-
 
 class Row(NamedTuple):
     """A measured figure, with its floor in the same run and its target.
 
-    Attributes
-    ----------
-    what : str
-    value : float
-    unit : str
-    floor : float or None
-        The same work at its barest, in the same unit; `floor_is` says how.
-    ratio : float or None
-        The figure that `most` or `least` limits, where it is not `value` itself: the median over the
-        repetitions of value divided by floor.
-    most, least : float or None
-        The target: upper or lower limit.
+    The `floor` is the same work at its barest, in the same unit; `floor_is` says how. The target `most` or
+    `least` limits the value, or the `ratio` if there is one: the median over the repetitions of value divided
+    by floor.
     """
 
     what: str

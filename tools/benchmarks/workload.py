@@ -23,8 +23,6 @@ from magbridge.mavlink import Codec
 from magbridge.records import Channel, Reading
 from sitl.fluxgate import Encoder, open_encoder
 
-__all__ = ["BEGIN_US", "Feed", "calibration", "write_config"]
-
 BEGIN_US = 1_750_000_000_000_000
 TELEMETRY_HZ = 20
 TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_POSITION_INT",)
@@ -82,11 +80,8 @@ def write_config(
 class Feed:
     """The bytes of a digitizer and of an autopilot, second after second.
 
-    Parameters
-    ----------
-    moving : bool
-        The masses always move; else they are at rest nine seconds of ten, and their telemetry jitters in its
-        last digit.
+    The masses are always `moving`; else they are at rest nine seconds of ten, and their telemetry jitters in
+    its last digit.
     """
 
     def __init__(self, *, moving: bool = False) -> None:

@@ -9,8 +9,6 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
 from referee.autopilot import Autopilot, Truth, finite
 
-__all__ = ["COPTER_RATES_HZ", "PLANE_RATES_HZ", "ArduPilot"]
-
 PLANE_RATES_HZ = dict.fromkeys(
     ("ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT"),
     1.0,
@@ -43,13 +41,7 @@ class ArduPilot(Autopilot):
     """A Plane (or a glider) with airspeed; without, a Rover.
 
     Its source set is switched to external navigation when GPS is lost, as a user or a script does.
-
-    Attributes
-    ----------
-    internal_errors : int
-        Numbers that were none where the firmware does not expect it.
-    healthy : bool
-        The visual odometry would pass the pre-arm check.
+    `internal_errors` counts numbers that were none where the firmware does not expect it.
     """
 
     STACK = MAV_AUTOPILOT.ARDUPILOTMEGA

@@ -13,8 +13,6 @@ from magbridge.mavlink.enums import MAV_CMD, MAV_FRAME, MAV_RESULT, MAV_TYPE
 from magbridge.mavlink.messages import MESSAGES, east_e7
 from referee.filter import PositionFilter
 
-__all__ = ["GPS_SIGMA", "Autopilot", "Truth", "finite"]
-
 GPS_SIGMA = 2.5
 """1-sigma of a GPS position on an axis, m."""
 FIX_3D, NO_FIX = 3, 1
@@ -30,20 +28,9 @@ Place = tuple[float, float]
 
 
 class Truth(NamedTuple):
-    """The vehicle at one moment.
+    """The vehicle at one moment: position (deg), speed through the water (m/s), angles (deg), depth (m).
 
-    Attributes
-    ----------
-    place : tuple of float
-        deg, latitude and longitude.
-    speed, heading, pitch : float
-        m/s through the water or air, deg, deg.
-    depth : float
-        m below the sea.
-    gps : tuple of float or None
-        deg, what the receiver measures; None without reception.
-    accuracy : float
-        m, what the receiver claims.
+    `gps` (deg) is what the receiver measures, None without reception; `accuracy` (m) is what it claims.
     """
 
     place: Place
@@ -58,29 +45,14 @@ class Truth(NamedTuple):
 class Autopilot:
     """An autopilot without its attitude and height control: a position filter, and its telemetry.
 
-    Parameters
-    ----------
-    origin : tuple of float
-        deg, deg, m above the sea: of the local frame.
-    start_us : int
-        µs since 1970 UTC, when it boots.
-    streams : collection of str
-        The messages that it sends besides HEARTBEAT, ATTITUDE, GPS_RAW_INT and GLOBAL_POSITION_INT. Without
-        ``VFR_HUD`` its speed is unknown; with ``GLOBAL_POSITION_INT`` that message has a velocity, too.
-    airspeed : bool
-        It measures its speed through the water or air.
-    obeys : bool
-        It takes fixes; else it does as if none had come.
-    rates : mapping of str to float, optional
-        Rate of each message in Hz, as after a start; a request changes it. None: each with every step.
-    vehicle : int
-        MAV_TYPE of its heartbeat.
+    The local frame has its `origin` (deg, deg, m above the sea); it boots at `start_us`, µs since 1970 UTC.
+    `streams` are the messages that it sends besides HEARTBEAT, ATTITUDE, GPS_RAW_INT and GLOBAL_POSITION_INT.
+    Without ``VFR_HUD`` its speed is unknown; with ``GLOBAL_POSITION_INT`` that message has a velocity, too.
+    With `airspeed` it measures its speed through the water or air. Unless it `obeys`, it does as if no fix
+    had come. `rates` are the rates of the messages after a start, Hz, which a request changes; None sends
+    each with every step. `vehicle` is the MAV_TYPE of its heartbeat.
 
-    Attributes
-    ----------
-    filter : PositionFilter
-    taken : Counter
-        How often which message was taken, and why others were not.
+    `taken` counts how often which message was taken, and why others were not.
     """
 
     STACK = 0

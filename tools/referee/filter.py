@@ -4,29 +4,15 @@ from __future__ import annotations
 
 from math import hypot, sqrt
 
-__all__ = ["PositionFilter"]
-
 Pair = tuple[float, float]
 
 
 class PositionFilter:
     """Position and wind on two axes, which share one covariance: all inputs have equal variances on both.
 
-    Parameters
-    ----------
-    walk : float
-        (m/s)²/s, spectral density of the wind's (or the velocity error's) random walk.
-
-    Attributes
-    ----------
-    position : tuple of float
-        m, north and east.
-    wind : tuple of float
-        m/s: what carries the vehicle besides its known motion.
-    velocity : tuple of float
-        m/s over ground.
-    pp, pw, ww : float
-        m², m²/s, m²/s²: their covariance.
+    `position` (m) and `wind` (m/s, what carries the vehicle besides its known motion) are north and east,
+    `velocity` (m/s) is over ground; `pp`, `pw`, `ww` (m², m²/s, m²/s²) are their covariance. `walk` is the
+    spectral density, (m/s)²/s, of the wind's (or the velocity error's) random walk.
     """
 
     def __init__(self, walk: float) -> None:

@@ -22,31 +22,16 @@ from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth
 from referee.receiver import Receiver, honest
 
-__all__ = ["Passage", "Run", "sail"]
-
 SECOND_US = 1_000_000
 
 
 class Passage(NamedTuple):
     """What a vehicle does, and what its corrected magnetometer gives; n samples, evenly spaced.
 
-    Attributes
-    ----------
-    time : ndarray, (n,)
-        s since 1970 UTC.
-    latitude, longitude : ndarray, (n,)
-        deg, true.
-    velocity : ndarray, (n, 2)
-        m/s north and east through the water, until the next sample.
-    total_field, sigma : ndarray, (n,)
-        nT.
-    depth : float
-        m.
-    gps : callable
-        Of s since the start: whether there is reception.
-    receiver : callable
-        Of s since the start and the true position (deg): the position that the receiver measures and the
-        accuracy (m) that it claims; None without a fix. See :mod:`referee.receiver`.
+    `time` (n,) is s since 1970 UTC, `latitude` and `longitude` (n,), deg, are true, `velocity` (n, 2), m/s
+    north and east, is through the water until the next sample, `total_field` and `sigma` (n,) are in nT,
+    `depth` in m. `gps` returns whether there is reception at a time, s since the start; `receiver` is one of
+    :mod:`referee.receiver`.
     """
 
     time: FloatArray
@@ -61,28 +46,13 @@ class Passage(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Once a second: who believes to be how far off.
+    """Once a second (n,): who believes to be how far off.
 
-    Attributes
-    ----------
-    seconds : ndarray, (n,)
-        s since the start.
-    error : ndarray, (n,)
-        m, of the bridge's position; NaN while it has none.
-    autopilot : ndarray, (n, 2)
-        m, of the autopilot's, north and east.
-    claimed : ndarray, (n,)
-        m, the autopilot's 1-sigma on each axis.
-    sent : ndarray, (n,)
-        Number of fixes until then.
-    state : ndarray, (n,)
-        State of the bridge's navigator.
-    sigma : ndarray, (n,)
-        m, 1-sigma of its position, root mean square of both axes.
-    gnss : ndarray, (n,)
-        State of the receiver's positions by the bridge.
-    texts : list of (float, str)
-        s since the start, and the announced text.
+    `seconds` is since the start, `error` (m) that of the bridge's position, NaN while it has none.
+    `autopilot` (n, 2), m north and east, is the error of the autopilot's position, `claimed` (m) its 1-sigma
+    on each axis. `sent` is the number of fixes until then, `state` that of the bridge's navigator, `sigma`
+    (m) the 1-sigma of its position, root mean square of both axes, `gnss` the state of the receiver's
+    positions by the bridge. `texts` are the announced texts with their times, s since the start.
     """
 
     seconds: FloatArray

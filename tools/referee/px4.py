@@ -9,8 +9,6 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
 from referee.autopilot import Autopilot, Truth, finite
 
-__all__ = ["PX4_RATES_HZ", "Px4"]
-
 PX4_RATES_HZ = {
     "ATTITUDE": 15.0, "VFR_HUD": 4.0, "GPS_RAW_INT": 5.0, "GLOBAL_POSITION_INT": 5.0,
     "LOCAL_POSITION_NED": 1.0, "ESTIMATOR_STATUS": 0.5,

@@ -9,8 +9,6 @@ import numpy as np
 from magbridge.field.geodesy import offset
 from referee.autopilot import GPS_SIGMA
 
-__all__ = ["Receiver", "carried_off", "frozen", "honest", "jammed", "jumped"]
-
 Place = tuple[float, float]
 Receiver = Callable[[float, Place], tuple[Place, float] | None]
 """Takes s since the start and the true position (deg); returns the measured one and the accuracy (m) that the
