@@ -98,19 +98,6 @@ def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> 
     assert np.sqrt(np.mean(error[at_rest] ** 2)) < 5.0
 
 
-def test_times_may_be_seconds_or_datetimes(tmp_path: Path) -> None:
-    log = demo_log().isel(time=slice(0, 400))
-    dated = log.assign_coords(time=(log["time"].to_numpy() * 1e9).astype("datetime64[ns]"))
-    runs = [mb.observations(data, ("battpos",)) for data in (log, dated)]
-    np.testing.assert_allclose(runs[0].time, runs[1].time, atol=1e-6)
-    corrected = mb.correct_rows(mb.Correction(None), dated)
-    assert corrected["time"].dtype.kind == "M"
-    seconds = mb.correct_rows(mb.Correction(None), log)
-    np.testing.assert_allclose(corrected["total_field"], seconds["total_field"])
-    mb.write(dated, tmp_path / "log.csv")
-    np.testing.assert_allclose(mb.read(tmp_path / "log.csv")["time"], log["time"], atol=1e-5)
-
-
 def test_the_heading_of_corrected_vectors() -> None:
     found = mb.heading(np.array([[10_000.0, 0.0, 40_000.0], [0.0, -10_000.0, 40_000.0]]), 0.0, 0.0)
     np.testing.assert_allclose(found.magnetic, [0.0, 90.0])

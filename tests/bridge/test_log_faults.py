@@ -19,7 +19,6 @@ from rig import Rig
 from magbridge.logs import read
 from magbridge.mavlink import LogReader
 from magbridge.records import Channel
-from sitl.replay.own_log import is_own_log, runs
 from sitl.replay.run import agreement
 
 MakeRig = Callable[..., Rig]
@@ -175,30 +174,6 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
         f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same "
         "bytes",
     )
-
-
-def test_two_bridges_in_one_folder(make_rig: MakeRig) -> None:
-    """Each keeps its own parameters, and the files of its log stand together."""
-    rig = make_rig(more="max_size = 0.02\n")
-    rig.start()
-    set_parameter(rig)
-    other = rig.folder / "other.toml"
-    other.write_text(
-        rig.config.read_text().replace("ttyUSB*", "ttyNone").replace(rig.url, "udpout:127.0.0.1:9")
-    )
-    second = rig.spawn(other)
-    begun = len(rig.logs)
-    rig.until(lambda: len(rig.logs) >= begun + 4 and sum(map(is_own_log, rig.logs)) == 2)
-    rig.run(1.0)
-    assert rig.stop() == 0
-    second.terminate()
-    assert second.wait(10) == 0
-    assert {path.name for path in rig.folder.glob("*.json")} == {"cal.json", "bridge.parameters.json"}
-    for files, kept in zip(runs(rig.logs), ({"MB_GAP_FACTOR": 3.0}, {}), strict=True):
-        recorded, published = rig.replay(files)
-        assert recorded.damages == 0
-        assert rig.of("PARAM_VALUE")[-1].frame in recorded.published or not kept
-        assert first_difference(published, recorded.published) is None
 
 
 def test_stopped_by_hand_with_a_log_in_many_files(make_rig: MakeRig) -> None:

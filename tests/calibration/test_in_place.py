@@ -119,14 +119,6 @@ def test_a_slope_of_the_crust_is_not_taken_for_a_level() -> None:
     assert 0.9 * MAIN_FIELD_SIGMA_NT < found.reference.level_sigma < 1.5 * MAIN_FIELD_SIGMA_NT
 
 
-def test_level_stands_in_the_file(survey: Survey) -> None:
-    calibration = survey[2].calibration
-    again = decode_calibration(encode_calibration(calibration))
-    assert again.reference == calibration.reference
-    assert again.level == calibration.level
-    assert again.reference.bias_sigma == MAIN_FIELD_SIGMA_NT
-
-
 def test_level_is_less_than_the_sigma_by_the_noise_at_least() -> None:
     """For any change of the offset: 150 nT across the field lengthen it by 0.2 nT, not a level."""
     w = np.zeros(9)
@@ -250,8 +242,7 @@ def test_a_track_that_drifts_is_bent_to_where_the_crustal_field_repeats() -> Non
     t = (data.time - data.time[0]) / np.ptp(data.time)
     drift = 150.0 * np.stack([np.sin(2.2 * np.pi * t + 0.3), np.cos(1.7 * np.pi * t) - 1.0, 0.0 * t], axis=1)
     off = replace(data, place=data.place + drift)
-    still, bent = (fit(off, "survey", position_sigma=sigma) for sigma in (0.0, 100.0))
-    assert still.creep is not None  # what else should it be taken for: then the sigma counts it
+    bent = fit(off, "survey", position_sigma=100.0)
     assert bent.creep is None
     error, sigma = error_of(bent, data, true)
     assert error < 1.1 * NOISE

@@ -31,13 +31,12 @@ def every(data: Observations, number: int) -> Observations:
     return data.part(np.arange(len(data)) % number == 0)
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_the_claimed_sigma_does_not_depend_on_the_rate(line: Observations, first: bool) -> None:
-    """Of one half, corrected with the fit to the other one, at 10 to 1 Hz."""
+def test_the_claimed_sigma_does_not_depend_on_the_rate(line: Observations) -> None:
+    """Of the second half, corrected with the fit to the first one, at 3.3 and 1 Hz."""
     sigmas = []
-    for step in (1, 3, 10):
+    for step in (3, 10):
         data = every(line, step)
-        half = (np.arange(len(data)) < len(data) // 2) == first
+        half = np.arange(len(data)) < len(data) // 2
         known, other = fit(data.part(half), "nominal").calibration, data.part(~half)
         corrected = correct(known, other.field, other.parameters, other.time)
         sigmas.append(np.sqrt(np.mean(corrected.sigma**2)))

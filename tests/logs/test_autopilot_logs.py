@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from struct import pack
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from ulogs import Output, ulog_of
 
 from magbridge import logs
@@ -105,21 +102,6 @@ def test_damaged_bin_is_read_to_its_end(tmp_path: Path) -> None:
     assert back.sizes["time"] == 19
     assert back["mag_x"][-1] == 100 * (100 + 19)
     assert back.attrs["bytes_skipped"] > 40
-
-
-@given(at=st.integers(0, 10**6), junk=st.binary(max_size=40), cut=st.integers(0, 60))
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_bin_with_anything_in_it(
-    at: int, junk: bytes, cut: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Whatever stands between or instead of records, only a deployment comes out, or one line."""
-    data = bin_log()
-    at %= len(data)
-    path = tmp_path / "log.bin"
-    path.write_bytes(data[:at] + junk + data[at + cut :])
-    with suppress(FormatError):
-        assert 0 <= logs.read(path).attrs["bytes_skipped"] <= len(data) + len(junk)
-    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(

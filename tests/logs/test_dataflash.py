@@ -146,17 +146,6 @@ def test_a_record_that_was_cut_short_is_not_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mag.fields["MagZ"], -300)
 
 
-def test_random_bytes_hold_no_records(tmp_path: Path) -> None:
-    """3 MB of them have about 45 headers, of which some are of known kinds; none joins another."""
-    log, path = flight(), tmp_path / "log.bin"
-    half = len(log.data) - len(log.record("XKFS", 0, 0, 0, 0, 0, 0))
-    junk = np.random.default_rng(1).bytes(3_000_000)
-    path.write_bytes(log.data[:half] + junk + log.data[half:])
-    ours = read_binary(path, EVERYTHING)
-    assert sum(len(one.at) for one in ours.records.values()) <= 40 * 8
-    assert ours.skipped >= len(junk)
-
-
 def test_a_kind_that_is_described_again(tmp_path: Path) -> None:
     """As after a boot with other firmware: each record is read as the description before it says."""
     first, second = Log(), Log({**KINDS, "BARO": (16, "QBffH", "TimeUS,I,Alt,Press,More")})

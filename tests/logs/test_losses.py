@@ -42,14 +42,6 @@ def test_one_damaged_time_costs_its_row(wrong: float, place: int, rows: int) -> 
     assert line.startswith(f"log.csv: row {place + 1}, column 'time': expected ")
 
 
-def test_infinite_times_in_a_row_cost_their_rows() -> None:
-    time = T0 + np.arange(100.0)
-    damaged = np.where(np.isin(np.arange(100), (40, 41, 42)), np.inf, time)
-    left, counts, _ = counted(damaged)
-    assert left == np.delete(time, (40, 41, 42)).tolist()
-    assert counts == {"rows_dropped": 3}
-
-
 def test_a_clock_set_back_costs_what_it_lives_through_twice() -> None:
     left, counts, _ = counted(T0 + np.r_[np.arange(100.0), np.arange(92.5, 200.0)])
     assert counts == {"rows_dropped": 7}

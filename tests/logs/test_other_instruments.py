@@ -66,17 +66,6 @@ def test_an_attitude_in_radians_is_recognised(tmp_path: Path) -> None:
     assert float(read(tmp_path, north)["heading"].max()) == pytest.approx(1.9)
 
 
-def test_minus_999_is_not_a_value(tmp_path: Path) -> None:
-    def row(k: int) -> str:
-        field = "-999,-999,-999" if k % 10 == 3 else f"{20_000 + k},100,45000"
-        return f"{START + k},{field},{-999 if k % 10 == 3 else 0.1 * k},{-999 if k % 10 == 3 else 20}"
-
-    log = read(tmp_path, table(f"{HEADER},battpos [in],depth", row))
-    for name in ("mag_x", "mag_y", "mag_z", "battpos", "depth"):
-        assert int(log[name].isnull().sum()) == 4, name
-    assert passed_over(log.attrs) == {"values_dropped": 20}
-
-
 def test_a_quoted_blank_is_an_empty_field(tmp_path: Path) -> None:
     header = (
         "Reading_Date,Reading_Time,Magnetic_Field,Weak_Signal,Measurement_Time,Mag_Latitude,Mag_Longitude"

@@ -12,7 +12,6 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
-from flash import Log
 from ulogs import Output, ulog_of
 
 from magbridge import logs
@@ -192,35 +191,3 @@ def test_every_column_of_a_telemetry_log_is_as_pymavlink_reads_it(real_data: Pat
     for name in {name for row in rows for name in row}:
         theirs = [row.get(name, np.nan) for row in rows]
         np.testing.assert_allclose(back[name], theirs, rtol=1e-6, atol=1e-9, err_msg=name)
-
-
-def test_every_column_of_ardupilot_is_carried_as_it_was_logged(tmp_path: Path) -> None:
-    """That each record is as pymavlink reads it has its own test; here columns are brought to rows."""
-    log = Log()
-    names = "roll", "heading", "battery_current", "battery2_current", "depth"
-    output: dict[str, Series] = {name: ([], []) for name in names}
-
-    def write_message(name: str, us: int, value: float) -> None:
-        output[name][0].append(us * 1e-6)
-        output[name][1].append(value)
-
-    for k in range(40):
-        us = 1_000_000 + 100_000 * k
-        if k % 3 == 0:
-            log.write_message("ATT", us + 5, 0, 0.5 * k, 0, 2.0, 0, 3.0 * k, 0, 0, 3)
-            write_message("roll", us + 5, 0.5 * k)
-            write_message("heading", us + 5, 3.0 * k)
-        if k % 4 == 1:
-            for number, name in enumerate(("battery_current", "battery2_current")):
-                log.write_message("BAT", us - 5, number, 16.0, 2.0 * k + number)
-                write_message(name, us - 5, 2.0 * k + number)
-        if k % 7 == 2:
-            log.write_message("BARO", us, 0, -0.25 * k, 1e5)
-            write_message("depth", us, 0.25 * k)
-        log.mag(us, 0, (100 + k, 200, -300), 1, [7, 0, 0, 0, 0, 50])
-    (tmp_path / "log.bin").write_bytes(log.data)
-    back = logs.read(tmp_path / "log.bin")
-    for name, (times, values) in output.items():
-        np.testing.assert_allclose(
-            back[name], carried(back["time"].to_numpy(), (times, values)), err_msg=name
-        )

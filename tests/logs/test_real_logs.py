@@ -156,15 +156,3 @@ def test_ardusub_bin(real_data: Path) -> None:
     assert back.attrs["bytes_skipped"] == 0
     assert back["mag_x"][0] == 100 * (-140 + 40)  # MagX less OfsX
     np.testing.assert_allclose(back["heading"][1:], 213.9, atol=0.1)
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".nc", ".parquet", ".tlog"])
-def test_seaglider_converted(seaglider: list[Path], suffix: str, tmp_path: Path) -> None:
-    dives = logs.read(seaglider[:2])
-    logs.write(dives, tmp_path / f"dives{suffix}")
-    back = logs.read(tmp_path / f"dives{suffix}")
-    for name in CHANNELS:
-        np.testing.assert_array_equal(back[name], dives[name])  # counts: exact even as float32
-    for column in dives.variables:
-        np.testing.assert_allclose(back[column], dives[column], rtol=2e-7, atol=6e-4, err_msg=str(column))
-    assert back.attrs["heading_reference"] == "magnetic"

@@ -115,18 +115,6 @@ def test_one_file_of_a_bag(kind: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(xr_equal[name], whole[name])
 
 
-def test_every_sample_is_as_rosbags_reads_it(tmp_path: Path) -> None:
-    path = bag(tmp_path / "log")
-    with AnyReader([path]) as reader:
-        wanted = [one for one in reader.connections if one.topic == "/imu/mag"]
-        theirs: list[Any] = [
-            reader.deserialize(raw, connection.msgtype) for connection, _, raw in reader.messages(wanted)
-        ]
-    back = logs.read(path)
-    np.testing.assert_array_equal(back["mag_x"], [1e9 * one.magnetic_field.x for one in theirs])
-    np.testing.assert_array_equal(back["mag_z"], [-1e9 * one.magnetic_field.z for one in theirs])
-
-
 @pytest.mark.parametrize(("unit", "per_tesla"), [("G", 1e4), ("uT", 1e6), ("mG", 1e7)])
 def test_a_driver_that_does_not_publish_tesla_is_reported(
     unit: str, per_tesla: float, tmp_path: Path

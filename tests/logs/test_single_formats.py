@@ -169,18 +169,6 @@ def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> N
     assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source", "history"}
 
 
-def test_parquet_of_someone_else(tmp_path: Path) -> None:
-    pa = pytest.importorskip("pyarrow")
-    pq = pytest.importorskip("pyarrow.parquet")
-    stamps = pa.array([1_500_000, 2_500_000], pa.timestamp("us", tz="UTC"))
-    pq.write_table(
-        pa.table({"time": stamps, "mag_x": pa.array([1, None], pa.int32())}), tmp_path / "a.parquet"
-    )
-    back = logs.read(tmp_path / "a.parquet")
-    np.testing.assert_array_equal(back["time"], [1.5, 2.5])
-    np.testing.assert_array_equal(back["mag_x"], [1, np.nan])
-
-
 def test_longitudes_to_the_east_fit_a_telemetry_log(tmp_path: Path) -> None:
     """302 degrees are -58: as 32 bits of 1e-7 deg they would not fit."""
     east = np.array([-58.0, 0.0, 58.0, 179.5, 180.5, 200.0, 302.0, np.nan])

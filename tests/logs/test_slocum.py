@@ -84,13 +84,3 @@ def test_an_empty_segment_costs_itself(tmp_path: Path) -> None:
     assert named_losses(back.attrs) == [f"{tmp_path / '1.sbd'}: expected rows, there are none"]
     with pytest.raises(FormatError, match=r"1\.sbd: expected rows, there are none"):
         logs.read(tmp_path / "1.sbd")
-
-
-def test_a_clock_that_is_set_back_costs_what_it_lives_through_twice(tmp_path: Path) -> None:
-    cycles = flight()
-    cycles["m_present_time"][20:] -= 8.0
-    segment(tmp_path / "a.sbd", cycles)
-    back = logs.read(tmp_path / "a.sbd")
-    assert (np.diff(back["time"]) > 0).all()
-    assert sum(passed_over(back.attrs).values()) == 2
-    assert back.sizes["time"] == 47

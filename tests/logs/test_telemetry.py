@@ -282,15 +282,6 @@ def test_version_1_frames(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back["mag_x"], [0, 100, 200, 300])
 
 
-def test_time_that_goes_back_drops_the_row(tmp_path: Path) -> None:
-    log = Log()
-    for t in (0, 1, 0.5, 1, 2):
-        log.mag(t, round(10 * t))
-    back = log.read(tmp_path)
-    np.testing.assert_array_equal(back["mag_x"], [0, 1000, 2000])
-    assert passed_over(back.attrs) == {"rows_dropped": 1, "duplicate_rows": 1}
-
-
 def test_a_live_log_is_read_back(tmp_path: Path) -> None:
     codec = Codec(1, 191)
     with closing(TlogWriter(tmp_path, max_size=0.01)) as log:

@@ -82,13 +82,6 @@ def test_new_file_by_size_and_by_age_loses_nothing(tmp_path: Path) -> None:
     assert len({path.name.rpartition("_")[2] for path in files}) == len(files)
 
 
-def test_files_of_an_earlier_run_are_left_alone(tmp_path: Path) -> None:
-    for text in (b"one", b"two"):
-        with closing(TlogWriter(tmp_path)) as log:
-            log.extend([(T0, 0, text)])
-    assert [path.read_bytes()[8:] for path in sorted(tmp_path.iterdir())] == [b"one", b"two"]
-
-
 def test_directory_that_cannot_be_made_is_reported_and_tried_again(tmp_path: Path) -> None:
     """As where a disk is there only some seconds after the bridge."""
     directory = tmp_path / "disk" / "logs"

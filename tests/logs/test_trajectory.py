@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from magbridge import logs
-from magbridge.logs.deployment import named_losses, passed_over
+from magbridge.logs.deployment import named_losses
 
 N = 6
 T0 = 1.7e9
@@ -121,15 +121,6 @@ def test_a_fill_value_of_any_type(attribute: str, declared: Any, kind: str, tmp_
     np.testing.assert_array_equal(back["pump"], [1, np.nan, 3, 4, 5, 6])
 
 
-def test_a_double_missing_value_of_a_float(tmp_path: Path) -> None:
-    values = np.array([1, -9999.9, 3, 4, 5, 6], "f4")
-    variables = flown("time") | {
-        "battpos": ("time", values, {"units": "in", "missing_value": np.float64(-9999.9)})
-    }
-    back = logs.read(made(tmp_path / "log.nc", {"time": N}, variables))
-    assert back["battpos"].isnull().values.tolist() == [False, True, False, False, False, False]
-
-
 MEANINGS = (
     "no_qc good_data probably_good probably_bad bad_data changed not_used not_used estimated missing_value"
 )
@@ -182,11 +173,3 @@ def test_a_column_in_a_unit_of_something_else_costs_itself(tmp_path: Path) -> No
     back = logs.read(path)
     assert "depth" not in back
     assert named_losses(back.attrs) == [f"{path}: column 'depth': expected m, not dbar: left out"]
-
-
-def test_a_repeated_time_costs_a_row(tmp_path: Path) -> None:
-    variables = flown("time")
-    variables["time"][1][3] = variables["time"][1][2]
-    back = logs.read(made(tmp_path / "log.nc", {"time": N}, variables))
-    assert back.sizes["time"] == N - 1
-    assert passed_over(back.attrs) == {"duplicate_rows": 1}
