@@ -18,8 +18,6 @@ mpl.use("agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-__all__ = ["draw"]
-
 RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#111111", "#c0392b"
 
 

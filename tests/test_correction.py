@@ -12,7 +12,7 @@ import xarray as xr
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import CalibratedRange, Calibration, Noise, Parameter, Reference
+from magbridge.calibration.model import CalibratedRange, Calibration, Noise, Parameter, Reference, identity
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import Align
 from magbridge.correction import Correction
@@ -150,3 +150,23 @@ def test_a_depth_effect_beyond_the_calibrated_range_stays_within_sigma() -> None
     assert np.sqrt((z[:2000] ** 2).mean()) < 1.25
     deep = corrected["quality"].to_numpy().astype(int)[depth > 160.0]
     assert (deep & Quality.EXTRAPOLATED != 0).mean() > 0.9
+
+
+def test_level_sigma_is_what_the_level_moves() -> None:
+    """A common gain of 0.2 % gives a level of 0.2 % of each field; without a level the column is missing."""
+    gain = 0.002 * 50_000.0
+    w = np.array([gain] * 3 + [0.0] * 6)
+    plain = replace(identity(), covariance=np.outer(w, w), method="survey")
+    levelled = replace(plain, level=tuple(w.tolist()), reference=Reference(50_000.0, level_sigma=100.0))
+    field = np.array([[10_000.0, 0.0, 48_000.0], [0.0, 20_000.0, 40_000.0]])
+    rows = xr.Dataset(
+        {f"mag_{axis}": ("time", column) for axis, column in zip("xyz", field.T, strict=True)},
+        coords={"time": [1e9, 1e9 + 4.0]},
+    )
+    corrected = correct_rows(Correction(levelled), rows)
+    np.testing.assert_allclose(corrected["level_sigma"], 0.002 * np.linalg.norm(field, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(corrected["total_field_sigma"], corrected["level_sigma"], rtol=1e-3)
+    assert "level_sigma" not in correct_rows(Correction(plain), rows)
+    back = Correction(levelled)
+    back._use(plain)  # as a learner that goes back to a calibration without one
+    assert "level_sigma" not in correct_rows(back, rows)

@@ -9,8 +9,6 @@ from magbridge.records import Reading
 from magbridge.sensors import ascii as wire
 from sitl.fluxgate.encoder import Encoder, clip
 
-__all__ = ["AsciiEncoder"]
-
 
 class AsciiEncoder(Encoder):
     """Sends a line with every reading."""

@@ -11,8 +11,6 @@ from magbridge.sensors.digitizer import FULL_SCALE, DigitizerOptions
 from magbridge.sensors.framing import cobs_encode
 from sitl.fluxgate.encoder import Encoder, clip
 
-__all__ = ["DigitizerEncoder"]
-
 WRAP = 1 << 16
 
 

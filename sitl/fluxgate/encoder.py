@@ -7,8 +7,6 @@ from typing import Any, ClassVar
 
 from magbridge.records import Reading
 
-__all__ = ["Encoder", "clip"]
-
 
 class Encoder(ABC):
     """An instrument, switched on, with the options of the driver that reads it.

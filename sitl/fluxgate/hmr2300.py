@@ -7,8 +7,6 @@ from magbridge.sensors import hmr2300 as wire
 from magbridge.sensors.framing import Framer
 from sitl.fluxgate.encoder import Encoder, clip
 
-__all__ = ["Hmr2300Encoder"]
-
 STOP = b"\x1b"
 
 

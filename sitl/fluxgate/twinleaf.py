@@ -12,8 +12,6 @@ from magbridge.sensors import twinleaf as tio
 from magbridge.sensors.framing import CRC32_RESIDUE, Framer
 from sitl.fluxgate.encoder import Encoder, clip
 
-__all__ = ["TwinleafEncoder"]
-
 FLOAT32 = 0x42
 STREAM = {1: 0, 2: 1}
 """The stream that holds the field, in each generation."""

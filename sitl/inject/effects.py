@@ -10,8 +10,6 @@ from sitl.instrument import rotation
 from sitl.signals import first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
-__all__ = ["EFFECTS"]
-
 CALIBRATED_AT = 4.5
 """Instrument's temperature during the calibration, to about half a degree, degC."""
 SWING = {"battpos": 0.6, "ballast": 200.0}

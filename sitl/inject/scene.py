@@ -14,10 +14,6 @@ from sitl.instrument import Instrument
 from sitl.signals import autoregressive, first_order
 from sitl.trajectory import Track
 
-__all__ = [
-    "Array", "Effect", "Generator", "HiddenEffect", "Scene", "direction", "furnish", "relays", "soaked",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Generator = np.random.Generator
 

@@ -3,6 +3,6 @@
 :mod:`.run` plays files. :mod:`.setup` makes the bridge's configuration where none is given; :mod:`.emulation`
 makes of a deployment what its two devices would have sent, the autopilot's MAVLink by :mod:`.autopilot`;
 :mod:`.own_log` takes that from the bridge's own log. The :mod:`.stage` has a pty, a socket and the bridge's
-process (:mod:`.bridge`), which keeps the log's time by the :mod:`.timetable`. :mod:`.listener` receives the
+process (:mod:`.bridge`), which keeps the log's time by a timetable. :mod:`.listener` receives the
 messages of the bridge, and :mod:`.summary` puts the result into words.
 """

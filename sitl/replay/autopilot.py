@@ -17,8 +17,6 @@ from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
 from magbridge.mavlink.messages import east_e7, spec, split_index
 
-__all__ = ["Autopilot"]
-
 HEARTBEAT_US = 1_000_000
 FIX_3D, GPS_ACCURACY = 3, 10_000
 """GPS_FIX_TYPE and mm of its receiver."""

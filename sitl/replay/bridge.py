@@ -23,9 +23,7 @@ from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
-from sitl.replay.timetable import read_entries
-
-__all__ = ["ScriptedEdge"]
+from sitl.replay.stage import read_entries
 
 EVENTS_PER_BATCH = 8192
 """Bytes to the autopilot that may wait to be sent together."""

@@ -16,13 +16,14 @@ import xarray as xr
 from magbridge.bridge import events
 from magbridge.bridge.events import Event
 from magbridge.config import Config
+from magbridge.field.geodesy import separation
 from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel, Reading
 from magbridge.sensors import open_driver
 from sitl.fluxgate import Encoder, open_encoder
 from sitl.replay.autopilot import Autopilot
 
-__all__ = ["emulate", "start_us"]
+__all__ = ["emulate", "start_us", "with_motion"]
 
 LEAD_US = 2_000_000
 """µs before the first row at which the bridge starts."""
@@ -48,8 +49,6 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
         The instrument cannot be emulated.
     """
     if config.navigation is not None:
-        from sitl.motion import with_motion  # noqa: PLC0415 - filterpy takes a second
-
         deployment = with_motion(deployment)
     begin_us = start_us(deployment)
     autopilot = Autopilot(config, begin_us)
@@ -108,3 +107,36 @@ def _stamp(time: float) -> int:
 def _rate(times: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
     steps = [later - earlier for earlier, later in pairwise(times[:1000].tolist())]
     return 1.0 / float(np.median(steps)) if steps else 1.0
+
+
+def with_motion(deployment: xr.Dataset) -> xr.Dataset:
+    """Return the deployment with the columns that the autopilot sends to a navigator.
+
+    These are ``gps_latitude gps_longitude`` (deg), the log's or its first position, and ``local_north
+    local_east`` (m) of a track or a velocity. From a speed or a glide the bridge dead-reckons itself. The
+    motions :data:`~magbridge.navigate.batch.MOTIONS` are tried in that order.
+
+    Raises
+    ------
+    FormatError
+        The log has no position to start from, or no motion.
+    """
+    from magbridge.navigate.batch import MOTIONS, first_position, motion_of  # noqa: PLC0415 - takes a second
+
+    source = str(deployment.attrs.get("source", "deployment"))
+    motion = motion_of(deployment, source)
+    if "gps_latitude" not in deployment:
+        for name, first in zip(("latitude", "longitude"), first_position(deployment, source), strict=True):
+            fix = np.where(np.arange(deployment.sizes["time"]) == 0, first, np.nan)
+            deployment = deployment.assign({f"gps_{name}": ("time", fix)})
+    columns = [deployment[name].to_numpy().astype(float) for name in MOTIONS[motion]]
+    if motion == "velocity":
+        step = np.diff(deployment["time"].to_numpy().astype(float), prepend=np.nan)
+        local = [np.nancumsum(step * (velocity + np.roll(velocity, 1)) / 2) for velocity in columns]
+    elif motion in ("inertial", "position"):
+        latitude, longitude = columns
+        known = np.flatnonzero(np.isfinite(latitude + longitude))[0]
+        local = list(separation(float(latitude[known]), float(longitude[known]), latitude, longitude))
+    else:
+        return deployment
+    return deployment.assign(local_north=("time", local[0]), local_east=("time", local[1]))

@@ -12,8 +12,6 @@ from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAG_NAVIGATION_STATE
 from magbridge.records import Quality
 
-__all__ = ["Listener"]
-
 FIELD, TEXT, NAVIGATION = spec("MAG_FIELD"), spec("STATUSTEXT"), spec("MAG_NAVIGATION")
 COLUMNS = {
     "time": "time_usec",

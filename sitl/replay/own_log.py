@@ -12,8 +12,6 @@ from magbridge.link.component import TIMESYNC_US
 from magbridge.mavlink import FrameLogReader, LogReader, Stream, TlogRecord, spec
 from magbridge.records import Channel
 
-__all__ = ["Recorded", "is_own_log", "runs"]
-
 BEGIN, PARAMETER, STREAM, COLUMN = (
     spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_SIGNING_STREAM", "MAG_COLUMN")
 )

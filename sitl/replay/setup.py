@@ -25,8 +25,6 @@ from magbridge.logs.telemetry_writer import short_name
 from sitl.like import simulate_like
 from sitl.scenario import load
 
-__all__ = ["Part", "ReplaySetup", "bridge_toml", "prepare", "rows_of"]
-
 FULL_SCALE = 100_000.0
 """nT that the emulated fluxgate can read."""
 SENSITIVITY = 5e-5

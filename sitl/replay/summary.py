@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["summary"]
-
 Result = dict[str, Any]
 UNKNOWN = 50_000.0
 """Sigma of the total field from which on nothing is known, nT."""

@@ -21,7 +21,8 @@ COUNT_NT = 100.0
 @pytest.mark.real
 def test_seaglider_dives_held_out(real_data: Path) -> None:
     """The nominal fit is at the sensor's quantisation; moving masses take a few per cent of it."""
-    deployment = read(sorted((real_data / "seaglider_sg167").glob("*.nc"))[:3]).isel(time=slice(None, None, 2))
+    dives = sorted((real_data / "seaglider_sg167").glob("*.nc"))[:3]
+    deployment = read(dives).isel(time=slice(None, None, 2))
     nominal, _ = hold_runs_out(observations(deployment, []), "nominal")
     moving, normalised = hold_runs_out(observations(deployment, ["vbdCC"]), "auto", 2)
     nominal, moving = (error[np.isfinite(error)] for error in (nominal, moving))

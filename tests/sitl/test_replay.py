@@ -25,8 +25,8 @@ from magbridge.mavlink import Codec, LogReader
 from magbridge.records import Channel
 from sitl import Twin, load, segments, simulate
 from sitl.demo import demo
-from sitl.motion import with_motion
 from sitl.replay.autopilot import Autopilot
+from sitl.replay.emulation import with_motion
 from sitl.replay.listener import Listener
 from sitl.replay.own_log import Recorded, is_own_log
 from sitl.replay.run import replay
