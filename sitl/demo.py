@@ -15,7 +15,7 @@ from magbridge.arrays import FloatArray
 from magbridge.bridge.events import StartEvent
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import Fit, fit
-from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observations import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.config import load as load_config
 from magbridge.estimation.residual import rms

@@ -28,7 +28,7 @@ import xarray as xr
 
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observations import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.config import load as load_config
 from magbridge.logs import write

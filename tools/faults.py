@@ -25,7 +25,7 @@ from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent, standstill
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observations import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.config import load as load_config
 from magbridge.records import Channel, Quality

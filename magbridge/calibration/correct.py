@@ -6,8 +6,9 @@ depend on the reading itself are solved for by iteration; all others are exact i
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import inf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from magbridge.calibration.corrector import (
     omega,
     ranges,
 )
-from magbridge.calibration.kernel import Kernel, apply, prepare, variances
+from magbridge.calibration.kernel import Kernel, Prepared, apply, prepare, variances
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import LogSeries, Step
 from magbridge.errors import CalibrationError
@@ -80,15 +81,9 @@ def correct(
             f"expected {len(calibration.channels)} channels ({', '.join(calibration.channels)}), "
             f"found {channels.shape[1]}"
         )
-    # Blocks that fit the cache. Effects have a state, so blocks are processed in order of time.
-    out = np.empty((8, n))
-    kernel, turn = calibration.kernel, omega(calibration)
-    steps = begun(calibration)
+    out, turn = np.empty((8, n)), omega(calibration)
     with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
-        for start in range(0, n, CORRECTED_AT_ONCE):
-            part = slice(start, start + CORRECTED_AT_ONCE)
-            phi = _regressors(kernel, steps, field[part], channels[part], time[part])
-            prepared = _prepare_many(kernel, phi)
+        for part, prepared in _prepared_blocks(calibration, field, channels, time):
             hx, hy, hz = field[part].T
             out[:, part] = apply(hx, hy, hz, prepared, turn, np.sqrt)
         # The flags of :class:`~.corrector.Corrector`, for arrays.
@@ -115,17 +110,25 @@ def vector_covariance(
     -----
     ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij`` with ``d = H_r - T`` (:mod:`.kernel`).
     """
-    kernel, steps, out = calibration.kernel, begun(calibration), np.empty((len(field), 3, 3))
+    out = np.empty((len(field), 3, 3))
     with np.errstate(all="ignore"):
-        for start in range(0, len(field), CORRECTED_AT_ONCE):
-            part = slice(start, start + CORRECTED_AT_ONCE)
-            phi = _regressors(kernel, steps, field[part], channels[part], time[part])
-            linear, V = _prepare_many(kernel, phi)
+        for part, (linear, V) in _prepared_blocks(calibration, field, channels, time):
             # d = H_r - T, then the six entries of V.
             d = field[part].T - np.stack(linear[9:12])
             for (i, j), value in zip(PAIRS, variances(d[0], d[1], d[2], V), strict=True):
                 out[part, i, j] = out[part, j, i] = value
     return out
+
+
+def _prepared_blocks(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> Iterator[tuple[slice, Prepared]]:
+    """Yield blocks of rows that fit the cache, in order of time because effects have a state."""
+    steps = begun(calibration)
+    for start in range(0, len(field), CORRECTED_AT_ONCE):
+        part = slice(start, start + CORRECTED_AT_ONCE)
+        phi = _regressors(calibration.kernel, steps, field[part], channels[part], time[part])
+        yield part, _prepare_many(calibration.kernel, phi)
 
 
 def _regressors(
@@ -157,7 +160,7 @@ def regressors(
     return np.stack(phi)
 
 
-def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:
+def _prepare_many(kernel: Kernel, phi: FloatArray) -> Prepared:
     """Prepare (m, n) regressors; if most repeat the sample before, once for each stretch of equal ones."""
     # At rest the regressors of successive samples are equal: prepare each stretch once, and repeat it.
     new = np.ones(phi.shape[1], bool)

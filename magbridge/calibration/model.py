@@ -9,7 +9,7 @@ The instrument reads ``H_r = D(p) H + T(p)``. The corrected field is::
 The paper is Claus & Bachmayer 2016, Field and Service Robotics, doi:10.1007/978-3-319-27702-8_6. Its eq. 2
 puts the rotation M where it drops out of the magnitude; with its eq. 3 the corrected vector is in the
 ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same ellipsoid, six numbers, and a vector
-that stays in sensor axes (see :mod:`.paper`). Each of the nine coefficients is a polynomial in the positions
+that stays in sensor axes (:func:`to_paper`). Each of the nine coefficients is a polynomial in the positions
 scaled to the range seen, ``x = (p - centre) / scale``. All are kept in nT: ``A = I + a / F_0``, with F_0 the
 field at calibration.
 
@@ -24,6 +24,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -38,7 +40,7 @@ from magbridge.wording import counted
 
 __all__ = [
     "LEVEL_STEP_SIGMA", "MIN_HALF_RANGE", "Boresight", "CalibratedRange", "CalibratedSensor", "Calibration",
-    "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "identity",
+    "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "facts", "identity", "to_paper",
 ]  # fmt: skip
 
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
@@ -383,3 +385,25 @@ def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) ->
         reference=Reference(field),
         method="none",
     )
+
+
+def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
+    """Return rotation M (3, 3) and scale S (3,), nT, of a symmetric positive ``A``; `field` is H_e, nT.
+
+    The axes are ordered and signed so that M is as near to I as possible.
+    """
+    values, axes = np.linalg.eigh(A)
+    order = max(permutations(range(3)), key=lambda p: sum(abs(axes[i, k]) for i, k in enumerate(p)))
+    axes, values = axes[:, order], values[list(order)]
+    axes = axes * np.where(np.diag(axes) < 0.0, -1.0, 1.0)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, np.argmin(np.abs(np.diag(axes)))] *= -1.0
+    return axes, field / values
+
+
+def facts(calibration: Calibration) -> dict[str, Any]:
+    """Return M, S and T (nT) of the terms, at the middle of each parameter's range, as plain values."""
+    middle = {parameter.name: parameter.centre for parameter in calibration.parameters}
+    A, T = calibration.matrices(np.array([[*middle.values()]]))
+    M, S = to_paper(A[0], calibration.reference.field)
+    return {"at": middle, "M": M.tolist(), "S_nT": S.tolist(), "T_nT": T[0].tolist()}

@@ -25,8 +25,8 @@ from magbridge.plugins import load, plugins
 from magbridge.wording import one_of
 
 __all__ = [
-    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "LogSeries", "Parameter", "Polynomial",
-    "PositionTerm", "Power", "Step", "Term", "Width", "full_order", "term_class",
+    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "LogSeries", "Parameter",
+    "Polynomial", "PositionTerm", "Power", "Step", "Term", "Width", "full_order", "term_class",
 ]  # fmt: skip
 
 Exponents = tuple[int, ...]

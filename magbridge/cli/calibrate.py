@@ -268,7 +268,7 @@ def _fit(
     start: FleetPrediction | None,
 ) -> tuple[Fit, Observations, dict[str, Any]]:
     """Return the fit, its samples and the benefit of a fleet's prior; print the warnings."""
-    from magbridge.calibration.fitting.lowpass import unfiltered
+    from magbridge.calibration.fitting.observations import unfiltered
     from magbridge.calibration.fitting.observe import observations
     from magbridge.calibration.fitting.pose import read_vehicle
     from magbridge.calibration.fitting.sources import unused_logs
@@ -433,7 +433,7 @@ def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
 
 def _facts(found: Fit, data: Observations) -> dict[str, Any]:
     from magbridge.calibration.fitting.uncertainty import expected_heading_sigma
-    from magbridge.calibration.paper import facts
+    from magbridge.calibration.model import facts
 
     sigma = expected_heading_sigma(found.calibration, data)
     return {

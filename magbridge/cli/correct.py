@@ -358,7 +358,7 @@ def export(
             "expected --c DIR, --ardupilot F.param, --px4 F.params, --seaglider F.cal or --table F.csv"
         )
 
-    from magbridge.calibration.export_seaglider import position_table
+    from magbridge.calibration.export_compass import position_table
     from magbridge.errors import CalibrationError
     from magbridge.files import atomic_path, new_folder
 
@@ -388,19 +388,19 @@ def _autopilot(
     file: Path, known: mb.Calibration, ardupilot: Path | None, px4: Path | None, number: int
 ) -> dict[Path, str]:
     """Return the autopilots' parameter files that are asked for; report what these cannot hold."""
-    from magbridge.calibration import export_autopilot
+    from magbridge.calibration import export_compass
 
     if ardupilot is None and px4 is None:
         return {}
-    compass, texts = export_autopilot.compass_of(known), dict[Path, str]()
+    compass, texts = export_compass.compass_of(known), dict[Path, str]()
     for lost in compass.lost:
         cli.complain(f"{file}: the autopilot's model cannot hold {lost}")
     if ardupilot is not None:
-        texts[ardupilot], warnings = export_autopilot.ardupilot(compass, number)
+        texts[ardupilot], warnings = export_compass.ardupilot(compass, number)
         for warning in warnings:
             cli.complain(warning)
     if px4 is not None:
-        texts[px4] = export_autopilot.px4(compass, number)
+        texts[px4] = export_compass.px4(compass, number)
     return texts
 
 
@@ -427,7 +427,7 @@ def _filter_lag(known: mb.Calibration, file: Path) -> list[str]:
 
 def _seaglider(file: Path, known: mb.Calibration, nt_per_count: float, dip: float) -> str:
     """Return a Seaglider's coefficients; report on stderr what they cannot hold, and its cost in degrees."""
-    from magbridge.calibration.export_seaglider import heading_cost, seaglider
+    from magbridge.calibration.export_compass import heading_cost, seaglider
 
     text = seaglider(known, nt_per_count)
     for cost in heading_cost(known, dip):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from magbridge.calibration.fitting.offset_terms import Creep
+    from magbridge.calibration.fitting.result import Creep
 
 __all__ = [
     "corrected_by_others", "from_vector", "is_table", "joined", "read_points", "read_table", "without_creep",

@@ -13,9 +13,15 @@ import numpy as np
 import pytest
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.export_autopilot import ardupilot, compass_of, px4
 from magbridge.calibration.export_c import c_header, c_source
-from magbridge.calibration.export_seaglider import heading_cost, position_table, seaglider
+from magbridge.calibration.export_compass import (
+    ardupilot,
+    compass_of,
+    heading_cost,
+    position_table,
+    px4,
+    seaglider,
+)
 from magbridge.calibration.file import load, save
 from magbridge.calibration.heading import heading, level_vector
 from magbridge.calibration.model import Boresight, Calibration, Parameter, identity

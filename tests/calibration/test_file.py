@@ -33,9 +33,10 @@ from magbridge.calibration.model import (
     Parameter,
     Reference,
     Run,
+    facts,
     identity,
+    to_paper,
 )
-from magbridge.calibration.paper import facts, to_paper
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError, FormatError
 

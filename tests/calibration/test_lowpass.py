@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.observations import Observations, unfiltered
 from magbridge.errors import CalibrationError
 
 CORNER = 0.33

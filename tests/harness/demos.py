@@ -8,7 +8,7 @@ from typing import NamedTuple
 import xarray as xr
 
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observations import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from sitl import load, simulate

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.fitting.boresight import choose_boresight, magnetic_headings
 from magbridge.calibration.fitting.crossings import rough_rock
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.offset_terms import offset_diagnostics
+from magbridge.calibration.fitting.result import Creep
 from magbridge.calibration.fitting.uncertainty import apart_from_level, expected_error, nearby_mission
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Polynomial
@@ -306,3 +307,16 @@ def _suspicions(found: Fit) -> Iterator[Diagnostic]:
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
         yield Diagnostic("unusual_scales", {"low": smallest, "high": largest})
+
+
+def offset_diagnostics(calibration: Calibration, creep: Creep | None) -> Iterator[Diagnostic]:
+    """Yield the quantities that the offset depends on."""
+    for effect in calibration.effects:
+        if isinstance(effect, ChannelEffect):
+            slope = float(np.linalg.norm(calibration.coefficients[-effect.size :]))
+            late = f", {effect.lag / 60:.0f} minutes late" if effect.lag else ""
+            values = {"slope": slope, "late": late, "channel": effect.channel}
+            yield Diagnostic("temperature_removed", values)
+    if creep is not None:
+        size = float(np.sqrt(np.mean((creep.offset**2).sum(axis=1))))
+        yield Diagnostic("offset_crept", {"rms_nT": size})

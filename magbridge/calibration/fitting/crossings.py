@@ -15,8 +15,8 @@ from magbridge.diagnostics import Diagnostic
 from magbridge.wording import counted
 
 __all__ = [
-    "PLACE_LENGTH_FRACTION", "courses", "crossed", "far_off", "jumped", "jumps", "left_open", "left_open_by",
-    "rough_rock", "tells_rock", "too_rough",
+    "PLACE_LENGTH_FRACTION", "courses", "crossed", "far_off", "jumped", "jumps", "left_open",
+    "left_open_by", "rough_rock", "tells_rock", "too_rough",
 ]  # fmt: skip
 
 MIN_CROSSING_DEG = 30.0

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import minimize
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
@@ -29,7 +29,7 @@ from magbridge.estimation.priors import PriorFamily
 __all__ = [
     "BENDS", "DECISIVE_LOG_RATIO", "MAX_FIELD_NODES", "MAX_UNCERTAIN_NODES", "SMOOTH", "Choice", "Weighed",
     "about_the_middle", "choose", "climb", "fine_enough", "first_guess", "ladder", "nodes_for", "plausible",
-    "refined", "same_noise",
+    "refined",
 ]  # fmt: skip
 
 # ---- Lengths and nodes ----
@@ -252,6 +252,7 @@ def climb(
     start: Choice,
     weighed: Weighed,
     *,
+    move_ratio: bool = True,
     move_length: bool = True,
     move_rho: bool = True,
     steps: int = 40,
@@ -259,11 +260,11 @@ def climb(
 ) -> Choice:
     """Maximise the evidence from a choice, its nodes kept, to within so much log evidence of the maximum.
 
-    Its length or its noise's memory change, too, if need be.
+    Its size, its length or its noise's memory stay where they must not move.
     """
     # unknowns without bounds: log ratio, logit of rho over its largest value, log length
     share = np.clip(max(start.rho, 0.01) / MAX_FIT_AUTOCORRELATION, 1e-6, 1.0 - 1e-6)
-    moves = [0] + [1] * move_rho + [2] * move_length
+    moves = [0] * move_ratio + [1] * move_rho + [2] * move_length
     first = np.array([0.0, np.log(share / (1.0 - share)), 0.0])
 
     def choice_at(moved: FloatArray) -> Choice:
@@ -303,24 +304,6 @@ def refined(
         nodes = nodes_for(place, field.length, field.alpha)
         field = replace(field, nodes=nodes)
     return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
-
-
-def same_noise(sums: SampleSums, choice: Choice, weighed: Weighed) -> Choice:
-    """Choose the noise's autocorrelation alone, with all samples, where the rest was chosen with a few."""
-
-    def downhill(x: float) -> float:
-        try:
-            rho = MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-x))
-            return -weighed.score(
-                eliminate_field(sums, choice.field, choice.ratio, float(rho)), choice.field, choice.ratio
-            )
-        except np.linalg.LinAlgError:
-            return 1e300
-
-    # rho alone, by its logit: everything else keeps its value
-    found = minimize_scalar(downhill, bounds=(-5.0, 5.0), method="bounded", options={"maxiter": 12})
-    rho = float(MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-found.x)))
-    return replace(choice, rho=rho if rho > WHITE_AUTOCORRELATION else 0.0)
 
 
 # ---- What the search leaves open ----

@@ -18,7 +18,7 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
 
-__all__ = ["Observations", "monomials", "polynomial_samples"]
+__all__ = ["Observations", "monomials", "polynomial_samples", "unfiltered"]
 
 RARE = 0.001
 """Share of the samples at either end that does not count for the range of a condition: it may be wrong."""
@@ -263,3 +263,36 @@ def polynomial_samples(
     """
     phi = monomials(data.parameters, data.ranges() if ranges is None else ranges, exponents)
     return ResidualSamples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
+
+
+MIN_SLOPE_TIME_CONSTANTS = 4.0
+"""Time constants that a slope spans at least: over shorter spans it would be noise."""
+
+
+def unfiltered(data: Observations, corner: float) -> Observations:
+    """Return `data` as they would be without a first-order filter of that corner.
+
+    `data`: as the filter passed them on. `corner`: Hz.
+
+    CalibrationError: the time constant of the filter is longer than the data.
+    """
+    if len(data) < 3:
+        return data
+    tau = 1.0 / (2.0 * np.pi * corner)
+    duration = float(np.ptp(data.time))
+    if tau > duration:
+        raise CalibrationError(
+            f"filter corner = {corner:g} Hz: its time constant of {tau:.3g} s is longer than the data "
+            f"({duration:.3g} s)"
+        )
+    reach = max(int(np.ceil(0.5 * MIN_SLOPE_TIME_CONSTANTS * tau / np.median(np.diff(data.time)))), 1)
+    stretch = np.cumsum(data.steps != 1)
+    rows = np.arange(len(data))
+    ahead, behind = np.minimum(rows + reach, len(data) - 1), np.maximum(rows - reach, 0)
+    # a slope does not reach into another run; at an end it looks one way only
+    ahead = np.where(stretch[ahead] == stretch, ahead, rows)
+    behind = np.where(stretch[behind] == stretch, behind, rows)
+    apart = data.time[ahead] - data.time[behind]
+    rise: FloatArray = data.field[ahead] - data.field[behind]
+    slope = np.divide(rise, apart[:, None], out=np.zeros_like(rise), where=apart[:, None] > 0.0)
+    return replace(data, field=data.field + tau * slope, filter_cutoff=corner)

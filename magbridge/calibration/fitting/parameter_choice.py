@@ -138,6 +138,9 @@ FAILURES = 2
 """Columns in a row that were not worth it, after which no more are tried."""
 MAX_HELD_OUT_ERROR_RATIO = 0.95
 """Share of the error on parts left out that may be left, for a column to be worth its coefficients."""
+SCREENING_SAMPLES = 20_000
+"""Samples at most with which columns are chosen, every second, third ... of a longer log: enough for a ratio
+of errors, and the time is bounded."""
 USUAL_DEPARTURE = 0.15
 """Departure of a scale from 1 that sensors have. Beyond it a parameter must not move the scales further away:
 its coefficients have then absorbed attitudes, because it moved with them."""
@@ -166,6 +169,8 @@ def best_parameters(
 
     CalibrationError: the data do not support a fit without parameters.
     """
+    step = -(-deployment.sizes["time"] // SCREENING_SAMPLES)
+    deployment = deployment.isel(time=slice(None, None, max(step, 1)))
     taken: tuple[str, ...] = ()
     found = fit(observations(deployment, taken, grid=grid), **options)
     offers: list[Offer] = []

@@ -11,7 +11,6 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.left_out import LeftOut
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.offset_terms import Creep
 from magbridge.calibration.fitting.pose import Posed
 from magbridge.calibration.fitting.solve import CoefficientPosterior
 from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Reference, Run
@@ -22,7 +21,23 @@ from magbridge.estimation.residual import ResidualSamples, rms, scales_and_offse
 from magbridge.version import __version__
 from magbridge.wording import counted
 
-__all__ = ["Fit", "assemble"]
+__all__ = ["Creep", "Fit", "assemble"]
+
+
+@dataclass(frozen=True, eq=False)
+class Creep:
+    """Drift of the offset during a survey."""
+
+    time: FloatArray
+    """(n,), s since 1970 UTC."""
+    offset: FloatArray
+    """(n, 3), nT, sensor axes, about the mean."""
+    calibration: Calibration
+    """Calibration without the walk; beyond the survey the offset may have any value of it."""
+
+    def offset_at(self, time: FloatArray) -> FloatArray:
+        """Return the offset (m, 3), nT, at times (m,), s since 1970 UTC."""
+        return np.stack([np.interp(time, self.time, one) for one in self.offset.T], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

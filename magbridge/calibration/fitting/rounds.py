@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -17,12 +17,12 @@ from magbridge.calibration.fitting.field_search import (
     Weighed,
     about_the_middle,
     choose,
+    climb,
     first_guess,
     ladder,
     nodes_for,
     plausible,
     refined,
-    same_noise,
 )
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.solve import approach, starts
@@ -119,6 +119,8 @@ SEARCHED, WIDE = 12_000, 5_000.0
 many m north and east, every second or third of these."""
 FIRST_SAMPLES = 50_000
 """Samples with which the iterations converge, before those with all of a longer log."""
+NOISE_ALONE: dict[str, Any] = {"move_ratio": False, "move_length": False, "steps": 16}
+"""Search of the noise's autocorrelation alone, with all samples."""
 MAX_SAMPLE_NODES = 40_000
 """Nodes about all samples, at most."""
 
@@ -175,7 +177,7 @@ class Rounds:
         self.last = self._residuals(self.z, self._slow(self.z) + survey.rock(field, self.w))
         survey.kept = survey.at_rest & (np.abs(self.last) <= FIT_OUTLIER_SIGMA * robust_scale(self.last))
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
-        self.choice = same_noise(self._sums(field), self.choice, weighed)
+        self.choice = climb(self._sums(field), self.choice, weighed, **NOISE_ALONE)
 
     def settle(self) -> Answer:
         """Return the answer; NoSolutionError: the iterations do not converge."""
@@ -211,7 +213,8 @@ class Rounds:
         # 1. normal equations about the last answer, and the sparse field eliminated from them
         sums = self._sums(self.choice.field)
         if searched and self.step > 1:
-            self.choice = same_noise(sums, self.choice, weighed)
+            # size and length were chosen with a part of the samples
+            self.choice = climb(sums, self.choice, weighed, **NOISE_ALONE)
         choice, reduced = (
             self.choice,
             eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho),

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "Design", "Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "facts", "flight_plan",
-    "mission_samples", "plan", "settled", "summary", "trim_of",
+    "Design", "Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "facts",
+    "flight_plan", "mission_samples", "plan", "settled", "summary", "trim_of",
 ]  # fmt: skip
 
 SLACK = 3.0

@@ -1,0 +1,270 @@
+"""Export a calibration as compass parameters of ArduPilot, PX4 and Seaglider, as far as they allow.
+
+The autopilots correct by a symmetric matrix and an offset, and by a vector times the battery's current::
+
+    ArduPilot  b = M (h + OFS) + MOT I                      mG, mG/A
+    PX4        b = M (h + COMP I - OFF)                     G, G/kA
+
+Ours is ``b = R A(x) (h - T(x))``. So ``M = A``, ``OFS = -T``; a parameter in ampere whose field is linear
+gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects, and the boresight R; the
+export reports the resulting error.
+
+A Seaglider corrects counts of its compass by an offset and a matrix, in axes with y and z reversed, and
+levels the result with roll and pitch::
+
+    m = (x, -y, -z),    p = soft (m - hard),    psi = atan2(p_y', p_x')
+
+With ``S = diag(1, -1, -1)`` and c nT in a count, the same heading follows from ``hard = S T / c`` and ``soft
+= S R A S``, both at the middle of each parameter's range: :func:`heading_cost` computes what that costs.
+
+References
+----------
+iop-apl-uw/basestation3, BaseMagCal.py (``compassTransform``) and Magcal.py (``hard0`` and ``soft0``).
+ArduPilot, AP_Compass_Backend::correct_field; PX4, sensor_calibration/Magnetometer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.heading import heading
+from magbridge.calibration.model import Calibration
+from magbridge.columns import NT_PER_UNIT, usual
+from magbridge.errors import CalibrationError
+
+__all__ = [
+    "Compass", "HeadingCost", "ardupilot", "compass_of", "heading_cost", "matrix_and_offset",
+    "position_table", "px4", "seaglider",
+]  # fmt: skip
+
+AUTOPILOT_AXES = "X", "Y", "Z"
+OFF = (0, 1), (0, 2), (1, 2)
+FLOAT, INTEGER = 9, 6
+"""MAV_PARAM_TYPE of a QGroundControl parameter file."""
+MAX_OFFSET_MG = 1_800.0
+"""mG: ArduPilot refuses to arm with longer offsets (COMPASS_OFFS_MAX)."""
+
+
+@dataclass(frozen=True)
+class Compass:
+    """The part of a calibration that an autopilot's compass model can represent."""
+
+    matrix: FloatArray
+    """(3, 3): Symmetric."""
+    offset: FloatArray
+    """(3,), nT, T at the middle of each parameter's range, at no current."""
+    current: FloatArray | None
+    """(3,), nT/A, dT/dI."""
+    lost: tuple[str, ...]
+    """Parts of the calibration that the format cannot represent, with the resulting error."""
+
+
+def compass_of(calibration: Calibration) -> Compass:
+    """Return the part of a calibration that an autopilot's compass model can represent."""
+    currents = [k for k, one in enumerate(calibration.parameters) if usual(one.unit) == "A"][:1]
+    # expand about the middle of each range, and about no current: T(I) = T + I dT/dI
+    middle = _middle(calibration)
+    middle[currents] = 0.0
+    matrix, offset = matrix_and_offset(calibration, middle)
+    current = None
+    if currents:
+        step = np.zeros(len(middle))
+        step[currents] = 1.0
+        current = matrix_and_offset(calibration, middle + step)[1] - offset
+    lost = []
+    # the error of that expansion is largest at the corners of the ranges
+    corners = product(*((one.low, one.high) for one in calibration.parameters))
+    field = calibration.reference.field * np.eye(3)
+    worst = 0.0
+    for corner in corners:
+        there, shift = matrix_and_offset(calibration, np.array(corner))
+        held = offset + (current * corner[currents[0]] if current is not None else 0.0)
+        worst = max(worst, float(np.linalg.norm(shift - held) + np.linalg.norm((there - matrix) @ field, 2)))
+    if worst > 1.0:
+        names = ", ".join(one.name for k, one in enumerate(calibration.parameters) if k not in currents)
+        what = f"the field of {names or 'the current beyond its first order'}"
+        lost.append(f"{what}: up to {worst:.0f} nT at the ends of its range")
+    lost += [f"an effect: {type(one).__name__}" for one in calibration.effects]
+    if calibration.boresight is not None:
+        angle = float(np.degrees(np.linalg.norm(calibration.boresight.rotation)))
+        lost.append(f"the boresight, a turn of {angle:.1f} deg: set the compass' orientation")
+    lost.append("uncertainties and flags")
+    return Compass(matrix, offset, current, tuple(lost))
+
+
+def matrix_and_offset(calibration: Calibration, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return A (3, 3) and T (3,), nT, at the parameters' values."""
+    A, T = calibration.matrices(np.reshape(values, (1, -1)))
+    return A[0], T[0]
+
+
+def _middle(calibration: Calibration) -> FloatArray:
+    """Return the middle of each parameter's range, (k,)."""
+    return np.array([0.5 * (one.low + one.high) for one in calibration.parameters])
+
+
+def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
+    """Return the text of a ``.param`` file for compass `number` (from 0), and warnings."""
+    mG = NT_PER_UNIT["mG"]
+    n = "" if number == 0 else str(number + 1)
+    # ArduPilot: corrected = ODI (raw + OFS) + MOT I, in mG
+    offset = -compass.offset / mG
+    values = {f"COMPASS_OFS{n}_{axis}": offset[k] for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {f"COMPASS_DIA{n}_{axis}": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {
+        f"COMPASS_ODI{n}_{axis}": compass.matrix[pair] for axis, pair in zip(AUTOPILOT_AXES, OFF, strict=True)
+    }
+    values[f"COMPASS_SCALE{n}"] = 1.0
+    if compass.current is not None:
+        # the current is compensated after the matrix
+        motor = -(compass.matrix @ compass.current) / mG
+        values |= {"COMPASS_MOTCT": 2.0} | {
+            f"COMPASS_MOT{n}_{axis}": motor[k] for k, axis in enumerate(AUTOPILOT_AXES)
+        }
+    text = "".join(f"{name},{float(value):.9g}\n" for name, value in values.items())
+    length = float(np.linalg.norm(offset))
+    long = [
+        f"offsets of {length:.0f} mG: ArduPilot does not arm beyond COMPASS_OFFS_MAX, {MAX_OFFSET_MG:.0f}"
+    ]
+    return text, long if length > MAX_OFFSET_MG else []
+
+
+def px4(compass: Compass, number: int = 0) -> str:
+    """Return the text of a QGroundControl parameter file for PX4's compass `number` (from 0)."""
+    G = NT_PER_UNIT["G"]
+    # PX4: corrected = SCALE (raw - OFF), in G; the current in kA
+    values = {f"CAL_MAG{number}_{axis}OFF": compass.offset[k] / G for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {f"CAL_MAG{number}_{axis}SCALE": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {
+        f"CAL_MAG{number}_{axis}ODIAG": compass.matrix[pair]
+        for axis, pair in zip(AUTOPILOT_AXES, OFF, strict=True)
+    }
+    lines = ["# Vehicle-Id Component-Id Name Value Type"]
+    if compass.current is not None:
+        values |= {
+            f"CAL_MAG{number}_{axis}COMP": -1e3 * compass.current[k] / G
+            for k, axis in enumerate(AUTOPILOT_AXES)
+        }
+        lines.append(f"1\t1\tCAL_MAG_COMP_TYP\t2\t{INTEGER}")
+    lines += [f"1\t1\t{name}\t{float(value):.9g}\t{FLOAT}" for name, value in values.items()]
+    return "\n".join(lines) + "\n"
+
+
+TO_SEAGLIDER_AXES = np.diag([1.0, -1.0, -1.0])
+TABLE_POSITIONS = 11
+"""Positions of the mass in a table."""
+PITCHES_DEG = -25.0, 0.0, 25.0
+"""Pitch angles of a glider at which the cost is computed."""
+HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
+
+
+@dataclass(frozen=True)
+class HeadingCost:
+    """Heading error (deg) that omitting a part of the calibration causes."""
+
+    name: str
+    """The parameter; empty for all together."""
+    rms: float
+    largest: float
+
+
+def rotation(calibration: Calibration) -> FloatArray:
+    """Return the boresight (3, 3); CalibrationError: there is none, and a heading needs one."""
+    if calibration.boresight is None:
+        raise CalibrationError(
+            "no boresight: the matrix of a compass needs one; calibrate with roll and pitch in the log, at "
+            "several pitch angles"
+        )
+    return calibration.boresight.matrix()
+
+
+def seaglider(calibration: Calibration, nT_per_count: float) -> str:
+    """Return the text of a ``tcm2mat.cal``.
+
+    CalibrationError: the calibration has no boresight.
+    """
+    S = TO_SEAGLIDER_AXES
+    A, T = matrix_and_offset(calibration, _middle(calibration))
+    hard = S @ T / nT_per_count
+    soft = S @ rotation(calibration) @ A @ S
+    hard_text = " ".join(f"{value:.1f}" for value in hard)
+    soft_text = " ".join(f"{value:.5f}" for value in soft.ravel())
+    return f'hard0="{hard_text}"\nsoft0="{soft_text}"\n'
+
+
+def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
+    """Return the heading error due to the moving masses if only one offset and one matrix are used.
+
+    `calibration`: with a boresight. `dip_deg`: deg, inclination of the Earth's field: the error is inversely
+    proportional to its horizontal part. Returns: With all parameters at the ends of their ranges; then with
+    one at its ends, each.
+    """
+    ends = [(one.low, one.high) for one in calibration.parameters]
+    centre = _middle(calibration)
+    R = rotation(calibration)
+    costs = []
+    for k in range(-1, len(ends) if len(ends) > 1 else 0):
+        moved = list(product(*ends)) if k < 0 else [_moved_mass(centre, k, end) for end in ends[k]]
+        errors = np.concatenate([_errors(calibration, R, np.array(one), dip_deg) for one in moved])
+        name = calibration.parameters[k].name if k >= 0 else ""
+        costs.append(HeadingCost(name, float(np.sqrt(np.mean(errors**2))), float(np.abs(errors).max())))
+    return costs if ends else []
+
+
+def _moved_mass(centre: FloatArray, k: int, value: float) -> FloatArray:
+    positions = centre.copy()
+    positions[k] = value
+    return positions
+
+
+def _errors(calibration: Calibration, R: FloatArray, positions: FloatArray, dip_deg: float) -> FloatArray:
+    """Return heading errors (deg), masses at `positions` and corrected as if at the middle."""
+    A_0, T_0 = matrix_and_offset(calibration, _middle(calibration))
+    A, T = matrix_and_offset(calibration, positions)
+    F, dip = calibration.reference.field, np.radians(dip_deg)
+    errors = []
+    for pitch in np.radians(PITCHES_DEG):
+        psi = np.radians(HEADINGS_DEG)
+        # the Earth's field in level axes, then in body axes of this pitch
+        ahead, right = F * np.cos(dip) * np.cos(psi), -F * np.cos(dip) * np.sin(psi)
+        down = np.full(len(psi), F * np.sin(dip))
+        body = np.stack(
+            [
+                np.cos(pitch) * ahead - np.sin(pitch) * down,
+                right,
+                np.sin(pitch) * ahead + np.cos(pitch) * down,
+            ],
+            axis=1,
+        )
+        # what the sensor reads there: h = A^-1 R^T b + T
+        raw = np.linalg.solve(A, (body @ R).T).T + T
+        corrected = (raw - T_0) @ (R @ A_0).T
+        found = heading(corrected, 0.0, np.full(len(psi), pitch)).magnetic
+        errors.append((found - HEADINGS_DEG + 180.0) % 360.0 - 180.0)
+    return np.concatenate(errors)
+
+
+def position_table(calibration: Calibration, parameter: str) -> str:
+    """Return a CSV of offset (nT) and matrix at positions of one mass, the others at the middle.
+
+    ``b = M (h - offset)``, in body axes, x forward, y starboard, z down.
+
+    CalibrationError: the calibration has no such parameter, or no boresight.
+    """
+    names = [one.name for one in calibration.parameters]
+    if parameter not in names:
+        raise CalibrationError(f"parameter {parameter!r}: expected one of {', '.join(names) or 'none'}")
+    k, R = names.index(parameter), rotation(calibration)
+    one = calibration.parameters[k]
+    axes = "xyz"
+    header = [f"{parameter} [{one.unit or 1}]", *(f"offset_{axis} [nT]" for axis in axes)]
+    header += [f"matrix_{row}{column}" for row in axes for column in axes]
+    lines = [",".join(header)]
+    for position in np.linspace(one.low, one.high, TABLE_POSITIONS):
+        A, T = matrix_and_offset(calibration, _moved_mass(_middle(calibration), k, position))
+        lines.append(",".join(f"{value:.9g}" for value in (position, *T, *(R @ A).ravel())))
+    return "\n".join(lines) + "\n"
