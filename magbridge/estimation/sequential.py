@@ -225,7 +225,7 @@ class SequentialTest:
     def competing(self, distance: float) -> tuple[list[int], FloatArray]:
         """Return the rows whose L is within `distance` of the largest, likeliest first, and their weights.
 
-        The weights are the posterior probabilities of these rows, if all were equally likely before.
+        The weights (m,) are the posterior probabilities of these rows, if all were equally likely before.
         """
         order = np.argsort(-self.log_ratio, kind="stable")
         rows = order[self.log_ratio[order] > self.log_ratio[order[0]] - distance]
