@@ -16,7 +16,7 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
 from magbridge.columns import TEMPERATURE
 from magbridge.config import Align
-from magbridge.field.nearby import HeldField
+from magbridge.field.igrf import HeldField
 from magbridge.filter_lag import LagCorrection
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
 from magbridge.health.consistency import MASS_FRACTION

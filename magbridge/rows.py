@@ -13,8 +13,7 @@ from magbridge.calibration.correct import vector_covariance
 from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, require
 from magbridge.correction import Correction
-from magbridge.field.igrf import magnitude
-from magbridge.field.nearby import HeldField
+from magbridge.field.igrf import HeldField, magnitude
 from magbridge.field.reference import main_field
 from magbridge.records import Quality, Reading
 

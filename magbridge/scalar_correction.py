@@ -18,12 +18,7 @@ import numpy as np
 from magbridge.align import Aligner, Input, Sample
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Noise
-from magbridge.calibration.scalar import (
-    CYCLE_LEVEL_SIGMA_NT,
-    ScalarSensor,
-    ScalarSeries,
-    correct_scalar,
-)
+from magbridge.calibration.scalar import CYCLE_LEVEL_SIGMA_NT, ScalarSensor, ScalarSeries, correct_scalar
 from magbridge.config import Align
 from magbridge.health import HealthMonitor, Messages
 from magbridge.parts import OptionalParts

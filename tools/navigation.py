@@ -59,7 +59,7 @@ from voyages import (
 
 from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree, separation
-from magbridge.navigate.bank import Tracker
+from magbridge.navigate.bank import Bank
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import Block, prior, transition
@@ -277,7 +277,7 @@ def show_speed(console: Console) -> None:
     """Print the processor time of an update, of 100,000 samples, and of a sample of a wide start."""
     grid = synthetic(Map(30, 1500), 3, 40_000.0)
     options = with_options(GLIDER, start_sigma=50.0)
-    tracker = Tracker(grid, *prior(options), options.gate)
+    tracker = Bank(grid, *prior(options), np.inf, options.gate)
     block = Block(int(START * 1e6), *PLACE, grid.look_up(PLACE[1], PLACE[0]).anomaly, 1.0, 0.0, 0.0)
     moved = transition(options, 4.0, 1.4)
     begun = clock.process_time()

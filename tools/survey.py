@@ -83,7 +83,7 @@ def run(hours: float, size: float, length: float, noise: str, drift: float, seed
         "bias": float(error.mean()) / float(bias.mean()),
     }
     if not drift:  # the map is drawn along the track as it was logged
-        row |= score_map(twin, survey(from_vector(log, found, 0)), size, length, best)
+        row |= score_map(twin, survey(from_vector(log, found)), size, length, best)
     return [row]
 
 

@@ -28,13 +28,12 @@ from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.depth import at_depth
+from magbridge.navigate.findings import errors as track_errors
 from magbridge.navigate.model import Block, Collector, block_length
 from magbridge.navigate.navigator import Navigator
-from magbridge.navigate.options import NavigationOptions, informed
+from magbridge.navigate.options import NavigationOptions, at_depth, informed
 from magbridge.navigate.own_survey import localise
 from magbridge.navigate.record import NavigationState
-from magbridge.navigate.reference_track import errors as track_errors
 from magbridge.rows import correct_rows
 from sitl import Twin, load, segments, simulate
 from sitl.dataset import at_rest

@@ -22,9 +22,8 @@ from magbridge.link.output import Rate
 from magbridge.mavlink import Message, by_id, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.navigate import NavigationOptions, NavigationState, Navigator, Record
-from magbridge.navigate.depth import at_depth
 from magbridge.navigate.gnss import GnssMonitor, GnssReason, GnssState
-from magbridge.navigate.options import informed
+from magbridge.navigate.options import at_depth, informed
 from magbridge.navigate.record import Reckoned
 from magbridge.records import Corrected
 from magbridge.toml import convert

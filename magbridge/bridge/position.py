@@ -11,7 +11,7 @@ from magbridge.field.geodesy import separation
 from magbridge.mavlink import Message, spec
 
 if TYPE_CHECKING:
-    from magbridge.field.nearby import NearbyField
+    from magbridge.field.igrf import NearbyField
 
 __all__ = ["CLOCK_SET_US", "Position"]
 
@@ -148,7 +148,7 @@ class Position:
         assert self._where is not None
         try:
             if self._model is None:
-                from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
+                from magbridge.field.igrf import NearbyField  # noqa: PLC0415 - the field model is optional live
 
                 self._model = NearbyField()
             return self._model.field_and_slopes(*self._where, self._depth, utc_us * 1e-6)[0]

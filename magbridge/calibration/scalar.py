@@ -206,24 +206,10 @@ def term_columns(channels: tuple[ScalarChannel, ...]) -> dict[str, slice]:
 
 
 def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScalar:
-    """Compensate a scalar magnetometer.
+    """Compensate a scalar magnetometer; the reference of `series` may be NaN throughout.
 
-    Parameters
-    ----------
-    sensor : ScalarSensor
-        The calibrated sensor.
-    series : ScalarSeries
-        `reference` may be NaN throughout.
-
-    Returns
-    -------
-    CorrectedScalar
-        `field` is NaN where a channel, the direction or the reading is unknown; `sigma` there is infinite.
-
-    Raises
-    ------
-    CalibrationError
-        Another number of channels than the sensor's.
+    The field (n,) is NaN where a channel, the direction or the reading is unknown; its sigma there is
+    infinite. CalibrationError: another number of channels than the sensor's.
     """
     known = sensor.channels
     if series.channels.shape[1] != len(known):
@@ -244,13 +230,8 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
         margin = RANGE_MARGIN * (high - low)
         outside = ((series.channels < low - margin) | (series.channels > high + margin)).any(axis=1)
     missing = ~np.isfinite(field)
-    return CorrectedScalar(
-        field,
-        np.where(missing, np.inf, np.sqrt(variance)),
-        level_sigma,
-        np.asarray(outside & ~missing),
-        missing,
-    )
+    sigma = np.where(missing, np.inf, np.sqrt(variance))
+    return CorrectedScalar(field, sigma, level_sigma, np.asarray(outside & ~missing), missing)
 
 
 def _level(
@@ -292,12 +273,8 @@ def compare_sensors(
 ) -> Witness:
     """Compare a compensated scalar sensor with the length of a corrected vector.
 
-    Parameters
-    ----------
-    scalar, scalar_sigma, total, total_sigma : (n,) array
-        nT, both sensors' total field with its standard deviation; NaN where unknown.
-    reference : (n,) array
-        nT, what the field is expected to be; NaN where unknown.
+    All are (n,), nT: both sensors' total field with its standard deviation, and the expected field; NaN where
+    unknown.
 
     Notes
     -----
@@ -318,12 +295,8 @@ def compare_sensors(
         # Both comparisons are False where the expected field is unknown.
         spares_scalar = off_total > BLAME_RATIO * off_scalar
         spares_vector = off_scalar > BLAME_RATIO * off_total
-    return Witness(
-        np.where(spares_scalar, 0.0, excess),
-        np.where(spares_vector, 0.0, excess),
-        np.asarray(disagrees),
-        _jumps(scalar) & ~_jumps(total),
-    )
+    for_scalar, for_vector = (np.where(spared, 0.0, excess) for spared in (spares_scalar, spares_vector))
+    return Witness(for_scalar, for_vector, np.asarray(disagrees), _jumps(scalar) & ~_jumps(total))
 
 
 def _expected_field(

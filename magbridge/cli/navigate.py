@@ -146,7 +146,7 @@ def _corrected(
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
     """Return a track's accuracy: by the filter's own sigma, and by the true track where the log has it."""
-    from magbridge.navigate.reference_track import errors
+    from magbridge.navigate.findings import errors
 
     valid, rows = float(track["valid"].mean()), track.sizes["time"]
     sigma = float((track["covariance_nn"] + track["covariance_ee"])[-1]) ** 0.5
@@ -215,7 +215,7 @@ def _continued(
     grid: AnomalyGrid, options: NavigationOptions, deployment: xr.Dataset
 ) -> tuple[AnomalyGrid, NavigationOptions]:
     """Return the map continued to the deployment's depth, and options with the error of that; report it."""
-    from magbridge.navigate.depth import at_depth
+    from magbridge.navigate.options import at_depth
 
     there, known = at_depth(grid, options, deployment.get("depth", 0.0))
     if there is not grid and known != options:

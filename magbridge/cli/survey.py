@@ -117,9 +117,9 @@ def survey(
     output
         The map, netCDF (.nc): what navigate --map takes. With --predict: the predictions (.csv).
     """
+    from magbridge.survey.maps import write_crossovers, write_tracks
     from magbridge.survey.run import facts, summary
     from magbridge.survey.run import survey as make
-    from magbridge.survey.write import write_crossovers, write_tracks
 
     cli.logs_to_read(logs, output, correction.base, products.predict, *correction.calibration)
     if products.predict is None and output.suffix.lower() != ".nc":
@@ -235,8 +235,8 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
 
 def _predict(done: Result, points: Path, output: Path) -> None:
     """Write the anomaly at the user's points."""
+    from magbridge.survey.maps import write_points
     from magbridge.survey.read import read_points
-    from magbridge.survey.write import write_points
 
     longitude, latitude, depth, place = read_points(points, done.samples.origin)
     anomaly, sigma = done.gridded.evaluate(place, depth)
@@ -245,8 +245,7 @@ def _predict(done: Result, points: Path, output: Path) -> None:
 
 def _map(done: Result, output: Path, products: MapOptions) -> None:
     """Write the map in every form that is asked for."""
-    from magbridge.survey.maps import anomaly_map
-    from magbridge.survey.write import write_geotiff
+    from magbridge.survey.maps import anomaly_map, write_geotiff
 
     spacing, altitude = products.spacing, products.altitude
     grid = anomaly_map(done.gridded, done.samples, spacing=spacing, altitude=altitude, name=output.name)

@@ -27,7 +27,6 @@ from magbridge.field.spline import filled
 
 __all__ = ["Continued", "continued", "raised", "smoothed"]
 
-
 SURE, TERMS = 3, 10
 """Terms of the series that are used, and terms that stand for the true field when the error is estimated:
 later ones are waves that no survey from above resolves."""
@@ -46,15 +45,10 @@ class Continued(NamedTuple):
 
 
 def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
-    """Return a grid continued to the mean depth, with its vertical gradient there.
+    """Return a grid continued to the mean depth, with its vertical gradient there; holes stay holes.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-        A grid of unknown altitude is returned unchanged. Holes stay holes.
-    depth : array_like, (n,)
-        All depths at which the grid will be used, m below the surface; negative is above. Their mean is the
-        level of the result.
+    `depth` (n,): all depths at which the grid will be used, m below the surface; negative is above. A grid of
+    unknown altitude is returned unchanged.
 
     Notes
     -----
@@ -101,12 +95,7 @@ SIGN_WAVELENGTH_FRACTION = 0.25
 def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     """Return a grid without its short waves; the removed part counts as its sigma. Holes stay holes.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-        Grid of any altitude.
-    wavelength : float
-        Wavelength that keeps half its amplitude, m; twice that keeps 84 %, half that 6 %.
+    A wave of `wavelength` (m) keeps half its amplitude, one of twice that 84 %, one of half that 6 %.
 
     Notes
     -----

@@ -19,7 +19,7 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.geodesy import metres_per_degree, signed_longitude, wrap
 from magbridge.field.grid_netcdf import write
-from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
+from magbridge.field.spline import coefficients, filled, weights
 
 __all__ = ["HOLE", "AnomalyGrid", "Local", "T", "curvature"]
 
@@ -140,58 +140,16 @@ class AnomalyGrid:
         return None if self.vertical is None else coefficients(self.vertical)
 
     def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
-        """Return the map around one place, all NaN off the map; the fast path of the filter.
-
-        Parameters
-        ----------
-        longitude, latitude : float
-            deg.
-        depth : float, optional
-            m below the surface; default the map's own height.
-        """
-        u = wrap(longitude - self._x0) / self._dx
-        if u < 0.0:  # a grid may span more than half the globe
-            u += 360.0 / self._dx
-        v = (latitude - self._y0) / self._dy
-        rows, columns = self._whole.shape
-        if not (0.0 <= u <= columns and 0.0 <= v <= rows):
-            return OFF_THE_MAP
-        j, i = min(int(u), columns - 1), min(int(v), rows - 1)
-        if not self._whole[i, j]:
-            return OFF_THE_MAP
-        s, t = u - j, v - i
-        # Cubic B-spline of the 4 x 4 coefficients: weights of value, slope and second derivative.
-        across = (WEIGHTS @ (1.0, s, s * s, s * s * s)).reshape(3, 4)
-        along = (WEIGHTS @ (1.0, t, t * t, t * t * t)).reshape(3, 4)
-        patch = self._coefficients[i : i + 4, j : j + 4]
-        # Depth by the vertical slope; NaN stands for the map's own height.
-        if self._vertical is not None and (below := depth + self.altitude) == below:
-            patch = patch + below * self._vertical[i : i + 4, j : j + 4]
-        (f, fx, fxx), (fy, fxy, _), (fyy, _, _) = (along @ patch @ across.T).tolist()
-        per_latitude, per_longitude = metres_per_degree(latitude)
-        north, east = 1.0 / (per_latitude * self._dy), 1.0 / (per_longitude * self._dx)
-        if self._even_sigma:
-            variance = float(self._variance[0, 0])
-        else:
-            # Bilinear interpolation of the variance.
-            a, b = self._variance[i, j : j + 2].tolist()
-            c, d = self._variance[i + 1, j : j + 2].tolist()
-            variance = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
-        return Local(
-            f, fy * north, fx * east, fyy * north * north, fxy * north * east, fxx * east * east, variance
-        )
+        """Return the map around one place, as :meth:`evaluate` does around many."""
+        local = self.evaluate(longitude, latitude, depth)
+        return Local._make(float(values[0]) for values in local)
 
     def evaluate(
         self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan
     ) -> Local[FloatArray]:
         """Return the map around n places as arrays (n,), NaN off the map and for NaN positions.
 
-        Parameters
-        ----------
-        longitude, latitude : array_like
-            deg.
-        depth : array_like, optional
-            m below the surface; default, and where it is NaN, the map's own height.
+        `depth` is in m below the surface; default, and where it is NaN, the map's own height.
         """
         lon, lat = np.broadcast_arrays(
             np.atleast_1d(np.asarray(longitude, float)), np.atleast_1d(np.asarray(latitude, float))
@@ -374,18 +332,11 @@ class Local(NamedTuple, Generic[T]):
     variance: T
 
 
-OFF_THE_MAP: Local[float] = Local(nan, nan, nan, nan, nan, nan, nan)
-
-
 def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
     """Return the effect of curvature on mean (nT) and variance (nT²) of the map within a position's spread.
 
-    Parameters
-    ----------
-    local : Local
-        The map at the position's mean.
-    nn, ne, ee : float or (n,) array
-        m², covariance P of the position.
+    `local` is the map at the position's mean; `nn`, `ne`, `ee` are the position's covariance P, m², floats or
+    (n,).
 
     Notes
     -----

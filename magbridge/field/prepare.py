@@ -58,20 +58,16 @@ def prepare(
     Raises
     ------
     OutOfRange
-        An altitude below a grid's: continuing downward amplifies what the survey did not resolve. A grid of
-        unknown altitude that is to be continued, or merged with one of known altitude. More than
-        :data:`MAX_MERGED_NODES` nodes.
+        An altitude below a grid's; a grid of unknown altitude that is to be continued, or merged with one of
+        known altitude; more than :data:`MAX_MERGED_NODES` nodes.
     """
     steps = [PreparationStep(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
     level = altitude if altitude is not None else max(known, default=nan)
     if isfinite(level) and len(known) < len(grids):
         silent = next(grid.name for grid in grids if not isfinite(grid.altitude))
-        raise OutOfRange(
-            "altitude",
-            f"{level:.0f} m",
-            f"{silent} does not say how high it was surveyed (--survey-altitude)",
-        )
+        covered = f"{silent} does not say how high it was surveyed (--survey-altitude)"
+        raise OutOfRange("altitude", f"{level:.0f} m", covered)
     lifted = []
     for grid in grids:
         up = level - grid.altitude
@@ -115,11 +111,8 @@ def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> lis
 def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
     """Return the grid as a survey `height` m higher would have seen it, holes kept; OutOfRange: below 0 m."""
     if height < 0.0:
-        raise OutOfRange(
-            "altitude",
-            f"{grid.altitude + height:.0f} m",
-            f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward",
-        )
+        covered = f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward"
+        raise OutOfRange("altitude", f"{grid.altitude + height:.0f} m", covered)
     return continued(grid, -(grid.altitude + height)).grid
 
 
@@ -162,16 +155,13 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
     apart = sqrt(max(float(differences.mean()), 0.0)) if shared.any() else nan
     variance = np.fmax(variance, 0.5 * apart**2 * count)
     with np.errstate(invalid="ignore"):
+        mean, sigma = total / np.where(count > 0, count, np.nan), np.sqrt(variance) / count
+        name = " + ".join(Path(grid.name).name for grid in grids)
         merged = AnomalyGrid(
-            longitude,
-            latitude,
-            total / np.where(count > 0, count, np.nan),
-            np.sqrt(variance) / count,
-            first.altitude,
-            " + ".join(Path(grid.name).name for grid in grids),
+            longitude, latitude, mean, sigma, first.altitude, name,
             sigma_length=max(grid.sigma_length for grid in grids),
             level_sigma=max(grid.level_sigma for grid in grids),
-        )
+        )  # fmt: skip
     return merged, apart
 
 
@@ -188,14 +178,9 @@ def draw_steps(steps: Sequence[PreparationStep], path: str | Path) -> None:
     for step, axis in zip(steps, axes, strict=False):
         grid = step.grid
         image = axis.pcolormesh(
-            grid.longitude,
-            grid.latitude,
-            grid.anomaly,
-            vmin=low,
-            vmax=high,
-            cmap="RdYlBu_r",
+            grid.longitude, grid.latitude, grid.anomaly, vmin=low, vmax=high, cmap="RdYlBu_r",
             shading="nearest",
-        )
+        )  # fmt: skip
         axis.set_title(step.title, fontsize=10)
         axis.set_aspect(1.0 / np.cos(np.radians(grid.latitude.mean())))
         axis.ticklabel_format(axis="y", useOffset=False)

@@ -20,9 +20,8 @@ from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.field.coordinates import Axes, geographic
 from magbridge.field.grid import HOLE, AnomalyGrid
-from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, libraries
+from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, libraries, table
 from magbridge.field.grid_netcdf import Parts, netcdf
-from magbridge.field.grid_table import table
 from magbridge.files import contents, existing
 from magbridge.guard import guarded
 
@@ -105,21 +104,10 @@ def read_grid(path: str | Path) -> AnomalyGrid:
 
 
 def without_fill(path: str | Path, values: RealArray) -> RealArray:
-    """Return the values with undeclared missing-value codes as NaN.
+    """Return the values (...,) with undeclared missing-value codes as NaN.
 
-    One of :data:`FILLS` that lies beyond the others by more than half their range is a hole.
-
-    Parameters
-    ----------
-    path : path
-        Named in errors.
-    values : (...,) array
-        In the grid's unit.
-
-    Raises
-    ------
-    FormatError
-        Values of -9999 or 9999 that lie among the others: holes, or not?
+    One of :data:`FILLS` that lies beyond the others by more than half their range is a hole. FormatError,
+    which names `path`: values of -9999 or 9999 that lie among the others.
     """
     for fill in FILLS:
         here = values == fill

@@ -1,14 +1,19 @@
-"""Reference field at every sample of a deployment: equation 4 of the paper."""
+"""Reference field at every sample of a deployment: equation 4 of the paper, and its variation in time.
+
+Over a day the field varies by tens of nT, in a storm by hundreds, nearly the same over a hundred kilometres.
+A log gets that as the column ``daily_variation``: a base station's field minus its median.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.columns import counts_from_boot
-from magbridge.errors import FormatError
+from magbridge.columns import CHANNELS, counts_from_boot
+from magbridge.errors import DataError, FormatError
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
@@ -18,9 +23,20 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
-    "reference_field", "require_date", "sphere_radius", "with_true_heading",
-]  # fmt: skip
+    "MAIN_FIELD_RANGE_NT",
+    "about_mean",
+    "earth_field",
+    "main_field",
+    "other_units",
+    "placed",
+    "positions",
+    "reference_field",
+    "require_date",
+    "separate_observatories",
+    "sphere_radius",
+    "with_daily_variation",
+    "with_true_heading",
+]
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
 """Range of the total field, nT: 22,000 to 67,000 at the surface (IGRF), and thousands of the crust."""
@@ -122,7 +138,7 @@ def sphere_radius(points: FloatArray) -> float:
 def earth_field(
     deployment: xr.Dataset, grid: AnomalyGrid | None = None
 ) -> tuple[FloatArray, FloatArray | None, str]:
-    """Return the reference that a calibration is fitted to: total field, vector, and a name for them.
+    """Return the reference that a calibration is fitted to.
 
     Returns
     -------
@@ -132,6 +148,7 @@ def earth_field(
         nT, north-east-down: the IGRF's direction with the length of `total`; None without positions, or
         without a date.
     name : str
+        Name of both.
     """
     if not {"latitude", "longitude"} <= set(deployment.variables) or counts_from_boot(deployment):
         return reference_field(deployment, grid), None, "reference_field"
@@ -237,19 +254,10 @@ def _interpolated(
 
 
 def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> xr.Dataset:
-    """Return the deployment with ``heading`` measured from true north.
+    """Return the deployment with ``heading`` (deg) measured from true north.
 
-    Parameters
-    ----------
-    deployment : Dataset (time)
-        With ``heading`` (deg), and ``latitude longitude`` (deg) if it is magnetic.
-    reference : {"true", "magnetic"}, optional
-        The north that headings are measured from; default: the attribute ``heading_reference``.
-
-    Raises
-    ------
-    FormatError
-        Magnetic headings on a day that is not known.
+    `reference` is the north that headings are measured from, "true" or "magnetic"; default: the attribute
+    ``heading_reference``. FormatError: magnetic headings on a day that is not known.
 
     Notes
     -----
@@ -266,3 +274,45 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
     out = deployment.assign(heading=("time", heading, deployment["heading"].attrs))
     out.attrs["heading_reference"] = "true"
     return out
+
+
+MAX_EXTRAPOLATION_S = 600.0
+"""s beyond the station's log, for which its last value is held."""
+
+
+def separate_observatories(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
+    """Separate the vehicle's logs from those of an observatory."""
+    own = [log for log in logs if "observatory" not in log.attrs]
+    return own, [log for log in logs if "observatory" in log.attrs]
+
+
+def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[xr.Dataset]:
+    """Return the vehicle's logs with a base station's variation as ``daily_variation``, nT.
+
+    `base` has ``total_field`` (nT), ``reference_field`` or a raw vector. FormatError: it has none of them.
+    DataError: it does not cover the logs' time.
+    """
+    total = _total(base)
+    known = np.isfinite(total)
+    time = base["time"].to_numpy()[known]
+    varied = total[known] - np.median(total[known]) if known.any() else total[known]
+    found = []
+    for log in logs:
+        t = log["time"].to_numpy()
+        if not len(time) or t[0] < time[0] - MAX_EXTRAPOLATION_S or t[-1] > time[-1] + MAX_EXTRAPOLATION_S:
+            source = base.attrs.get("source", "the base station's log")
+            raise DataError(f"{source}: does not cover the time of {log.attrs.get('source', 'the log')}")
+        found.append(log.assign(daily_variation=("time", np.interp(t, time, varied), {"units": "nT"})))
+    return found
+
+
+def _total(base: xr.Dataset) -> FloatArray:
+    """Return the total field (n,), nT, that a base station measured."""
+    for name in ("total_field", "reference_field"):
+        if name in base:
+            return np.asarray(base[name].to_numpy(), float)
+    if all(name in base for name in CHANNELS):
+        return np.asarray(np.sqrt(sum(base[name].to_numpy() ** 2 for name in CHANNELS)))
+    raise FormatError(
+        base.attrs.get("source", "the base station's log"), "expected total_field, or mag_x mag_y mag_z"
+    )

@@ -8,12 +8,12 @@
 
 A :class:`Navigator` takes both in, in order of time. :mod:`.deadreckoning` moves a position along, and
 :mod:`.model` averages the samples between which the map is linear. :mod:`.estimate` finds how far off dead
-reckoning is, on the states of :mod:`.model`: by one Kalman filter where the position is narrow enough
-(:mod:`.bank`), else by many (:mod:`.bank`); :mod:`.integrity` says whether to believe it. Each update is a
-:mod:`.record`. :mod:`.options` hold the prior uncertainties, and :mod:`.depth` brings the map to the vehicle.
+reckoning is, on the states of :mod:`.model`, by a :mod:`.bank` of one Kalman filter where the position is
+narrow enough, else of many; :mod:`.integrity` tests whether it is right. Each update is a :mod:`.record`.
+:mod:`.options` hold the prior uncertainties, and bring the map to the vehicle's depth.
 
-Ashore, :mod:`.batch` runs the same navigator over a log and smooths the track; :mod:`.reference_track`,
-:mod:`.findings` and :mod:`.draw` say how good it is. :mod:`.bound` says what a map is worth before the dive.
+Ashore, :mod:`.batch` runs the same navigator over a log and smooths the track; :mod:`.findings` and
+:mod:`.draw` report how good it is. :mod:`.bound` computes what a map is worth before the dive.
 Without a map :mod:`.own_survey` localises a whole log in the field that it met itself, by :mod:`.particles`.
 """
 

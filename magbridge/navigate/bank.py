@@ -3,24 +3,23 @@
 A Gaussian too wide for the map to be linear within it is split into many that are narrow enough. Each is
 filtered as if it were alone, all in one pass of arrays, and weighted by its likelihood (Alspach & Sorenson
 1972). Hypotheses that grow too wide are split again, those of negligible weight are dropped, and those at
-the same place are merged. Nothing is drawn at random: the same samples give the same bits. With one
-hypothesis the bank equals the tracker.
+the same place are merged. Nothing is drawn at random: the same samples give the same bits. A bank of
+infinite resolution is one extended Kalman filter of second order.
 """
 
 from __future__ import annotations
 
-from math import isnan, log, nan, pi
+from math import inf, isinf, log, nan, pi
 from typing import NamedTuple
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.field.geodesy import metres_per_degree, worse_axis
+from magbridge.field.geodesy import metres_per_degree, offset, worse_axis
 from magbridge.field.grid import AnomalyGrid, Local, curvature
-from magbridge.navigate.model import N_STATES, Block, measurement_row
+from magbridge.navigate.model import N_STATES, Block
 
-__all__ = ["Bank", "Innovation", "Tracker", "widest"]
+__all__ = ["Bank", "Innovation", "widest"]
 
 MAX_HYPOTHESES = 6_000
 """Hypotheses, at most."""
@@ -45,6 +44,19 @@ SPLIT_WEIGHTS = np.array([0.2252246249, 0.5495507502, 0.2252246249])
 SPLIT_VARIANCE = 1.0 - float(SPLIT_WEIGHTS @ SPLIT_MEANS**2)
 
 
+class Innovation(NamedTuple):
+    """Innovation of a measurement; off the map, value, variance and anomaly are NaN, and it was not used."""
+
+    value: float
+    """nT, or m of a position fix: measured minus expected."""
+    variance: float
+    log_likelihood: float
+    accepted: bool
+    """It lies within the gate."""
+    anomaly: float = nan
+    """nT, of the map at the likeliest hypothesis."""
+
+
 class Bank:
     """A Gaussian mixture on the six states, each part linearised about its own mean.
 
@@ -57,7 +69,7 @@ class Bank:
     x, P : ndarray, (6,), (6, 6)
         The Gaussian to begin with.
     resolution : float
-        m, the position sigma to which a hypothesis is cut.
+        m, the position sigma to which a hypothesis is cut; infinite: there is one hypothesis.
     gate : float
         Innovation squared over variance beyond which a hypothesis does not learn from a measurement.
     level : float, optional
@@ -90,6 +102,11 @@ class Bank:
 
     def __len__(self) -> int:
         return self.w.size
+
+    @property
+    def is_single(self) -> bool:
+        """True for one filter, which is never split."""
+        return isinf(self.finest)
 
     def _lattice(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Cut one Gaussian into a lattice of Gaussians of the bank's resolution along its position's axes.
@@ -137,10 +154,16 @@ class Bank:
         half = (F @ self.P.reshape(N_STATES, -1)).reshape(self.P.shape)
         self.P = F @ half + Q[:, :, None]
 
-    def update(self, block: Block) -> tuple[float, float, float]:
-        """Update with one measurement; return its innovation (nT), its variance and its log-likelihood.
+    def update(self, block: Block) -> Innovation:
+        """Update with one measurement of the field and return its innovation.
 
         A hypothesis off the map predicts the map's mean, with the map's variance, and is not updated.
+
+        Notes
+        -----
+        ``h = a(p) + ∇F·δ + b + e m`` and ``R = r + map variance``, both with the contribution of the map's
+        curvature (:func:`~magbridge.field.grid.curvature`); e as in
+        :meth:`~magbridge.field.grid.AnomalyGrid.error`.
         """
         # 1. Map and its slopes at each hypothesis; off the map, zeros stand in for NaN.
         north, east = self.x[:2]
@@ -149,6 +172,9 @@ class Bank:
             block.longitude + east / per_longitude, block.latitude + north / per_latitude, block.depth
         )
         off = np.isnan(local.anomaly)
+        if off.all() and self.is_single:
+            return Innovation(nan, nan, 0.0, accepted=False)
+        seen = local.anomaly
         local = Local(*np.where(off, 0.0, local))
         # 2. Second-order filter: the curvature within a hypothesis shifts the expected value by `bent` and
         # adds the variance `spread`.
@@ -160,22 +186,32 @@ class Bank:
         slopes = np.where(off, 0.0, (local.north + block.slope_north, local.east + block.slope_east))
         gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + errors * self.P[5]
         s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + errors * gain[5]
-        # 4. Off the map the field is that of the whole map: its mean, with its variance.
+        # 3. Off the map the field is that of the whole map: its mean, with its variance.
         anomaly[off], v[off] = self._off_map[0], block.variance + self._off_map[1]
-        return self._observe(block.anomaly - anomaly - self.x[4] - errors * self.x[5], gain, s + v, off)
+        y = block.anomaly - anomaly - self.x[4] - errors * self.x[5]
+        innovation = self._observe(y, gain, s + v, off, self._gate)
+        return innovation._replace(
+            anomaly=float(seen[0]) if self.is_single else self._map_at_likeliest(block)
+        )
+
+    def _map_at_likeliest(self, block: Block) -> float:
+        """Return the map's anomaly, nT, at the likeliest hypothesis; NaN off the map."""
+        north, east = self.x[:2, int(self.w.argmax())].tolist()
+        latitude, longitude = offset(block.latitude, block.longitude, north, east)
+        return self._grid.look_up(longitude, latitude, block.depth).anomaly
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
         """Update with a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
+        # One filter uses every fix: the caller has tested it.
+        gate = inf if self.is_single else self._gate
         for axis, value in enumerate((north, east)):
-            gain = self.P[axis]
-            self._observe(
-                value - self.x[axis], gain, gain[axis] + sigma * sigma, np.zeros(len(self), dtype=bool)
-            )
+            gain, used = self.P[axis], np.zeros(len(self), dtype=bool)
+            self._observe(value - self.x[axis], gain, gain[axis] + sigma * sigma, used, gate)
 
     def _observe(
-        self, y: FloatArray, gain: FloatArray, s: FloatArray, rejected: BoolArray
-    ) -> tuple[float, float, float]:
-        """Update with innovations (n,) of variances (n,) and ``P H'`` (6, n); return as :meth:`update`."""
+        self, y: FloatArray, gain: FloatArray, s: FloatArray, rejected: BoolArray, gate: float
+    ) -> Innovation:
+        """Update with innovations (n,) of variances (n,), and ``P H'`` (6, n)."""
         # Log-likelihood of each innovation. The gate limits it, so that one outlier cannot decide.
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
@@ -183,7 +219,7 @@ class Bank:
         mean = float(self.w @ y)
         spread = float(self.w @ (s + (y - mean) ** 2))
         # Kalman update, K = P H' / s; a rejected measurement has the gain zero.
-        gain = np.where((z2 <= self._gate) & ~rejected, gain, 0.0)
+        gain = np.where((z2 <= gate) & ~rejected, gain, 0.0)
         scaled = gain / s
         self.x = self.x + scaled * y
         self.P = self.P - gain[:, None] * scaled
@@ -194,7 +230,8 @@ class Bank:
         self.w = w / total
         self._updates += 1
         self._limit_hypotheses()
-        return mean, spread, top + log(total)
+        accepted = mean * mean <= self._gate * spread
+        return Innovation(mean, spread, top + log(total), accepted)
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Return mean (6,) and covariance (6, 6) of the whole mixture."""
@@ -261,97 +298,3 @@ def widest(P: FloatArray) -> float:
     """Return the largest 1-sigma of the position, m, of a covariance (6, 6)."""
     (nn, ne), (_, ee) = P[:2, :2].tolist()
     return float(worse_axis(nn, ne, ee))
-
-
-class Innovation(NamedTuple):
-    """Innovation of a measurement: ``value`` nT (or m), ``variance``, log-likelihood, whether it was used.
-
-    Off the map, where there is nothing to compare with, it is NaN and was not used.
-    """
-
-    value: float
-    variance: float
-    log_likelihood: float
-    accepted: bool
-    anomaly: float = nan  # nT, the map under the position
-
-
-class Tracker:
-    """Extended Kalman filter on the six states of :mod:`~magbridge.navigate.model`.
-
-    ``x`` is (6,), because filterpy's default (6, 1) silently broadcasts a scalar innovation to (6, 6).
-    filterpy's update is Joseph's form: the covariance stays symmetric and positive.
-    """
-
-    def __init__(self, grid: AnomalyGrid, x: FloatArray, P: FloatArray, gate: float) -> None:
-        self._grid, self._gate = grid, gate
-        self._filter = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
-        self._filter.x, self._filter.P = x.copy(), P.copy()
-        self.curvature_variance = 0.0
-        """Variance that the map's curvature within the spread added to the last measurement's, nT²."""
-
-    @property
-    def x(self) -> FloatArray:
-        """State, (6,)."""
-        x: FloatArray = self._filter.x
-        return x
-
-    @property
-    def P(self) -> FloatArray:  # noqa: N802  the name every filter gives it
-        """Covariance, (6, 6)."""
-        covariance: FloatArray = self._filter.P
-        return covariance
-
-    def predict(self, F: FloatArray, Q: FloatArray) -> None:
-        """Propagate by one transition: F and the noise's covariance Q, (6, 6)."""
-        self._filter.F, self._filter.Q = F, Q
-        self._filter.predict()
-
-    def update(self, block: Block) -> Innovation:
-        """Update with one measurement of the field.
-
-        Notes
-        -----
-        ``h = a(p) + ∇F·δ + b + e m`` and ``R = r + map variance``, both with the contribution of the map's
-        curvature (:func:`~magbridge.field.grid.curvature`); e as in
-        :meth:`~magbridge.field.grid.AnomalyGrid.error`.
-        """
-        north, east = float(self.x[0]), float(self.x[1])
-        per_latitude, per_longitude = metres_per_degree(block.latitude)
-        local = self._grid.look_up(
-            block.longitude + east / per_longitude, block.latitude + north / per_latitude, block.depth
-        )
-        if isnan(local.anomaly):
-            return Innovation(nan, nan, 0.0, accepted=False)
-        # Second-order extended Kalman filter: the map's curvature within P biases the expected value
-        # and adds to the variance of the measurement.
-        (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
-        bent, self.curvature_variance = curvature(local, pnn, pne, pee)
-        expected = local.anomaly + block.slope_north * north + block.slope_east * east + bent
-        errors, independent = self._grid.error(local.variance)
-        variance = block.variance + independent + self.curvature_variance
-        row = measurement_row(local.north + block.slope_north, local.east + block.slope_east, errors)
-        expected += float(self.x[4] + errors * self.x[5])
-        innovation = self._observe(block.anomaly, expected, row, variance)
-        return innovation._replace(anomaly=local.anomaly)
-
-    def update_position(self, north: float, east: float, sigma: float) -> None:
-        """Update with a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
-        for axis, value in enumerate((north, east)):
-            row = np.zeros((1, N_STATES))
-            row[0, axis] = 1.0
-            self._observe(value, float(self.x[axis]), row, sigma * sigma, gated=False)
-
-    def _observe(
-        self, value: float, expected: float, row: FloatArray, variance: float, *, gated: bool = True
-    ) -> Innovation:
-        # Innovation y and its variance s = H P H' + R; the gate tests y^2 / s, a chi-square with one degree.
-        y = value - expected
-        s = float((row @ self.P @ row.T)[0, 0]) + variance
-        accepted = not gated or y * y <= self._gate * s
-        if accepted:
-            self._filter.update(
-                np.array([value]), lambda _: row, lambda _: np.array([expected]), np.array([[variance]])
-            )
-        likelihood = -0.5 * (min(y * y / s, self._gate) + log(2.0 * pi * s))
-        return Innovation(y, s, likelihood, accepted)

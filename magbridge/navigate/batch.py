@@ -16,11 +16,10 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.deadreckoning import GLIDE
-from magbridge.navigate.findings import findings_of
+from magbridge.navigate.findings import REFERENCES, findings_of, reference_track, with_errors
 from magbridge.navigate.navigator import NO_POSITION_FLAGS, Navigator
 from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.record import Record
-from magbridge.navigate.reference_track import REFERENCES, reference_track, with_errors
 from magbridge.progress import track
 
 __all__ = ["COLUMN_UNITS", "MOTIONS", "columns_of", "first_position", "motion_of", "navigate", "samples_of"]
@@ -59,7 +58,7 @@ def navigate(
         On ``time``, with ``total_field`` (nT), ``total_field_sigma`` if known (else 1 nT), and the columns of
         one of :data:`MOTIONS`.
     grid : AnomalyGrid
-        The anomaly map, at the altitude where the vehicle is (:func:`~.depth.at_depth`).
+        The anomaly map, at the altitude where the vehicle is (:func:`~.options.at_depth`).
     options : NavigationOptions, optional
         How well start, current, calibration and map are known.
     start : (latitude, longitude), optional

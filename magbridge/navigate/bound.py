@@ -13,9 +13,8 @@ from magbridge.errors import OutOfRange
 from magbridge.field.geodesy import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, transition
-from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.options import NavigationOptions, lasting_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -98,9 +97,8 @@ def position_bound(
     interval = every * (int(lasts / every + 1e-9) + 1)  # a block of as many samples as the filter's
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
     if not at.size:
-        raise OutOfRange(
-            "track", f"{corners[-1] - corners[0]:g} s", f"at least {0.5 * interval:.0f} s are needed"
-        )
+        many = f"{corners[-1] - corners[0]:g} s"
+        raise OutOfRange("track", many, f"at least {0.5 * interval:.0f} s are needed")
     lat, lon = np.interp(at, corners, lat), wrap(np.interp(at, corners, lon))
     metres = np.diff(np.interp(at, corners, along), prepend=0.0)
     local = grid.evaluate(lon, lat)

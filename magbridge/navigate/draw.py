@@ -17,8 +17,8 @@ from magbridge.field.geodesy import metres_per_degree, signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.bound import Bound
+from magbridge.navigate.findings import errors
 from magbridge.navigate.record import NavigationState
-from magbridge.navigate.reference_track import errors
 from magbridge.pictures import save
 
 if TYPE_CHECKING:

@@ -7,9 +7,8 @@ from math import expm1, inf, isfinite, log, sqrt
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.bank import Bank, Innovation, Tracker, widest
+from magbridge.navigate.bank import Bank, Innovation, widest
 from magbridge.navigate.deadreckoning import MotionNoise, Step
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
@@ -43,7 +42,6 @@ class Estimate:
     ----------
     options : NavigationOptions
         As given, but with a wider constant error of the field once the filter was lost.
-    state : NavigationState
     time_us : int
         µs, of the last start, fix or measurement.
     x, P : ndarray, (6,), (6, 6)
@@ -58,10 +56,8 @@ class Estimate:
         Restarts of the estimate, across which a smoother must not look.
     alone : ndarray, (4, 4)
         Covariance of position and current by dead reckoning alone, since the start or the last fix.
-    travelled : float
-        m through the water until `time_us`.
-    motion : MotionNoise
-        Uncertainty of the dead-reckoned motion until then.
+    travelled, motion
+        Distance through the water, m, and uncertainty of the dead-reckoned motion, until `time_us`.
     step : Step
         Motion between the last two measurements on the map.
     """
@@ -76,7 +72,7 @@ class Estimate:
         self.time_us, self.travelled, self.motion = 0, 0.0, NO_MOTION_NOISE
         self.step = Step()
         self._measured = 0, 0.0, NO_MOTION_NOISE  # µs, m, noise of the motion at the last measurement
-        self._filter: Tracker | Bank | None = None
+        self._filter: Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
         self._log_odds_unmapped = 0.0
@@ -102,7 +98,7 @@ class Estimate:
     @property
     def hypotheses(self) -> int:
         """Number of hypotheses."""
-        return len(self._filter) if isinstance(self._filter, Bank) else 1
+        return len(self._filter) if self._filter else 1
 
     def start(self, time_us: int, sigma: float) -> None:
         """Begin at the dead-reckoned position, known to `sigma` m on each axis."""
@@ -117,25 +113,15 @@ class Estimate:
         """Update with a fix that holds at the time of the last prediction.
 
         The fix confirms the place. It does not end :attr:`NavigationState.LOST`: the map must first describe
-        the field there.
-
-        Parameters
-        ----------
-        fix : ndarray, (2,)
-            m, north and east of the dead-reckoned position.
-        sigma : float
-            m, of the fix, each axis.
-        fused_sigma : float, optional
-            m, with which it is fused: larger than `sigma` if its error is that of the previous fix.
+        the field there. `fix` is (2,), m north and east of the dead-reckoned position, with `sigma` (m) on
+        each axis. It is fused with `fused_sigma`, larger if its error is that of the previous fix.
         """
         assert self._filter is not None
         self._refresh()
         # Chi-square test of the fix with two degrees of freedom. A fix that fails replaces the position;
         # current, bias and map error keep their estimates, with their prior variance added.
-        if (
-            squared_mahalanobis(fix - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2))
-            > MAX_FIX_DISTANCE_SQUARED
-        ):
+        distance = squared_mahalanobis(fix - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2))
+        if distance > MAX_FIX_DISTANCE_SQUARED:
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
             self._begin(np.concatenate([fix, self.x[2:]]), start, "a fix contradicts the filter")
@@ -168,26 +154,19 @@ class Estimate:
     def update(self, block: Block, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> Innovation:
         """Update with a measurement and return its innovation, NaN off the map.
 
-        Parameters
-        ----------
-        block : Block
-            Samples averaged to one measurement.
-        travelled : float
-            m through the water since the start.
-        motion : MotionNoise
-            Uncertainty of the dead-reckoned motion since the start.
+        `travelled` (m) and `motion` are distance and uncertainty of the motion since the start.
         """
         self.predict(block.time_us, travelled, motion)
         # 1. The resolution follows the most precise measurement so far.
         finer = resolution(self.grid, self.options, block.variance)
         if finer < MIN_REFINEMENT * self._resolution:  # never coarser: a first block may have been a poor one
             self._resolution = finer
-            if isinstance(self._filter, Bank):
+            if self._filter and not self._filter.is_single:
                 self._filter.finest = finer
         if self._filter is None:
             self._filter = self._estimator(self.x, self.P)
         # 2. Kalman update of the one filter, or of each hypothesis.
-        seen = self._measure(block)
+        seen = self._filter.update(block)
         self._refresh()
         # 3. On the map: compare the filter with other explanations of the same measurement.
         on_the_map = isfinite(seen.anomaly)
@@ -240,31 +219,16 @@ class Estimate:
         self.alone += Q[:4, :4]
         self._refresh()
 
-    def _measure(self, block: Block) -> Innovation:
-        if isinstance(self._filter, Tracker):
-            return self._filter.update(block)
-        assert self._filter is not None
-        # A bank reports the innovation of the mixture; the map's value is that of the likeliest hypothesis.
-        innovation, variance, likelihood = self._filter.update(block)
-        best = self._filter.x[:, int(self._filter.w.argmax())]
-        latitude, longitude = offset(block.latitude, block.longitude, float(best[0]), float(best[1]))
-        anomaly = self.grid.look_up(longitude, latitude, block.depth).anomaly
-        accepted = innovation**2 <= self.options.gate * variance
-        return Innovation(innovation, variance, likelihood, accepted, anomaly)
-
     def _refresh(self) -> None:
-        if isinstance(self._filter, Bank):
+        if self._filter is not None:
             self.x, self.P = self._filter.moments()
-        elif self._filter is not None:
-            self.x, self.P = self._filter.x, self._filter.P
 
     # ---- one hypothesis or many, and whether to believe them -----------------------------------------
 
-    def _estimator(self, x: FloatArray, P: FloatArray) -> Tracker | Bank:
-        """Return one tracker if the position is narrow enough for it, else a bank."""
-        if widest(P) < SPLIT_SPREAD * self._resolution:
-            return Tracker(self.grid, x, P, self.options.gate)
-        return Bank(self.grid, x, P, self._resolution, self.options.gate)
+    def _estimator(self, x: FloatArray, P: FloatArray) -> Bank:
+        """Return one filter if the position is narrow enough for it, else many."""
+        single = widest(P) < SPLIT_SPREAD * self._resolution
+        return Bank(self.grid, x, P, inf if single else self._resolution, self.options.gate)
 
     def _begin(self, x: FloatArray, P: FloatArray, cause: str) -> None:
         """Start again from a Gaussian."""
@@ -283,9 +247,8 @@ class Estimate:
         # again at its lower limit (Page 1954).
         unmapped = self._unmapped.update(block, self.step, self._filter.curvature_variance)
         against = unmapped - seen.log_likelihood
-        if (
-            not seen.accepted
-        ):  # the likelihood is limited by the gate: a rejected sample never supports the map
+        # The likelihood is limited by the gate: a rejected sample never supports the map.
+        if not seen.accepted:
             against = max(against, 0.0)
         self._log_odds_unmapped = max(self._log_odds_unmapped + against, -log(self.options.alarm_odds))
         if self._log_odds_unmapped > log(self.options.alarm_odds):
@@ -300,15 +263,9 @@ class Estimate:
         if self._monitor is None:
             reach = self._reach() * (2.0 if self._lost else 1.0)
             self._monitor = IntegrityMonitor(
-                self.grid,
-                self.options,
-                self.x,
-                self.P,
-                block.time_us,
-                reach,
-                self._resolution,
+                self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution,
                 self._levels(),
-            )
+            )  # fmt: skip
             return
         verdict = self._monitor.step(block, self.step, self.x, self.P)
         if verdict is Verdict.ELSEWHERE:
@@ -373,11 +330,12 @@ class Estimate:
         """Change between a bank and one tracker if the width demands it; set the state."""
         width = widest(self.P)
         # Hysteresis between JOIN_SPREAD and SPLIT_SPREAD: the kind of filter does not alternate.
-        if isinstance(self._filter, Bank) and width < JOIN_SPREAD * self._resolution:
-            self._filter = Tracker(self.grid, self.x, self.P, self.options.gate)
-        elif isinstance(self._filter, Tracker) and width > SPLIT_SPREAD * self._resolution:
-            self._filter = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
+        assert self._filter is not None
+        if self._filter.is_single and width > SPLIT_SPREAD * self._resolution:
+            self._filter = self._estimator(self.x, self.P)
             self._monitor = None
+        elif not self._filter.is_single and width < JOIN_SPREAD * self._resolution:
+            self._filter = self._estimator(self.x, self.P)
         if self._lost:
             self.state = NavigationState.LOST
         elif not self._compact(width):

@@ -1,4 +1,4 @@
-"""Findings about a track, in words: was the map left, flat or wrong; was the filter ever lost."""
+"""Findings about a track, its errors against the best position that the estimate did not use included."""
 
 from __future__ import annotations
 
@@ -10,13 +10,69 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import BoolArray, RealArray
-from magbridge.field.geodesy import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.record import Jump, NavigationState
 
-__all__ = ["findings_of"]
+__all__ = ["REFERENCES", "errors", "findings_of", "reference_track", "with_errors"]
+
+REFERENCES = (
+    ("truth_latitude", "truth_longitude"),
+    ("gps_latitude", "gps_longitude"),
+    ("latitude", "longitude"),
+)
+"""Columns of a position, the best first."""
+
+
+def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset | None:
+    """Return the best position that the estimate has not used, with the field there, or None."""
+    for pair in REFERENCES:
+        if pair[0] not in used and all(name in deployment for name in pair):
+            others = [name for name in ("total_field_sigma", "depth") if name in deployment]
+            wanted = [*pair, "total_field", *others]
+            known = deployment[wanted].rename(dict(zip(pair, ("latitude", "longitude"), strict=True)))
+            known = known.dropna("time", subset=["latitude", "longitude"])
+            if known.sizes["time"]:
+                return known.assign_attrs(reference_track=pair[0].removesuffix("latitude") or "log")
+    return None
+
+
+def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
+    """Add the errors against the reference track, m, where that has a position near in time."""
+    if truth is None:
+        return result
+    time = result["time"].to_numpy()
+    known = truth["time"].to_numpy()
+    spacing = max(60.0, 2.0 * float(np.median(np.diff(known)))) if known.size > 1 else 60.0
+    # Interpolate the reference track; a row without a reference position near in time has no error.
+    nearest = np.abs(known[np.clip(np.searchsorted(known, time), 0, known.size - 1)] - time)
+    before = np.abs(known[np.clip(np.searchsorted(known, time) - 1, 0, known.size - 1)] - time)
+    near = np.minimum(nearest, before) <= spacing
+    latitude = np.interp(time, known, truth["latitude"].to_numpy())
+    longitude = np.interp(time, known, np.unwrap(truth["longitude"].to_numpy(), period=360.0))
+    added = {}
+    for prefix in ("", "smoothed_"):
+        there = (result[f"{prefix}{name}"].to_numpy() for name in ("latitude", "longitude"))
+        north, east = separation(latitude, longitude, *there)
+        added[f"{prefix}error_north"] = np.where(near, north, np.nan)
+        added[f"{prefix}error_east"] = np.where(near, east, np.nan)
+    named = {
+        name: ("time", values, {"units": "m", "long_name": name.replace("_", " ")})
+        for name, values in added.items()
+    }
+    return result.assign(named).assign_attrs(reference_track=truth.attrs["reference_track"])
+
+
+def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+    """Return the errors (n,), m, of the estimate and of dead reckoning alone; NaN where unknown."""
+    if "error_north" not in result:
+        nobody = result["north"] * np.nan
+        return nobody, nobody
+    north, east = result["error_north"], result["error_east"]
+    return (north**2 + east**2) ** 0.5, ((north - result["north"]) ** 2 + (east - result["east"]) ** 2) ** 0.5
+
 
 MIN_MAP_POSITIONS = 40
 """Positions, below which a map's place cannot be judged."""
@@ -47,18 +103,10 @@ def findings_of(
     jumps: Sequence[Jump],
     reference_track: xr.Dataset | None,
 ) -> list[str]:
-    """Return the findings, one sentence each; empty when there is nothing to remark.
+    """Return the findings, one sentence each; empty when there is nothing to report.
 
-    Parameters
-    ----------
-    result : Dataset
-        The records, as :func:`~magbridge.navigate.batch.navigate` has them.
-    grid, options
-        What `result` was made with.
-    jumps : sequence of Jump
-        What the integrity monitor saw, in order.
-    reference_track : Dataset or None
-        ``latitude longitude total_field`` at known positions.
+    `result` holds the records made with `grid` and `options`, `jumps` the restarts in order, and
+    `reference_track` ``latitude longitude total_field`` at known positions.
     """
     hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
     state = result["state"].to_numpy().astype(int)
@@ -145,17 +193,7 @@ class _Shift(NamedTuple):
 def _best_shift(
     grid: AnomalyGrid, latitude: RealArray, longitude: RealArray, depth: RealArray, anomaly: RealArray
 ) -> _Shift:
-    """Return by how much the map must be moved to describe an anomaly measured at known positions.
-
-    Parameters
-    ----------
-    grid : AnomalyGrid
-        The anomaly map.
-    latitude, longitude, depth : array, (n,)
-        deg, m.
-    anomaly : array, (n,)
-        nT; a constant is subtracted.
-    """
+    """Return by how much the map must be moved to describe an anomaly (n,), nT, but for a constant."""
     # Exhaustive search over a lattice of shifts: the scatter has many minima.
     shifts = np.linspace(-SEARCH, SEARCH, LATTICE)
     per_latitude, per_longitude = metres_per_degree(float(np.mean(latitude)))

@@ -28,7 +28,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.bank import Tracker
+from magbridge.navigate.bank import Bank
 from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
 from magbridge.navigate.model import Block, prior, transition
@@ -97,34 +97,25 @@ class GnssReason(IntEnum):
 
 
 class Prediction(NamedTuple):
-    """What the navigator predicts at the time of a GNSS position, relative to dead reckoning.
-
-    Attributes
-    ----------
-    position : ndarray, (2,)
-        m, north and east.
-    covariance, alone : ndarray, (2, 2)
-        m²: of the position, and of dead reckoning since the last position that was used.
-    current : ndarray, (2,)
-        m/s, by which dead reckoning is wrong.
-    current_sigma : float
-        m/s, 1-sigma on each axis.
-    travelled, speed, turns : float
-        m since the start, m/s, and :attr:`MotionNoise.turns` since the start.
-    lost, informed : bool
-        The navigator is lost; the field has improved its position.
-    """
+    """What the navigator predicts at the time of a GNSS position, relative to dead reckoning."""
 
     position: FloatArray
+    """(2,), m, north and east."""
     covariance: FloatArray
     alone: FloatArray
+    """`covariance`, `alone`, (2, 2), m²: of the position, and of dead reckoning since the last position that
+    was used."""
     current: FloatArray
+    """(2,), m/s, by which dead reckoning is wrong."""
     current_sigma: float
     travelled: float
     speed: float
+    """`current_sigma`, `travelled`, `speed`: m/s on each axis, m since the start, m/s."""
     turns: float
+    """:attr:`MotionNoise.turns` since the start."""
     lost: bool
     informed: bool
+    """`lost`, `informed`: The navigator is lost; the field has improved its position."""
 
 
 class _Position(NamedTuple):
@@ -141,23 +132,9 @@ class _Position(NamedTuple):
 
 
 class GnssMonitor:
-    """Tests GNSS positions, in order of time.
+    """Tests GNSS positions, in order of time; `state` and, where they are not used, the `reason`.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-    options : NavigationOptions
-        Of the navigator.
-
-    Attributes
-    ----------
-    state : GnssState
-    reason : GnssReason
-        Why the positions are not used.
-    deviation : float
-        m, of the last position from the navigator's.
-    drift : float
-        m, mean deviation over the last 20 s.
+    `deviation` and `drift` are the last position's distance from the navigator's, m, and its mean over 20 s.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -218,18 +195,8 @@ class GnssMonitor:
     ) -> GnssState:
         """Test a position and return the state.
 
-        Parameters
-        ----------
-        time_us : int
-            µs of event time.
-        place : tuple of float
-            Latitude and longitude, deg.
-        offset_m : tuple of float
-            m, north and east of the dead-reckoned position.
-        sigma : float
-            m, 1-sigma on each axis.
-        prediction : Prediction
-            Of the navigator, at this time.
+        `place`: latitude and longitude, deg. `offset_m`: the same, m north and east of the dead-reckoned
+        position. `sigma`: m, on each axis. `prediction`: of the navigator, at this time.
         """
         sigma = max(sigma, MIN_SIGMA_M)
         # A jammed receiver's claimed error varies: the smallest recent one is the limit.
@@ -266,14 +233,7 @@ class GnssMonitor:
     def observe(self, block: Block, step: Step, filter_likelihood: float) -> None:
         """Compare a measurement of the field with the map at the last position.
 
-        Parameters
-        ----------
-        block : Block
-            Samples averaged to one measurement.
-        step : Step
-            Motion since the previous one.
-        filter_likelihood : float
-            Log-likelihood by the navigator's filter.
+        It is one `step` after the previous one, with a log-likelihood by the navigator's filter.
         """
         self._field.update(block, step, filter_likelihood)
 
@@ -387,16 +347,9 @@ class GnssMonitor:
 class _FieldTest:
     """Compares the field with the map at the GNSS position, with an unrelated field, and with the navigator.
 
-    Each difference of log-likelihoods is summed, within ± the logarithm of ``options.alarm_odds``.
-
-    Attributes
-    ----------
-    limit : float
-        Largest log odds.
-    log_odds_of_map : float
-        Of the map at the position against a field unrelated to it.
-    log_odds_of_position : float
-        Of the map at the position against the map at the navigator's.
+    Each difference of log-likelihoods is summed, within ± `limit`, the logarithm of ``options.alarm_odds``:
+    `log_odds_of_map` is for the map at the position against a field unrelated to it, `log_odds_of_position`
+    for the map at the position against the map at the navigator's.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -405,7 +358,7 @@ class _FieldTest:
         self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)
         self._grid, self._options = grid, any_level(options, grid)
         self._unmapped = Unmapped(grid, self._options)
-        self._tracker: Tracker | None = None
+        self._tracker: Bank | None = None
         self._offset, self._sigma, self._time_us = (0.0, 0.0), inf, -MAX_GNSS_AGE_US
         self._step = Step()  # since the last measurement that was used
 
@@ -441,12 +394,12 @@ class _FieldTest:
         # One filter runs at the receiver's position; only its bias and map error are free.
         whole, self._step = self._step, Step()
         if self._tracker is None:
-            self._tracker = Tracker(self._grid, *prior(self._options, self._sigma), self._options.gate)
+            self._tracker = Bank(self._grid, *prior(self._options, self._sigma), inf, self._options.gate)
         tracker = self._tracker
         tracker.predict(*transition(self._options, *whole))
         # the position is the receiver's, whatever the field says; bias and map error are estimated
         x, P = tracker.x, tracker.P
-        x[:2] = self._offset
+        x[:2, 0] = self._offset
         P[:2], P[:, :2] = 0.0, 0.0
         P[0, 0] = P[1, 1] = self._sigma**2
         seen = tracker.update(block)

@@ -102,24 +102,11 @@ class Unmapped:
 class IntegrityMonitor:
     """Two banks compared on equal terms: *here* begins at the filter, *elsewhere* is spread around it.
 
-    Both use the same measurements, several blocks averaged to one, because a bank costs more than a
-    filter and the comparison can wait a minute. The filter starts a new monitor once it is confirmed or
-    starts again.
-
-    Parameters
-    ----------
-    grid, options
-        As the filter's.
-    x, P : ndarray, (6,), (6, 6)
-        The filter's estimate now.
-    time_us : int
-        µs, its time.
-    reach : float
-        m, 1-sigma by which *elsewhere* is spread around the filter.
-    resolution : float
-        m, of the banks.
-    levels : tuple of 2 float
-        nT, 1-sigma of the bias elsewhere, and that of half of the places there; 0: of none.
+    Both use the same measurements, several blocks averaged to one, because a bank costs more than a filter
+    and the comparison can wait a minute. The filter starts a new monitor once it is confirmed or starts
+    again. `x` (6,) and `P` (6, 6) are the filter's estimate at `time_us`, `reach` (m) the 1-sigma by which
+    *elsewhere* is spread around it, and `resolution` (m) that of the banks. `levels` (nT) are the 1-sigma of
+    the bias elsewhere, and that of half of the places there; 0: of none.
     """
 
     def __init__(
@@ -196,13 +183,8 @@ class IntegrityMonitor:
 
 
 def squared_mahalanobis(difference: FloatArray, P: FloatArray) -> float:
-    """Return the squared Mahalanobis distance of two positions.
+    """Return the squared Mahalanobis distance of two positions by their difference, m, and its covariance.
 
-    Parameters
-    ----------
-    difference : (2,) or (6,) array
-        Difference of the positions; its first two elements are m north and east.
-    P : (2, 2) or (6, 6) array
-        Covariance of the difference, m².
+    The first two elements of `difference` (2,) or (6,), and of `P`, are north and east.
     """
     return float(difference[:2] @ np.linalg.solve(P[:2, :2], difference[:2]))

@@ -29,27 +29,21 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.nearby import NearbyField
+from magbridge.field.igrf import NearbyField
 from magbridge.navigate.deadreckoning import DeadReckoning, MotionNoise
 from magbridge.navigate.options import NavigationOptions
 
 __all__ = [
-    "NO_MOTION_NOISE",
-    "N_STATES",
-    "Block",
-    "Collector",
-    "average",
-    "block_length",
-    "measurement_row",
-    "prior",
-    "resolution",
-    "transition",
+    "NO_MOTION_NOISE", "N_STATES", "Block", "Collector", "average", "block_length", "measurement_row",
+    "prior", "resolution", "transition",
 ]  # fmt: skip
 
 N_STATES = 6
 NO_MOTION_NOISE = MotionNoise()
 MAX_SPREAD_FRACTION = 0.35
 """Share of the spread that one measurement allows: errors of successive ones are correlated and add up."""
+MIN_SIGMA_NT = 1e-3
+"""Smallest sigma of a sample that is used, nT."""
 
 
 class Block(NamedTuple):
@@ -98,16 +92,9 @@ def prior(options: NavigationOptions, position_sigma: float | None = None) -> tu
 def transition(
     options: NavigationOptions, seconds: float, metres: float, motion: MotionNoise = NO_MOTION_NOISE
 ) -> tuple[FloatArray, FloatArray]:
-    """Return F and Q (6, 6) over a time and a distance through the water.
+    """Return F and Q (6, 6) over a time (s) and a distance through the water (m).
 
-    Parameters
-    ----------
-    options : NavigationOptions
-        Of the navigator.
-    seconds, metres : float
-        Time, and distance through the water.
-    motion : MotionNoise, optional
-        Uncertainty of the dead-reckoned motion in that time, in addition to ``options.drift``.
+    `motion` is the uncertainty of the dead-reckoned motion in that time, in addition to ``options.drift``.
 
     Notes
     -----
@@ -147,15 +134,8 @@ def block_length(grid: AnomalyGrid) -> float:
 def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -> float:
     """Return the position spread, m, within which the map is linear to the noise of one measurement.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-        Its scatter σ and its correlation length L.
-    options : NavigationOptions
-        Bias and map error.
-    variance : float
-        nT², of a measurement. A sixteenth of what bias and map error gain until the next is added (as for
-        half the spread): those errors persist, as the error by curvature does.
+    `variance` (nT²) is that of a measurement. A sixteenth of what bias and map error gain until the next is
+    added (as for half the spread): those errors persist, as the error by curvature does.
 
     Notes
     -----
@@ -173,20 +153,11 @@ def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -
     return float(min(0.25 * length, MAX_SPREAD_FRACTION * (2.0 * noise) ** 0.25 / curvature**0.5))
 
 
-MIN_SIGMA_NT = 1e-3
-"""Smallest sigma of a sample that is believed, nT."""
-
-
 class Collector:
     """Subtract the main field where dead reckoning puts the vehicle, and average until the block is full.
 
-    Samples are weighted by their precision, so that one in ten taken with a mass in motion does no harm.
-
-    Parameters
-    ----------
-    options : NavigationOptions
-    step : float
-        m, that a block covers at most.
+    Samples are weighted by their precision, so that one in ten taken with a mass in motion does no harm. A
+    block covers at most `step` m.
 
     Notes
     -----
@@ -209,14 +180,8 @@ class Collector:
     ) -> Block | None:
         """Add a sample; return the block that it fills, or the one that it is too far away to join.
 
-        Parameters
-        ----------
-        time_us, utc_offset_us : int
-            Monotonic time and its offset to UNIX time, µs: the main field depends on the date.
-        reckoning : DeadReckoning
-            Dead reckoning at the sample's place.
-        total_field, sigma : float
-            Total field and its 1-sigma, nT.
+        `utc_offset_us` is added to `time_us` for UNIX time: the main field depends on the date. `total_field`
+        and its 1-sigma `sigma` are in nT.
         """
         # Anomaly = total field - main field at the dead-reckoned position and date.
         main, slope_north, slope_east = self._main_field.field_and_slopes(

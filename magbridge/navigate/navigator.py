@@ -19,11 +19,10 @@ from magbridge.field.geodesy import offset, separation, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import widest
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
 from magbridge.navigate.model import Block, Collector, block_length, transition
-from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.options import NavigationOptions, lasting_errors
 from magbridge.navigate.record import NavigationState, Reckoned, Record
 from magbridge.records import Corrected, Quality
 
@@ -65,14 +64,7 @@ class Navigator:
     ) -> Record | None:
         """Update with a position, the start or a GPS fix; return the update that it completes.
 
-        Parameters
-        ----------
-        time_us : int
-            Event time, µs.
-        latitude, longitude : float
-            Position, deg.
-        sigma : float, optional
-            1-sigma of each axis, m; default ``options.start_sigma``.
+        `sigma` is that of each axis, m; default ``options.start_sigma``.
         """
         return self._correct(time_us, (latitude, longitude), sigma, None)
 

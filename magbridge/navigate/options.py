@@ -1,17 +1,20 @@
-"""Options: how well start, current, calibration and map are known before anything is measured."""
+"""Options: how well start, current, calibration and map are known; and the map at the vehicle's depth."""
 
 from __future__ import annotations
 
 from math import hypot, log, sqrt
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
+from numpy.typing import ArrayLike
 
 from magbridge.calibration.model import Calibration
 from magbridge.config import NotNegative, Positive
+from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["NavigationOptions", "any_level", "informed", "with_level"]
+__all__ = ["NavigationOptions", "any_level", "at_depth", "informed", "lasting_errors", "with_level"]
 
 MAX_NOISE_INTERVALS = 3.0
 """Longest correlation time of noise, in intervals; noise with a longer one becomes a bias."""
@@ -57,16 +60,9 @@ class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 def informed(options: NavigationOptions, calibration: Calibration, sigma: float) -> NavigationOptions:
-    """Return options that include a calibration's own errors.
+    """Return options that include a calibration's own errors, with `sigma` (nT) that of a typical sample.
 
-    Parameters
-    ----------
-    options : NavigationOptions
-        Their bias is that of all other sources: the map's level, the field's variation in time.
-    calibration : Calibration
-        Of the total field that will be used.
-    sigma : float
-        nT, 1-sigma that the calibration claims for a typical sample.
+    The bias of `options` is that of all other sources: the map's level, the field's variation in time.
 
     Notes
     -----
@@ -122,3 +118,58 @@ def _wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
     return replace(
         o, bias_sigma=sigma, bias_time=o.bias_time * (sigma / max(o.bias_sigma, 1e-3 * sigma)) ** 2
     )
+
+
+NEGLIGIBLE_FRACTION = 0.1
+"""Fraction of the map error below which what lies between the nodes changes it by less than 1 %."""
+
+
+def at_depth(
+    grid: AnomalyGrid, options: NavigationOptions, depth: ArrayLike
+) -> tuple[AnomalyGrid, NavigationOptions]:
+    """Return the map at the vehicle's depth, and options whose map error includes what that and nodes cost.
+
+    A map of unknown altitude is returned as it is. `depth` (n,), m, is the vehicle's; NaN is ignored, and
+    without any depth the map is continued to the surface.
+
+    Notes
+    -----
+    Independent errors of the map add their variances σᵢ² and the mean squares of their slopes, σᵢ²/Lᵢ², so
+    that together 1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ². The error between nodes is as long as half their spacing.
+    """
+    known = np.asarray(depth, float)
+    known = known[np.isfinite(known)]
+    # Errors of the continued map add to the map's own error as independent ones.
+    there = continued(grid, known if known.size else 0.0)
+    errors = [(there.sigma, there.length)] if there.sigma else []
+    if grid.interpolation_sigma > NEGLIGIBLE_FRACTION * options.map_sigma:
+        errors.append((grid.interpolation_sigma, 0.5 * grid.spacing))
+    return lasting_errors(there.grid, _added(options, errors) if errors else options)
+
+
+def lasting_errors(grid: AnomalyGrid, options: NavigationOptions) -> tuple[AnomalyGrid, NavigationOptions]:
+    """Return the map and options whose map error has the sigma that lasts from sample to sample.
+
+    A sigma with a ``sigma_length`` is correlated along the track, as the filter's map error is, and the noise
+    of a measurement is not. The state is a typical error, the map's median and that of the options; by how
+    much it counts at a node, the map's sigma there says, with that of the options in it. The map's level is
+    a bias.
+    """
+    options = with_level(options, grid.level_sigma)
+    if grid.level_sigma:
+        grid = grid.replaced(level_sigma=0.0)
+    typical = float(np.median(grid.sigma[np.isfinite(grid.anomaly)]))
+    if not (grid.sigma_length and typical):
+        return grid, options
+    known = _added(options, [(typical, grid.sigma_length)])
+    sigma = np.hypot(grid.sigma, options.map_sigma)
+    return grid.replaced(sigma=sigma, sigma_length=0.0, typical_error=known.map_sigma), known
+
+
+def _added(options: NavigationOptions, errors: list[tuple[float, float]]) -> NavigationOptions:
+    """Return options whose map error includes others, of a sigma, nT, and a length, m."""
+    whole = [*errors, (options.map_sigma, options.map_length)]
+    sigma = hypot(*(sigma for sigma, _ in whole))
+    # sigma^2 = sum s_i^2 and (sigma / L)^2 = sum (s_i / L_i)^2.
+    steepness = hypot(*(sigma / length for sigma, length in whole))
+    return replace(options, map_sigma=sigma, map_length=sigma / steepness)

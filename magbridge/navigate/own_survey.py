@@ -9,10 +9,9 @@ Rao-Blackwellised sampler: f is integrated out, and particles follow the posteri
 field's length several: no single track with a Gaussian sigma describes that, the particles' spread does.
 Where the field says nothing they stay where dead reckoning has them.
 
-The likelihood of a drift d(t) in the field f with the calibration's error b is
+The likelihood of a drift d(t) is
 
-.. math:: y_i = f(x_i + d(t_i)) + b(t_i) + e_i, \quad
-          \log p(y | d) = -\tfrac12 y^T K^{-1} y - \tfrac12 \log|K| + \text{const},
+.. math:: \log p(y | d) = -\tfrac12 y^T K^{-1} y - \tfrac12 \log|K| + \text{const},
 
 .. math:: K_{ij} = s^2 k(|x_i + d_i - x_j - d_j| / \ell) + \beta_{ij} + R_{ij}
 
@@ -40,10 +39,10 @@ from magbridge.field.geodesy import offset, separation
 from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.batch import COLUMN_UNITS, MOTIONS, columns_of, first_position, motion_of, samples_of
 from magbridge.navigate.deadreckoning import DeadReckoning
+from magbridge.navigate.findings import reference_track, with_errors
 from magbridge.navigate.model import Block, Collector, transition
 from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.particles import Particles, sample
-from magbridge.navigate.reference_track import reference_track, with_errors
 
 __all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions", "localise", "own_bound"]
 
@@ -143,14 +142,8 @@ def localise(
     field = OwnField(blocks, np.stack(separation(*origin, rows[:, 1], rows[:, 2]), axis=1), options)
     counts = [len(blocks) * stage // STAGE_COUNT for stage in range(1, STAGE_COUNT + 1)]
     with threadpool_limits(1, "blas"):
-        particles = sample(
-            field.log_likelihood,
-            field.q,
-            len(COVARIANCE_KINDS),
-            counts,
-            PARTICLE_COUNT,
-            partial(_lost, field),
-        )
+        kinds, stop = len(COVARIANCE_KINDS), partial(_lost, field)
+        particles = sample(field.log_likelihood, field.q, kinds, counts, PARTICLE_COUNT, stop)
         found = _PosteriorTracks.from_particles(field, particles)
         known = reference_track(deployment, frozenset(MOTIONS[motion]))
         result = with_errors(_dataset(field, found, options, origin, rows[:, 7]), known)
@@ -230,17 +223,10 @@ def _findings(
     sigma = np.sqrt((result["covariance_nn"] + result["covariance_ee"]).to_numpy())
     alone = result["unaided_sigma"].to_numpy()
     size, length, noise = found.scales.tolist()
-    yield Diagnostic(
-        "own_track",
-        {
-            "amplitude_nT": size,
-            "length_m": length,
-            "median_m": float(np.median(sigma)),
-            "last_m": float(sigma[-1]),
-            "alone_median_m": float(np.median(alone)),
-            "alone_last_m": float(alone[-1]),
-        },
-    )
+    reached = {"amplitude_nT": size, "length_m": length}
+    for name, values in (("", sigma), ("alone_", alone)):
+        reached |= {f"{name}median_m": float(np.median(values)), f"{name}last_m": float(values[-1])}
+    yield Diagnostic("own_track", reached)
     if "bound_sigma" in result:
         best = float((result["bound_sigma"] ** 2).mean()) ** 0.5
         yield Diagnostic("own_track.bound", {"bound_m": best})
@@ -303,27 +289,10 @@ def drift_functions(time: FloatArray, options: NavigationOptions) -> FloatArray:
 
 
 class OwnField:
-    """Blocks along a dead-reckoned track, and the likelihood of what they measured.
+    """Blocks along a dead-reckoned track at `place` (n, 2), m, and the likelihood of what they measured.
 
-    Unknown is u (q,), N(0, 1) each beforehand: the weights of the drift's functions north (r,) and east (r,),
-    and the logarithms of the field's size, its length and the noise over their spread.
-
-    Parameters
-    ----------
-    blocks : list of Block
-    place : (n, 2) array
-        m, north and east, where dead reckoning has them.
-    options : NavigationOptions
-        How well start, current and calibration are known.
-
-    Attributes
-    ----------
-    time : (n,) array
-        s.
-    drift : (n, r) array
-        m, :func:`drift_functions`.
-    q : int
-        Number of unknowns.
+    The unknown is u (q,), N(0, 1) each beforehand: the weights of the functions `drift` (n, r), m, north (r,)
+    and east (r,), and the logarithms of the field's size, its length and the noise over their spread.
     """
 
     def __init__(self, blocks: list[Block], place: FloatArray, options: NavigationOptions) -> None:
@@ -431,16 +400,8 @@ def own_bound(
 ) -> FloatArray:
     """Return the smallest covariance (n, 2, 2), m², that any estimator of the drift could reach.
 
-    Parameters
-    ----------
-    field : OwnField
-        The measured field.
-    place, slopes : (n, 2) array
-        The true places, m, and the field's slopes there, nT/m; NaN where not known: such blocks tell nothing.
-    typical : (q,) array
-        Unknowns of which size, length and noise are taken.
-    kind : int
-        Of the field.
+    `place` (m) and `slopes` (nT/m), (n, 2), are the true places and the field's slopes there; blocks where
+    one is NaN carry no information. Size, length and noise are those of `typical` (q,).
 
     Notes
     -----

@@ -41,9 +41,7 @@ from magbridge.estimation.information import covariance_of
 from magbridge.estimation.residual import rms, robust_scale
 from magbridge.survey.crossovers import crossovers
 from magbridge.survey.gridding import FINE_NOISE_NT, FINER_NODES, level_blocks
-from magbridge.survey.roughness import Roughness
-from magbridge.survey.rows import Rows
-from magbridge.survey.samples import Samples
+from magbridge.survey.samples import Roughness, Rows, Samples
 from magbridge.survey.scalar import COMPENSATION, ScalarRows
 
 __all__ = ["ScalarTerms", "align"]
@@ -141,26 +139,11 @@ def align(
 ) -> tuple[Samples, ScalarTerms]:
     """Fit lag, lever arm, heading error and channels together with the crustal field and the lines' levels.
 
-    Parameters
-    ----------
-    rows : ScalarRows
-        The survey.
-    lag : float, optional
-        Time of the reading after the position, s; estimated if not given.
-    lever_known : bool
-        The positions are those of the sensor already.
+    The `lag` of the reading after the position, s, is estimated if not given. With `lever_known` the
+    positions are those of the sensor already. The samples that are returned are at the sensor's places,
+    without heading error and channels; their uncertainty is in `modes`.
 
-    Returns
-    -------
-    samples : Samples
-        At the sensor's places, without heading error and channels; their uncertainty is in `modes`.
-    terms : ScalarTerms
-        The result of the fit.
-
-    Raises
-    ------
-    CalibrationError
-        The samples do not determine a field.
+    CalibrationError: the samples do not determine a field.
     """
     free = np.array([lag is None, not lever_known, not lever_known])
     try:

@@ -29,23 +29,7 @@ def draw_survey(
     misties: tuple[FloatArray, FloatArray],
     path: Path,
 ) -> None:
-    """Draw a survey.
-
-    Parameters
-    ----------
-    grid : AnomalyGrid
-        Its map.
-    samples : Samples
-        What the map is made of.
-    residual : (n,) array
-        nT, of every sample from the map and its line's level.
-    found : Crossovers
-        Where lines cross.
-    misties : tuple of two (m,) arrays
-        nT, before and after levelling.
-    path : Path
-        The picture to write.
-    """
+    """Draw map and sigma, the samples' residuals (n,), and mis-ties before and after levelling (m,), nT."""
     figure = Figure(figsize=(12.0, 9.0), layout="constrained")
     axes = figure.subplots(2, 2)
     latitude, longitude = offset(*samples.origin, samples.place[:, 0], samples.place[:, 1])

@@ -21,8 +21,7 @@ from scipy.spatial import cKDTree
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.estimation.residual import rms
-from magbridge.survey.roughness import Roughness
-from magbridge.survey.samples import Samples
+from magbridge.survey.samples import Roughness, Samples
 
 __all__ = ["Kriged", "kriged"]
 
@@ -111,14 +110,8 @@ class Kriged:
 def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
     """Return the predictor from the nearest samples; its size varies with the place if that is likelier.
 
-    Parameters
-    ----------
-    samples : Samples
-        At least :data:`AMONG`.
-    value : (n,) array
-        nT, without the lines' levels.
-    length : float
-        m, of the field, about.
+    There are at least :data:`AMONG` samples; `value` (n,), nT, is without the lines' levels, and the field
+    has about the `length`, m.
     """
     tree, size = cKDTree(samples.place), float(np.std(value))
     share = np.zeros(int(samples.line.max()) + 1)
@@ -154,23 +147,16 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
 
     # Nelder-Mead over the logs of depth, size and noise.
     simplex = first + 0.5 * np.vstack([np.zeros(3), np.eye(3)])
-    found = minimize(
-        downhill,
-        first,
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": MAX_SEARCH_STEPS},
-    )
+    options = {"initial_simplex": simplex, "maxfev": MAX_SEARCH_STEPS}
+    found = minimize(downhill, first, method="Nelder-Mead", options=options)
     return kriged_with(found.x), -float(found.fun)
 
 
 def _share(kriged: Kriged, line: int) -> float:
     """Return the likeliest g of a line by the prediction of the others; its prior where there are none."""
     rows = np.flatnonzero(kriged.line == line)
-    step = (
-        float(np.median(np.linalg.norm(np.diff(kriged.place[rows], axis=0), axis=1)))
-        if len(rows) > 1
-        else 1.0
-    )
+    steps = np.linalg.norm(np.diff(kriged.place[rows], axis=0), axis=1)
+    step = float(np.median(steps)) if len(steps) else 1.0
     rows = rows[:: max(round(SAMPLE_SPACING_DEPTHS * kriged.below / max(step, 1e-3)), 1)]
     near = kriged.tree.query(kriged.place[rows], AMONG)[1]
     near, whole = _first(near, kriged.line[near] != line)

@@ -1,17 +1,25 @@
-"""From a gridded survey to an anomaly map on even longitudes and latitudes."""
+"""From a gridded survey to its map, and to files of the map, the tracks and the crossovers."""
 
 from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from xml.sax.saxutils import escape
+
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.field.continuation import continued, raised
-from magbridge.field.geodesy import metres_per_degree
+from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
-from magbridge.survey.gridded import Gridded
+from magbridge.files import atomic_path
+from magbridge.survey.crossovers import Crossovers
+from magbridge.survey.gridding import Gridded
 from magbridge.survey.samples import Samples
 
-__all__ = ["anomaly_map"]
+__all__ = ["anomaly_map", "write_crossovers", "write_geotiff", "write_points", "write_tracks"]
 
 A_LENGTH = 8.0
 """Nodes of a map to one length of its field."""
@@ -31,20 +39,10 @@ def anomaly_map(
     altitude: float | None = None,
     name: str = "survey",
 ) -> AnomalyGrid:
-    """Return the map of a survey, at its own height or continued upward.
+    """Return the map of a survey, at its own height or continued to `altitude`, m above the ellipsoid.
 
-    Parameters
-    ----------
-    gridded : Gridded
-        The survey.
-    samples : Samples
-        That it was made of.
-    spacing : float, optional
-        m between nodes; an eighth of the field's length if not given.
-    altitude : float, optional
-        m above the ellipsoid. Downward, what the series leaves out counts in the sigma.
-    name : str
-        Of the map.
+    Downward, what the series leaves out counts in the sigma. The `spacing` of the nodes, m, is an eighth of
+    the field's length if not given.
     """
     places = gridded.field.nodes.places
     inner = places[gridded.field.nodes.covers(places)]
@@ -87,3 +85,99 @@ def _continued(grid: AnomalyGrid, gridded: Gridded, nodes: FloatArray, altitude:
         for one in gridded.draw(nodes, DRAWN_FIELDS)
     ]
     return there.replaced(sigma=np.hypot(np.sqrt(np.mean(drawn, axis=0)), missing))
+
+
+VERTICES = 5_000
+"""Largest number of vertices of a track."""
+SCALE, TIE, KEYS, NODATA = 33550, 33922, 34735, 42113
+"""TIFF tags: ModelPixelScale, ModelTiepoint, GeoKeyDirectory (GeoTIFF 1.1), and GDAL's NODATA."""
+WGS84 = (1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 1, 2048, 0, 1, 4326)
+"""GeoKeys: geographic, a pixel is an area, EPSG:4326."""
+
+
+def write_geotiff(grid: AnomalyGrid, path: Path) -> None:
+    """Write a map's anomaly as a GeoTIFF, float32 on WGS84, holes as NaN.
+
+    WriteError: the file cannot be written.
+    """
+    from PIL import Image, TiffImagePlugin  # noqa: PLC0415 - only here
+
+    dx, dy = (float(axis[1] - axis[0]) for axis in (grid.longitude, grid.latitude))
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    corner = (float(grid.longitude[0]) - 0.5 * dx, float(grid.latitude[-1]) + 0.5 * dy)
+    for tag, kind, value in (
+        (SCALE, 12, (dx, dy, 0.0)),
+        (TIE, 12, (0.0, 0.0, 0.0, *corner, 0.0)),
+        (KEYS, 3, WGS84),
+        (NODATA, 2, "nan"),
+    ):
+        tags.tagtype[tag] = kind
+        tags[tag] = value
+    with atomic_path(path) as temporary:
+        image = Image.fromarray(np.ascontiguousarray(grid.anomaly[::-1], np.float32))
+        image.save(temporary, format="TIFF", tiffinfo=tags)
+
+
+def write_tracks(samples: Samples, path: Path) -> None:
+    """Write every line's track, as GeoJSON or, where the suffix is .kml, as KML."""
+    tracks = {f"{label}": _track(samples, label) for label in np.unique(samples.line).tolist()}
+    with atomic_path(path) as temporary:
+        if path.suffix.lower() == ".kml":
+            temporary.write_text(_kml(tracks), encoding="utf-8")
+            return
+        features = [
+            {
+                "type": "Feature",
+                "properties": {"line": label, "tie": bool(samples.tie[samples.line == int(label)].any())},
+                "geometry": {"type": "LineString", "coordinates": track.round(7).tolist()},
+            }
+            for label, track in tracks.items()
+        ]
+        content = {"type": "FeatureCollection", "features": features}
+        temporary.write_text(json.dumps(content), encoding="utf-8")
+
+
+def write_crossovers(
+    found: Crossovers, samples: Samples, old_misties: FloatArray, new_misties: FloatArray, path: Path
+) -> None:
+    """Write a row for each crossover: place, lines, and its mis-ties (m,), nT, before and after."""
+    latitude, longitude = offset(*samples.origin, found.place[:, 0], found.place[:, 1])
+    lines: list[IndexArray] = [samples.line[found.first], samples.line[found.second]]
+    heads = ["longitude", "latitude", "line", "crossed", "before [nT]", "after [nT]"]
+    columns: list[FloatArray | IndexArray] = [longitude.round(7), latitude.round(7), *lines]
+    columns += [old_misties.round(3), new_misties.round(3)]
+    _write_csv(path, heads, columns)
+
+
+def write_points(
+    longitude: FloatArray, latitude: FloatArray, anomaly: FloatArray, sigma: FloatArray, path: Path
+) -> None:
+    """Write predictions at points, (n,) each: deg, nT, and their 1-sigma."""
+    heads = ["longitude", "latitude", "anomaly [nT]", "anomaly_sigma [nT]"]
+    _write_csv(path, heads, [longitude, latitude, anomaly.round(3), sigma.round(3)])
+
+
+def _write_csv(path: Path, heads: list[str], columns: Sequence[FloatArray | IndexArray]) -> None:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(heads)
+        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _track(samples: Samples, label: int) -> FloatArray:
+    """Return longitude and latitude (v, 2) along a line, deg."""
+    place = samples.place[samples.line == label]
+    place = place[:: max(len(place) // VERTICES, 1)]
+    latitude, longitude = offset(*samples.origin, place[:, 0], place[:, 1])
+    return np.stack([longitude, latitude], axis=1)
+
+
+def _kml(tracks: dict[str, FloatArray]) -> str:
+    marks = "\n".join(
+        f"<Placemark><name>line {escape(label)}</name><LineString><coordinates>"
+        + " ".join(f"{x:.7f},{y:.7f}" for x, y in track.tolist())
+        + "</coordinates></LineString></Placemark>"
+        for label, track in tracks.items()
+    )
+    header = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    return f"{header}\n{marks}\n</Document></kml>\n"

@@ -1,4 +1,4 @@
-"""Logs and tables to the samples of a survey: corrected here, or by others."""
+"""Logs and tables to the samples of a survey, corrected here or elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observe import at_one_time
 from magbridge.calibration.fitting.uncertainty import apart_from_level
 from magbridge.calibration.model import Calibration
-from magbridge.columns import CHANNELS
+from magbridge.columns import CHANNELS, require
 from magbridge.correction import Correction
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import separation
@@ -32,22 +32,20 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.result import Creep
 
 __all__ = [
-    "corrected_by_others", "from_vector", "is_table", "joined", "read_points", "read_table", "without_creep",
+    "corrected_by_others", "from_vector", "is_table", "joined", "located", "read_points", "read_table",
+    "without_creep",
 ]  # fmt: skip
 
 ANOMALY_COLUMNS = (
-    "anomaly",
-    "total_field_anomaly_nt",
-    "total_field_anomaly",
-    "mag_anomaly",
-    "magnetic_anomaly",
-    "tfa",
-)
+    "anomaly", "total_field_anomaly_nt", "total_field_anomaly", "mag_anomaly", "magnetic_anomaly", "tfa"
+)  # fmt: skip
 """Names of the anomaly in third-party tables."""
 HEIGHT = ("height", "altitude", "height_m", "height_ell_m", "altitude_m", "elevation")
 TABLE_SUFFIXES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
 MODES, FAINT = 24, 0.05
 """Uncertain combinations of a calibration at most, and nT below which one does not matter."""
+MIN_SAMPLES = 10
+"""Samples of a table or a log, at least."""
 THINNED = 2_000
 """Samples by which they are found."""
 
@@ -82,7 +80,7 @@ def read_table(path: Path) -> Samples:
     kind = table["line_type"].astype(str).str.upper() if "line_type" in table else None
     tie = np.zeros(len(value), bool) if kind is None else (kind == "TIE").to_numpy()
     known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)
-    if known.sum() < 10:
+    if known.sum() < MIN_SAMPLES:
         raise FormatError(
             path, f"only {counted(int(known.sum()), 'row')} with longitude, latitude and anomaly"
         )
@@ -111,45 +109,84 @@ def read_points(
     return longitude, latitude, depth, np.stack(separation(*origin, latitude, longitude), axis=1)
 
 
-def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
+def corrected_by_others(ds: xr.Dataset) -> Samples:
     """Return the samples of a log with ``total_field`` or ``anomaly``, nT, and positions.
 
     FormatError: it has neither, or no position.
     """
-    source = ds.attrs.get("source", "the log")
-    if not {"latitude", "longitude"} <= set(ds.variables):
-        raise FormatError(source, "expected latitude and longitude: a map needs to know where")
+    require(ds, ("latitude", "longitude"))
     if "anomaly" in ds:
         value = ds["anomaly"].to_numpy().astype(float)
     elif "total_field" in ds:
         value = ds["total_field"].to_numpy().astype(float) - magnitude(main_field(ds))
     else:
+        source = ds.attrs.get("source", "the log")
         raise FormatError(source, "expected mag_x mag_y mag_z, total_field or anomaly")
-    value = np.where(_doubtful(ds), np.nan, value - _daily(ds))
-    lines = ds["line"].to_numpy() if "line" in ds else np.zeros(len(value))
-    samples = _placed(ds, value, lines, label)
-    return replace(samples, level_sigma=float(ds["level_sigma"].median())) if "level_sigma" in ds else samples
+    samples, known = located(ds, np.where(_doubtful(ds), np.nan, value - _daily(ds)))
+    level_sigma = float(ds["level_sigma"].median()) if "level_sigma" in ds else 0.0
+    return replace(samples.part(known), level_sigma=level_sigma)
 
 
-def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples:
-    """Correct a log with its calibration; flagged samples are left out, the calibration's sigma is kept."""
+def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
+    """Correct a log with its calibration; flagged samples are left out, the calibration's sigma is kept.
+
+    FormatError: it has no position.
+    """
+    require(ds, ("latitude", "longitude"))
     ds = at_one_time(ds)
     corrected = correct_rows(Correction(calibration), ds)
     value = np.where(_doubtful(corrected), np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
-    samples = _placed(ds, value, np.zeros(len(value)), label)
-    known = np.isfinite(value) & np.isfinite(positions(ds)[1]) & placed(ds)
+    samples, known = located(ds, value, by_line=False)
     field = np.stack([ds[name].to_numpy() for name in CHANNELS], axis=1)[known]
     channels = [
         ds[name].to_numpy() if name in ds else np.full(len(value), np.nan) for name in calibration.channels
     ]
     read = np.stack(channels, axis=1)[known] if channels else np.empty((len(field), 0))
-    modes = _modes(apart_from_level(calibration), field, read, ds["time"].to_numpy()[known])
     return replace(
-        samples,
+        samples.part(known),
         rho=None if calibration.warnings else calibration.noise.autocorrelation,  # else it is the crust
-        modes=modes,
+        modes=_modes(apart_from_level(calibration), field, read, samples.time[known]),
         level_sigma=calibration.reference.level_sigma,
     )
+
+
+def located(
+    ds: xr.Dataset, value: FloatArray, what: str = "a field", *, by_line: bool = True
+) -> tuple[Samples, BoolArray]:
+    """Return all rows of a log with anomalies (n,), nT, and which of them can be used, (n,).
+
+    Parameters
+    ----------
+    ds : Dataset
+        The log.
+    value : (n,) array
+        nT; NaN where it is not known.
+    what : str
+        Name of the value in the error.
+    by_line : bool
+        Whether the log's ``line`` and ``line_type`` divide it into lines.
+
+    Raises
+    ------
+    FormatError
+        Fewer than ten rows have a value and a position.
+    """
+    longitude, latitude, depth = positions(ds)
+    known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
+    if (many := int(known.sum())) < MIN_SAMPLES:
+        source = ds.attrs.get("source", "the log")
+        raise FormatError(source, f"only {counted(many, 'sample')} with {what} and a position")
+    origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
+    place = np.stack(separation(*origin, latitude, longitude), axis=1)
+    line, tie = np.zeros(len(value), int), np.zeros(len(value), bool)
+    if by_line and "line" in ds:
+        names = ds["line"].to_numpy()
+        names = names.astype(str) if names.dtype.kind == "O" else names
+        line = np.unique(names, return_inverse=True)[1].ravel()
+        if "line_type" in ds:
+            tie = np.char.upper(ds["line_type"].to_numpy().astype(str)) == "TIE"
+    time = np.asarray(ds["time"].to_numpy(), float)
+    return Samples(place, depth, time, value, line, tie, origin), known
 
 
 def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
@@ -201,20 +238,6 @@ def _doubtful(corrected: xr.Dataset) -> BoolArray:
 def _daily(ds: xr.Dataset) -> FloatArray | float:
     """Return a base station's variation (n,), nT; 0 without one."""
     return ds["daily_variation"].to_numpy() if "daily_variation" in ds else 0.0
-
-
-def _placed(ds: xr.Dataset, value: FloatArray, lines: FloatArray, label: int) -> Samples:
-    longitude, latitude, depth = positions(ds)
-    known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
-    if known.sum() < 10:
-        source = ds.attrs.get("source", "the log")
-        raise FormatError(source, f"only {counted(int(known.sum()), 'sample')} with a field and a position")
-    origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
-    north, east = separation(*origin, latitude, longitude)
-    of = np.unique(lines, return_inverse=True)[1].ravel() + label
-    tie = np.zeros(len(value), bool)
-    time = np.asarray(ds["time"].to_numpy(), float)
-    return Samples(np.stack([north, east], axis=1), depth, time, value, of, tie, origin).part(known)
 
 
 def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray) -> FloatArray:

@@ -23,11 +23,10 @@ from magbridge.calibration.fitting.field_search import Choice
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.diagnostics import Diagnostic
-from magbridge.errors import CalibrationError, DataError, FormatError
+from magbridge.errors import CalibrationError, DataError
 from magbridge.survey.alignment import ScalarTerms, align
 from magbridge.survey.crossovers import Crossovers, crossovers
-from magbridge.survey.gridded import Gridded
-from magbridge.survey.gridding import gridded
+from magbridge.survey.gridding import Gridded, gridded
 from magbridge.survey.read import corrected_by_others, from_vector, joined
 from magbridge.survey.samples import Samples
 from magbridge.survey.scalar import scalar_rows
@@ -61,21 +60,10 @@ class Result:
 
 
 def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) -> Samples:
-    """Return the corrected samples of several logs.
+    """Return the samples of several logs, corrected where they have a vector.
 
-    Parameters
-    ----------
-    logs : sequence of Dataset
-        Those with a vector are corrected, others must hold a corrected field.
-    calibrations : sequence of Calibration
-        One for all logs with a vector, or one for each of them in order.
-
-    Raises
-    ------
-    DataError
-        Another number of calibrations.
-    FormatError
-        A log without positions.
+    There is one calibration for all logs with a vector, or one for each of them in order. DataError: another
+    number of calibrations. FormatError: a log without positions.
     """
     parts: list[Samples] = []
     with_vector = [log for log in logs if _has_vector(log)]
@@ -89,28 +77,16 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
     )
     for log in logs:
         if _has_vector(log):
-            if not {"latitude", "longitude"} <= set(log.variables):
-                raise FormatError(log.attrs.get("source", "the log"), "expected latitude and longitude")
-            parts.append(from_vector(log, waiting.pop(0), 0))
+            parts.append(from_vector(log, waiting.pop(0)))
         else:
-            parts.append(corrected_by_others(log, 0))
+            parts.append(corrected_by_others(log))
     return joined(parts)
 
 
 def survey(samples: Samples, start: Choice | None = None) -> Result:
-    """Level and grid corrected samples.
+    """Level and grid corrected samples, from the `start` that a joint fit has found, if any.
 
-    Parameters
-    ----------
-    samples : Samples
-        Corrected.
-    start : Choice, optional
-        Field and noise, where a joint fit has found them.
-
-    Raises
-    ------
-    CalibrationError
-        The samples cannot be gridded.
+    CalibrationError: the samples cannot be gridded.
     """
     warnings: list[Diagnostic] = []
     # 1. Leave out samples far from all others. 2. Grid. 3. Compare lines at their crossings before and after.

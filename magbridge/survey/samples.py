@@ -1,14 +1,25 @@
-"""Corrected samples of a survey, wherever they come from."""
+"""Corrected samples of a survey, the roughness of their field, and their rows in a linear model.
+
+A single amplitude for a whole survey is too small over an intrusion that crops out, and too large elsewhere.
+The field's second differences along the lines, smoothed over some of its lengths, show where it is rougher:
+the field's amplitude is made proportional to their root mean square.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.estimation.blocks import BLOCK_ROWS, BlockColumns, ParameterBlock, in_chunks
+from magbridge.estimation.elimination import LinearisedRows, SampleSums, sum_rows
+from magbridge.estimation.gaussian_field import GaussianField
 
-__all__ = ["Samples"]
+__all__ = ["Roughness", "Rows", "Samples"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,3 +62,135 @@ class Samples:
             self.place[rows], self.depth[rows], self.time[rows], self.value[rows], self.line[rows],
             self.tie[rows], self.origin, self.weight[rows], self.rho, self.modes[rows], self.level_sigma,
         )  # fmt: skip
+
+
+LAG, REACH = 0.5, 2.0
+"""Lengths between the samples of a second difference, and of the smoothing's sigma."""
+LEAST, LARGEST = 0.2, 6.0
+"""Limits of a roughness, relative to the typical one."""
+MAX_CELLS_PER_SIDE = 400
+"""Most cells a side."""
+PRIOR = 0.1
+"""Weight of the typical roughness, over that of the average cell's samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class Roughness:
+    """The size of the field over the typical one, on a grid of cells."""
+
+    low: FloatArray
+    """(2,), m north and east."""
+    cell: float
+    """Side of a cell, m."""
+    scale: FloatArray
+    """(a, b)."""
+
+    @classmethod
+    def uniform(cls) -> Roughness:
+        """Return one that is the same everywhere."""
+        return cls(np.zeros(2), 1.0, np.ones((1, 1)))
+
+    @classmethod
+    def from_samples(cls, samples: Samples, length: float) -> Roughness:
+        """Return that of a survey whose field has a `length`, m."""
+        place = samples.place
+        low, extent = place.min(axis=0), np.ptp(place, axis=0)
+        # Cells of a fraction of the smoothing length, limited in number.
+        cell = max(float(extent.max()) / MAX_CELLS_PER_SIDE, REACH * length / 4.0)
+        # Second differences are free of levels and slow changes; their mean square follows the roughness.
+        bent = _bends(samples, LAG * length)
+        known = np.isfinite(bent)
+        if known.sum() < 50:
+            return cls.uniform()
+        at = np.floor((place[known] - low) / cell).astype(int)
+        shape = np.floor(extent / cell).astype(int) + 1
+        power, count = np.zeros(shape), np.zeros(shape)
+        np.add.at(power, (at[:, 0], at[:, 1]), bent[known] ** 2)
+        np.add.at(count, (at[:, 0], at[:, 1]), 1.0)
+        power, count = (
+            gaussian_filter(one, REACH * length / cell, mode="constant") for one in (power, count)
+        )
+        # Shrink cells with few samples to the typical power.
+        typical2 = float(np.median((power / np.maximum(count, 1e-12))[count > PRIOR * count.mean()]))
+        few = PRIOR * count.mean()
+        scale = np.sqrt((power + few * typical2) / ((count + few) * max(typical2, 1e-12)))
+        return cls(low, cell, np.clip(scale, LEAST, LARGEST))
+
+    def evaluate(self, place: FloatArray) -> FloatArray:
+        """Return the roughness (n,) at places (n, 2), m."""
+        if min(self.scale.shape) < 2:
+            return np.full(len(place), float(self.scale.mean()))
+        u = (place - self.low) / self.cell - 0.5
+        i = np.clip(np.floor(u).astype(int), 0, np.array(self.scale.shape) - 2)
+        t = np.clip(u - i, 0.0, 1.0)
+        # Bilinear interpolation between the centres of the cells.
+        a = self.scale[i[:, 0], i[:, 1]] * (1 - t[:, 1]) + self.scale[i[:, 0], i[:, 1] + 1] * t[:, 1]
+        b = self.scale[i[:, 0] + 1, i[:, 1]] * (1 - t[:, 1]) + self.scale[i[:, 0] + 1, i[:, 1] + 1] * t[:, 1]
+        return np.asarray(a * (1 - t[:, 0]) + b * t[:, 0])
+
+
+def _bends(samples: Samples, lag: float) -> FloatArray:
+    """Return the second difference (n,) of the field over `lag` m along the line, nT; NaN at its ends."""
+    y, line, place = samples.value, samples.line, samples.place
+    # y(s + lag) - 2 y(s) + y(s - lag) along one line.
+    step = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
+    m = max(round(lag / max(step, 1e-3)), 1)
+    out = np.full(len(y), np.nan)
+    if len(y) > 2 * m:
+        whole = (line[2 * m :] == line[m:-m]) & (line[: -2 * m] == line[m:-m])
+        out[m:-m][whole] = (y[2 * m :] - 2.0 * y[m:-m] + y[: -2 * m])[whole]
+    return out
+
+
+class Rows:
+    """The samples of a survey as rows of a linear model."""
+
+    def __init__(self, samples: Samples, groups: tuple[ParameterBlock, ...], roughness: Roughness) -> None:
+        self.samples, self.groups = samples, groups
+        self.mean = float(np.median(samples.value))
+        self.middle = float(np.nanmedian(samples.depth))
+        self.deeper = np.nan_to_num(samples.depth - self.middle)
+        self.D = BlockColumns(groups)
+        self.scale = roughness.evaluate(samples.place)
+        self.kept = np.ones(len(samples.value), bool)
+
+    def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
+        """Return the contribution of the field's coefficients to the samples `rows`, (m, nodes)."""
+        # Splines at the samples, times the roughness there.
+        known = field.basis(self.samples.place[rows], self.deeper[rows])
+        return csr_array(diags_array(self.scale[rows]) @ known)
+
+    def mean_over_samples(self, field: GaussianField) -> FloatArray:
+        """Return the contribution of each of the field's coefficients to the samples' mean, (nodes,)."""
+        kept, total = np.flatnonzero(self.kept), np.zeros(field.nodes.size)
+        for start in range(0, len(kept), BLOCK_ROWS):
+            total += self.basis(field, kept[start : start + BLOCK_ROWS]).sum(axis=0)
+        return total / len(kept)
+
+    def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
+        """Return the field of coefficients w (nodes,) at every sample, (n,), nT."""
+        return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
+
+    def sums(self, field: GaussianField, rows: IndexArray, modes: bool = False) -> SampleSums:
+        """Return the sums of the samples `rows` (m,), of them the kept; with the calibration's modes."""
+        return sum_rows(self._pieces(field, rows, modes))
+
+    def _pieces(self, field: GaussianField, rows: IndexArray, modes: bool) -> Iterator[LinearisedRows]:
+        s = self.samples
+        rows = rows[self.kept[rows]]
+        # Noise is correlated between neighbours on one line only.
+        follows = np.zeros(len(rows), bool)
+        follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
+        for start in range(0, len(rows), BLOCK_ROWS):
+            # One row of overlap: the noise is correlated with that of the row before.
+            first = max(start - 1, 0)
+            mine = rows[first : start + BLOCK_ROWS]
+            weight = -1.0 / s.weight[mine]
+            V = [(s.value[mine] - self.mean)[:, None], self.D[mine]]
+            if modes:
+                V.append(s.modes[mine])
+            rows_of = np.concatenate(V, axis=1)
+            rows_of[:, 1:] *= weight[:, None]
+            rows_of[:, 0] *= -weight
+            B = csr_array(diags_array(weight) @ self.basis(field, mine))
+            yield LinearisedRows(rows_of, B, follows[first : start + BLOCK_ROWS], overlap=start > 0)

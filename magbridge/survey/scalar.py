@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.arrays import FloatArray
 from magbridge.calibration.figure_of_merit import BoxFlight, box_flight
 from magbridge.calibration.fitting.scalar_log import compensate, moved_to_sensor, scalar_reading
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, require
 from magbridge.correction import Correction
 from magbridge.errors import DataError, FormatError
-from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
-from magbridge.field.reference import main_field, placed, positions, require_date
+from magbridge.field.reference import main_field, require_date
 from magbridge.rows import correct_rows
-from magbridge.survey.read import joined
+from magbridge.survey.read import joined, located
 from magbridge.survey.samples import Samples
-from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -34,7 +32,6 @@ SPEED_SMOOTHING_S = 2.0
 """Time over which the velocity is averaged, s."""
 MAX_SPEED_GAP_INTERVALS = 3.0
 """Intervals without a sample after which the velocity starts again."""
-MIN_PLACED_READINGS = 10
 
 
 class AlignmentTerm(NamedTuple):
@@ -85,27 +82,10 @@ def scalar_rows(
     calibrations: Sequence[Calibration] = (),
     lever: tuple[float, float, float] | None = None,
 ) -> ScalarRows:
-    """Return the samples of logs with a scalar magnetometer.
+    """Return the samples of logs with a scalar magnetometer; arguments as of :func:`.run.scalar_survey`.
 
-    Parameters
-    ----------
-    logs : sequence of Dataset
-        Each with `column`, nT, and positions.
-    column : str
-        The scalar's reading.
-    names : sequence of str
-        Telemetry channels whose effect is fitted, where no calibration has the sensor.
-    calibrations : sequence of Calibration
-        None, one for all logs, or one for each. One with the sensor compensates it.
-    lever : tuple of 3 float, optional
-        Position of the sensor relative to the logged positions, m forward, starboard and down, if known.
-
-    Raises
-    ------
-    FormatError
-        A column is missing, or fewer than ten samples have a reading and a position.
-    DataError
-        The reading is not nT, or the number of calibrations is neither one nor that of the logs.
+    FormatError: a column is missing, or fewer than ten samples have a reading and a position. DataError: the
+    reading is not nT, or the number of calibrations is neither one nor that of the logs.
     """
     known: list[Calibration | None] = list(calibrations) or [None]
     if len(known) not in (1, len(logs)):
@@ -166,48 +146,32 @@ def _log_rows(
     else:
         value, terms = scalar_reading(log, column), _channel_terms(log, names)
     log = moved_to_sensor(log, lever) if lever else log
-    # Anomaly = reading - main field (- daily variation).
     expected = magnitude(main_field(log))
     if "daily_variation" in log:
         expected = expected + log["daily_variation"].to_numpy()
     # Anomalies: minus the main field and the daily variation.
     raw, value = scalar_reading(log, column) - expected, value - expected
-    place, depth, origin = _places(log)
-    known = np.isfinite(value) & np.isfinite(place).all(axis=1) & placed(log)
+    samples, known = located(log, value, column)
     for term in terms:
         known &= np.isfinite(term.columns).all(axis=1)
-    if known.sum() < MIN_PLACED_READINGS:
-        source, many = log.attrs.get("source", "the log"), counted(int(known.sum()), "sample")
-        raise FormatError(source, f"only {many} with {column} and a position")
-    time = np.asarray(log["time"].to_numpy(), float)
     # Without a heading, the course over ground stands for it.
-    velocity = _velocity(time, place)
+    velocity = _velocity(samples.time, samples.place)
     heading = np.arctan2(velocity[:, 1], velocity[:, 0])
     if "heading" in log:
         own = np.radians(log["heading"].to_numpy().astype(float))
         heading = np.where(np.isfinite(own), own, heading)
-    boxes = _boxes(log, time, heading, raw, value, terms)
-    # A box flight tests the compensation, so that it is not fitted.
+    boxes = _boxes(log, samples.time, heading, raw, value, terms)
     # Manoeuvres of a box are not fitted: they test the result.
     for box_rows in boxes:
         known &= ~box_rows.box.rows(len(known))
-    line, tie = _lines(log)
-    samples = Samples(place, depth, time, value, line, tie, origin, rho=None).part(known)
+    samples = replace(samples, rho=None).part(known)
     used = tuple(AlignmentTerm(name, columns[known]) for name, columns in terms)
     return ScalarRows(column, samples, raw[known], heading[known], velocity[known], used, compensated, boxes)
-
-
-def _places(log: xr.Dataset) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
-    """Return m north and east (n, 2) of an origin, depth (n,), m, and the origin (deg)."""
-    longitude, latitude, depth = positions(log)
-    origin = float(np.nanmedian(latitude)), float(np.nanmedian(longitude))
-    return np.stack(separation(*origin, latitude, longitude), axis=1), depth, origin
 
 
 def _velocity(time: FloatArray, place: FloatArray) -> FloatArray:
     """Return the velocity north and east (n, 2), m/s, over some seconds, never across a gap of the log."""
     interval = max(float(np.median(np.diff(time))), 1e-3)
-    # Central difference over the smoothing time, cut at gaps.
     half = max(1, round(0.5 * SPEED_SMOOTHING_S / interval))
     # Central difference over the smoothing time, cut at the ends of a stretch without gaps.
     stretch = np.cumsum(np.diff(time, prepend=time[0]) > MAX_SPEED_GAP_INTERVALS * interval)
@@ -232,17 +196,6 @@ def _boxes(
     roll, pitch = (log[name].to_numpy().astype(float) for name in ("roll", "pitch"))
     box = box_flight(time, roll, pitch, np.degrees(heading))
     return () if box is None else (BoxRows(box, heading, raw, value, terms),)
-
-
-def _lines(log: xr.Dataset) -> tuple[IndexArray, BoolArray]:
-    """Return the number of each sample's line (n,), and whether it is a tie line (n,)."""
-    n = log.sizes["time"]
-    if "line" not in log:
-        return np.zeros(n, int), np.zeros(n, bool)
-    line = np.unique(log["line"].to_numpy().astype(str), return_inverse=True)[1].ravel()
-    if "line_type" not in log:
-        return line, np.zeros(n, bool)
-    return line, np.char.upper(log["line_type"].to_numpy().astype(str)) == "TIE"
 
 
 def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[AlignmentTerm, ...]:

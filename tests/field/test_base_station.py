@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from magbridge.cli.common import by_base_station
 from magbridge.errors import DataError, WrongUse
-from magbridge.field.base_station import with_daily_variation
 from magbridge.field.igrf import igrf
+from magbridge.field.reference import with_daily_variation
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment
 

@@ -7,8 +7,7 @@ import pytest
 
 from magbridge.errors import OutOfRange
 from magbridge.field.geodesy import offset
-from magbridge.field.igrf import total_field
-from magbridge.field.nearby import NearbyField
+from magbridge.field.igrf import NearbyField, total_field
 
 TIME = 1.7e9
 

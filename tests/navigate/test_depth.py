@@ -13,8 +13,7 @@ from voyages import GLIDER, Map, dived, sail, synthetic, track_over
 from magbridge.cli.navigate import _continued
 from magbridge.field.continuation import continued, smoothed
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.depth import at_depth, lasting_errors
-from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.options import NavigationOptions, at_depth, lasting_errors
 
 
 def test_errors_of_the_map_add_up() -> None:

@@ -11,9 +11,9 @@ from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
 from magbridge.field.igrf import total_field
 from magbridge.navigate import own_survey
+from magbridge.navigate.findings import errors
 from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.own_survey import OwnField, localise
-from magbridge.navigate.reference_track import errors
 
 START, HOURS, DT = (49.5, -57.9), 3.0, 60.0
 OPTIONS = NavigationOptions(start_sigma=1.0, current_sigma=0.03, drift=0.05, bias_sigma=1.0)

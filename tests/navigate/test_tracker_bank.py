@@ -10,8 +10,8 @@ from voyages import PLACE
 
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid, Local
-from magbridge.navigate.bank import Bank, Tracker, widest
-from magbridge.navigate.model import Block, prior, transition
+from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.model import Block, prior
 from magbridge.navigate.options import NavigationOptions
 
 Moments = tuple[np.ndarray, np.ndarray]
@@ -39,17 +39,16 @@ def correlated() -> Moments:
 def test_a_map_s_variance_counts_with_the_measurement_s(grid: AnomalyGrid, correlated: Moments) -> None:
     x, P = correlated
     unsure = AnomalyGrid(grid.longitude, grid.latitude, grid.anomaly, 3.0)
-    for make in (
-        lambda m: Tracker(m, x, P, gate=25.0), lambda m: Bank(m, x, 1e-6 * P, 500.0, gate=25.0)
-    ):  # fmt: skip
-        sure, not_sure = (make(one).update(block(0.0))[1] for one in (grid, unsure))
+    for scale, resolution in ((1.0, np.inf), (1e-6, 500.0)):
+        banks = (Bank(one, x, scale * P, resolution, gate=25.0) for one in (grid, unsure))
+        sure, not_sure = (bank.update(block(0.0)).variance for bank in banks)
         assert not_sure - sure == pytest.approx(9.0, rel=1e-3)
 
 
 def test_the_tracker_is_the_second_order_filter(grid: AnomalyGrid, correlated: Moments) -> None:
     """The textbook equations, with the whole covariance, in the plainest code."""
     x, P = correlated
-    tracker = Tracker(grid, x, P, gate=25.0)
+    tracker = Bank(grid, x, P, np.inf, gate=25.0)
     local = around(grid, x[0], x[1])
     hessian = np.array(
         [[local.north_north[0], local.north_east[0]], [local.north_east[0], local.east_east[0]]]
@@ -61,15 +60,15 @@ def test_the_tracker_is_the_second_order_filter(grid: AnomalyGrid, correlated: M
     z = expected + 2.0
     gain = P @ h / s
     seen = tracker.update(block(z))
-    np.testing.assert_allclose(tracker.x, x + gain * 2.0, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(tracker.P, P - np.outer(gain, gain) * s, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(tracker.x[:, 0], x + gain * 2.0, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(tracker.P[:, :, 0], P - np.outer(gain, gain) * s, rtol=1e-6, atol=1e-6)
     assert seen.value == pytest.approx(2.0, abs=1e-9)
     assert seen.variance == pytest.approx(s)
     assert seen.accepted
 
 
 def test_the_gate_keeps_an_outlier_out(grid: AnomalyGrid, correlated: Moments) -> None:
-    tracker = Tracker(grid, *correlated, gate=16.0)
+    tracker = Bank(grid, *correlated, np.inf, gate=16.0)
     before = tracker.x.copy()
     seen = tracker.update(block(5_000.0))
     assert not seen.accepted
@@ -78,27 +77,9 @@ def test_the_gate_keeps_an_outlier_out(grid: AnomalyGrid, correlated: Moments) -
 
 def test_off_the_map_nothing_is_compared(grid: AnomalyGrid, correlated: Moments) -> None:
     x, P = correlated
-    seen = Tracker(grid, x + 1e6 * np.eye(6)[0], P, 16.0).update(block(0.0))
+    seen = Bank(grid, x + 1e6 * np.eye(6)[0], P, np.inf, 16.0).update(block(0.0))
     assert np.isnan(seen.value)
     assert not seen.accepted
-
-
-def test_a_bank_of_one_is_the_tracker(grid: AnomalyGrid, correlated: Moments) -> None:
-    tracker, bank = Tracker(grid, *correlated, gate=16.0), Bank(grid, *correlated, resolution=1e4, gate=16.0)
-    moved = transition(NavigationOptions(), 20.0, 7.0)
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        z = float(around(grid, 0.0, 0.0).anomaly[0] + rng.normal())
-        tracker.predict(*moved)
-        bank.predict(*moved)
-        one, many = tracker.update(block(z)), bank.update(block(z))
-        assert many == pytest.approx((one.value, one.variance, one.log_likelihood), rel=1e-9)
-    assert len(bank) == 1
-    np.testing.assert_allclose(bank.x[:, 0], tracker.x, rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(bank.P[:, :, 0], tracker.P, rtol=1e-6, atol=1e-9)
-    tracker.update_position(30.0, -20.0, 10.0)
-    bank.update_position(30.0, -20.0, 10.0)
-    np.testing.assert_allclose(bank.x[:, 0], tracker.x, rtol=1e-7, atol=1e-9)
 
 
 def test_a_cut_gaussian_is_still_that_gaussian(grid: AnomalyGrid, correlated: Moments) -> None:

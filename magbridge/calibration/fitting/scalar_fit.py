@@ -22,7 +22,7 @@ those that harm, but a physical width does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -45,6 +45,10 @@ from magbridge.calibration.scalar import (
     term_columns,
 )
 from magbridge.errors import CalibrationError
+from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
+from magbridge.estimation.hyperparameters import log_evidence
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.priors import PriorFamily
 
 __all__ = ["ScalarFit", "adapt_to_log", "fit_scalar"]
 
@@ -99,62 +103,28 @@ class ScalarFit:
     """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """Columns that share a prior width."""
-
-    name: str
-    columns: slice
-    centre: float
-    spread: float
-    """1-sigma of the log of the width; 0: the width is fixed."""
-
-
 def fit_scalar(
     series: ScalarSeries,
     names: tuple[str, ...],
     *,
     column: str = "scalar",
-    directions_from: str = "vector",
     units: tuple[str, ...] = (),
     lag: float | None = None,
     map_known: bool = False,
-    use: BoolArray | None = None,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ScalarFit:
-    """Fit the compensation of a scalar magnetometer.
+    """Fit the compensation of a scalar magnetometer; samples with a missing value are left out.
 
-    Parameters
-    ----------
-    series : ScalarSeries
-        All samples; those with a missing value are left out.
-    names : tuple of str
-        The channels' columns.
-    column, directions_from : str
-        Names that the result carries.
-    units : tuple of str
-        The channels' units.
-    lag : float, optional
-        s, of the scalar after the vector; estimated if not given.
-    map_known : bool
-        True if the reference includes the crustal field. Otherwise the crustal field along the track is a
-        Matern process.
-    use : (n,) array of bool, optional
-        Samples that may be fitted, for example those at which a witness agrees.
-    lever : tuple of 3 float
-        m, that the reference already includes; the result carries it.
+    `names` and `units` are those of the channels. `lag` (s) is that of the scalar after the vector; it is
+    estimated if not given. With `map_known` the reference includes the crustal field; otherwise that is a
+    Matern process along the track. The reference includes `lever` (m) already.
 
-    Raises
-    ------
-    CalibrationError
-        Too few samples, or a constant direction.
+    CalibrationError: too few samples, or a constant direction.
     """
     valid = (
         np.isfinite(series.scalar) & np.isfinite(series.vector).all(axis=1) & np.isfinite(series.reference)
     )
     valid &= np.isfinite(series.channels).all(axis=1)
-    if use is not None:
-        valid &= use
     if valid.sum() < MIN_SCALAR_SAMPLES:
         raise CalibrationError(
             f"{column}: expected at least {MIN_SCALAR_SAMPLES} samples with vector, reference and "
@@ -176,7 +146,7 @@ def fit_scalar(
                 break
             kept &= ~outliers
             start = state.log_noise
-    return _result(problem, kept, state, series, column, directions_from, channels, lever)
+    return _result(problem, kept, state, series, column, channels, lever)
 
 
 def _agreeing(
@@ -212,14 +182,17 @@ def _channel(name: str, values: FloatArray, unit: str) -> ScalarChannel:
 
 
 @dataclass(frozen=True, eq=False)
-class _State:
-    """Hyperparameters and posterior."""
+class _Posterior:
+    """Hyperparameters where the evidence is largest, and the posterior that they give."""
 
-    log_noise: FloatArray
-    widths: FloatArray
+    log_widths: FloatArray
+    prior_sigma: FloatArray
+    """(m,), 1-sigma of each coefficient's prior."""
     mean: FloatArray
     covariance: FloatArray
-    value: float
+    cost: float
+    """Negative log of evidence times prior, up to a constant."""
+    log_noise: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +204,7 @@ class _ScalarProblem:
     """(n,), nT, reading minus reference."""
     design: FloatArray
     """(n, m), all columns, levels last."""
-    blocks: tuple[_Block, ...]
+    family: PriorFamily
     segments: tuple[slice, ...]
     interval: float
     cycles: tuple[int | None, ...]
@@ -265,18 +238,18 @@ class _ScalarProblem:
         group = piece * len(table) + (np.arange(len(table)) - first[piece]) // many
         _, starts, counts = np.unique(group, return_index=True, return_counts=True)
         table = np.add.reduceat(table, starts, axis=0) / counts[:, None]
-        blocks = _blocks(channels, len(cycles), fixed_lag=lag is not None)
+        family = _prior_family(channels, len(cycles), fixed_lag=lag is not None)
         return _ScalarProblem(
-            table[:, 0], table[:, 1], table[:, 2:], blocks, _segments(table[:, 0], many * step), many * step,
+            table[:, 0], table[:, 1], table[:, 2:], family, _segments(table[:, 0], many * step), many * step,
             cycles, many,
         )  # fmt: skip
 
     def part(self, kept: BoolArray) -> _ScalarProblem:
         """Return the problem of some samples."""
         time = self.time[kept]
-        return _ScalarProblem(
-            time, self.target[kept], self.design[kept], self.blocks, _segments(time, self.interval),
-            self.interval, self.cycles, self.averaged,
+        return replace(
+            self, time=time, target=self.target[kept], design=self.design[kept],
+            segments=_segments(time, self.interval),
         )  # fmt: skip
 
     def whiten(self, log_noise: FloatArray) -> tuple[FloatArray, FloatArray, float]:
@@ -303,17 +276,18 @@ class _ScalarProblem:
             log_det += float(np.log1p(s).sum())
         return both[:, 0], both[:, 1:], log_det
 
-    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> tuple[_State, FloatArray]:
-        """Return the posterior given the hyperparameters, and the optimal log widths."""
+    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> _Posterior:
+        """Return the posterior given the noise, with the widths that maximise the evidence."""
         y, X, log_det = self.whiten(log_noise)
-        chosen = _choose_widths(X.T @ X, X.T @ y, self.blocks, log_widths)
-        value = chosen.value + 0.5 * (float(y @ y) + log_det) - _log_noise_prior(log_noise)
-        return _State(log_noise, chosen.sigma, chosen.mean, chosen.covariance, value), chosen.log_widths
+        data = GaussianInformation(X.T @ X, X.T @ y, float(y @ y))
+        found = _choose_widths(data, self.family, log_widths)
+        cost = found.cost + 0.5 * log_det - _log_noise_prior(log_noise)
+        return replace(found, log_noise=log_noise, cost=cost)
 
-    def optimise(self, *, map_known: bool, start: FloatArray | None) -> _State:
+    def optimise(self, *, map_known: bool, start: FloatArray | None) -> _Posterior:
         """Maximise the evidence over the noise, and for each noise over the widths."""
-        warm = np.log([block.centre for block in self.blocks if block.spread > 0.0])
-        best: _State | None = None
+        warm = self.family.centre
+        best: _Posterior | None = None
 
         # A time scale beyond these limits is white noise or part of the level; its filter would be unstable.
         limits = [(-9.0, 9.0)] * (1 + len(TIME_CONSTANTS_S))
@@ -323,10 +297,10 @@ class _ScalarProblem:
             nonlocal warm, best
             if not np.isfinite(self.whiten(log_noise)[1]).all():
                 return REFUSED_COST
-            state, widths = self.posterior(log_noise, warm)
-            if best is None or state.value < best.value:
-                best, warm = state, widths
-            return state.value
+            state = self.posterior(log_noise, warm)
+            if best is None or state.cost < best.cost:
+                best, warm = state, state.log_widths
+            return state.cost
 
         if start is None:
             rough = np.diff(self.target) / np.sqrt(2.0)
@@ -342,7 +316,7 @@ class _ScalarProblem:
         assert best is not None
         return best
 
-    def outliers(self, state: _State, kept: BoolArray) -> BoolArray:
+    def outliers(self, state: _Posterior, kept: BoolArray) -> BoolArray:
         """Return samples (n,) whose whitened residual is far too large, with their neighbours."""
         part = self.part(kept)
         y, X, _ = part.whiten(state.log_noise)
@@ -355,64 +329,34 @@ class _ScalarProblem:
         return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Widths:
-    """Optimal prior widths and the posterior that they give."""
-
-    log_widths: FloatArray
-    sigma: FloatArray
-    """(m,), 1-sigma of each coefficient's prior."""
-    mean: FloatArray
-    covariance: FloatArray
-    value: float
-    """Negative log of evidence times prior, without the terms that do not depend on the widths."""
-
-
-def _choose_widths(
-    gram: FloatArray, moment: FloatArray, blocks: tuple[_Block, ...], log_widths: FloatArray
-) -> _Widths:
-    """Maximise the evidence over the widths, given the normal equations of whitened columns.
+def _choose_widths(data: GaussianInformation, family: PriorFamily, log_widths: FloatArray) -> _Posterior:
+    """Maximise the evidence over the widths, given the information of the whitened samples.
 
     Notes
     -----
     With ``B = 1 + W X^T X W``, W the prior's 1-sigma on the diagonal, the posterior mean is ``W B^-1 W X^T
-    y`` and its covariance ``W B^-1 W``; the log evidence is ``-(log|B| + y^T y - y^T X mean) / 2``, and its
-    derivative by the log of a block's width the block's sum of ``(mean^2 + variance) / w^2 - 1``.
+    y`` and its covariance ``W B^-1 W``.
     """
-    free = [block for block in blocks if block.spread > 0.0]
-    centres = np.log([block.centre for block in free])
-    spreads = np.array([block.spread for block in free])
-    size = len(moment)
 
-    def evaluate(logs: FloatArray) -> tuple[float, FloatArray, _Widths]:
-        sigma = _prior_sigma(blocks, np.exp(logs), size)
-        factor = cho_factor(np.eye(size) + sigma[:, None] * gram * sigma, lower=True)
-        mean = sigma * cho_solve(factor, sigma * moment)
-        covariance = sigma[:, None] * cho_solve(factor, np.eye(size)) * sigma
-        value = float(np.log(np.diag(factor[0])).sum()) - 0.5 * float(moment @ mean)
-        value += 0.5 * float((((logs - centres) / spreads) ** 2).sum())
-        slope = (logs - centres) / spreads**2
-        second = (mean**2 + np.diag(covariance)) / sigma**2 - 1.0
-        for index, block in enumerate(free):
-            slope[index] -= second[block.columns].sum()
-        return value, slope, _Widths(logs, sigma, mean, covariance, value)
+    def downhill(logs: FloatArray) -> tuple[float, FloatArray]:
+        value, slope, _ = log_evidence(data, family, logs, 0.0)
+        return (-value if np.isfinite(value) else REFUSED_COST), -slope[:-1]
 
     found = minimize(
-        lambda logs: evaluate(logs)[:2], log_widths, jac=True, method="L-BFGS-B",
-        bounds=[LOG_WIDTH_LIMITS] * len(log_widths), options={"maxiter": 60},
+        downhill, log_widths, jac=True, method="L-BFGS-B", bounds=[LOG_WIDTH_LIMITS] * len(log_widths),
+        options={"maxiter": 60},
     )  # fmt: skip
-    return evaluate(found.x)[2]
+    sigma = family.widths(found.x)
+    factor = cho_factor(np.eye(len(sigma)) + sigma[:, None] * data.precision * sigma, lower=True)
+    mean = sigma * cho_solve(factor, sigma * data.vector)
+    covariance = sigma[:, None] * cho_solve(factor, np.eye(len(sigma))) * sigma
+    return _Posterior(found.x, sigma, mean, covariance, float(found.fun), np.empty(0))
 
 
 def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
     """Return the sensor with the priors of its channels for one swing over the fitted and another log.
 
-    Parameters
-    ----------
-    sensor : ScalarSensor
-        Fitted compensation.
-    channels : (n, k) array
-        The channels in the log to be corrected; NaN where unknown.
+    `channels` (n, k) are those of the log to be corrected; NaN where unknown.
 
     Notes
     -----
@@ -436,15 +380,15 @@ def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
     precision = np.linalg.inv(np.array(sensor.covariance))
     moment = precision @ np.array(sensor.coefficients)
     information = (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor
-    blocks = _blocks(tuple(wider), len(sensor.power_cycles), fixed_lag=prior[PLATFORM_TERMS - 1] < 1e-6)
-    start = np.log([prior[block.columns][0] for block in blocks if block.spread > 0.0])
-    chosen = _choose_widths(information, moment * factor, blocks, start)
+    family = _prior_family(tuple(wider), len(sensor.power_cycles), fixed_lag=prior[PLATFORM_TERMS - 1] < 1e-6)
+    start = np.log(prior[family.design.argmax(axis=0)])
+    chosen = _choose_widths(GaussianInformation(information, moment * factor), family, start)
     return msgspec.structs.replace(
         sensor,
         channels=tuple(wider),
         coefficients=tuple(chosen.mean.tolist()),
         covariance=tuple(tuple(row) for row in chosen.covariance.tolist()),
-        prior_sigma=tuple(chosen.sigma.tolist()),
+        prior_sigma=tuple(chosen.prior_sigma.tolist()),
     )
 
 
@@ -469,27 +413,17 @@ def _power_cycles(
     return index, tuple(None if label < 0.0 else int(label) for label in found.tolist())
 
 
-def _blocks(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool) -> tuple[_Block, ...]:
-    columns = term_columns(channels)
-    blocks = [
-        _Block(name, columns[name], centre, LOG_WIDTH_SIGMA) for name, centre in WIDTH_CENTRES_NT.items()
-    ]
-    blocks.append(_Block("lag", columns["lag"], 1e-9 if fixed_lag else LAG_SIGMA_S, 0.0))
-    blocks += [
-        _Block(channel.name, columns[channel.name], CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA)
-        for channel in channels
-    ]
-    column = PLATFORM_TERMS + 3 * len(channels)
-    blocks.append(_Block("level", slice(column, column + levels), CYCLE_LEVEL_SIGMA_NT, 0.0))
-    return tuple(blocks)
-
-
-def _prior_sigma(blocks: tuple[_Block, ...], widths: FloatArray, size: int) -> FloatArray:
-    """Return the prior's 1-sigma of every coefficient, (m,)."""
-    sigma, free = np.empty(size), iter(widths.tolist())
-    for block in blocks:
-        sigma[block.columns] = next(free) if block.spread > 0.0 else block.centre
-    return sigma
+def _prior_family(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool) -> PriorFamily:
+    """Return the prior of the coefficients: free widths but for the lag and the levels."""
+    widths = {name: (centre, LOG_WIDTH_SIGMA) for name, centre in WIDTH_CENTRES_NT.items()}
+    widths["lag"] = 1e-9 if fixed_lag else LAG_SIGMA_S, 0.0
+    blocks = []
+    for name, columns in term_columns(channels).items():
+        width, spread = widths.get(name, (CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA))
+        size = columns.stop - columns.start
+        blocks.append(ParameterBlock(name, np.empty((0, size)), np.ones(size), width, spread))
+    blocks.append(ParameterBlock("level", np.empty((0, levels)), np.ones(levels), CYCLE_LEVEL_SIGMA_NT))
+    return with_blocks(NO_COEFFICIENTS, tuple(blocks))
 
 
 def _segments(time: FloatArray, interval: float) -> tuple[slice, ...]:
@@ -583,19 +517,18 @@ def _matern_transition(
 def _result(
     problem: _ScalarProblem,
     kept: BoolArray,
-    state: _State,
+    state: _Posterior,
     series: ScalarSeries,
     column: str,
-    directions_from: str,
     channels: tuple[ScalarChannel, ...],
     lever: tuple[float, float, float],
 ) -> ScalarFit:
     """Return the fit with its sensor, RMS before and after, and contributions."""
     part = problem.part(kept)
     residual = part.target - part.design @ state.mean
+    columns = term_columns(channels) | {"level": slice(PLATFORM_TERMS + 3 * len(channels), None)}
     contribution = {
-        block.name: float(np.std(part.design[:, block.columns] @ state.mean[block.columns]))
-        for block in problem.blocks
+        name: float(np.std(part.design[:, term] @ state.mean[term])) for name, term in columns.items()
     }
     averaged_white = float(np.exp(state.log_noise[0]))
     duration = float(part.time[-1] - part.time[0])
@@ -605,12 +538,12 @@ def _result(
     sensor = ScalarSensor(
         kind="scalar",
         column=column,
-        directions_from=directions_from,
+        directions_from="vector",
         reference_field=float(np.median(series.reference[np.isfinite(series.reference)])),
         channels=channels,
         coefficients=tuple(state.mean.tolist()),
         covariance=tuple(tuple(row) for row in state.covariance.tolist()),
-        prior_sigma=tuple(state.widths.tolist()),
+        prior_sigma=tuple(state.prior_sigma.tolist()),
         noise=ScalarNoise(
             averaged_white * float(np.sqrt(problem.averaged)), problem.interval / problem.averaged,
             TIME_CONSTANTS_S, tuple(np.sqrt(variances).tolist()),
@@ -623,5 +556,5 @@ def _result(
     )  # fmt: skip
     return ScalarFit(
         sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
-        int((~kept).sum()) * problem.averaged, -state.value,
+        int((~kept).sum()) * problem.averaged, -state.cost,
     )  # fmt: skip

@@ -16,9 +16,11 @@ from magbridge.calibration.fitting.observe import at_one_time
 from magbridge.calibration.fitting.scalar_fit import ScalarFit, adapt_to_log, fit_scalar
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.scalar import (
+    CorrectedScalar,
     ScalarQuality,
     ScalarSensor,
     ScalarSeries,
+    Witness,
     compare_sensors,
     correct_scalar,
     scalar_design,
@@ -26,6 +28,7 @@ from magbridge.calibration.scalar import (
 )
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import DataError, FormatError
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.reference import reference_field
 
 if TYPE_CHECKING:
@@ -44,7 +47,6 @@ MAX_CHANNEL_GAP_S = 30.0
 """s between two values of a channel, across which it is not interpolated."""
 MAX_MODES, MIN_MODE_NT = 24, 0.02
 """Uncertain combinations of a compensation at most, and the RMS effect, nT, below which one is left out."""
-EARTH_RADIUS_M = 6371008.8
 TELEMETRY_OF_SENSOR = ("sensor_temperature", "depth")
 """Columns with a meaning of their own that may also be telemetry channels."""
 SAMPLE_LABELS = {"run", "dive", "line", "line_type", "power_cycle"}
@@ -53,15 +55,7 @@ NOT_TELEMETRY_PREFIXES = ("mag_", "age_", "gps_", "dr_", "truth_", "local_")
 
 
 def telemetry_columns(ds: xr.Dataset, column: str) -> tuple[str, ...]:
-    """Return the columns of a log that are telemetry: numbers without another meaning, which change.
-
-    Parameters
-    ----------
-    ds : Dataset
-        The log.
-    column : str
-        The scalar's column, which is none of them.
-    """
+    """Return the telemetry columns of a log with the scalar `column`: numbers without another meaning."""
     names = []
     for name in map(str, ds.data_vars):
         own = (name in COLUMNS and name not in TELEMETRY_OF_SENSOR) or name in SAMPLE_LABELS
@@ -151,12 +145,7 @@ def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
 def merit_of(ds: xr.Dataset, measured: FloatArray, compensated: FloatArray) -> dict[str, Any] | None:
     """Return the figure of merit of a log's box flight; None if it holds none, or no attitude.
 
-    Parameters
-    ----------
-    ds : Dataset
-        The log, n samples.
-    measured, compensated : (n,) array
-        nT, the scalar minus its reference, before and after compensation.
+    `measured`, `compensated` (n,): nT, the scalar minus its reference, before and after compensation.
     """
     if not {"roll", "pitch", "heading"} <= set(ds.variables):
         return None
@@ -166,37 +155,17 @@ def merit_of(ds: xr.Dataset, measured: FloatArray, compensated: FloatArray) -> d
 
 
 def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[ScalarSensor]) -> xr.Dataset:
-    """Return a corrected log with the compensated scalar magnetometer.
+    """Return a corrected log with :data:`SCALAR_COLUMNS` of the first of the sensors that the log has.
 
-    Parameters
-    ----------
-    corrected : Dataset (time)
-        What the correction of the vector sensor made of `log`.
-    log : Dataset
-        With the scalar's column and its telemetry channels; other times than those of `corrected` are
-        interpolated for telemetry, and have no reading.
-    sensors : sequence of ScalarSensor
-        Of the calibration; the first whose column the log has is used.
-
-    Returns
-    -------
-    Dataset
-        With :data:`SCALAR_COLUMNS`; ``total_field_sigma`` is larger where the two sensors differ and the
-        vector sensor may be the cause. Unchanged where the log has no such column.
-
-    Raises
-    ------
-    FormatError
-        A telemetry channel of the compensation is not in the log.
+    ``total_field_sigma`` is larger where the two sensors differ and the vector sensor may be the cause. The
+    log is unchanged where it has no such column. FormatError: it lacks a telemetry channel of the
+    compensation.
     """
     sensor = next((one for one in sensors if one.column in log), None)
     if sensor is None:
         return corrected
-    series = _series_of_sensor(corrected, log, sensor)
-    total, sigma = (corrected[name].to_numpy() for name in ("total_field", "total_field_sigma"))
-    found = correct_scalar(adapt_to_log(sensor, series.channels), series)
-    seen = compare_sensors(found.field, found.sigma, total, sigma, series.reference)
-    quality = np.zeros(len(total), int)
+    found, seen, _, _ = _compensated(corrected, log, sensor)
+    quality = np.zeros(len(found.field), int)
     for flag, rows in (
         (ScalarQuality.EXTRAPOLATED, found.extrapolated),
         (ScalarQuality.DISAGREES, seen.disagrees),
@@ -204,17 +173,13 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
         (ScalarQuality.MISSING, found.missing),
     ):
         quality[rows] |= int(flag)
-    columns = (
-        found.field,
-        np.sqrt(found.sigma**2 + seen.scalar_variance),
-        found.level_sigma,
-        quality.astype(float),
-    )
+    widened = np.sqrt(found.sigma**2 + seen.scalar_variance)
+    columns = found.field, widened, found.level_sigma, quality.astype(float)
     added = {
         name: ("time", values, COLUMNS[name]._asdict())
         for name, values in zip(SCALAR_COLUMNS, columns, strict=True)
     }
-    wider = np.sqrt(sigma**2 + seen.vector_variance)
+    wider = np.sqrt(corrected["total_field_sigma"].to_numpy() ** 2 + seen.vector_variance)
     own = {"total_field_sigma": ("time", wider, corrected["total_field_sigma"].attrs)}
     return corrected.assign(own | added)
 
@@ -233,25 +198,9 @@ class Compensation(NamedTuple):
 def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> Compensation:
     """Compensate a log's scalar and return the parts of it, for a joint fit with a survey's terms.
 
-    Parameters
-    ----------
-    corrected : Dataset (time)
-        What the correction of the vector sensor made of `log`.
-    log : Dataset
-        With the scalar's column and its channels.
-    sensor : ScalarSensor
-        The calibrated scalar.
-
-    Raises
-    ------
-    FormatError
-        A telemetry channel of the compensation is not in the log.
+    FormatError: the log lacks a telemetry channel of the compensation.
     """
-    series = _series_of_sensor(corrected, log, sensor)
-    adapted = adapt_to_log(sensor, series.channels)
-    found = correct_scalar(adapted, series)
-    total, sigma = (corrected[name].to_numpy() for name in ("total_field", "total_field_sigma"))
-    seen = compare_sensors(found.field, found.sigma, total, sigma, series.reference)
+    found, seen, adapted, series = _compensated(corrected, log, sensor)
     design = scalar_design(series, adapted.channels, adapted.reference_field)
     mean, size = np.array(adapted.coefficients), design.shape[1]
     contribution = {
@@ -268,15 +217,24 @@ def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> 
     return Compensation(np.where(seen.disagrees, np.nan, found.field), modes, contribution)
 
 
-def _series_of_sensor(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> ScalarSeries:
-    """Return the samples at the rows of a corrected log; FormatError: a channel is missing."""
+def _compensated(
+    corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor
+) -> tuple[CorrectedScalar, Witness, ScalarSensor, ScalarSeries]:
+    """Return compensation and comparison with the vector, the sensor adapted to the log, and its samples.
+
+    FormatError: a channel is missing.
+    """
     if missing := [channel.name for channel in sensor.channels if channel.name not in log]:
         source = log.attrs.get("source", "the log")
         raise FormatError(source, f"column {missing[0]!r} is missing: the scalar's compensation needs it")
     log = log.sel(time=corrected["time"]) if log.sizes["time"] != corrected.sizes["time"] else log
     vector = np.stack([corrected[f"field_{axis}"].to_numpy() for axis in "xyz"], axis=1)
-    reference = corrected["total_field"].to_numpy() - corrected["anomaly"].to_numpy()
-    return _series(log, sensor.column, [channel.name for channel in sensor.channels], vector, reference)
+    total, sigma = (corrected[name].to_numpy() for name in ("total_field", "total_field_sigma"))
+    reference = total - corrected["anomaly"].to_numpy()
+    series = _series(log, sensor.column, [channel.name for channel in sensor.channels], vector, reference)
+    adapted = adapt_to_log(sensor, series.channels)
+    found = correct_scalar(adapted, series)
+    return found, compare_sensors(found.field, found.sigma, total, sigma, reference), adapted, series
 
 
 def _series(
@@ -323,12 +281,11 @@ def moved_to_sensor(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dat
     known: BoolArray = np.isfinite(np.stack(angles)).all(axis=0)
     turned = np.zeros((len(known), 3))
     turned[known] = Rotation.from_euler("ZYX", np.stack(angles, axis=1)[known], degrees=True).apply(lever)
-    latitude = ds["latitude"].to_numpy() + np.degrees(turned[:, 0] / EARTH_RADIUS_M)
-    east = turned[:, 1] / (EARTH_RADIUS_M * np.cos(np.radians(latitude)))
-    return ds.assign(
-        latitude=("time", latitude, ds["latitude"].attrs),
-        longitude=("time", ds["longitude"].to_numpy() + np.degrees(east), ds["longitude"].attrs),
-    )
+    moved = {}
+    degrees = metres_per_degree(ds["latitude"].to_numpy())
+    for k, name in enumerate(("latitude", "longitude")):
+        moved[name] = "time", ds[name].to_numpy() + turned[:, k] / degrees[k], ds[name].attrs
+    return ds.assign(moved)
 
 
 def _is_field(column: xr.DataArray) -> bool:
