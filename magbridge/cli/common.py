@@ -341,7 +341,7 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
 
     FormatError, DataError: the base station's log has no field, or not for the logs' time.
     """
-    from magbridge.field.base_station import separate_observatories, with_daily_variation
+    from magbridge.field.reference import separate_observatories, with_daily_variation
     from magbridge.logs.deployment import join
 
     own, stations = separate_observatories(logs)

@@ -44,7 +44,7 @@ HEIGHT = ("height", "altitude", "height_m", "height_ell_m", "altitude_m", "eleva
 TABLE_SUFFIXES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
 MODES, FAINT = 24, 0.05
 """Uncertain combinations of a calibration at most, and nT below which one does not matter."""
-MIN_SAMPLES = 10
+MIN_LOCATED_SAMPLES = 10
 """Samples of a table or a log, at least."""
 THINNED = 2_000
 """Samples by which they are found."""
@@ -80,7 +80,7 @@ def read_table(path: Path) -> Samples:
     kind = table["line_type"].astype(str).str.upper() if "line_type" in table else None
     tie = np.zeros(len(value), bool) if kind is None else (kind == "TIE").to_numpy()
     known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)
-    if known.sum() < MIN_SAMPLES:
+    if known.sum() < MIN_LOCATED_SAMPLES:
         raise FormatError(
             path, f"only {counted(int(known.sum()), 'row')} with longitude, latitude and anomaly"
         )
@@ -151,7 +151,7 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
 
 
 def located(
-    ds: xr.Dataset, value: FloatArray, what: str = "a field", *, by_line: bool = True
+    ds: xr.Dataset, value: FloatArray, name: str = "a field", *, by_line: bool = True
 ) -> tuple[Samples, BoolArray]:
     """Return all rows of a log with anomalies (n,), nT, and which of them can be used, (n,).
 
@@ -161,7 +161,7 @@ def located(
         The log.
     value : (n,) array
         nT; NaN where it is not known.
-    what : str
+    name : str
         Name of the value in the error.
     by_line : bool
         Whether the log's ``line`` and ``line_type`` divide it into lines.
@@ -173,9 +173,9 @@ def located(
     """
     longitude, latitude, depth = positions(ds)
     known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
-    if (many := int(known.sum())) < MIN_SAMPLES:
+    if (many := int(known.sum())) < MIN_LOCATED_SAMPLES:
         source = ds.attrs.get("source", "the log")
-        raise FormatError(source, f"only {counted(many, 'sample')} with {what} and a position")
+        raise FormatError(source, f"only {counted(many, 'sample')} with {name} and a position")
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     place = np.stack(separation(*origin, latitude, longitude), axis=1)
     line, tie = np.zeros(len(value), int), np.zeros(len(value), bool)
