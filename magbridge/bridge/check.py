@@ -57,10 +57,7 @@ class ConfigFault(NamedTuple):
 def findings(path: Path) -> list[ConfigFault]:
     """Return all faults of a configuration; only the files that it names are opened.
 
-    Parameters
-    ----------
-    path : Path
-        The ``bridge.toml``.
+    `path`: the ``bridge.toml``.
     """
     try:
         table = load_toml(path)
@@ -307,21 +304,11 @@ class LiveCheck:
     The bridge's own pipeline reads the bytes, so that the sensor is started and messages are requested as by
     ``run``. No sample and no fix is sent, and no log is written.
 
-    Parameters
-    ----------
-    config : Config
-        A configuration with which the bridge would start.
-    duration_s : float
-        s for which the ports are read.
-
-    Attributes
-    ----------
-    arrived : list of Arrived
-        Messages by sender, the needed ones first.
-    readings_hz : dict of str to float
-        Rate of each sensor's readings, by the sensor's name.
-    faults : list of ConfigFault
-        One warning for each thing that is missing, with its remedy.
+    `config`: a configuration with which the bridge would start.
+    `duration_s`: s for which the ports are read.
+    `arrived`: messages by sender, the needed ones first.
+    `readings_hz`: rate of each sensor's readings, by the sensor's name.
+    `faults`: one warning for each thing that is missing, with its remedy.
     """
 
     def __init__(self, config: Config, duration_s: float) -> None:

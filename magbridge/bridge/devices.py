@@ -151,19 +151,11 @@ class SerialPort(PacedPort):
 def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
     """Return the (unopened) port of a serial line.
 
-    Parameters
-    ----------
-    name : str
-        A device, a pattern or a pyserial URL.
-    baudrate : int
-        Bits per second.
-    source, key : str
-        The file and the key that `name` comes from, for the error.
-
-    Raises
-    ------
-    ConfigError
-        No device's name, a URL of a kind that pyserial does not know, or one of a socket without HOST:PORT.
+    `name`: a device, a pattern or a pyserial URL.
+    `baudrate`: bits per second.
+    `source`, `key`: the file and the key that `name` comes from, for the error.
+    ConfigError: no device's name, a URL of a kind that pyserial does not know, or one of a socket without
+        HOST:PORT.
     """
     kind, url, _ = name.partition("://")
     known = kind.isalnum() and find_spec(f"serial.urlhandler.protocol_{kind.lower()}")
@@ -288,12 +280,8 @@ def open_bus(name: str) -> Any:
 class BusPort(Port):
     """Poll a part on a bus; return the readings as lines.
 
-    Parameters
-    ----------
-    name : str
-        As :func:`open_bus` takes it.
-    driver : Rm3100
-        Configures the part and reads its registers.
+    `name`: as :func:`open_bus` takes it.
+    `driver`: configures the part and reads its registers.
     """
 
     def __init__(self, name: str, driver: Rm3100) -> None:
@@ -389,10 +377,8 @@ class BusPort(Port):
 def sensor_port(sensor: Sensor, path: Path) -> SerialPort | BusPort:
     """Return the (unopened) port of a sensor in the configuration `path`: a serial line, or a part on a bus.
 
-    Raises
-    ------
-    ConfigError
-        A name that is neither, a driver that does not read a bus, or a library that is not installed.
+    ConfigError: a name that is neither, a driver that does not read a bus, or a library that is not
+        installed.
     """
     source, key = str(path), sensor.key
     if not sensor.port.startswith(("i2c:", "spi:")):

@@ -164,23 +164,12 @@ NOTICE_US = 1_000_000
 
 
 class StateChanges:
-    """Record and announce the changes that the frames of :mod:`.states` report.
+    """Record and announce the changes that state frames report.
 
-    Parameters
-    ----------
-    codec : Codec
-        The link's: its ``utc_offset_us`` follows the host's clock.
-    announcer : Announcer
-    sensors : mapping of int to SensorLine
-        By sensor id.
-
-    Attributes
-    ----------
-    log_state : MAG_LOG_STATE
-    log_lost : int
-        Records that the log has lost.
-    since_us, until_us : int
-        µs: inputs up to `until_us` may have waited since `since_us`.
+    `codec`: the link's: its ``utc_offset_us`` follows the host's clock.
+    `sensors`: by sensor id.
+    `log_lost`: records that the log has lost.
+    `since_us`, `until_us`: µs: inputs up to `until_us` may have waited since `since_us`.
     """
 
     def __init__(self, codec: Codec, announcer: Announcer, sensors: Mapping[int, SensorLine]) -> None:
@@ -254,12 +243,8 @@ SENT, LINK, SENSOR, STATE = Channel
 class Recorder:
     """Collect records until :meth:`drain`.
 
-    Attributes
-    ----------
-    active : bool
-        Whether records are collected and counted; False without a log.
-    count : int
-        Records collected since the start.
+    `active`: whether records are collected and counted; False without a log.
+    `count`: records collected since the start.
     """
 
     def __init__(self, system: int, component: int, *, active: bool) -> None:
@@ -342,20 +327,14 @@ def declarations(
 ) -> list[bytes]:
     """Return the frames that declare source and correction of each column of the log.
 
-    Parameters
-    ----------
-    system, component : int
-        The bridge's own.
-    telemetry : mapping of str to Telemetry
-        By parameter.
-    nt_per_count : float
-        nT per count of the sensor, 0 for one without counts. A reader then takes the channels from the
-        counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
-    settings : mapping of str to float, optional
-        What decides about flags and sigmas, by its key in the configuration: attributes of the log.
-    sensors : sequence of (Sensor, Driver)
-        The sensors after the first. Their columns have the name of the sensor: ``NAME`` for a scalar, else
-        ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the reading.
+    `system`, `component`: the bridge's own.
+    `telemetry`: by parameter.
+    `nt_per_count`: nT per count of the sensor, 0 for one without counts. A reader then takes the channels
+        from the counts, because MAG_RAW's float32 fields are less precise than the values that were
+        corrected.
+    `settings`: what decides about flags and sigmas, by its key in the configuration: attributes of the log.
+    `sensors`: the sensors after the first. Their columns have the name of the sensor: ``NAME`` for a scalar,
+        else ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the reading.
     """
     codec = Codec(system, component)
     columns: list[dict[str, Any]] = [

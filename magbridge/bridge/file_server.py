@@ -42,16 +42,10 @@ Sender = tuple[int, int]
 class FileServer:
     """Serve the metadata of the parameters, and the logs.
 
-    Parameters
-    ----------
-    texts : mapping of str to bytes
-        The metadata's files, by path.
-    logs : Path or None
-        The folder of the logs.
-    rate : callable
-        Returns bytes/s at which files are sent; 0 refuses every request by silence.
-    notify : callable
-        Wakes the live thread with a state frame, or with none.
+    `texts`: the metadata's files, by path.
+    `logs`: the folder of the logs.
+    `rate`: returns bytes/s at which files are sent; 0 refuses every request by silence.
+    `notify`: wakes the live thread with a state frame, or with none.
     """
 
     def __init__(

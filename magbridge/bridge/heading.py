@@ -50,19 +50,10 @@ NO_HEADING_FLAGS: Final = int(
 class LiveHeading:
     """Compute the heading of each sample; send it to the autopilot and to NMEA receivers.
 
-    Parameters
-    ----------
-    wanted : HeadingOutput
-        ``[heading]`` of the configuration.
-    component : Component
-        The MAVLink side.
-
-    Attributes
-    ----------
-    nmea : deque of bytes
-        Sentences that are due; the bridge takes them out. A replay does not: the oldest are dropped.
-    stack : int
-        MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    `wanted`: ``[heading]`` of the configuration.
+    `component`: the MAVLink side.
+    `nmea`: sentences that are due; the bridge takes them out. A replay does not: the oldest are dropped.
+    `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
     """
 
     def __init__(self, wanted: HeadingOutput, component: Component) -> None:
@@ -103,16 +94,10 @@ class LiveHeading:
     ) -> Attitude:
         """Return the attitude at a sample, with its heading; unknown without a recent ATTITUDE.
 
-        Parameters
-        ----------
-        sample, corrected
-            As aligned, and as corrected.
-        corrector : Corrector
-            Has just corrected the sample.
-        main : tuple of 3 float
-            nT, main field, north-east-down; NaN where unknown.
-        crustal : float
-            nT, 1-sigma of the crustal field that the main-field model lacks.
+        `sample`, `corrected`: as aligned, and as corrected.
+        `corrector`: has just corrected the sample.
+        `main`: nT, main field, north-east-down; NaN where unknown.
+        `crustal`: nT, 1-sigma of the crustal field that the main-field model lacks.
         """
         boresight = corrector.calibration.boresight
         since_us = sample.time_us - self._attitude_us
@@ -193,11 +178,7 @@ def nmea_port(config: Config) -> Port | None:
 class NmeaOutput:
     """Sends sentences on a port, which it opens again when it is lost.
 
-    Parameters
-    ----------
-    port : Port
-    notify : callable
-        Receives a state frame when the port cannot be opened or is lost, once for each reason.
+    `notify`: receives a state frame when the port cannot be opened or is lost, once for each reason.
     """
 
     def __init__(self, port: Port, notify: Callable[[bytes], None]) -> None:

@@ -41,17 +41,9 @@ class Answers:
 def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str:
     """Return the text of the configuration, with a comment at every key.
 
-    Parameters
-    ----------
-    answers : Answers
-        What the user said.
-    calibration : Calibration, optional
-        Its parameters get a table each, in its own units.
-
-    Raises
-    ------
-    ConfigError
-        No such driver.
+    `answers`: what the user said.
+    `calibration`: its parameters get a table each, in its own units.
+    ConfigError: no such driver.
     """
     units = dict(map(_named, answers.parameters))
     if calibration is not None:

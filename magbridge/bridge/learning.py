@@ -52,21 +52,11 @@ def open_learner(
 ) -> Learner | None:
     """Return the learner of ``[learning]``; None without that table or a calibration.
 
-    Parameters
-    ----------
-    config : Config
-        The bridge's.
-    calibration : Calibration or None
-        To begin with.
-    currents : tuple of str, optional
-        Names of telemetry in ampere; by default those of ``[telemetry]``.
-
-    Raises
-    ------
-    ConfigError
-        The calibration is none that can be learned.
-    FormatError, OutOfRange
-        ``learning.reference`` is not a grid.
+    `config`: the bridge's.
+    `calibration`: to begin with.
+    `currents`: names of telemetry in ampere; by default those of ``[telemetry]``.
+    ConfigError: the calibration is none that can be learned.
+    FormatError, OutOfRange: ``learning.reference`` is not a grid.
     """
     if currents is None:
         currents = tuple(name for name, one in config.telemetry.items() if one.unit == "A")
@@ -107,10 +97,7 @@ def kept_path(config: Config) -> Path | None:
 class LearningService:
     """Connect a learner to the link.
 
-    Attributes
-    ----------
-    to_keep : deque of Calibration
-        Calibrations published since the caller last emptied it, to be written to a file.
+    `to_keep`: calibrations published since the caller last emptied it, to be written to a file.
     """
 
     def __init__(self, learner: Learner, component: Component) -> None:

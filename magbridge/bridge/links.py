@@ -416,25 +416,14 @@ def open_link(
 ) -> Port:
     """Return the (unopened) port for a MAVLink URL.
 
-    Parameters
-    ----------
-    url : str
-        As in ``[link]``.
-    baudrate : int
-        bit/s of a serial device.
-    source, key : str
-        What an error names.
-    autopilot : (int, int) or None
-        System and component that a link with many peers answers before all others.
-    budget : float
-        Bytes/s that all other peers get together there.
-    signed : bool
-        Peers are answered once :meth:`Port.credit` has named a frame of theirs.
-
-    Raises
-    ------
-    ConfigError
-        An unknown kind of link or of serial URL, no device's name, or an address that is not HOST:PORT.
+    `url`: as in ``[link]``.
+    `baudrate`: bit/s of a serial device.
+    `source`, `key`: what an error names.
+    `autopilot`: system and component that a link with many peers answers before all others.
+    `budget`: bytes/s that all other peers get together there.
+    `signed`: peers are answered once :meth:`Port.credit` has named a frame of theirs.
+    ConfigError: an unknown kind of link or of serial URL, no device's name, or an address that is not
+        HOST:PORT.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:

@@ -38,11 +38,7 @@ STANDSTILL_US = 400_000
 class LiveEdge:
     """Convert the input of the ports to events in order.
 
-    Parameters
-    ----------
-    ports : dict of int to Port
-        By MAG_PORT_NAME: the link and the sensors; opened here, in their order.
-    clock : HostClock
+    `ports`: by MAG_PORT_NAME: the link and the sensors; opened here, in their order.
     """
 
     def __init__(self, ports: Mapping[int, Port], clock: HostClock) -> None:

@@ -33,12 +33,8 @@ UNSET = (0, 0)
 class Frame:
     """Track the origin of the autopilot's local frame, and the vehicle's height and attitude.
 
-    Attributes
-    ----------
-    origin : tuple of float or None
-        deg, deg, m above the sea.
-    attitude : tuple of float
-        Quaternion w, x, y, z from body to north-east-down, as last heard.
+    `origin`: deg, deg, m above the sea.
+    `attitude`: quaternion w, x, y, z from body to north-east-down, as last heard.
     """
 
     def __init__(self) -> None:
@@ -142,22 +138,11 @@ class MotionSource(IntEnum):
 class Motion:
     """Pass the vehicle's motion to the navigator, from the best available source.
 
-    Parameters
-    ----------
-    navigator : Navigator
-    component : Component
-    frame : Frame
-        Has received each message before.
-    velocity_stays : callable
-        Whether a fix leaves the autopilot's velocity as it was, so that this remains a measurement.
-
-    Attributes
-    ----------
-    source : Source
-    fed_back : bool
-        Our fixes are in the autopilot's position.
-    gps_trusted : bool
-        No GPS position that was rejected is in the autopilot's position.
+    `frame`: has received each message before.
+    `velocity_stays`: whether a fix leaves the autopilot's velocity as it was, so that this remains a
+        measurement.
+    `fed_back`: our fixes are in the autopilot's position.
+    `gps_trusted`: no GPS position that was rejected is in the autopilot's position.
     """
 
     def __init__(

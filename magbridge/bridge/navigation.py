@@ -93,23 +93,11 @@ class Gps:
 class Fixing:
     """Send fixes while the autopilot has no GPS, and process its answers.
 
-    Parameters
-    ----------
-    kind : Kind
-        Of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
-    component : Component
-    frame : Frame
-        Has received each message before.
-    gnss : GnssMonitor
-        Has tested each GPS position before.
-
-    Attributes
-    ----------
-    gps : Gps
-    stack : int
-        MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
-    sent, accepted, refused : int
-        Number of fixes, and of answers.
+    `kind`: of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
+    `frame`: has received each message before.
+    `gnss`: has tested each GPS position before.
+    `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    `sent`, `accepted`, `refused`: number of fixes, and of answers.
     """
 
     def __init__(self, kind: Kind, component: Component, frame: Frame, gnss: GnssMonitor) -> None:
@@ -339,13 +327,7 @@ COPIED_FIELDS = (
 class NavigationService:
     """Feed the navigator, and send its updates and fixes.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-    options : Options
-    fix : Kind
-        Of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
-    component : Component
+    `fix`: of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
     """
 
     def __init__(

@@ -56,34 +56,14 @@ ANNOUNCED_FLAGS = int(
 class Pipeline:
     """Sensor bytes, link bytes and changes of state in; MAVLink frames and sensor commands out.
 
-    Parameters
-    ----------
-    config : Config
-    calibration : Calibration or None
-    start : StartEvent
-    key : bytes or None
-        The signing key.
-    navigate : callable or None
-        Makes the navigation of ``[navigation]`` for the component that sends its messages.
-    more : mapping of int to Calibration, optional
-        Calibrations of the sensors after the first, by sensor id.
-
-    Attributes
-    ----------
-    component : Component
-        The MAVLink side.
-    recorder : Recorder
-        All inputs and outputs since it was last drained: the records for the log.
-    streams : list of SensorStream
-        The sensors; the first is the main sensor.
-    navigation : Navigation or None
-    learning : Learning or None
-
-    Raises
-    ------
-    ConfigError
-        A driver, an option, a message, a field or a rate that does not exist; a calibration that needs a
-        parameter which ``[telemetry]`` does not provide, or in another unit.
+    `key`: the signing key.
+    `navigate`: makes the navigation of ``[navigation]`` for the component that sends its messages.
+    `more`: calibrations of the sensors after the first, by sensor id.
+    `component`: the MAVLink side.
+    `recorder`: all inputs and outputs since it was last drained: the records for the log.
+    `streams`: the sensors; the first is the main sensor.
+    ConfigError: a driver, an option, a message, a field or a rate that does not exist; a calibration that
+        needs a parameter which ``[telemetry]`` does not provide, or in another unit.
     """
 
     def __init__(

@@ -43,12 +43,8 @@ LOOK = 1.0
 class Peer:
     """A network peer of a port.
 
-    Attributes
-    ----------
-    address : hashable
-        As the port knows it.
-    genuine, pilot : float
-        When it last sent something valid, and something of the autopilot's; s, monotonic.
+    `address`: as the port knows it.
+    `genuine`, `pilot`: when it last sent something valid, and something of the autopilot's; s, monotonic.
     """
 
     __slots__ = ("address", "codec", "genuine", "pilot", "share", "since")
@@ -62,22 +58,12 @@ class Peer:
 class Peers:
     """The peers of one port.
 
-    Parameters
-    ----------
-    autopilot : (int, int) or None
-        System and component whose peer goes before all others.
-    budget : float
-        Bytes/s that all but the autopilot's get together.
-    signed : bool
-        A frame is valid once :meth:`credit` has named it; else if it is a known message.
-
-    Attributes
-    ----------
-    ignored, withheld : int
-        Bytes that were not parsed, because their sender had used up its share; and that others than the
-        autopilot did not get, because the budget was used up.
-    notices : deque of str
-        Texts about the peers to announce, each once.
+    `autopilot`: system and component whose peer goes before all others.
+    `budget`: bytes/s that all but the autopilot's get together.
+    `signed`: a frame is valid once :meth:`credit` has named it; else if it is a known message.
+    `ignored`, `withheld`: bytes that were not parsed, because their sender had used up its share; and that
+        others than the autopilot did not get, because the budget was used up.
+    `notices`: texts about the peers to announce, each once.
     """
 
     def __init__(
@@ -307,15 +293,9 @@ class PacedPort(Port):
     What the line has no room for waits here, where it can still be dropped, and not in the system's buffers,
     which would send it seconds late. The order is kept, since signatures and sequence numbers depend on it.
 
-    Parameters
-    ----------
-    name : str
-    piece : int
-        Bytes that are handed to the system at once, and what completes a message.
-    share : int
-        Bytes that are read at once.
-    ended : str
-        Reason of the :class:`PortError` at an end of file.
+    `piece`: bytes that are handed to the system at once, and what completes a message.
+    `share`: bytes that are read at once.
+    `ended`: reason of the :class:`PortError` at an end of file.
     """
 
     def __init__(self, name: str, piece: int, share: int, ended: str) -> None:

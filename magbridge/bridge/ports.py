@@ -68,14 +68,9 @@ def listen(
 ) -> tuple[Recognised, int | None, bytes]:
     """Recognise the sender on a device, its baud rate, and the bytes received; nothing is sent.
 
-    Parameters
-    ----------
-    device : str
-        A device or a pyserial URL.
-    baudrates : sequence of int
-        Tried in turn, until one is understood.
-    seconds : float
-        For each.
+    `device`: a device or a pyserial URL.
+    `baudrates`: tried in turn, until one is understood.
+    `seconds`: for each.
     """
     best, at, came = Recognised("", "silent"), None, b""
     for baudrate in baudrates:

@@ -43,11 +43,7 @@ ALTITUDE_M: Final = -15_000.0, 100_000.0
 class Position:
     """Last position of the vehicle; the first one loads the field model.
 
-    Parameters
-    ----------
-    notify : callable
-        Receives the reason why the main field is unknown at a known position.
-
+    `notify`: receives the reason why the main field is unknown at a known position.
     """
 
     MESSAGE: ClassVar[int] = POSITION.id
@@ -114,10 +110,7 @@ class Position:
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.
 
-        Parameters
-        ----------
-        time_us, utc_us : int
-            µs of event time, and of UNIX time by the host's clock as it is set now.
+        `time_us`, `utc_us`: µs of event time, and of UNIX time by the host's clock as it is set now.
         """
         if (
             self.last_position is None

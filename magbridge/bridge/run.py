@@ -159,15 +159,8 @@ def run(path: Path) -> None:
 
     Announcements over the link are printed on stderr, too.
 
-    Parameters
-    ----------
-    path : Path
-        The ``bridge.toml``.
-
-    Raises
-    ------
-    ConfigError, FormatError, CalibrationError
-        As :func:`set_up`; nothing was opened then.
+    `path`: the ``bridge.toml``.
+    ConfigError, FormatError, CalibrationError: as :func:`set_up`; nothing was opened then.
     """
     config = load(path)
     keeper = Keeper(config)

@@ -54,34 +54,18 @@ LINE_CHECK_INTERVAL_US = 1_000_000
 class SensorLine:
     """Watch the line; send the start-up commands whenever the sensor may have lost them.
 
-    Parameters
-    ----------
-    name : str
-        What the sensor is called in messages about its state.
-    start : callable
-        To be called whenever the line was opened; returns the commands that start the sensor.
-    timeout_us : int
-        µs without a reading after which it counts as silent.
-    searching : bool
-        The line may be another instrument's: it is listened to before it gets commands, and it gets none if
-        it sends NMEA 0183 and no readings.
-    announcer, timers
-        The link's.
-    start_us : int
-        µs since 1970 UTC.
-    sensor_id : int
-        Which sensor.
-
-    Attributes
-    ----------
-    state : MAG_PORT_STATE
-    timer : str
-        Name of the timer that fires if the sensor is silent.
-    to_send : list of bytes
-        Commands that are due; the caller of the pipeline sends them and empties the list.
-    wrong_device : bool
-        No reading has come since the line was opened, but a timeout or NMEA 0183 has: it may be another
-        instrument's. The owner of the line tries another one, if there is one, and resets this.
+    `name`: what the sensor is called in messages about its state.
+    `start`: to be called whenever the line was opened; returns the commands that start the sensor.
+    `timeout_us`: µs without a reading after which it counts as silent.
+    `searching`: the line may be another instrument's: it is listened to before it gets commands, and it gets
+        none if it sends NMEA 0183 and no readings.
+    `announcer`, `timers`: the link's.
+    `start_us`: µs since 1970 UTC.
+    `sensor_id`: which sensor.
+    `timer`: name of the timer that fires if the sensor is silent.
+    `to_send`: commands that are due; the caller of the pipeline sends them and empties the list.
+    `wrong_device`: no reading has come since the line was opened, but a timeout or NMEA 0183 has: it may be
+        another instrument's. The owner of the line tries another one, if there is one, and resets this.
     """
 
     def __init__(
@@ -266,19 +250,10 @@ def scalar_entry(
 ) -> ScalarSensor | None:
     """Return the compensation of a scalar sensor; None if no calibration has one.
 
-    Parameters
-    ----------
-    sensor : Sensor
-        Its name is the column of the compensation.
-    config : Config
-        For its path and its telemetry.
-    own_calibration, main : Calibration or None
-        That of the sensor itself, and that of sensor 0.
-
-    Raises
-    ------
-    ConfigError
-        `own_calibration` has no entry for the sensor, or a channel is not in ``[telemetry]``.
+    `sensor`: its name is the column of the compensation.
+    `config`: for its path and its telemetry.
+    `own_calibration`, `main`: that of the sensor itself, and that of sensor 0.
+    ConfigError: `own_calibration` has no entry for the sensor, or a channel is not in ``[telemetry]``.
     """
     entries = (own_calibration or main).sensors if own_calibration is not None or main is not None else ()  # type: ignore[union-attr]
     entry = next((one for one in entries if one.column == sensor.name), None)
@@ -296,27 +271,12 @@ def scalar_entry(
 class SensorStream:
     """One sensor.
 
-    Parameters
-    ----------
-    sensor : Sensor
-    driver : Driver
-    correction : Correction or ScalarCorrection
-    component : Component
-        The MAVLink side.
-    start_us : int
-        µs, when the bridge started.
-    publisher : Publisher
-        Sends its samples.
-
-    Attributes
-    ----------
-    sensor_id : int
-    line : SensorLine
-        Holds the commands that are to be sent to the sensor.
-    samples, lost : int
-        Readings received, and those missing by the instrument's own numbering.
-    quality : int
-        The flags that were announced last.
+    `component`: the MAVLink side.
+    `start_us`: µs, when the bridge started.
+    `publisher`: sends its samples.
+    `line`: holds the commands that are to be sent to the sensor.
+    `samples`, `lost`: readings received, and those missing by the instrument's own numbering.
+    `quality`: the flags that were announced last.
     """
 
     def __init__(
@@ -358,16 +318,10 @@ class SensorStream:
     ) -> list[CorrectedReading]:
         """Correct a reading; return the samples that are complete now.
 
-        Parameters
-        ----------
-        reading, stamp
-            As :meth:`receive` returns them.
-        main_field : float
-            nT, the main field's total; NaN where unknown.
-        position : tuple of 2 float or None
-            deg, latitude and longitude; None where not known.
-        depth : float
-            m; NaN where not known.
+        `reading`, `stamp`: as :meth:`receive` returns them.
+        `main_field`: nT, the main field's total; NaN where unknown.
+        `position`: deg, latitude and longitude; None where not known.
+        `depth`: m; NaN where not known.
         """
         self.samples += 1
         self.lost += stamp.missing
@@ -444,19 +398,10 @@ def open_correction(
 ) -> tuple[Correction | ScalarCorrection, Calibration | None]:
     """Return the correction of a sensor, and the calibration that it uses.
 
-    Parameters
-    ----------
-    sensor, driver, config
-        The sensor, its driver, and the configuration.
-    own_calibration, main : Calibration or None
-        That of the sensor itself, and that of sensor 0.
-    learner : Learner, optional
-        Of sensor 0.
-
-    Raises
-    ------
-    ConfigError
-        The link does not provide what the calibration needs.
+    `sensor`, `driver`, `config`: the sensor, its driver, and the configuration.
+    `own_calibration`, `main`: that of the sensor itself, and that of sensor 0.
+    `learner`: of sensor 0.
+    ConfigError: the link does not provide what the calibration needs.
     """
     settings = own_settings(sensor, driver, config.align)
     if is_scalar(driver):

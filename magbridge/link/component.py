@@ -48,20 +48,12 @@ class Commands:
     for the autopilot's. Calibration of the autopilot's own compass (DO_START_MAG_CAL and the like) is the
     autopilot's business; a request to the bridge itself gets a STATUSTEXT on how ours is calibrated.
 
-    Parameters
-    ----------
-    outbox : Outbox
-    messages : mapping of int to callable
-        What can be requested, by message id; sends the message, and returns False where there is nothing to
-        send yet.
-    interval_us : callable
-        Interval of a message id in µs: -1 off, 0 unknown; KeyError where it has none.
-    set_rate : callable
-        Takes a message id and a rate in Hz (-1 off, None for the default); returns whether it is allowed.
-        KeyError where the message has no rate.
-    authority : Authority
-        Knows who may change a rate.
-    announcer : Announcer
+    `messages`: what can be requested, by message id; sends the message, and returns False where there is
+        nothing to send yet.
+    `interval_us`: interval of a message id in µs: -1 off, 0 unknown; KeyError where it has none.
+    `set_rate`: takes a message id and a rate in Hz (-1 off, None for the default); returns whether it is
+        allowed. KeyError where the message has no rate.
+    `authority`: knows who may change a rate.
     """
 
     def __init__(
@@ -186,44 +178,23 @@ FILE_REQUESTS = ("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA
 class Component:
     """One MAVLink component, without port or clock: the same events give the same bytes.
 
-    Parameters
-    ----------
-    link : Link
-        ``[link]``: who we are, and whom we listen to.
-    publish : mapping of str to float
-        ``[publish]``: rates in Hz; a message that is not named is off.
-    tunables : iterable of Tunable
-        What can be tuned besides the messages' rates.
-    start_us : int
-        Event time of the start, in µs; a multiple of 4.
-    signing : Signing or None
-    calibration_id : int
-        CRC-32 of the calibration's file; 0 is none.
-    version : str
-        Of the program, ``"0.1.0"``.
-    kept : mapping of str to float
-        Parameters that a station changed in an earlier run.
-    status : callable
-        Returns the part of MAG_STATUS that the component cannot know itself (samples, log, sensor).
-    speaking : callable
-        Says whether readings come from the sensor: the heartbeat's state is critical where they do not.
-
-    Attributes
-    ----------
-    outbox : Outbox
-        Messages to send.
-    received : list of bytes
-        Everything that came, as frames for the log; the bridge empties it.
-    genuine : list of bytes
-        The signed frames of the last :meth:`receive` that were accepted.
-    file_requests : deque of Message
-        Requests for files; the bridge takes them out.
-    more_reports : list of callable
-        Functions that send the messages with the rate of MAG_STATUS.
-    metadata : mapping of str to bytes
-        The files that describe the parameters, by path.
-    parameters, rates, announcer, vehicle, publisher
-        The services, for use by the bridge.
+    `link`: ``[link]``: who we are, and whom we listen to.
+    `publish`: ``[publish]``: rates in Hz; a message that is not named is off.
+    `tunables`: what can be tuned besides the messages' rates.
+    `start_us`: event time of the start, in µs; a multiple of 4.
+    `calibration_id`: CRC-32 of the calibration's file; 0 is none.
+    `version`: of the program, ``"0.1.0"``.
+    `kept`: parameters that a station changed in an earlier run.
+    `status`: returns the part of MAG_STATUS that the component cannot know itself (samples, log, sensor).
+    `speaking`: says whether readings come from the sensor: the heartbeat's state is critical where they do
+        not.
+    `outbox`: messages to send.
+    `received`: everything that came, as frames for the log; the bridge empties it.
+    `genuine`: the signed frames of the last :meth:`receive` that were accepted.
+    `file_requests`: requests for files; the bridge takes them out.
+    `more_reports`: functions that send the messages with the rate of MAG_STATUS.
+    `metadata`: the files that describe the parameters, by path.
+    `parameters`, `rates`, `announcer`, `vehicle`, `publisher`: the services, for use by the bridge.
     """
 
     def __init__(

@@ -162,12 +162,8 @@ def nmea_sentences(attitude: Attitude, utc_us: int) -> bytes:
 
     HDT and PASHR are left out where the declination is unknown.
 
-    Parameters
-    ----------
-    attitude : Attitude
-        With a known magnetic heading.
-    utc_us : int
-        Time of the attitude, µs since 1970 UTC.
+    `attitude`: with a known magnetic heading.
+    `utc_us`: time of the attitude, µs since 1970 UTC.
     """
     variation = ","
     if isfinite(attitude.declination):

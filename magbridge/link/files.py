@@ -90,12 +90,8 @@ class Entry(NamedTuple):
 class Tree:
     """A read-only tree.
 
-    Parameters
-    ----------
-    texts : mapping of str to bytes
-        Files of the root, ``/name``.
-    logs : Path or None
-        The folder of the logs.
+    `texts`: files of the root, ``/name``.
+    `logs`: the folder of the logs.
     """
 
     def __init__(self, texts: Mapping[str, bytes], logs: Path | None) -> None:
@@ -311,11 +307,7 @@ class Session:
 class FtpServer:
     """Answer the requests of all stations.
 
-    Parameters
-    ----------
-    tree : Tree
-    now : callable
-        A clock in s, for sessions that are no longer used.
+    `now`: a clock in s, for sessions that are no longer used.
     """
 
     def __init__(self, tree: Tree, now_s: Callable[[], float]) -> None:

@@ -29,12 +29,8 @@ ANNOUNCEMENT_INTERVAL_US = 1_000_000
 class Outbox:
     """Pack and queue the messages of the services; the bridge drains the queue.
 
-    Attributes
-    ----------
-    codec : Codec
-        Its ``now_us`` is the event time that the next frame gets.
-    frames : list of (int, bytes)
-        Event time in µs, frame; in the order in which to send.
+    `codec`: its ``now_us`` is the event time that the next frame gets.
+    `frames`: event time in µs, frame; in the order in which to send.
     """
 
     def __init__(self, codec: Codec) -> None:
@@ -61,10 +57,7 @@ class Timers:
     The result depends only on the times given to :meth:`advance`, not on when it is called: a replay, which
     calls it at other moments, fires the same timers at the same times.
 
-    Attributes
-    ----------
-    next_deadline : int
-        µs at which the next timer fires; `FOREVER` where none is set.
+    `next_deadline`: µs at which the next timer fires; `FOREVER` where none is set.
     """
 
     def __init__(self) -> None:
@@ -125,10 +118,7 @@ def period_us(hertz: float) -> int:
 class Rate:
     """Thin a stream of samples to a rate, in event time and without drift.
 
-    Parameters
-    ----------
-    hertz : float
-        1/s; 0 passes every sample, a negative rate none.
+    `hertz`: 1/s; 0 passes every sample, a negative rate none.
     """
 
     __slots__ = ("_next_us", "_period_us", "hertz")
@@ -165,10 +155,7 @@ class Rate:
 class Announcer:
     """Send STATUSTEXT; the text of a state only if the state has changed.
 
-    Attributes
-    ----------
-    texts : deque of (MAV_SEVERITY, str)
-        The last texts sent; another thread may take them out and print them.
+    `texts`: the last texts sent; another thread may take them out and print them.
     """
 
     def __init__(self, outbox: Outbox, timers: Timers) -> None:

@@ -28,10 +28,7 @@ class Authority:
     A station is a sender with a heartbeat of that type. A sender of another system without a heartbeat is
     taken for one, because small programs send none; another component of our own vehicle is not.
 
-    Parameters
-    ----------
-    system, autopilot : int
-        Of our own vehicle.
+    `system`, `autopilot`: of our own vehicle.
     """
 
     def __init__(self, system: int, autopilot: int) -> None:
@@ -145,12 +142,8 @@ class Parameters:
     A value that was never set is exactly the default, not rounded to float32, so that an untuned bridge
     computes with the configuration's own numbers.
 
-    Attributes
-    ----------
-    table : dict of str to Tunable
-        By name, in order: the order gives the index on the link.
-    revision : int
-        Grows with every change.
+    `table`: by name, in order: the order gives the index on the link.
+    `revision`: grows with every change.
     """
 
     def __init__(self, table: Iterable[Tunable]) -> None:
@@ -210,12 +203,7 @@ STATIONS = 16
 class ParameterService:
     """Answer PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; all values are REAL32.
 
-    Parameters
-    ----------
-    parameters : Parameters
-    outbox, timers, announcer
-    authority : Authority
-        Knows who may set a parameter.
+    `authority`: knows who may set a parameter.
     """
 
     def __init__(

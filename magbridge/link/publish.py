@@ -60,17 +60,10 @@ NO_HEADING: Final = (0.0, 0.0, 0.0)
 class Publisher:
     """Send each sample as the messages that are due.
 
-    Parameters
-    ----------
-    outbox : Outbox
-    rates : mapping of str to Rate
-        By message name; of those of `PUBLISHED`, the messages that are sent.
-    calibration_id : int
-        CRC-32 of the calibration's file; 0 is none.
-    start_us : int
-        µs, when the bridge started: NAMED_VALUE_FLOAT counts from there.
-    sensor_id : int
-        Which sensor the samples are of.
+    `rates`: by message name; of those of `PUBLISHED`, the messages that are sent.
+    `calibration_id`: CRC-32 of the calibration's file; 0 is none.
+    `start_us`: µs, when the bridge started: NAMED_VALUE_FLOAT counts from there.
+    `sensor_id`: which sensor the samples are of.
     """
 
     def __init__(
@@ -94,16 +87,10 @@ class Publisher:
     ) -> None:
         """Send the messages that are due for a sample; ``outbox.codec.now_us`` is the time of sending.
 
-        Parameters
-        ----------
-        sample : Sample
-            As aligned.
-        corrected : Corrected
-            What the calibration made of it.
-        anomaly : float
-            nT above the main field; NaN where the position is not known.
-        attitude : Attitude
-            With the heading that follows from the corrected field.
+        `sample`: as aligned.
+        `corrected`: what the calibration made of it.
+        `anomaly`: nT above the main field; NaN where the position is not known.
+        `attitude`: with the heading that follows from the corrected field.
         """
         self.latest = sample, corrected, anomaly, attitude
         self.samples += 1
@@ -231,21 +218,11 @@ class Condition(NamedTuple):
 class Reports:
     """Send HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the description of the component.
 
-    Parameters
-    ----------
-    outbox : Outbox
-    vehicle : VehicleState
-    start_us : int
-        µs, when the bridge started.
-    version : str
-        Of the program, ``"0.1.0"``.
-    calibration_id : int
-    status : callable
-        Returns the Condition.
-    speaking : callable
-        Says whether readings come from the sensor.
-    general : bytes
-        The general metadata file.
+    `start_us`: µs, when the bridge started.
+    `version`: of the program, ``"0.1.0"``.
+    `status`: returns the Condition.
+    `speaking`: says whether readings come from the sensor.
+    `general`: the general metadata file.
     """
 
     def __init__(

@@ -88,24 +88,11 @@ def find(layout: Spec, name: str, path: Path, key: str) -> Field:
 class TelemetryMap:
     """Extract the configured parameters from messages, with the time of each value.
 
-    Parameters
-    ----------
-    telemetry : mapping of str to Telemetry
-        ``[telemetry.NAME]`` of the configuration.
-    autopilot : int
-        Component whose clock the ``VehicleClock`` knows.
-    path : Path
-        The configuration, for errors.
-
-    Attributes
-    ----------
-    delays_us : dict of str to int
-        Time in µs by which each parameter is late: to be subtracted from the time of its values.
-
-    Raises
-    ------
-    ConfigError
-        A message or field that does not exist.
+    `telemetry`: ``[telemetry.NAME]`` of the configuration.
+    `autopilot`: component whose clock the ``VehicleClock`` knows.
+    `path`: the configuration, for errors.
+    `delays_us`: time in µs by which each parameter is late: to be subtracted from the time of its values.
+    ConfigError: a message or field that does not exist.
     """
 
     def __init__(
@@ -257,16 +244,11 @@ def needed_rates(
 ) -> dict[Stream, tuple[float, float]]:
     """Return the needed rate (Hz) of each message, for an aircraft and for any other vehicle.
 
-    Parameters
-    ----------
-    autopilot : int
-        Its component.
-    telemetry : iterable of Telemetry
-        Sources of the parameters of the calibration; one without a component is expected of the autopilot.
-    attitude : bool
-        The direction of the field is checked.
-    navigation : bool
-        The bridge navigates.
+    `autopilot`: its component.
+    `telemetry`: sources of the parameters of the calibration; one without a component is expected of the
+        autopilot.
+    `attitude`: the direction of the field is checked.
+    `navigation`: the bridge navigates.
     """
     rates = {
         (one.component or autopilot, spec(one.message).id): (5.0, 2.0)
@@ -288,16 +270,10 @@ class StreamRequests:
     A message that the autopilot does not send and another component sends at the needed rate is not
     requested.
 
-    Parameters
-    ----------
-    peer : tuple of 2 int
-        System and component of the autopilot.
-    rates : mapping of Stream to tuple of 2 float
-        As :func:`needed_rates` returns them.
-    outbox, timers, announcer
-        Those of the link.
-    active : bool
-        False: rates are only measured.
+    `peer`: system and component of the autopilot.
+    `rates`: as :func:`needed_rates` returns them.
+    `outbox`, `timers`, `announcer`: those of the link.
+    `active`: false: rates are only measured.
     """
 
     def __init__(
@@ -422,13 +398,8 @@ ACK: Final = spec("COMMAND_ACK").id
 class Sources:
     """Select one component as the source of each telemetry parameter, and report conflicts.
 
-    Parameters
-    ----------
-    telemetry : mapping of str to Telemetry
-        ``[telemetry.NAME]`` of the configuration.
-    system, autopilot : int
-        Of our own vehicle.
-    announcer : Announcer
+    `telemetry`: ``[telemetry.NAME]`` of the configuration.
+    `system`, `autopilot`: of our own vehicle.
     """
 
     def __init__(

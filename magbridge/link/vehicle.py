@@ -107,14 +107,9 @@ class VehicleClock:
     def bridge_time(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
         """Return our time at which the vehicle's clock showed `vehicle_us`; at most `t_us`.
 
-        Parameters
-        ----------
-        vehicle_us : int
-            A time in a message.
-        t_us : int
-            When the message came.
-        wrap_us : int
-            µs after which the message's time field wraps to 0; 0: never.
+        `vehicle_us`: a time in a message.
+        `t_us`: when the message came.
+        `wrap_us`: µs after which the message's time field wraps to 0; 0: never.
         """
         offset_us = round(self.offset_us(t_us))
         if wrap_us:
@@ -136,10 +131,7 @@ WATCHED: Final = 16
 class Numbers:
     """The frames of one component.
 
-    Attributes
-    ----------
-    received, lost : int
-        Frames that came, and those that are missing.
+    `received`, `lost`: frames that came, and those that are missing.
     """
 
     __slots__ = ("_last", "_missing", "lost", "received")
@@ -167,11 +159,7 @@ class Numbers:
 class Losses:
     """Count the lost frames of each component of one vehicle, and report components that lose many.
 
-    Parameters
-    ----------
-    system : int
-    announcer, timers
-        The link's.
+    `announcer`, `timers`: the link's.
     """
 
     def __init__(self, system: int, announcer: Announcer, timers: Timers) -> None:
@@ -231,14 +219,9 @@ BOOT_TIMES: Final = {
 class VehicleState:
     """Watch the messages of the configured system.
 
-    Attributes
-    ----------
-    clock : VehicleClock
-        Reset when the autopilot reboots.
-    reboots : int
-        Number of restarts of the boot clock.
-    on_reboot : callable
-        Called at each restart.
+    `clock`: reset when the autopilot reboots.
+    `reboots`: number of restarts of the boot clock.
+    `on_reboot`: called at each restart.
     """
 
     def __init__(
