@@ -1,7 +1,10 @@
 """The program: ``magbridge``, or ``python -m magbridge``."""
 
+import gc
 import os
 import sys
+from io import TextIOWrapper
+from pathlib import Path
 
 __all__ = ["main"]
 
@@ -11,11 +14,15 @@ LIVE = ("run", "replay", "correct")
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code. Ctrl-C prints one line, even while libraries are being loaded."""
-    if (sys.argv[1:] if arguments is None else arguments)[:1] in [[name] for name in LIVE]:
+    given = sys.argv[1:] if arguments is None else arguments
+    _open_streams()
+    if given[:1] in [[name] for name in LIVE]:
         # read as numpy is loaded. Two threads round otherwise, which no replay on one core would repeat;
         # and on a busy computer they wait for each other for up to 0.4 s, where one alone takes 1 ms
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
+        if len(given) == 3 and given[:2] == ["run", "--config"] and not given[2].startswith("-"):
+            return _run_bridge(Path(given[2]))
         from magbridge.cli import main as command  # noqa: PLC0415 - inside the try: importing takes time
 
         return command(arguments)
@@ -25,6 +32,33 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:  # a part of the program cannot be loaded: no file handle is left, a damaged disk
         print(f"magbridge: {error.strerror or error} (magbridge itself cannot be loaded)", file=sys.stderr)
         return 1
+
+
+def _run_bridge(config: Path) -> int:
+    """Run a bridge without loading the command line, which would delay its first heartbeat."""
+    gc.disable()  # until the bridge runs: what is loaded stays, and the collector would only scan it
+    from magbridge.bridge.run import run  # noqa: PLC0415 - as above
+    from magbridge.errors import MagbridgeError  # noqa: PLC0415
+
+    try:
+        run(config)
+    except (MagbridgeError, ImportError, UnicodeEncodeError, OSError, MemoryError) as error:
+        from magbridge.cli import report_error  # noqa: PLC0415 - only now
+
+        return report_error(error)
+    return 0
+
+
+def _open_streams() -> None:
+    """Open missing output streams, and make every character printable in any locale."""
+    # closed by the parent process; opened in this order, each gets its own descriptor
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
+    out = sys.stdout
+    if isinstance(out, TextIOWrapper) and (out.errors == "strict" or out.encoding.lower() != "utf-8"):
+        # as stderr does, also in the locale C: a result must not end in an error
+        out.reconfigure(errors="backslashreplace")
 
 
 if __name__ == "__main__":

@@ -15,8 +15,10 @@ import serial
 from serial.tools import list_ports
 
 from magbridge.bridge.check import access
+from magbridge.errors import PortError
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.sensors import DRIVERS, driver_class
+from magbridge.sensors.framing import nmea_checksum
 
 __all__ = ["BAUDRATES", "Recognised", "SerialDevice", "listen", "ports", "recognise"]
 
@@ -71,13 +73,14 @@ def listen(
     `device`: a device or a pyserial URL.
     `baudrates`: tried in turn, until one is understood.
     `seconds`: for each.
+    PortError: the device cannot be opened.
     """
     best, at, came = Recognised("", "silent"), None, b""
     for baudrate in baudrates:
         try:
             data = _read(device, baudrate, seconds)
         except (serial.SerialException, OSError, ValueError) as error:
-            return Recognised("", _refusal(device, error)), None, b""
+            raise PortError(device, _refusal(device, error)) from error
         recognised = recognise(data, seconds)
         if recognised.who not in {"", "bytes", "text"}:
             return recognised, baudrate, data
@@ -152,19 +155,12 @@ def _mavlink(data: bytes) -> Recognised | None:
 
 
 def _nmea(data: bytes) -> Recognised | None:
-    valid = [line for line in NMEA_0183.findall(data) if _checked(line)]
+    sentences = [line.rstrip().partition(b"*") for line in NMEA_0183.findall(data)]
+    valid = [text for text, _, digits in sentences if int(digits, 16) == nmea_checksum(text)]
     if len(valid) < MIN_RECOGNISED:
         return None
-    kinds = sorted({line[1:6].decode() for line in valid})
+    kinds = sorted({text[1:6].decode() for text in valid})
     return Recognised("nmea", f"NMEA 0183: {' '.join(kinds)}")
-
-
-def _checked(sentence: bytes) -> bool:
-    text, _, digits = sentence[1:].partition(b"*")
-    total = 0
-    for byte in text:
-        total ^= byte
-    return total == int(digits[:2], 16)
 
 
 def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:

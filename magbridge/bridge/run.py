@@ -162,6 +162,8 @@ def run(path: Path) -> None:
     `path`: the ``bridge.toml``.
     ConfigError, FormatError, CalibrationError: as :func:`set_up`; nothing was opened then.
     """
+    if sys.stderr.isatty():
+        print(f"{path}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
     config = load(path)
     keeper = Keeper(config)
     clock = HostClock()
@@ -182,6 +184,7 @@ def run(path: Path) -> None:
     sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # these objects live as long as the process: the collector need not scan them
+    gc.enable()
     watch = LogWatch(log, edge, pipeline)
 
     logs = config.resolve(config.log.directory) if config.log else None

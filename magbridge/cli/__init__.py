@@ -11,7 +11,6 @@ import signal
 import sys
 from contextlib import suppress
 from importlib import import_module
-from io import TextIOWrapper
 from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
@@ -19,7 +18,7 @@ from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 from magbridge.cli.common import FailedResult, app, complain, print_error
 from magbridge.errors import MagbridgeError, MissingExtra
 
-__all__ = ["app", "main"]
+__all__ = ["app", "main", "report_error"]
 
 ROOMS = ("bridge", "calibrate", "correct", "diagnose", "fleet", "logs", "navigate", "survey")
 """Modules of commands: importing one makes its functions commands of `app`."""
@@ -42,7 +41,6 @@ ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code."""
-    _open_streams()
     with suppress(ValueError):  # signal handlers can be set on the main thread only
         _heed_signals()
     try:
@@ -50,11 +48,8 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         sys.stderr.close()
     except (CycloptsError, MagbridgeError, ImportError, UnicodeEncodeError, OSError, MemoryError) as error:
-        sentence, code = _explained(error)
         as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
-        if as_json and not isinstance(error, FailedResult):
-            print_error(sentence, code)
-        return complain(sentence, code)
+        return report_error(error, as_json=as_json)
     except _Terminated as end:
         signal.signal(end.number, signal.SIG_DFL)
         signal.raise_signal(end.number)
@@ -62,6 +57,14 @@ def main(arguments: list[str] | None = None) -> int:
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     return 0
+
+
+def report_error(error: Exception, *, as_json: bool = False) -> int:
+    """Print an error that ends a command; return the exit code."""
+    sentence, code = _explained(error)
+    if as_json and not isinstance(error, FailedResult):
+        print_error(sentence, code)
+    return complain(sentence, code)
 
 
 def _explained(error: Exception) -> tuple[str, int]:
@@ -88,18 +91,6 @@ def _explained(error: Exception) -> tuple[str, int]:
         case _:
             sentence = str(error) or "not enough memory"
     return sentence, code
-
-
-def _open_streams() -> None:
-    """Open missing output streams, and make every character printable in any locale."""
-    # closed by the parent process; opened in this order, each gets its own descriptor
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 - as long as the process
-    out = sys.stdout
-    if isinstance(out, TextIOWrapper) and (out.errors == "strict" or out.encoding.lower() != "utf-8"):
-        # as stderr does, also in the locale C: a result must not end in an error
-        out.reconfigure(errors="backslashreplace")
 
 
 def _misuse(error: CycloptsError) -> str:

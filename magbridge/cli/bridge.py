@@ -104,8 +104,6 @@ def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json
 
     from magbridge.bridge.run import run as attach
 
-    if sys.stderr.isatty():
-        print(f"{config}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
     attach(config)
 
 
@@ -421,7 +419,8 @@ def ports(
     """Listen on serial ports, and show which device sends on each.
 
     It is a sensor, an autopilot, a GPS, or a line that cannot be parsed, which is then shown. Nothing is
-    sent: a sensor that waits for a command stays silent here.
+    sent: a sensor that waits for a command stays silent here. The exit code is 1 if a port that is named here
+    cannot be opened.
 
     Parameters
     ----------
@@ -432,14 +431,19 @@ def ports(
     seconds
         How long to listen at each baud rate.
     """
-    from magbridge.bridge.ports import BAUDRATES, SerialDevice, listen
+    from magbridge.bridge.ports import BAUDRATES, Recognised, SerialDevice, listen
     from magbridge.bridge.ports import ports as there
+    from magbridge.errors import PortError
     from magbridge.progress import track
 
     asked = [SerialDevice(name, "") for name in names] or there()
-    found = []
+    found, closed = [], []
     for port in track(asked, "listening", len(asked)):
-        recognised, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
+        try:
+            recognised, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
+        except PortError as error:
+            recognised, at = Recognised("", error.reason), None
+            closed.append(port.device)
         one = {"device": port.description, "who": recognised.who, "said": recognised.text, "baudrate": at}
         found.append({"port": port.device, **one})
         if not json:
@@ -447,6 +451,8 @@ def ports(
             about = f" ({port.description})" if port.description else ""
             print(f"{port.device}{about}: {recognised.text}{speed}")
     cli.print_result({"ports": found}, "" if asked else "no serial port is there", json)
+    if names and closed:
+        raise cli.FailedResult(f"not listened to: {', '.join(closed)}")
 
 
 @cli.command("drivers [NAME] [OPTIONS]")

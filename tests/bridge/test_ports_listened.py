@@ -22,6 +22,7 @@ from magbridge.bridge.check import findings
 from magbridge.bridge.init import Answers, bridge_toml
 from magbridge.bridge.ports import listen, recognise
 from magbridge.config import load
+from magbridge.errors import PortError
 from magbridge.mavlink import Codec
 from magbridge.sensors.options import driver_names, options_of
 
@@ -89,7 +90,8 @@ def test_systems_are_named() -> None:
 
 def test_ports_as_a_command(command: Command) -> None:
     with speaking(SPEAKERS["nmea"]) as device:
-        output = command("ports", device, "/dev/no_such", "--seconds", "0.3", "--baudrate", "9600", "--json")
+        options = "--seconds", "0.3", "--baudrate", "9600", "--json"
+        output = command("ports", device, "/dev/no_such", *options, code=1)  # one cannot be opened
     first, second = json.loads(output.out)["ports"]
     assert (first["who"], first["said"], first["baudrate"]) == ("nmea", "NMEA 0183: GPGGA", 9600)
     assert "cannot be opened" in second["said"] or "may not be opened" in second["said"]
@@ -105,12 +107,13 @@ def test_a_busy_port_names_the_program_that_holds_it() -> None:
     ) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        recognised, _, _ = listen(os.ttyname(slave), (9600,), 0.1)
+        with pytest.raises(PortError) as refused:
+            listen(os.ttyname(slave), (9600,), 0.1)
         other.communicate(b"\n")
     os.close(master)
     os.close(slave)
-    assert recognised.text.startswith("busy: ")
-    assert f"(process {other.pid})" in recognised.text
+    assert refused.value.reason.startswith("busy: ")
+    assert f"(process {other.pid})" in refused.value.reason
 
 
 @pytest.mark.parametrize("driver", driver_names())
