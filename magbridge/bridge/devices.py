@@ -9,7 +9,9 @@ import re
 import select
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from math import inf
@@ -42,12 +44,12 @@ class SerialPort(PacedPort):
     """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
 
     def __init__(self, name: str, baudrate: int) -> None:
-        super().__init__(name, round(baudrate / 10 * LEAD), READ_BYTES, "hung up")
+        super().__init__(name, round(baudrate / 10 * LEAD))
         self.baudrate = baudrate
         self._last = self._passed = ""
         self._idle_at = -inf
         self._serial: Any = None
-        self._pump: _Pump | None = None
+        self._pump: Pump | None = None
 
     def open(self) -> None:
         """Open the first device that the name or pattern finds; raises :class:`PortError`."""
@@ -66,7 +68,8 @@ class SerialPort(PacedPort):
             try:
                 descriptor = opened.fileno()
             except (AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
-                self._pump = _Pump(opened)
+                opened.timeout, opened.write_timeout = 0.05, 1.0
+                self._pump = Pump(partial(_wait_for_bytes, opened))
                 descriptor = self._pump.fd
             self._serial, self._last, self._fd = opened, name, descriptor
             return
@@ -188,30 +191,39 @@ def _reason(error: Exception) -> str:
     return getattr(beneath, "strerror", None) or str(error)
 
 
-class _Pump:
-    """Move bytes from a port without a file descriptor into a pipe."""
+def _wait_for_bytes(line: Any) -> bytes:
+    """Return the bytes of a pyserial port, or none after its timeout."""
+    data: bytes = line.read(max(1, line.in_waiting))
+    return data
 
-    def __init__(self, source: Any) -> None:
-        self._source = source
-        source.timeout, source.write_timeout = 0.05, 1.0
+
+class Pump:
+    """A thread that moves what `read` returns into a pipe, for a port without a descriptor of its own.
+
+    `fd`: the pipe's end to read from. It is at its end of file when `read` has raised OSError, whose reason
+    `failed` then receives.
+    """
+
+    def __init__(self, read: Callable[[], bytes], failed: Callable[[str], object] = str) -> None:
+        self._read, self._failed = read, failed
         self.fd, self._in = os.pipe()
         os.set_blocking(self.fd, False)
         self._running = True
-        self._thread = threading.Thread(target=self._run, name="serial pump", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="pump", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
         try:
             while self._running:
-                data = self._source.read(max(1, self._source.in_waiting))
-                if data:
+                if data := self._read():
                     os.write(self._in, data)
-        except (serial.SerialException, OSError):
-            self._running = False
+        except OSError as error:  # pyserial's errors are such, too
+            self._failed(error.strerror or str(error))
         finally:
-            os.close(self._in)  # the reader sees an end of file: the port is lost
+            os.close(self._in)
 
     def close(self) -> None:
+        """End the thread."""
         self._running = False
         self._thread.join()
         os.close(self.fd)
@@ -285,18 +297,14 @@ class BusPort(Port):
     """
 
     def __init__(self, name: str, driver: Rm3100) -> None:
-        super().__init__(name)
+        super().__init__(name, ended="the part does not answer")
         self._driver = driver
         self._bus: Any = None
-        self._fd = self._waker = -1
-        self._thread: threading.Thread | None = None
-        self._running = False
-        self._reason = "the part does not answer"
-
-    @property
-    def is_open(self) -> bool:
-        """True while the part is polled."""
-        return self._bus is not None
+        self._pump: Pump | None = None
+        self._pause_s = min(driver.period / 4.0, 0.05)
+        self._silence_s = max(MIN_SILENCE_S, SILENT_PERIODS * driver.period)
+        self._errors = self._repeated = 0
+        self._heard, self._last = 0.0, b""
 
     def open(self) -> None:
         """Open the bus, configure the part and start to poll it; raises :class:`PortError`."""
@@ -308,70 +316,49 @@ class BusPort(Port):
             if bus is not None:
                 bus.close()
             raise PortError(self.name, error.strerror or str(error)) from error
-        self._fd, self._waker = os.pipe()
-        os.set_blocking(self._fd, False)
-        self._running = True
-        self._thread = threading.Thread(target=self._run, args=(bus,), name="bus poll", daemon=True)
-        self._bus = bus
-        self._thread.start()
+        self._bus, self._heard = bus, time.monotonic()
+        self._errors = self._repeated = 0
+        self._pump = Pump(partial(self._poll, bus), self._give_up)
+        self._fd = self._pump.fd
 
     def move_on(self) -> None:
         """Close the port; opening it configures a silent part again."""
         self.close()
-
-    def fds(self) -> list[int]:
-        """Return the one descriptor, if open."""
-        return [self._fd] if self._bus is not None else []
-
-    def read(self) -> bytes:
-        """Return the lines that have come; an end of file is a lost bus."""
-        try:
-            data = os.read(self._fd, READ_BYTES)
-        except BlockingIOError:
-            return b""
-        if not data:
-            raise self.lost(self._reason)
-        return data
 
     def write(self, data: bytes) -> None:
         """Drop the bytes: the part accepts no commands from the pipeline."""
 
     def close(self) -> None:
         """Stop polling and close the bus."""
-        bus, self._bus, self._running = self._bus, None, False
-        if bus is None:
-            return
-        if self._thread is not None:
-            self._thread.join()
-        bus.close()
-        os.close(self._fd)
+        pump, bus, self._pump, self._bus, self._fd = self._pump, self._bus, None, None, -1
+        if pump is not None and bus is not None:
+            pump.close()
+            bus.close()
 
-    def _run(self, bus: Bus) -> None:
-        """Poll until the port is closed, or the bus fails `MAX_ERRORS` times in a row."""
-        pause = min(self._driver.period / 4.0, 0.05)
-        silence = max(MIN_SILENCE_S, SILENT_PERIODS * self._driver.period)
-        errors = repeated = 0
-        heard, last = time.monotonic(), b""
+    def _give_up(self, reason: str) -> None:
+        """Record why the bus failed."""
+        self._ended = reason
+
+    def _poll(self, bus: Bus) -> bytes:
+        """Return the next reading, or none; raise OSError if the bus fails `MAX_ERRORS` times in a row."""
+        time.sleep(self._pause_s)
+        now = time.monotonic()
         try:
-            while self._running and errors < MAX_ERRORS:
-                now = time.monotonic()
-                try:
-                    if now - heard > silence or repeated > FROZEN_READINGS:
-                        heard, repeated = now, 0
-                        self._driver.configure(bus)
-                    line = self._driver.poll(bus, now)
-                    errors = 0
-                except OSError as error:
-                    errors, line = errors + 1, b""
-                    self._reason = error.strerror or str(error)
-                if line:
-                    results = line.rpartition(b",")[2]
-                    heard, repeated, last = now, repeated + 1 if results == last else 0, results
-                    os.write(self._waker, line)
-                time.sleep(pause)
-        finally:
-            with suppress(OSError):
-                os.close(self._waker)  # the reader sees an end of file: the port is lost
+            if now - self._heard > self._silence_s or self._repeated > FROZEN_READINGS:
+                self._heard, self._repeated = now, 0
+                self._driver.configure(bus)
+            line = self._driver.poll(bus, now)
+        except OSError:
+            self._errors += 1
+            if self._errors == MAX_ERRORS:
+                raise
+            return b""
+        self._errors = 0
+        if line:
+            results = line.rpartition(b",")[2]
+            self._repeated = self._repeated + 1 if results == self._last else 0
+            self._heard, self._last = now, results
+        return line
 
 
 def sensor_port(sensor: Sensor, path: Path) -> SerialPort | BusPort:

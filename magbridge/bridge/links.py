@@ -59,12 +59,33 @@ def resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int, 
     return family, resolved
 
 
-class _Connection(PacedPort):
-    """One TCP connection."""
+class TcpConnection(PacedPort):
+    """``tcp``: connection to a server at `address`; or, without one, a client of :class:`TcpServer`."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name, UNSENT, PEER_READ_BYTES, "closed by the other end")
+    def __init__(self, name: str, address: tuple[str, int] | None = None) -> None:
+        super().__init__(name, UNSENT, read_bytes=PEER_READ_BYTES, ended="closed by the other end")
+        self._address = address
         self._connection: socket.socket | None = None
+        self.since = 0.0
+        """When it was made, s, monotonic."""
+
+    def open(self) -> None:
+        """Connect, waiting at most a second; raises :class:`PortError`."""
+        if self._address is None:
+            raise PortError(self.name, "not connected")
+        try:
+            self.adopt(socket.create_connection(self._address, timeout=1.0))
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+
+    def adopt(self, connection: socket.socket) -> None:
+        """Use `connection`."""
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
+        self.close()
+        self.since = time.monotonic()
+        self._connection, self._fd = connection, connection.fileno()
 
     def write(self, data: bytes) -> None:
         """Send as :meth:`PacedPort.write` does; without a connection, `data` are dropped."""
@@ -83,48 +104,12 @@ class _Connection(PacedPort):
         self._connection.sendall(data)
         self._connection.setblocking(False)
 
-    def adopt(self, connection: socket.socket) -> None:
-        """Use `connection`."""
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
-        self.close()
-        self._connection, self._fd = connection, connection.fileno()
-
     def close(self) -> None:
         """Close the connection and discard the bytes still to be sent on it."""
         if self._connection is not None:
             self._connection.close()
         self._connection, self._fd = None, -1
         self._forget()
-
-
-class TcpClient(_Connection):
-    """``tcp``: connection to a server."""
-
-    def __init__(self, name: str, address: tuple[str, int]) -> None:
-        super().__init__(name)
-        self._address = address
-
-    def open(self) -> None:
-        """Connect, waiting at most a second; raises :class:`PortError`."""
-        try:
-            self.adopt(socket.create_connection(self._address, timeout=1.0))
-        except OSError as error:
-            raise PortError(self.name, error.strerror or str(error)) from error
-
-
-class _Client(_Connection):
-    """One client of a server; the server continues when it leaves."""
-
-    def __init__(self, name: str, connection: socket.socket) -> None:
-        super().__init__(name)
-        self.since = time.monotonic()
-        self.adopt(connection)
-
-    def open(self) -> None:
-        """Raise :class:`PortError`, because only a client can open the connection."""
-        raise PortError(self.name, "not connected")
 
 
 class TcpServer(Port):
@@ -139,12 +124,7 @@ class TcpServer(Port):
         self._peers: Peers
         self._address, self._signed = address, signed
         self._listener: socket.socket | None = None
-        self._clients: dict[int, _Client] = {}
-
-    @property
-    def is_open(self) -> bool:
-        """Return True if the server listens."""
-        return self._listener is not None
+        self._clients: dict[int, TcpConnection] = {}
 
     def open(self) -> None:
         """Listen; raises :class:`PortError`."""
@@ -155,11 +135,11 @@ class TcpServer(Port):
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
         listener.setblocking(False)
-        self._listener = listener
+        self._listener, self._fd = listener, listener.fileno()
 
     def fds(self) -> list[int]:
         """Return the listener's descriptor and the clients'."""
-        return ([self._listener.fileno()] if self._listener is not None else []) + list(self._clients)
+        return super().fds() + list(self._clients)
 
     def read(self) -> bytes:
         """Accept clients that wait, then return the bytes of all; a client that leaves is not an error."""
@@ -236,7 +216,7 @@ class TcpServer(Port):
             self._dismiss(fd)
         if self._listener is not None:
             self._listener.close()
-        self._listener = None
+        self._listener, self._fd = None, -1
 
     def _accept(self, connection: socket.socket) -> None:
         """Accept a client; if necessary, in place of one that has sent nothing valid for some time."""
@@ -248,7 +228,8 @@ class TcpServer(Port):
                 connection.close()
                 return
             self._dismiss(idle)
-        self._clients[connection.fileno()] = _Client(self.name, connection)
+        client = self._clients[connection.fileno()] = TcpConnection(self.name)
+        client.adopt(connection)
 
     def _dismiss(self, fd: int) -> None:
         self._clients.pop(fd).close()
@@ -264,18 +245,13 @@ class UdpPort(Port):
         self._socket: socket.socket | None = None
         self._received = 0.0
 
-    @property
-    def is_open(self) -> bool:
-        """Return True if the socket is open."""
-        return self._socket is not None
-
     def open(self) -> None:
         """Bind or connect; raises :class:`PortError`."""
         try:
             opened = self._new()
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
-        self._socket, self._received = opened, time.monotonic()
+        self._socket, self._received, self._fd = opened, time.monotonic(), opened.fileno()
 
     def tend(self) -> None:
         """Connect again if nothing has come for long, and the host, or we, have another address by now."""
@@ -301,10 +277,6 @@ class UdpPort(Port):
             opened.close()
             raise
         return opened
-
-    def fds(self) -> list[int]:
-        """Return the one descriptor, if open."""
-        return [self._socket.fileno()] if self._socket is not None else []
 
     def read(self) -> bytes:
         """Return the datagrams that have come; an unreachable peer is nothing, not an error.
@@ -372,7 +344,7 @@ class UdpPort(Port):
         """Close the socket."""
         if self._socket is not None:
             self._socket.close()
-        self._socket = None
+        self._socket, self._fd = None, -1
 
 
 def _datagrams(data: bytes) -> Iterator[bytes]:
@@ -394,7 +366,7 @@ def _ends(connected: socket.socket) -> tuple[Any, Any]:
     return connected.getsockname()[0], connected.getpeername()
 
 
-CLIENT_LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpClient}
+CLIENT_LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpConnection}
 """Kinds of link that go to one peer, by the first part of the URL, as in the MAVLink world."""
 SHARED: dict[str, Callable[[str, tuple[str, int], Peers, bool], Port]] = {
     "udpin": lambda name, address, peers, _: UdpPort(name, address, peers),

@@ -206,20 +206,28 @@ HEADER, CHECKSUM = 10, 2
 
 
 class Port(ABC):
-    """Interface of a port."""
+    """A port with one descriptor, that of a file, a terminal, a socket or a pipe.
 
-    def __init__(self, name: str, peers: Peers | None = None) -> None:
+    `peers`: those of a port that anyone can come to.
+    `read_bytes`: bytes that are read at once.
+    `ended`: reason of the :class:`PortError` at an end of file.
+    """
+
+    def __init__(
+        self, name: str, peers: Peers | None = None, *, read_bytes: int = READ_BYTES, ended: str = "hung up"
+    ) -> None:
         self.name = name
-        self._peers = peers
+        self._peers, self._read_bytes, self._ended = peers, read_bytes, ended
+        self._fd = -1  # set last when the port opens, which another thread may do
         self.dropped = 0
         """Bytes that could not be written."""
         self.overrun = 0
         """Number of the `dropped` bytes that an open port could not buffer, because it is too slow."""
 
     @property
-    @abstractmethod
     def is_open(self) -> bool:
         """Return True if bytes can be read and written."""
+        return self._fd >= 0
 
     @abstractmethod
     def open(self) -> None:
@@ -228,16 +236,24 @@ class Port(ABC):
     def tend(self) -> None:  # noqa: B027 - most ports need nothing
         """Do periodic slow work while the port is open; called by the thread that opens it."""
 
-    @abstractmethod
     def fds(self) -> list[int]:
         """Return the file descriptors to wait for."""
+        return [self._fd] if self._fd >= 0 else []
 
-    @abstractmethod
     def read(self) -> bytes:
         """Return the received bytes, when a descriptor is ready; raises :class:`PortError` for a lost port.
 
         A serial line that is ready and yet has nothing is one that hung up, so do not ask when none is ready.
         """
+        try:
+            data = os.read(self._fd, self._read_bytes)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise self.lost(error.strerror) from error
+        if not data:
+            raise self.lost(self._ended)
+        return data
 
     @abstractmethod
     def write(self, data: bytes) -> None:
@@ -294,37 +310,15 @@ class PacedPort(Port):
     which would send it seconds late. The order is kept, since signatures and sequence numbers depend on it.
 
     `piece`: bytes that are handed to the system at once, and what completes a message.
-    `share`: bytes that are read at once.
-    `ended`: reason of the :class:`PortError` at an end of file.
     """
 
-    def __init__(self, name: str, piece: int, share: int, ended: str) -> None:
-        super().__init__(name)
-        self._piece, self._share, self._ended = piece, share, ended
-        self._fd = -1  # set last when the port opens, which another thread may do
+    def __init__(
+        self, name: str, piece: int, *, read_bytes: int = READ_BYTES, ended: str = "hung up"
+    ) -> None:
+        super().__init__(name, read_bytes=read_bytes, ended=ended)
+        self._piece = piece
         self._waiting: deque[_Waiting] = deque()
         self._begun = bytearray()
-
-    @property
-    def is_open(self) -> bool:
-        """Return True if there is a descriptor."""
-        return self._fd >= 0
-
-    def fds(self) -> list[int]:
-        """Return the one descriptor, if open."""
-        return [self._fd] if self._fd >= 0 else []
-
-    def read(self) -> bytes:
-        """Return the received bytes; an end of file or an error is a lost port."""
-        try:
-            data = os.read(self._fd, self._share)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise self.lost(error.strerror) from error
-        if not data:
-            raise self.lost(self._ended)
-        return data
 
     def write(self, data: bytes) -> None:
         """Send messages, each whole or not at all; the others wait until the line takes them."""
