@@ -21,8 +21,8 @@ import xarray as xr
 from studies import Column, Row, Study, study_options
 
 from magbridge.arrays import FloatArray
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent, standstill
+from magbridge.bridge.pipeline import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import unfiltered

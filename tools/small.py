@@ -8,9 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import StartEvent
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order

@@ -22,8 +22,8 @@ from small import bridge_text
 from studies import command_line
 
 from magbridge.bridge import events
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.pipeline import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial

@@ -16,16 +16,15 @@ from typing import Any, Final, NamedTuple
 from msgspec.structs import replace
 
 from magbridge.bridge.devices import sensor_port
-from magbridge.bridge.drive import drive
 from magbridge.bridge.events import Event, HostClock
 from magbridge.bridge.heading import nmea_port
 from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
 from magbridge.bridge.live import LiveEdge
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, drive
 from magbridge.bridge.port import cut
 from magbridge.bridge.run import Keeper, leave_wrong_devices, ports
-from magbridge.bridge.sensor import open_correction, open_drivers, other_calibrations, unmet
+from magbridge.bridge.sensor import needed_units, open_correction, open_drivers, other_calibrations, unmet
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, Sensor, load, parse
 from magbridge.errors import ConfigError, MagbridgeError
@@ -226,7 +225,7 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFaul
         )
         yield ConfigFault(fatal=False, text=text + "would be uncalibrated")
         return
-    for error in unmet(calibration, config):
+    for error in unmet(needed_units(calibration), config):
         yield ConfigFault(fatal=True, text=str(error))
     key = "calibration.file" if config.calibration else "learning.prior"
     for doubt in calibration.warnings:

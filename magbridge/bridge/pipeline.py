@@ -4,15 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import nan, sqrt
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from magbridge.align import Sample
 from magbridge.bridge import events
-from magbridge.bridge.events import Event, Recorder, StartEvent, StateChanges, beginning, declarations
+from magbridge.bridge.events import (
+    Event,
+    Recorder,
+    StartEvent,
+    StateChanges,
+    beginning,
+    declarations,
+    port_number,
+)
 from magbridge.bridge.heading import LiveHeading
-from magbridge.bridge.learning import LearningService, open_learner
+from magbridge.bridge.learning import LearningService, first_calibration, open_learner
 from magbridge.bridge.position import Position
-from magbridge.bridge.sensor import SensorStream, open_correction, open_drivers
+from magbridge.bridge.sensor import SensorStream, open_correction, open_drivers, other_calibrations
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.config import Align, Config
@@ -23,7 +31,8 @@ from magbridge.link.estimates import NO_ATTITUDE, Attitude
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.publish import Condition, check_publish
 from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, Sources, TelemetryMap, is_possible, needed_rates
-from magbridge.mavlink import Message, Signing, Spec, spec
+from magbridge.logs.tlog import TlogWriter
+from magbridge.mavlink import Message, Signing, Spec, load_key, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
@@ -34,7 +43,7 @@ from magbridge.version import __version__
 if TYPE_CHECKING:
     from magbridge.bridge.navigation import NavigationService  # imports filterpy, which few vehicles have
 
-__all__ = ["Pipeline"]
+__all__ = ["Edge", "Pipeline", "drive", "set_up"]
 
 NOT_USED = "calibration is not of a {}: not used"
 
@@ -406,3 +415,53 @@ class Pipeline:
             self._changes.log_lost,
             self._changes.log_state,
         )
+
+
+class Edge(Protocol):
+    """Source of events and destination of bytes."""
+
+    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield events in order; at least an empty one by `deadline` (µs)."""
+        ...
+
+    def send(self, number: int, data: bytes) -> None:
+        """Send to the link or to a sensor, by its MAG_PORT_NAME."""
+        ...
+
+    def credit(self, frames: list[bytes]) -> None:
+        """Record which frames of the last event from the link were signed with the key."""
+        ...
+
+
+def set_up(config: Config, start: StartEvent) -> Pipeline:
+    """Return the pipeline that a configuration describes.
+
+    ConfigError, FormatError, CalibrationError: the content of the configuration, or of a file that it names,
+    is wrong.
+    """
+    calibration = first_calibration(config)
+    key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
+    navigate = None
+    if config.navigation is not None:
+        from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
+
+        navigate = open_navigation(config, config.navigation, calibration)
+    return Pipeline(config, calibration, start, key, navigate, other_calibrations(config))
+
+
+def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after_event: Callable[[int], None]) -> None:
+    """Feed the pipeline until the edge ends; call ``after_event(time_us)`` after each event."""
+    for event in edge.events(lambda: pipeline.deadline):
+        sent = pipeline.feed(event)
+        if pipeline.component.genuine:
+            edge.credit(pipeline.component.genuine)
+        if sent:
+            edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
+        for stream in pipeline.streams:
+            if commands := stream.line.to_send:
+                edge.send(port_number(stream.sensor_id), b"".join(commands))
+                commands.clear()
+        records = pipeline.recorder.drain()
+        if log is not None and records:
+            log.extend(records)
+        after_event(event.time_us)

@@ -19,14 +19,13 @@ from msgspec import Meta
 
 from magbridge.bridge import events
 from magbridge.bridge.devices import BusPort, SerialPort, sensor_port
-from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import HostClock, StartEvent, port_number
 from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.heading import NmeaOutput, nmea_port
 from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, drive, set_up
 from magbridge.bridge.port import Port
 from magbridge.config import Config, load
 from magbridge.errors import FormatError

@@ -174,29 +174,14 @@ class SensorLine:
             )
 
 
-def check(calibration: Calibration, config: Config) -> None:
-    """Check that the link will provide what the calibration needs.
-
-    ConfigError: a parameter that ``[telemetry]`` lacks, or that comes in another unit.
-    """
-    for error in unmet(calibration, config):
-        raise error
-
-
-def unmet(calibration: Calibration, config: Config) -> list[ConfigError]:
-    """Return an error for each need of the calibration that the link does not provide."""
+def needed_units(calibration: Calibration) -> dict[str, str]:
+    """Return the telemetry that a calibration needs, by name, with the unit of each."""
     units = calibration.units
-    return _unmet({name: units.get(name, "") for name in calibration.channels if name != TEMPERATURE}, config)
+    return {name: units.get(name, "") for name in calibration.channels if name != TEMPERATURE}
 
 
-def check_channels(units: Mapping[str, str], config: Config) -> None:
-    """Check that the link will provide telemetry channels in these units; raises as :func:`check`."""
-    for error in _unmet(units, config):
-        raise error
-
-
-def _unmet(units: Mapping[str, str], config: Config) -> list[ConfigError]:
-    """Return an error for each channel that ``[telemetry]`` lacks or has in another unit."""
+def unmet(units: Mapping[str, str], config: Config) -> list[ConfigError]:
+    """Return an error for each channel of `units` that ``[telemetry]`` lacks or has in another unit."""
     errors = []
     for name, expected_unit in units.items():
         if name not in config.telemetry:
@@ -208,6 +193,12 @@ def _unmet(units: Mapping[str, str], config: Config) -> list[ConfigError]:
             expected = f"expected {expected_unit!r}, the calibration's unit, not {unit!r}"
             errors.append(ConfigError(config.path, f"telemetry.{name}.unit", expected))
     return errors
+
+
+def check(units: Mapping[str, str], config: Config) -> None:
+    """Check that the link will provide telemetry in these units; ConfigError: as :func:`unmet`."""
+    for error in unmet(units, config):
+        raise error
 
 
 RATE_SAMPLES = 64
@@ -264,7 +255,7 @@ def scalar_entry(
             raise ConfigError(config.path, f"{sensor.key}.calibration", text)
         entry = entries[0]
     if entry is not None:
-        check_channels({channel.name: channel.unit for channel in entry.channels}, config)
+        check({channel.name: channel.unit for channel in entry.channels}, config)
     return entry
 
 
@@ -409,7 +400,7 @@ def open_correction(
         used = None if entry is None else own_calibration or main
         return ScalarCorrection(entry, settings, sensor.sigma), used
     if own_calibration is not None:
-        check(own_calibration, config)
+        check(needed_units(own_calibration), config)
         if not own_calibration.sensor.may_be(sensor.driver):
             return Correction(None, settings, learner), None
     return Correction(own_calibration, settings, learner), own_calibration

@@ -121,8 +121,23 @@ def _odometry(outbox: Outbox, attitude: Attitude, time_us: int, stack: int) -> N
 
     ArduPilot takes the frame LOCAL_FRD only; PX4 takes a yaw as from true north in LOCAL_NED only.
     """
-    (x, y, z), covariance = _pose(attitude, stack)
+    position, covariance = _pose(attitude, stack)
     frame = MAV_FRAME.LOCAL_NED if stack == MAV_AUTOPILOT.PX4 else MAV_FRAME.LOCAL_FRD
+    turn = quaternion(attitude.roll, attitude.pitch, radians(attitude.heading))
+    _send_odometry(outbox, time_us, frame, position, turn, covariance)
+
+
+def _send_odometry(
+    outbox: Outbox,
+    time_us: int,
+    frame: MAV_FRAME,
+    position: tuple[float, float, float],
+    turn: tuple[float, float, float, float],
+    covariance: list[float],
+    resets: int = 0,
+) -> None:
+    """Send an ODOMETRY without velocities: position (m), quaternion, and the pose's covariance."""
+    x, y, z = position
     outbox.send(
         "ODOMETRY",
         time_usec=time_us,
@@ -131,10 +146,11 @@ def _odometry(outbox: Outbox, attitude: Attitude, time_us: int, stack: int) -> N
         x=x,
         y=y,
         z=z,
-        q=quaternion(attitude.roll, attitude.pitch, radians(attitude.heading)),
+        q=turn,
         **dict.fromkeys(("vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed"), nan),
         pose_covariance=covariance,
         velocity_covariance=[nan] * 21,
+        reset_counter=resets & 0xFF,
         estimator_type=MAV_ESTIMATOR_TYPE.VISION,
         quality=FULL_QUALITY,
     )
@@ -193,8 +209,6 @@ SENSOR_ID = 1
 """GLOBAL_POSITION_SENSOR.id; PX4 takes the one that ``EKF2_AGPn_ID`` names, and 0 is off."""
 LATITUDE_LONGITUDE_ONLY = 0
 """GLOBAL_POSITION_SENSOR.flags"""
-GOOD = 100
-"""ODOMETRY.quality, in %: only valid positions are sent."""
 OTHERS_VARIANCE = 1.0
 """Variances of height (m²) and attitude (rad²) in an ODOMETRY; both are the autopilot's own."""
 WALK = 1e-3
@@ -324,27 +338,13 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
     none there is an internal error. It drops a velocity that is none.
     """
     assert fix.pose is not None
-    pose = fix.pose
+    north, east, down, attitude = fix.pose
     covariance = [0.0] * 21  # the upper triangle of x y z roll pitch yaw, row by row
     covariance[0], covariance[1], covariance[6] = fix.covariance_nn, fix.covariance_ne, fix.covariance_ee
     for diagonal in (11, 15, 18, 20):
         covariance[diagonal] = OTHERS_VARIANCE
-    outbox.send(
-        "ODOMETRY",
-        time_usec=fix.time_us,
-        frame_id=MAV_FRAME.LOCAL_FRD,
-        child_frame_id=MAV_FRAME.BODY_FRD,
-        x=pose.north,
-        y=pose.east,
-        z=pose.down,
-        q=pose.attitude,
-        **dict.fromkeys(("vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed"), nan),
-        pose_covariance=covariance,
-        velocity_covariance=[nan] * 21,
-        reset_counter=fix.resets & 0xFF,
-        estimator_type=MAV_ESTIMATOR_TYPE.VISION,
-        quality=GOOD,
-    )
+    frame = MAV_FRAME.LOCAL_FRD
+    _send_odometry(outbox, fix.time_us, frame, (north, east, down), attitude, covariance, fix.resets)
 
 
 class Kind(NamedTuple):

@@ -15,23 +15,7 @@ from magbridge.mavlink.messages import BAD_DATA, REFUSED, SECRET, Message, Sourc
 from magbridge.mavlink.tlog import LogReader, TlogRecord, pack_record, pack_records
 
 __all__ = [
-    "BAD_DATA",
-    "REFUSED",
-    "SECRET",
-    "Codec",
-    "FrameLogReader",
-    "FrameLogWriter",
-    "LogReader",
-    "Message",
-    "Signing",
-    "Source",
-    "Spec",
-    "Stream",
-    "TlogRecord",
-    "by_id",
-    "load_key",
-    "pack_record",
-    "pack_records",
-    "readable_by_all",
-    "spec",
+    "BAD_DATA", "REFUSED", "SECRET", "Codec", "FrameLogReader", "FrameLogWriter", "LogReader", "Message",
+    "Signing", "Source", "Spec", "Stream", "TlogRecord", "by_id", "load_key", "pack_record", "pack_records",
+    "readable_by_all", "spec",
 ]  # fmt: skip

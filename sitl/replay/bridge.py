@@ -15,9 +15,9 @@ from pathlib import Path
 import msgspec
 
 from magbridge.bridge.devices import SerialPort
-from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.bridge.links import open_link
+from magbridge.bridge.pipeline import drive, set_up
 from magbridge.bridge.port import Port
 from magbridge.config import Log, load
 from magbridge.errors import MagbridgeError, WriteError

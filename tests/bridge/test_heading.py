@@ -18,9 +18,8 @@ import pytest
 from small import bridge_text
 
 from magbridge.bridge.check import findings
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, Calibration, Noise, Reference
 from magbridge.calibration.terms import Polynomial

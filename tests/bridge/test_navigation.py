@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 from small import bridge_text
 
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load

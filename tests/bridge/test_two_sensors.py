@@ -16,8 +16,8 @@ from devices import open_line
 
 from magbridge.bridge import events
 from magbridge.bridge.check import findings
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent, port_number
+from magbridge.bridge.pipeline import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, CalibratedSensor, Calibration, Noise, Reference
 from magbridge.calibration.scalar import (

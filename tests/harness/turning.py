@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from small import ASCII_OPTIONS, START, bridge_text
 
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import load, save
 from magbridge.calibration.model import Calibration, Noise, Reference
 from magbridge.calibration.terms import Polynomial

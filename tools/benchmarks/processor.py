@@ -17,9 +17,8 @@ from benchmarks.peer import Peer
 from benchmarks.row import Row, processor_time
 from benchmarks.workload import BEGIN_US, Feed, write_config
 
-from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.pipeline import Pipeline, drive, set_up
 from magbridge.config import load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
