@@ -94,37 +94,13 @@ class Pipeline:
         self._correction = main
         self._direction = main.direction if isinstance(main, Correction) else None
         self._calibration_id = calibration_id(used) if used else 0
-        autopilot = config.link.system, config.link.autopilot
-        stamps = start.signing_timestamp, start.signing_streams
-        self.signing = Signing(key, *stamps, autopilot) if key else None
-        self.component = Component(
-            config.link,
-            config.publish,
-            [
-                *alignment(config.align),
-                *telemetry_ages(config.telemetry),
-                *file_rate(),
-                *(learning(config.learning.enabled) if config.learning else ()),
-            ],
-            start_us=start.time_us,
-            signing=self.signing,
-            calibration_id=self._calibration_id,
-            version=__version__,
-            kept=start.parameters,
-            status=self._status,
-            speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
-            streams=needed_rates(
-                config.link.autopilot,
-                config.telemetry.values(),
-                attitude=self._direction is not None,
-                navigation=config.navigation is not None,
-            ),
-        )
         own = config.link
+        stamps = start.signing_timestamp, start.signing_streams
+        self.signing = Signing(key, *stamps, (own.system, own.autopilot)) if key else None
+        self.component = self._open_component()
         self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
-        stream = SensorStream(
-            config.sensor, drivers[0], main, self.component, start.time_us, self.component.publisher
-        )
+        publisher = self.component.publisher
+        stream = SensorStream(config.sensor, drivers[0], main, self.component, start.time_us, publisher)
         self.streams = [stream, *self._other_streams(drivers[1:], more or {}, used)]
         self._by_id = {one.sensor_id: one for one in self.streams}
         lines = {one.sensor_id: one.line for one in self.streams}
@@ -134,7 +110,7 @@ class Pipeline:
         self._comparisons = [
             SensorComparison((config.sensor.label, one.label)) for one in config.more_sensors
         ]
-        self.recorder = Recorder(config.link.system, config.link.component, active=config.log is not None)
+        self.recorder = Recorder(own.system, own.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
         self.learning = LearningService(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
@@ -146,6 +122,32 @@ class Pipeline:
         self.component.parameters.watch(self._tune)
         self._tune()
         self._begin(start, used, foreign=foreign)
+
+    def _open_component(self) -> Component:
+        """Return the MAVLink side, with what can be tuned and the messages that are needed."""
+        config, start = self._config, self._start
+        tunables = [*alignment(config.align), *telemetry_ages(config.telemetry), *file_rate()]
+        if config.learning is not None:
+            tunables += learning(config.learning.enabled)
+        streams = needed_rates(
+            config.link.autopilot,
+            config.telemetry.values(),
+            attitude=self._direction is not None,
+            navigation=config.navigation is not None,
+        )
+        return Component(
+            config.link,
+            config.publish,
+            tunables,
+            start_us=start.time_us,
+            signing=self.signing,
+            calibration_id=self._calibration_id,
+            version=__version__,
+            kept=start.parameters,
+            status=self._status,
+            speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
+            streams=streams,
+        )
 
     def _other_streams(
         self, drivers: Sequence[Driver], calibrations: Mapping[int, Calibration], main: Calibration | None

@@ -163,9 +163,8 @@ def run(path: Path) -> None:
     """
     if sys.stderr.isatty():
         print(f"{path}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
-    config = load(path)
+    config, clock = load(path), HostClock()
     keeper = Keeper(config)
-    clock = HostClock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
     link, sensors = ports(config)
     nmea = nmea_port(config)
@@ -174,42 +173,26 @@ def run(path: Path) -> None:
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
-    sentences = NmeaOutput(nmea, edge.notify) if nmea is not None else None
     _stop_on_signals(edge)
     # not before a signal would end the bridge in good order: a program that reads the first text may send one
-    Thread(
-        target=_print_statustexts, args=(pipeline.component.announcer.texts,), name="voice", daemon=True
-    ).start()
+    texts = pipeline.component.announcer.texts
+    Thread(target=_print_statustexts, args=(texts,), name="voice", daemon=True).start()
     sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # these objects live as long as the process: the collector need not scan them
     gc.enable()
-    watch = LogWatch(log, edge, pipeline)
-
-    logs = config.resolve(config.log.directory) if config.log else None
-    parameters, requests = pipeline.component.parameters, pipeline.component.file_requests
-    files = FileServer(
-        pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.notify
-    )
+    sentences = NmeaOutput(nmea, edge.notify) if nmea is not None else None
+    upkeep = Upkeep(config, pipeline, edge, keeper, link, log, sentences)
 
     def finish_event(time_us: int) -> None:
-        while requests:
-            files.ask(requests.popleft())
-        if not link.waiting:
-            station, messages = files.drain()
-            if messages:
-                edge.answer(station, pipeline.interleaved(messages))
-        keeper.look(pipeline, time_us)
-        watch.look(time_us)
-        if sentences is not None and pipeline.heading is not None:
-            sentences.send(pipeline.heading.nmea, time_us)
+        upkeep.finish_event(time_us)
         leave_wrong_devices(pipeline, sensors)
 
     try:
         drive(pipeline, edge, log, finish_event)
     finally:
         keeper.save(pipeline, last=True)
-        files.close()
+        upkeep.files.close()
         edge.close()
         if sentences is not None:
             sentences.close()
@@ -278,25 +261,52 @@ def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter 
     )
 
 
-class LogWatch:
-    """Report failures, recoveries and losses of the log; keep the log's `beginning` up to date."""
+class Upkeep:
+    """Work between two events: files for stations, saved state, changes of the log, NMEA sentences."""
 
-    def __init__(self, log: TlogWriter | None, edge: LiveEdge, pipeline: Pipeline) -> None:
-        self._log, self._edge, self._pipeline = log, edge, pipeline
+    def __init__(
+        self,
+        config: Config,
+        pipeline: Pipeline,
+        edge: LiveEdge,
+        keeper: Keeper,
+        link: Port,
+        log: TlogWriter | None,
+        sentences: NmeaOutput | None,
+    ) -> None:
+        self._pipeline, self._edge, self._keeper, self._link = pipeline, edge, keeper, link
+        self._log, self._sentences = log, sentences
+        component = pipeline.component
+        self._parameters, self._requests = component.parameters, component.file_requests
+        folder = config.resolve(config.log.directory) if config.log else None
+        self.files = FileServer(
+            component.metadata, folder, lambda: 1e3 * self._parameters["MB_FILE_RATE"], edge.notify
+        )
         self._revision = -1
         self._reported = ("", 0)
         self._look_us = 0
 
-    def look(self, time_us: int) -> None:
-        """Check the log, at most once a second."""
-        if self._log is None or time_us < self._look_us:
-            return
-        self._look_us = time_us + LOG_LOOK_US
-        parameters = self._pipeline.component.parameters
-        if parameters.revision != self._revision:
-            self._revision = parameters.revision
-            self._log.beginning = self._pipeline.beginning(parameters.changed())
-        state = self._log.failure, self._log.lost
+    def finish_event(self, time_us: int) -> None:
+        """Do what is due after an event at `time_us`."""
+        while self._requests:
+            self.files.ask(self._requests.popleft())
+        if not self._link.waiting:
+            station, messages = self.files.drain()
+            if messages:
+                self._edge.answer(station, self._pipeline.interleaved(messages))
+        self._keeper.look(self._pipeline, time_us)
+        if self._log is not None and time_us >= self._look_us:
+            self._look_us = time_us + LOG_LOOK_US
+            self._look_at_log(self._log)
+        if self._sentences is not None and self._pipeline.heading is not None:
+            self._sentences.send(self._pipeline.heading.nmea, time_us)
+
+    def _look_at_log(self, log: TlogWriter) -> None:
+        """Report failures, recoveries and losses of the log; keep the `beginning` of its next file."""
+        if self._parameters.revision != self._revision:
+            self._revision = self._parameters.revision
+            log.beginning = self._pipeline.beginning(self._parameters.changed())
+        state = log.failure, log.lost
         if state != self._reported:
             self._reported = state
             self._edge.notify(events.log_state(*state))
