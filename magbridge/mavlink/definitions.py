@@ -29,22 +29,10 @@ BOTH = """<?xml version="1.0"?>
 def write_definitions(folder: Path) -> list[Path]:
     """Write the XML of the dialect and of its includes, and a module for pymavlink of each dialect.
 
-    Parameters
-    ----------
-    folder : Path
-        It exists; files of these names in it are replaced.
-
-    Returns
-    -------
-    list of Path
-        The dialects' XML and modules, without the included ones.
-
-    Raises
-    ------
-    ImportError
-        pymavlink, which has the standard definitions and makes the modules, is not installed.
-    DataError
-        Its generator made no module.
+    `folder`: it exists; files of these names in it are replaced.
+    Returns the dialects' XML and modules, without the included ones.
+    ImportError: pymavlink, which has the standard definitions and makes the modules, is not installed.
+    DataError: its generator made no module.
     """
     import pymavlink  # noqa: PLC0415 - the generator takes long to import
     from pymavlink.generator import mavgen, mavparse  # noqa: PLC0415

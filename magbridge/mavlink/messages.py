@@ -278,19 +278,10 @@ def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
     plausible and another frame begins at its end, or when it ends with the data. A random
     header hardly ever is plausible, so that garbage does not delay the frames behind it.
 
-    Parameters
-    ----------
-    data : bytes
-        Bytes received; ``data[start]`` is a magic byte.
-    start, stop : int
-        Look at no more than ``data[start:stop]``.
-    last : bool
-        Nothing comes after `stop`.
-
-    Returns
-    -------
-    int
-        The end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the bytes from `stop` on are needed to decide.
+    `data`: bytes received; ``data[start]`` is a magic byte.
+    `start`, `stop`: look at no more than ``data[start:stop]``.
+    `last`: nothing comes after `stop`.
+    Returns the end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the bytes from `stop` on are needed to decide.
     """
     available = stop - start
     header = 10 if data[start] == V2 else 6

@@ -172,15 +172,10 @@ class Stamp(msgspec.Struct, frozen=True, gc=False):
 class DeviceClock:
     """Host times of an instrument's readings.
 
-    Parameters
-    ----------
-    time_modulo : float
-        s, at which the instrument's time wraps; 0: never.
-    sequence_modulo : int
-        Where its count of readings wraps; 0: never.
-    period : float
-        s between the readings of an instrument without a clock; 0: not steady, and a reading is dated by its
-        arrival.
+    `time_modulo`: s, at which the instrument's time wraps; 0: never.
+    `sequence_modulo`: where its count of readings wraps; 0: never.
+    `period`: s between the readings of an instrument without a clock; 0: not steady, and a reading is dated
+        by its arrival.
     """
 
     def __init__(self, *, time_modulo: float = 0.0, sequence_modulo: int = 0, period: float = 0.0) -> None:
@@ -236,17 +231,11 @@ class DeviceClock:
     ) -> Stamp:
         """Return when a reading was taken.
 
-        Parameters
-        ----------
-        device_time : float
-            s on the instrument's clock; NaN where it has none.
-        arrival_us : int
-            µs on the host's clock.
-        sequence : int or None
-            The instrument's count of readings.
-        informative : bool
-            Whether the relation between the clocks is learned from this reading; False for one that only
-            waited for a later one.
+        `device_time`: s on the instrument's clock; NaN where it has none.
+        `arrival_us`: µs on the host's clock.
+        `sequence`: the instrument's count of readings.
+        `informative`: whether the relation between the clocks is learned from this reading; False for one
+            that only waited for a later one.
         """
         if not abs(device_time) < MAX_DEVICE_TIME_S:
             device_time = nan

@@ -22,17 +22,9 @@ CRC32_RESIDUE = 0x2144DF1C
 class Framer:
     """Cuts a byte stream at a delimiter; a frame longer than `limit` bytes is skipped, not kept.
 
-    Parameters
-    ----------
-    delimiter : bytes
-        One byte.
-    limit : int
-        Longest frame, without its delimiter.
-
-    Attributes
-    ----------
-    skipped : int
-        Bytes of frames that were too long; the driver adds those of frames that it rejects.
+    `delimiter`: one byte.
+    `limit`: longest frame, without its delimiter.
+    `skipped`: bytes of frames that were too long; the driver adds those of frames that it rejects.
     """
 
     __slots__ = ("_delimiter", "_limit", "_overlong", "_rest", "skipped")
@@ -47,10 +39,8 @@ class Framer:
     def begin(self, *, inside_frame: bool) -> None:
         """Restart: bytes that wait for their delimiter are skipped.
 
-        Parameters
-        ----------
-        inside_frame : bool
-            The next byte may be in the middle of a frame: all up to the first delimiter is skipped.
+        `inside_frame`: the next byte may be in the middle of a frame: all up to the first delimiter is
+            skipped.
         """
         self.skipped += len(self._rest)
         self._rest, self._overlong = b"", inside_frame
@@ -137,19 +127,10 @@ class FramedDriver:
 class FixedFramer:
     """Cuts a byte stream into frames of one size whose last byte is a delimiter that may be data as well.
 
-    Parameters
-    ----------
-    layout : Struct
-        Numbers of a frame, without its delimiter.
-    delimiter : int
-        Last byte.
-    text : bytes
-        Bytes of replies to commands: a first frame of these only is skipped.
-
-    Attributes
-    ----------
-    skipped, broken : int
-        Bytes that belonged to no frame, and how often the alignment was lost.
+    `layout`: numbers of a frame, without its delimiter.
+    `delimiter`: last byte.
+    `text`: bytes of replies to commands: a first frame of these only is skipped.
+    `skipped`, `broken`: bytes that belonged to no frame, and how often the alignment was lost.
 
     Notes
     -----

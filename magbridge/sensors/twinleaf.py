@@ -27,7 +27,7 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import MAX_MEASURED_NT, Reading
-from magbridge.sensors.framing import CRC32_RESIDUE, Framer, saturated
+from magbridge.sensors.framing import CRC32_RESIDUE, FramedDriver, saturated
 
 __all__ = ["Twinleaf", "TwinleafOptions", "pack", "slip", "unslip"]
 
@@ -140,7 +140,7 @@ class _Row(NamedTuple):
     scale: float
 
 
-class Twinleaf:
+class Twinleaf(FramedDriver):
     """Parser of a TIO device, of either generation.
 
     ``Reading.power_cycle`` is the session number of the device, which differs after every power-on.
@@ -149,16 +149,12 @@ class Twinleaf:
 
     Options: ClassVar = TwinleafOptions
     sequence_modulo = WRAP_1
-    time_modulo = 0.0
-    period = 0.0
-    nt_per_count = 0.0
 
     def __init__(self, options: TwinleafOptions) -> None:
+        super().__init__(END, MAX_FRAME_BYTES)
         self._options = options
         self._routing = bytes(reversed(options.hops()))
         self.range_nt = options.range
-        self._framer = Framer(END, MAX_FRAME_BYTES)
-        self.frames_bad = 0
         self._session: int | None = None
         self._timebases: dict[int, float] = {}
         self._sources: dict[int, tuple[StreamColumn, ...]] = {}
@@ -167,11 +163,6 @@ class Twinleaf:
         self._segments: dict[tuple[int, int], Segment] = {}
         self._rows: dict[int, _Row | None] = {}
         self._last: tuple[int, int, int] = (0, 0, 0)
-
-    @property
-    def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid frame, or to samples of the wanted stream not yet described."""
-        return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
         """Return a heartbeat, and the two generations' requests for descriptors."""
