@@ -43,7 +43,7 @@ from magbridge.version import __version__
 if TYPE_CHECKING:
     from magbridge.bridge.navigation import NavigationService  # imports filterpy, which few vehicles have
 
-__all__ = ["Edge", "Pipeline", "drive", "set_up"]
+__all__ = ["Pipeline", "drive", "set_up"]
 
 NOT_USED = "calibration is not of a {}: not used"
 

@@ -30,7 +30,10 @@ from magbridge.sensors.clock import DeviceClock, Stamp
 if TYPE_CHECKING:
     from magbridge.learning import Learner
 
-__all__ = ["SensorLine", "SensorStream", "open_correction", "open_drivers", "other_calibrations", "unmet"]
+__all__ = [
+    "SensorLine", "SensorStream", "needed_units", "open_correction", "open_drivers", "other_calibrations",
+    "unmet",
+]  # fmt: skip
 
 OK: Final = MAG_PORT_STATE.OK
 COMMAND_GAP_US = 100_000
