@@ -12,7 +12,7 @@ from scipy.stats import norm
 from study.cases import PARTS, plan
 from study.deployment import CHARTS, LOSSES, MEMORY, charted, drawn, project, whiten
 from study.ideal import SIZES, Draws, Span
-from study.table import needed_size
+from study.table import is_false_alarm, needed_size
 
 from sitl import Twin, load
 
@@ -120,3 +120,12 @@ def test_a_run_writes_the_table_and_the_plots(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "| false alarms | 1 % |" in (tmp_path / "table.md").read_text()
     assert (tmp_path / "confusion.png").stat().st_size > 10_000
+
+
+def test_a_step_since_the_calibration_is_no_false_alarm_where_the_world_has_one() -> None:
+    row = {"part": "charted", "verdict": "explained", "found": [["offset_step", None, 20.0, []]]}
+    assert not is_false_alarm(row)
+    assert is_false_alarm(row | {"part": "null"})
+    assert is_false_alarm(row | {"found": [["offset_drift", None, 20.0, []]]})
+    assert is_false_alarm(row | {"found": []})
+    assert not is_false_alarm(row | {"verdict": "nothing_found", "found": []})

@@ -66,12 +66,21 @@ def holds(row: Row) -> bool:
 
 
 def has_second(row: Row) -> bool:
-    """Return True if more causes are named than are hidden.
+    """Return True if more causes are named than are hidden."""
+    return len(asserted(row) - changed(row)) > max(len(hidden(row)), 1)
 
-    The offset of a vehicle whose reference is a map has changed since its calibration: its name is right.
+
+def is_false_alarm(row: Row) -> bool:
+    """Return True if a log without a hidden effect has more than its world's own change."""
+    return found(row) and not (asserted(row) and asserted(row) <= changed(row))
+
+
+def changed(row: Row) -> set[str]:
+    """Return the name of what the world itself changes.
+
+    The offset of a vehicle whose reference is a map is another one since its calibration, by `TURN_ON`.
     """
-    changed = {"offset_step"} if row["part"] == "charted" else set()
-    return len(asserted(row) - changed) > max(len(hidden(row)), 1)
+    return {"offset_step"} if row["part"] == "charted" else set()
 
 
 def is_nameable(row: Row) -> bool:
