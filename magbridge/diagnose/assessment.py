@@ -15,7 +15,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.columns import Candidate
-from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.diagnosis import Diagnosis, Finding, label, measured, names_of, series_of
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE
 from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.observed import Memory, Returns, Seen, memory, returns, seen
@@ -28,7 +28,6 @@ from magbridge.diagnose.problem import (
     samples_of,
 )
 from magbridge.diagnose.state import CompetingHypothesis
-from magbridge.diagnose.texts import label, measured, names_of, series_of
 from magbridge.diagnostics import CONDITION_CODES, Diagnostic, number, write_text
 from magbridge.estimation.residual import residuals, residuals_of, rms
 

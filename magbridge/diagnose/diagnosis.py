@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import floor, isfinite, log10
 
 import numpy as np
 
@@ -162,3 +163,28 @@ def verdict_of(
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"
+
+
+def label(cause: str, channel: str | None) -> str:
+    """Return a cause as people read it."""
+    return cause.replace("_", " ") + (f" ({channel})" if channel else "")
+
+
+def names_of(candidates: Sequence[Candidate], joint: str = ", ") -> str:
+    """Return causes as a list in words."""
+    return joint.join(label(candidate.cause, series_of(candidate)) for candidate in candidates)
+
+
+def series_of(candidate: Candidate) -> str | None:
+    """Return the telemetry that a candidate follows, as people read it; None where it follows none."""
+    several = len({channel for effect in candidate.effects for channel in effect.channels()}) > 1
+    return "several together" if candidate.channel is None and several else candidate.channel
+
+
+def measured(value: float, sigma: float | None) -> str:
+    """Write a number to the second digit of its sigma; without one (a count, a period), to four digits."""
+    if not sigma or not isfinite(sigma):
+        return f"{float(f'{value:.4g}'):g}"
+    places = 1 - floor(log10(sigma))
+    # an added 0 turns a value that was rounded to -0 into 0
+    return f"{round(value, places) + 0.0:.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")

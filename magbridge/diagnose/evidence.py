@@ -34,7 +34,7 @@ Gaussian noise).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -90,14 +90,6 @@ class Information:
         """Return the likeliest calibration and model (q + k,) if the coefficients at `places` are `taken`."""
         return np.append(base.z, base.coefficients) - self.shift[:, places] @ taken
 
-    def projected_out(self, index: IndexArray, prior: FloatArray) -> Information:
-        """Project out the coefficients at `index` as well, with their prior precision (i,)."""
-        S = self.matrix[np.ix_(index, index)] + np.diag(prior)
-        K = np.linalg.solve(S, self.matrix[index])
-        return Information(
-            self.matrix - self.matrix[:, index] @ K, self.score - K.T @ self.score[index], self.shift
-        )
-
     def fitted(self, base: Joint) -> Information:
         """Project out the model of `base` as well, whose columns are the last."""
         m = len(self.score) - base.coefficients.size
@@ -117,8 +109,10 @@ class Information:
         """
         first, own = len(self.score) - base.coefficients.size, np.r_[*places]
         others = np.setdiff1d(np.arange(first, len(self.score)), own)
-        alone = self.projected_out(others, base.prior[len(base.z) + others - first])
-        return replace(alone, score=alone.score + alone.matrix[:, own] @ base.coefficients[own - first])
+        S = self.matrix[np.ix_(others, others)] + np.diag(base.prior[len(base.z) + others - first])
+        K = np.linalg.solve(S, self.matrix[others])
+        matrix, b = self.matrix - self.matrix[:, others] @ K, self.score - K.T @ self.score[others]
+        return Information(matrix, b + matrix[:, own] @ base.coefficients[own - first], self.shift)
 
 
 def information(
@@ -169,7 +163,7 @@ def score(info: Information, place: slice, candidate: Candidate) -> Score:
     """Score the candidate whose columns stand at `place`; one of the wrong sign scores zero."""
     # A size that cannot be negative has no evidence where its score is negative
     b, statistic = info.score[place], Statistic(info.matrix[place, place], candidate.spectra)
-    freedom = int(statistic.freedom)
+    freedom = statistic.freedom
     if not freedom or (candidate.positive and b.min() < 0.0):
         return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
     if candidate.spectra is not None:

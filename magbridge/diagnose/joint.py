@@ -183,8 +183,8 @@ class Ridge:
 class Statistic:
     """The likelihood ratio of one candidate's coefficients, of information S (k, k).
 
-    `spectra` (l, k) are alternatives for the prior variances, up to a common factor. Without them each
-    coefficient is free, and S (..., k, k) may be that of several candidates.
+    `spectra` (l, k) are alternatives for the prior variances, up to a common factor; without them each
+    coefficient is free.
     """
 
     def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:
@@ -192,19 +192,18 @@ class Statistic:
         if spectra is None:
             values, self.vectors = np.linalg.eigh(S)
             self.values = np.where(values > VISIBLE, values, np.inf)  # ignore directions without a signal
-            self.freedom = np.asarray(np.isfinite(self.values).sum(axis=-1))
+            self.freedom = int(np.isfinite(self.values).sum())
             return
         root = np.sqrt(spectra)
         # w^1/2 S w^1/2 = V diag(lambda) V^T, one decomposition for each spectrum
         values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
         self.values, self.vectors = np.maximum(values, 0.0), root[:, :, None] * vectors
-        self.freedom = np.asarray(1)
+        self.freedom = 1
 
     def ratio(self, b: FloatArray) -> FloatArray:
-        """Return (..., m) likelihood ratios of scores b (..., k, m)."""
+        """Return (m,) likelihood ratios of scores b (k, m)."""
         if self.spectra is None:
-            y = np.swapaxes(self.vectors, -1, -2) @ b
-            return np.asarray(np.sum(y**2 / self.values[..., None], axis=-2))
+            return np.asarray(np.sum((self.vectors.T @ b) ** 2 / self.values[:, None], axis=0))
         return np.asarray(
             2.0 * np.max([self._evidences(k, b).max(axis=0) for k in range(len(self.spectra))], axis=0)
         )

@@ -12,14 +12,13 @@ from posed import candidate, right
 from magbridge.cli.diagnose import causes_of, summary
 from magbridge.diagnose.assessment import IMPLAUSIBLE_MULTIPLE, level, not_separated, times_usual
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.diagnosis import Finding, small, verdict_of
+from magbridge.diagnose.diagnosis import Finding, measured, small, verdict_of
 from magbridge.diagnose.evidence import Hypothesis
 from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.problem import isotropic
-from magbridge.diagnose.report.page import marked_up
+from magbridge.diagnose.report.page import chance, marked_up
 from magbridge.diagnose.state import CompetingHypothesis
-from magbridge.diagnose.texts import chance, measured
 from magbridge.diagnostics import number
 
 

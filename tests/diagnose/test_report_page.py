@@ -13,13 +13,12 @@ from reported import page_of, section
 from magbridge.diagnose.assessment import Assessment, assess
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.columns import GridPoint
-from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.diagnosis import Diagnosis, measured
 from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.search import Outliers
 from magbridge.diagnose.state import CompetingHypothesis
-from magbridge.diagnose.texts import measured
 from magbridge.diagnostics import number, write_text
 
 

@@ -89,7 +89,7 @@ class ActuatorOrder(Cause):
         return [
             *(self._term(problem, e) for e in missing),
             *(_powers(problem, effect, None) for effect in changed),
-            *(self._sources(problem, p.name, near) for p in moved for near in SOURCE_DISTANCES),
+            *(_sources(problem, self.name, p.name, near) for p in moved for near in SOURCE_DISTANCES),
         ]
 
     def _term(self, problem: Problem, exponents: Exponents) -> Candidate:
@@ -98,19 +98,20 @@ class ActuatorOrder(Cause):
         effect = LegendreEffect(cause=self.name, exponents=exponents)
         return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXIS_NAMES))
 
-    def _sources(self, problem: Problem, name: str, distance: float) -> Candidate:
-        """Return sources all along one mass' path, and a little beyond its ends, of one common size."""
-        low, high = problem.survey.channels[name].extent
-        scale = 0.5 * distance * (high - low)
-        # Sources at equal distances, from one end of the path to a little beyond the other
-        gaps = int(np.ceil(2.0 / (SOURCE_SPACING * distance)))
-        centre = 0.5 * (low + high - gaps * SOURCE_SPACING * scale)
-        effect = SourcesEffect(
-            cause=self.name, channel=name, centre=centre, scale=scale, apart=SOURCE_SPACING, count=gaps + 1
-        )
-        places = centre + SOURCE_SPACING * scale * np.arange(gaps + 1)
-        names = tuple(f"{axis} {name} {x:.3g}" for x in places for axis in AXIS_NAMES)
-        return of_effect(problem, effect, 50.0, "nT", names=names, spectra=np.ones((1, effect.size)))
+
+def _sources(problem: Problem, cause: str, name: str, distance: float) -> Candidate:
+    """Return sources all along one mass' path, and a little beyond its ends, of one common size."""
+    low, high = problem.survey.channels[name].extent
+    scale = 0.5 * distance * (high - low)
+    # Sources at equal distances, from one end of the path to a little beyond the other
+    gaps = int(np.ceil(2.0 / (SOURCE_SPACING * distance)))
+    centre = 0.5 * (low + high - gaps * SOURCE_SPACING * scale)
+    effect = SourcesEffect(
+        cause=cause, channel=name, centre=centre, scale=scale, apart=SOURCE_SPACING, count=gaps + 1
+    )
+    places = centre + SOURCE_SPACING * scale * np.arange(gaps + 1)
+    names = tuple(f"{axis} {name} {x:.3g}" for x in places for axis in AXIS_NAMES)
+    return of_effect(problem, effect, 50.0, "nT", names=names, spectra=np.ones((1, effect.size)))
 
 
 class Hysteresis(Cause):

@@ -1,5 +1,4 @@
 """The report: ``findings.json`` for programs (:mod:`.findings`), ``report.html`` for people (:mod:`.page`).
 
-:mod:`.figures` draws; :mod:`.page` also writes the files. :mod:`~magbridge.diagnose.texts` writes names and
-numbers.
+:mod:`.figures` draws; :mod:`.page` also writes the files.
 """

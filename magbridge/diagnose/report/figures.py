@@ -13,8 +13,7 @@ from PIL import Image
 from scipy.signal import periodogram
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.texts import label
+from magbridge.diagnose.diagnosis import Diagnosis, label
 from magbridge.pictures import literal
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"

@@ -7,11 +7,13 @@ below.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import cache, partial
+from itertools import groupby
 from math import isfinite
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +23,11 @@ from markupsafe import Markup, escape
 
 from magbridge.calibration.file import encode_calibration
 from magbridge.diagnose.assessment import DiagnosisResult, Fitness, separation
-from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.diagnosis import Diagnosis, label, measured, names_of, series_of
 from magbridge.diagnose.evidence import CONFOUNDED, Visible
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.findings import findings_json, parameters
 from magbridge.diagnose.state import CompetingHypothesis
-from magbridge.diagnose.texts import MAX_UNFOLDED_NUMBERS, chance, label, measured, names_of, series_of, sizes
 from magbridge.diagnostics import number
 from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path, new_folder
@@ -42,6 +43,9 @@ KIND_SUBJECTS = {
     "broadband": "Something broadband",
 }
 """Descriptions of the unexplained part, as the subject of a sentence."""
+SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+MAX_UNFOLDED_NUMBERS = 12
+"""Numbers that a table shows unfolded."""
 
 
 def report_html(result: DiagnosisResult, remarks: Sequence[str] = ()) -> str:
@@ -134,9 +138,8 @@ def marked_up(line: str) -> Markup:
 
 def _rest(result: DiagnosisResult) -> dict[str, Any]:
     """Return the unexplained part: its place among the findings, the noise, the budget of the RMS."""
-    diagnosis, budget = result.diagnosis, result.assessment.budget
+    diagnosis = result.diagnosis
     rest, noise, problem = diagnosis.unexplained, diagnosis.fit.noise, diagnosis.problem
-    parts = problem.survey.parts
     return {
         "louder": rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings),
         "of_reference": any(candidate.about != "vehicle" for candidate in diagnosis.named),
@@ -146,13 +149,6 @@ def _rest(result: DiagnosisResult) -> dict[str, Any]:
         "total": len(noise.scale),
         "slow": rms(problem.slow_noise(diagnosis.fit.z)),
         "shifts": problem.survey.time[list(rest.shifts if rest else ())].tolist(),
-        "budget": {
-            "predicted by the calibration as given: noise and its own uncertainty": budget.predicted,
-            "with the calibration as given": budget.before,
-            f"with its own coefficients refitted, on {parts} left out": budget.refitted,
-            f"extended, without the named errors of the reference, on {parts} left out": budget.after,
-            "left in the fit to the whole log": budget.fitted,
-        },
     }
 
 
@@ -183,3 +179,24 @@ def write(result: DiagnosisResult, out_dir: str | os.PathLike[str], remarks: Seq
     with new_folder(out_dir) as folder, ExitStack() as written:
         for name, content in contents.items():
             written.enter_context(atomic_path(folder / name)).write_bytes(content)
+
+
+def chance(p_value: float) -> str:
+    """Write a probability to one digit, without a place where a line could break: 0.002, 3·10⁻⁸."""
+    if p_value > 1e-4:
+        return f"{p_value:.1g}"
+    digit, power = f"{max(p_value, 1e-99):.0e}".split("e-")
+    return ("" if p_value > 1e-99 else "below ") + f"{digit}·10⁻{power.lstrip('0').translate(SUPERSCRIPTS)}"
+
+
+def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
+    """Return sizes in words from values and units by name; an infinite one is left out."""
+    seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
+    shown = seen if len(seen) <= MAX_UNFOLDED_NUMBERS else seen[:3]
+    texts = [
+        ", ".join(f"{name} {number(size)}" for name, size, _ in same) + f" {unit}"
+        for unit, same in groupby(shown, key=itemgetter(2))
+    ]
+    if len(shown) < len(seen):
+        texts.append(f"and {len(seen) - len(shown)} more")
+    return ", ".join(texts) or "no plausible size reaches it"
