@@ -96,9 +96,9 @@ def in_time(diagnosis: Diagnosis, axis: Any, values: FloatArray, colour: str, na
     return np.asarray(since[part] / unit)
 
 
-def unjoined(since: FloatArray, values: FloatArray) -> FloatArray:
+def unjoined(times: FloatArray, values: FloatArray) -> FloatArray:
     """Return values (m,) with NaN before each gap in the times, so that no line crosses it."""
-    steps = np.diff(since, append=since[-1])
+    steps = np.diff(times, append=times[-1])
     return np.where(steps > LINE_GAP_STEPS * np.median(steps), np.nan, values)
 
 
