@@ -43,8 +43,6 @@ from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
 from magbridge.estimation.residual import ResidualSamples
 
-__all__ = ["ellipsoid", "fit_auto", "fit_nominal"]
-
 # ---- Polynomials with physical priors ----
 
 SHRUNK = 0.15

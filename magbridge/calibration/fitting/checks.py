@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,6 @@ from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.fitting.boresight import choose_boresight, magnetic_headings
 from magbridge.calibration.fitting.crossings import rough_rock
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.result import Creep
 from magbridge.calibration.fitting.uncertainty import apart_from_level, expected_error, nearby_mission
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Polynomial
@@ -24,8 +23,6 @@ from magbridge.wording import counted
 
 if TYPE_CHECKING:
     from magbridge.calibration.fitting.result import Fit
-
-__all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "judged", "warnings_for"]
 
 # ---- What the data determine ----
 
@@ -48,23 +45,11 @@ RANK_TOLERANCE = 1e-9
 """Share of the largest singular value, below which one counts as zero."""
 
 
-@dataclass(frozen=True, eq=False)
-class Combinations:
-    """Combinations of coefficients that the data determine, best known first."""
+def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> FloatArray:
+    """Return the 1-sigma, nT, of each estimable combination of coefficients (rank,), best known first.
 
-    rank: int
-    """How many are determined at all, however large the noise."""
-    sigma: FloatArray
-    """(rank,), nT, 1-sigma of each from the data alone."""
-    vectors: FloatArray
-    """(rank, K): Each a unit vector over the coefficients, scaled by the norms of their Jacobian columns."""
-
-
-def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> Combinations:
-    """Find the estimable combinations, from the singular values of the Jacobian over the noise.
-
-    `samples`: the calibration runs. `coefficients` (9 m,): where to linearise. `sigma`: nT, noise of a
-    sample.
+    From the data alone, by the singular values of the Jacobian at `coefficients` (9 m,) over the noise of a
+    sample, `sigma`, nT. The rank is the number of combinations that are determined, however large the noise.
     """
     # thin the rows, and scale them so that they carry the information of all
     step = max(len(samples.field) // JACOBIAN_ROWS, 1)
@@ -75,20 +60,14 @@ def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: floa
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0.0, size, 1.0)
     # singular values over the noise: 1 / value is the 1-sigma of a combination of coefficients
-    _, values, vectors = np.linalg.svd(J / scale * np.median(scale), full_matrices=False)
-    rank = int((values > RANK_TOLERANCE * values[0]).sum())
-    return Combinations(rank, 1.0 / values[:rank], vectors[:rank])
+    values = np.linalg.svd(J / scale * np.median(scale), compute_uv=False)
+    return np.asarray(1.0 / values[values > RANK_TOLERANCE * values[0]])
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
     """Return the RMS error near the runs (any heading, 10 deg more roll) over a sample's noise."""
     error = expected_error(calibration, nearby_mission(calibration, data))
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
-
-
-def warnings_for(calibration: Calibration, data: Observations) -> tuple[Diagnostic, ...]:
-    """Return warnings about quantities that the runs leave undetermined."""
-    return tuple(found for check in CHECKS for found in check(calibration, data))
 
 
 def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
@@ -230,14 +209,8 @@ def judged(found: Fit, data: Observations) -> Fit:
             mismatch.append(magnetic)
     # the level is common to all samples, and no manoeuvre reduces it: leave it out of the expected error
     ratio = expected_ratio(apart_from_level(calibration), data)
-    lasting = found.details.get("autocorrelation", 0.0)
     noise = calibration.noise.sensor
-    warnings = (
-        *_warnings(ratio, noise, heading_gap(data), lasting),
-        *_noise_for_attitudes(found.samples.field, noise),
-        *rough_rock(data, found.details.get("crustal_field"), noise),
-        *_contradicted_prior(found),
-    )
+    warnings = tuple(_reasons(found, data, ratio, noise))
     if ratio > UNSUPPORTED:
         warnings = (*warnings, *found.open)
     reasons = tuple(warning.text for warning in warnings)
@@ -249,47 +222,40 @@ def judged(found: Fit, data: Observations) -> Fit:
         warnings=(
             *unsupported,
             *(found.open if ratio <= UNSUPPORTED else ()),
-            *warnings_for(calibration, data),
+            *(warning for check in CHECKS for warning in check(calibration, data)),
             *mismatch,
             *_suspicions(found),
         ),
         details={
             **found.details,
             "expected_over_noise": ratio,
-            "rank": seen.rank,
-            "combinations_nT": seen.sigma.tolist(),
+            "rank": len(seen),
+            "combinations_nT": seen.tolist(),
         },
     )
 
 
-def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[Diagnostic]:
-    """Yield reasons not to support a fit: error over `noise` (nT), widest gap of headings (deg), correlation.
-
-    `lasting` is the residual's autocorrelation after the crustal field has been subtracted.
-    """
+def _reasons(found: Fit, data: Observations, ratio: float, noise: float) -> Iterator[Diagnostic]:
+    """Yield reasons not to support a fit with `noise` (nT) and an expected error of `ratio` times that."""
+    # autocorrelation of the residual after the crustal field has been subtracted
+    lasting = found.details.get("autocorrelation", 0.0)
     if lasting > MAX_NOISE_AUTOCORRELATION:
         yield Diagnostic("lasting_residual", {"noise_nT": noise, "autocorrelation": lasting})
     if ratio > UNSUPPORTED:
         yield Diagnostic("expected_error", {"error_nT": ratio * noise})
-    if gap > MAX_HEADING_GAP_DEG:
+    if (gap := heading_gap(data)) > MAX_HEADING_GAP_DEG:
         yield Diagnostic("narrow_headings", {"width_deg": 360.0 - gap})
-
-
-def _contradicted_prior(found: Fit) -> Iterator[Diagnostic]:
-    """Report scales that the prior of an ellipsoid does not expect, and attitudes that do not prove them."""
-    # both must hold: where the data overrule the prior, an unusual gain is the sensor's
+    # smallest variation of the field along any axis: noise must be small against it (errors in variables)
+    least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(found.samples.field.T))[0], 0.0)))
+    if least < MIN_SIGNAL_TO_NOISE * noise:
+        yield Diagnostic("noise_for_attitudes", {"noise_nT": noise, "variation_nT": least})
+    yield from rough_rock(data, found.details.get("crustal_field"), noise)
+    # scales that the prior of an ellipsoid does not expect, and attitudes that do not prove them: where the
+    # data overrule the prior, an unusual gain is the sensor's
     unlikely = found.details.get("prior_chi_squared", 0.0) > MAX_PRIOR_CHI_SQUARED
     if unlikely and found.details["scale_sigma_ratio"] > MAX_SCALE_SIGMA_RATIO:
         low, high = found.scales
         yield Diagnostic("unusual_gain", {"low": low, "high": high})
-
-
-def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[Diagnostic]:
-    """Report if the sensor's noise (nT) is not small against the variation of the field (n, 3), nT."""
-    # smallest variation of the field along any axis: noise must be small against it (errors in variables)
-    least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(field.T))[0], 0.0)))
-    if least < MIN_SIGNAL_TO_NOISE * noise:
-        yield Diagnostic("noise_for_attitudes", {"noise_nT": noise, "variation_nT": least})
 
 
 def _suspicions(found: Fit) -> Iterator[Diagnostic]:
@@ -297,7 +263,16 @@ def _suspicions(found: Fit) -> Iterator[Diagnostic]:
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield Diagnostic("outliers", {"count": outliers, "samples": samples, "product": "fit"})
-    yield from offset_diagnostics(found.calibration, found.creep)
+    # the quantities that the offset depends on
+    for effect in found.calibration.effects:
+        if isinstance(effect, ChannelEffect):
+            slope = float(np.linalg.norm(found.calibration.coefficients[-effect.size :]))
+            late = f", {effect.lag / 60:.0f} minutes late" if effect.lag else ""
+            values = {"slope": slope, "late": late, "channel": effect.channel}
+            yield Diagnostic("temperature_removed", values)
+    if found.creep is not None:
+        size = float(np.sqrt(np.mean((found.creep.offset**2).sum(axis=1))))
+        yield Diagnostic("offset_crept", {"rms_nT": size})
     if ends := found.details.get("ends", 0):
         yield Diagnostic("ends_left_out", {"samples": counted(ends, "sample")})
     if (ratio := found.details.get("left_out_ratio", 1.0)) > MAX_ERROR_RATIO:
@@ -307,16 +282,3 @@ def _suspicions(found: Fit) -> Iterator[Diagnostic]:
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
         yield Diagnostic("unusual_scales", {"low": smallest, "high": largest})
-
-
-def offset_diagnostics(calibration: Calibration, creep: Creep | None) -> Iterator[Diagnostic]:
-    """Yield the quantities that the offset depends on."""
-    for effect in calibration.effects:
-        if isinstance(effect, ChannelEffect):
-            slope = float(np.linalg.norm(calibration.coefficients[-effect.size :]))
-            late = f", {effect.lag / 60:.0f} minutes late" if effect.lag else ""
-            values = {"slope": slope, "late": late, "channel": effect.channel}
-            yield Diagnostic("temperature_removed", values)
-    if creep is not None:
-        size = float(np.sqrt(np.mean((creep.offset**2).sum(axis=1))))
-        yield Diagnostic("offset_crept", {"rms_nT": size})

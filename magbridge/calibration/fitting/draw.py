@@ -14,8 +14,6 @@ from magbridge.calibration.model import Calibration
 from magbridge.estimation.residual import rms, robust_scale
 from magbridge.pictures import save
 
-__all__ = ["draw_fit"]
-
 PANEL_POINTS = 5_000
 """Points drawn in a panel; more only make a blot."""
 PANEL_HALF_HEIGHT_SIGMA = 6.0

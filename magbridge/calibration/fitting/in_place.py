@@ -63,8 +63,6 @@ from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import rms
 
-__all__ = ["fit_in_place", "offered", "with_creep", "with_temperature"]
-
 REFERENCE_ERROR_LENGTH_M = 25_000.0
 """m over which the reference's error, of waves far longer than a site, changes by its size: 6 nT/km."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)

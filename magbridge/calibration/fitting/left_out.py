@@ -32,8 +32,6 @@ from magbridge.estimation.noise import OUTLIER_SIGMA, effective_fraction
 from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
-__all__ = ["LeftOut", "error_between", "error_forward", "leave_out"]
-
 PARTS, BLOCKS = 10, 4
 """Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three, or one
 that is most of the log."""

@@ -44,8 +44,6 @@ from magbridge.estimation.priors import SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, P
 from magbridge.estimation.residual import ResidualSamples, residuals_of
 from magbridge.wording import counted
 
-__all__ = ["ANYTHING", "fit_cubic", "fit_horizontal", "fit_per_run"]
-
 # ---- Cubic polynomials ----
 
 PLAIN = 1e4

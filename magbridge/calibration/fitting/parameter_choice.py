@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["AUTO", "Offer", "best_parameters", "lines", "undeclared", "worths"]
-
 # ---- Columns that a fit suggests ----
 
 PARTS, BLOCKS = 8, 32
@@ -169,21 +167,28 @@ def best_parameters(
 
     CalibrationError: the data do not support a fit without parameters.
     """
-    step = -(-deployment.sizes["time"] // SCREENING_SAMPLES)
-    deployment = deployment.isel(time=slice(None, None, max(step, 1)))
+
+    def screened(names: tuple[str, ...]) -> Observations:
+        return observations(deployment, names, grid=grid).thinned(SCREENING_SAMPLES)
+
     taken: tuple[str, ...] = ()
-    found = fit(observations(deployment, taken, grid=grid), **options)
+    found = fit(screened(taken), **options)
     offers: list[Offer] = []
     failures = 0
     # Forward selection: offer the column that explains most of the residual; keep it if a new fit predicts
     # held-out parts better, both those between others and the later ones.
     while len(taken) < MAX_PARAMETERS and failures < FAILURES:
-        name = _most_promising(deployment, found, taken, [*offered], {one.name for one in offers}, grid)
+        data = screened(taken)
+        rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
+        tried = {one.name for one in offers}
+        columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}
+        explained = worths(found.calibration, data, columns, HINTED)
+        name = max(explained, key=explained.__getitem__, default=None)
         if name is None:
             break
         without = float(found.details["left_out_nT"])
         try:
-            further = fit(observations(deployment, (*taken, name), grid=grid), **options)
+            further = fit(screened((*taken, name)), **options)
         except CalibrationError:  # a position that cannot be, or too few samples that have it
             offers.append(Offer(name, without, np.inf, taken=False))
             failures += 1
@@ -216,19 +221,3 @@ def lines(offers: Sequence[Offer]) -> list[str]:
         f"{one.left_out:.0f} with it: {'taken' if one.taken else 'not worth it'}"
         for one in offers
     ]
-
-
-def _most_promising(
-    deployment: xr.Dataset,
-    found: Fit,
-    taken: tuple[str, ...],
-    offered: Sequence[str],
-    tried: set[str],
-    grid: AnomalyGrid | None,
-) -> str | None:
-    """Return the column that explains most of the residual of a fit."""
-    data = observations(deployment, taken, grid=grid)
-    rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
-    columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}
-    explained = worths(found.calibration, data, columns, HINTED)
-    return max(explained, key=explained.__getitem__, default=None)

@@ -52,8 +52,6 @@ from magbridge.estimation.priors import PriorFamily
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
-__all__ = ["FIRST_SAMPLES", "SEARCHED", "WIDE", "Answer", "Drift", "Rounds", "SurveySamples", "beside_motion"]
-
 # ---- The state of the iterations, and where they begin ----
 
 

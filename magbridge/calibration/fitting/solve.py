@@ -42,11 +42,6 @@ from magbridge.estimation.residual import (
     scales_and_offsets,
 )
 
-__all__ = [
-    "Climbed", "CoefficientPosterior", "approach", "best_climb", "check_scales", "flown", "lasting_noise",
-    "settle", "starts", "thinned", "thinned_rows", "with_slow_noise",
-]  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class CoefficientPosterior:

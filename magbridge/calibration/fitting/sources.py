@@ -19,8 +19,6 @@ from magbridge.estimation.residual import rms
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["heterogeneous_logs", "source_of", "unused_logs"]
-
 MAX_JOINT_RMS_RATIO = 3.0
 """RMS of a fit to all logs over that of fits to each: sampling and slow errors alone do not reach it."""
 JUDGED = 10
