@@ -221,7 +221,7 @@ def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **opti
     from magbridge.diagnose import run  # noqa: PLC0415 - scipy only where it is used
 
     if not deployments:
-        raise WrongUse("expected at least one deployment")
+        raise WrongUse("deployments: expected at least one Dataset, got none")
     return run.diagnose([in_seconds(deployment) for deployment in deployments], calibration, **options)
 
 
@@ -267,7 +267,7 @@ def survey(
     from magbridge.survey import run  # noqa: PLC0415 - scipy only where it is used
 
     if not deployments:
-        raise WrongUse("expected at least one deployment")
+        raise WrongUse("deployments: expected at least one Dataset, got none")
     logs = [in_seconds(log) for log in deployments]
     if scalar:
         return run.scalar_survey(logs, scalar, calibrations=calibrations, **options)

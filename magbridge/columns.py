@@ -16,26 +16,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "AGE",
-    "CHANNELS",
-    "CHANNEL_TIMES",
-    "COLUMNS",
-    "CORRECTED",
-    "FURTHER_AXIS",
-    "HEADINGS",
-    "NT_PER_UNIT",
-    "TEMPERATURE",
-    "Column",
-    "absent",
-    "counts_from_boot",
-    "decoded",
-    "factor",
-    "in_seconds",
-    "may_be",
-    "require",
-    "require_units",
-    "usual",
-]
+    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "HEADINGS", "NT_PER_UNIT",
+    "TEMPERATURE", "Column", "absent", "counts_from_boot", "decoded", "factor", "in_seconds", "may_be",
+    "require", "require_units", "usual",
+]  # fmt: skip
 
 
 class Column(NamedTuple):
@@ -189,9 +173,7 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
             seconds = (time.values - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
             described = {**time.attrs, **COLUMNS[name]._asdict()}
             values = (time.dims, np.where(unknown, np.nan, seconds), described)
-            deployment = (
-                deployment.assign_coords(time=values) if name == "time" else deployment.assign({name: values})
-            )
+            deployment = deployment.assign({name: values})
         elif time.dtype.kind not in "iuf":
             source = deployment.attrs.get("source", "the deployment")
             raise FormatError(
@@ -217,9 +199,7 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
             moments[~np.isfinite(time.values)] = np.datetime64("NaT")
             described = {key: value for key, value in time.attrs.items() if key != "units"}
             values = (time.dims, moments, described)
-            deployment = (
-                deployment.assign_coords(time=values) if name == "time" else deployment.assign({name: values})
-            )
+            deployment = deployment.assign({name: values})
     return deployment
 
 

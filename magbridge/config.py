@@ -103,7 +103,7 @@ class Link(Table, frozen=True):
 
     def __post_init__(self) -> None:
         if self.component == self.autopilot:
-            raise ValueError(f"component: another than the autopilot's, {self.autopilot}")
+            raise ValueError(f"component: expected another number than the autopilot's, got {self.autopilot}")
 
     @property
     def shared(self) -> bool:
@@ -142,11 +142,11 @@ class Telemetry(Table, frozen=True):
 
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.scale) < inf:
-            raise ValueError(f"scale: a number other than 0, not {self.scale}")
+            raise ValueError(f"scale: expected a finite number other than 0, got {self.scale}")
         if not isfinite(self.offset):
-            raise ValueError(f"offset: a number, not {self.offset}")
+            raise ValueError(f"offset: expected a finite number, got {self.offset}")
         if not abs(self.delay) <= MAX_DELAY_S:
-            raise ValueError(f"delay: at most {MAX_DELAY_S:g} s either way, not {self.delay}")
+            raise ValueError(f"delay: expected at most {MAX_DELAY_S:g} s either way, got {self.delay}")
 
 
 class CalibrationFile(Table, frozen=True):
@@ -236,7 +236,9 @@ class Learning(Table, frozen=True):
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges.items():
             if not -1e12 < low < high < 1e12:
-                raise ValueError(f"ranges.{name}: expected the least and the greatest value")
+                raise ValueError(
+                    f"ranges.{name}: expected the lowest and the highest value, got {low:g} and {high:g}"
+                )
 
 
 class Log(Table, frozen=True):
@@ -325,7 +327,9 @@ def parse(table: dict[str, Any], path: Path) -> Config:
     tables = {f"sensor.{name}": one for name, one in named.items()} or {"sensor": table.get("sensor")}
     for key, one in tables.items():
         if isinstance(one, dict) and "name" in one:
-            raise ConfigError(path, f"{key}.name", "unknown key: name the table, [sensor.NAME]")
+            raise ConfigError(
+                path, f"{key}.name", "unknown key; name the sensor in its table's head, [sensor.NAME]"
+            )
     if not named:
         config = convert(table, Config, path)
         sensors = [config.sensor]
@@ -340,7 +344,9 @@ def parse(table: dict[str, Any], path: Path) -> Config:
     if main.calibration is not None:
         if calibration is not None:
             raise ConfigError(
-                path, "calibration.file", f"{main.label} has a calibration of its own: remove one"
+                path,
+                "calibration.file",
+                f"expected one calibration of {main.label}, got this and its own; remove one",
             )
         calibration = CalibrationFile(file=main.calibration)
     return msgspec.structs.replace(

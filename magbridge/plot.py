@@ -54,7 +54,7 @@ def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = No
     from magbridge.logs.draw import corrected_panel  # noqa: PLC0415 - xarray is for those who draw logs
 
     if column not in log:
-        raise WrongUse(f"the log has no column {column!r}: correct it first")
+        raise WrongUse(f"expected a column {column!r}, got a log without it; correct the log first")
     axes = _axes(ax)
     corrected_panel(axes, log, column)
     axes.legend(frameon=False, fontsize="small")

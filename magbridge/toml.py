@@ -38,7 +38,7 @@ def load_toml(path: str | Path) -> dict[str, Any]:
             raise ConfigError(path, "", f"expected a TOML file of at most {MAX_SIZE // 10**6} MB")
         text = contents(path).decode("utf-8-sig")
         if not text.strip():
-            raise ConfigError(path, "", "expected a TOML file, the file is empty")
+            raise ConfigError(path, "", "expected a TOML file, got an empty file")
         if any(line.count(".") > MAX_DEPTH and NESTED.match(line.lstrip(" [")) for line in text.splitlines()):
             raise ConfigError(path, "", too_deep)
         return tomllib.loads(text)

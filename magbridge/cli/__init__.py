@@ -82,7 +82,7 @@ def _explained(error: Exception) -> tuple[str, int]:
                 raise error
             sentence, code = str(MissingExtra(str(error.name), extra)), 2
         case UnicodeEncodeError():  # netCDF and JSON take no name that is not of the locale
-            sentence = f"{error.object}: a name that cannot be written in {error.encoding}: rename it"
+            sentence = f"{error.object}: expected a name in {error.encoding}; rename the file"
         case IsADirectoryError(filename=name) if name:
             sentence = f"{name}: expected a file, got a folder; name a file in it"
         case OSError(strerror=str(reason)):  # the system refuses a file, a folder or memory

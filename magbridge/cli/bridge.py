@@ -100,7 +100,7 @@ def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json
         _check(config, live=live, json=json)
         return
     if live or json:
-        raise WrongUse("run: --live and --json go with --check")
+        raise WrongUse("--live, --json: expected --check with them; without it the bridge runs until stopped")
 
     from magbridge.bridge.run import run as attach
 
@@ -191,7 +191,9 @@ def replay(
         result = played(files, config, speed_of(speed), log, reading.options)
     cli.print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
-        raise cli.FailedResult("the replay did not publish what the log holds")
+        raise cli.FailedResult(
+            "the replay published other values than the log holds; the runs with differences are listed above"
+        )
 
 
 @cli.command("dialect -o DIR")
@@ -306,7 +308,7 @@ def init(
         The calibration (cal.json) to correct with.
     """
     if output.exists():
-        raise WrongUse(f"{output}: is there already; choose another with -o")
+        raise WrongUse(f"{output}: exists already and is not overwritten; choose another file with -o")
 
     from magbridge.bridge.check import findings
     from magbridge.bridge.init import PLACEHOLDER, Answers, bridge_toml
@@ -355,20 +357,22 @@ def _relative(file: Path | None, output: Path) -> str | None:
 def _ask(question: str, hint: str, default: str, asks: bool, flag: str) -> str:
     if not asks:
         if not default:
-            raise WrongUse(f"expected {flag}")
+            raise WrongUse(f"expected {flag}, which is asked for on a terminal only")
         return default
     if hint:
         print(hint)
     try:
         answer = input(f"{question} [{default}] " if default else f"{question} ").strip()
     except EOFError:
-        raise WrongUse("no answer: nothing is written") from None
+        raise WrongUse(
+            f"{question} expected an answer, got the end of the input; nothing is written"
+        ) from None
     return answer or default
 
 
 def _system(answer: str) -> int:
     if not (answer.isdecimal() and 1 <= int(answer) <= 255):
-        raise WrongUse(f"expected a system id from 1 to 255, not {answer!r}: nothing is written")
+        raise WrongUse(f"system id: expected a number from 1 to 255, got {answer!r}; nothing is written")
     return int(answer)
 
 
@@ -402,7 +406,7 @@ def _option(text: str) -> tuple[str, Any]:
 
     name, equals, value = text.partition("=")
     if not equals:
-        raise WrongUse(f"--option {text}: expected NAME=VALUE, as sensitivity=5e-5")
+        raise WrongUse(f"--option {text}: expected NAME=VALUE, such as sensitivity=5e-5")
     try:
         return name.strip(), tomllib.loads(f"value = {value.strip()}")["value"]
     except tomllib.TOMLDecodeError:

@@ -90,13 +90,13 @@ class ModelOptions:
     def check(self) -> None:
         """WrongUse: options that do not go together."""
         if self.masses and self.method != "auto":
-            raise WrongUse(
-                f"--vehicle: method {self.method} does not use the positions of the masses; auto does"
-            )
+            raise WrongUse(f"--vehicle: expected --method auto, got {self.method}, which has no use for it")
         if "auto" in self.parameter and (self.method != "auto" or self.fleet or self.masses):
-            raise WrongUse("--parameter auto: goes with method auto, and without --vehicle and --fleet")
+            raise WrongUse(
+                "--parameter auto: expected --method auto without --vehicle and --fleet; name parameters"
+            )
         if self.fleet and self.method != "auto":
-            raise WrongUse("--fleet: goes with method auto")
+            raise WrongUse(f"--fleet: expected --method auto, got {self.method}; leave one of them out")
 
 
 @Parameter(name="*")
@@ -402,11 +402,13 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
     source = deployment.attrs["source"]
     placed = {"latitude", "longitude"} <= set(deployment.data_vars) and not counts_from_boot(deployment)
     if placed or "reference_field" in deployment:
-        raise WrongUse(f"--reference mean: {source} tells what the field was; leave the option out")
+        raise WrongUse(
+            f"--reference mean: {source} has positions or reference_field already; leave the option out"
+        )
     deployment = about_mean(deployment)
     mean = float(deployment["reference_field"][0])
     cli.complain(
-        f"{source}: fitted about a mean of {mean:.0f} nT, since nothing tells what the Earth's field was"
+        f"{source}: the Earth's field is not known; the reference is the mean reading, {mean:.0f} nT"
     )
     return deployment, GAIN_SIGMA * mean if site_bias is None else site_bias
 
@@ -427,7 +429,9 @@ def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
         except DataError as error:
             cli.complain(f"compass {number}: {error}")
     if not results:
-        raise DataError(f"{request.files[0]}: not one of its compasses could be calibrated")
+        raise DataError(
+            f"{request.files[0]}: none of its {len(numbers)} compasses could be calibrated; see above"
+        )
     return results
 
 
@@ -469,6 +473,6 @@ def _digests(files: tuple[Path, ...]) -> dict[str, str]:
     for file in files:
         first = seen.setdefault(digest(file), file)
         if first is not file:
-            cli.complain(f"{file}: identical to {first}; its samples are counted once")
+            cli.complain(f"{file}: has the same content as {first}; its samples are used once")
     names = [file.name for file in seen.values()]
     return {str(file) if names.count(file.name) > 1 else file.name: key for key, file in seen.items()}

@@ -92,7 +92,7 @@ def _whole_number(_: Any, tokens: Sequence[Token]) -> int:
     try:
         return int(tokens[0].value)
     except ValueError:
-        raise ValueError(f"expected a whole number, not {tokens[0].value}.") from None
+        raise ValueError(f"expected a whole number, got {tokens[0].value}.") from None
 
 
 def _day(_: Any, tokens: Sequence[Token]) -> dt.date:
@@ -100,7 +100,7 @@ def _day(_: Any, tokens: Sequence[Token]) -> dt.date:
     try:
         return dt.date.fromisoformat(tokens[0].value)
     except ValueError:
-        raise ValueError(f"expected YYYY-MM-DD, not {tokens[0].value}.") from None
+        raise ValueError(f"expected YYYY-MM-DD, got {tokens[0].value}.") from None
 
 
 Day = Annotated[dt.date | None, Parameter(converter=_day)]
@@ -180,7 +180,7 @@ class ScalarOptions:
     def check(self, *, is_reference: bool = False) -> None:
         """WrongUse: lag or lever arm are not numbers, or an option needs --scalar."""
         if not self.scalar and (is_reference or self.lag != "auto" or self.lever):
-            raise WrongUse("--reference scalar, --lag and --lever: give --scalar COLUMN, too")
+            raise WrongUse("--reference scalar, --lag, --lever: expected --scalar COLUMN with them; add it")
         try:
             are_finite = isfinite(self.lag_s or 0.0), all(map(isfinite, self.lever_m or ()))
         except ValueError:
@@ -233,7 +233,7 @@ def check_inputs(
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]
     if output is not None and os.path.realpath(output) in read:
-        raise WrongUse(f"{output}: is among the files to read; choose another file to write")
+        raise WrongUse(f"{output}: is one of the files to read; choose another file to write")
     return files
 
 
@@ -246,7 +246,7 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
     """
     for path in check_inputs(files, output, *others):
         if not is_bag(path) and not existing(path).stat().st_size:
-            raise FormatError(path, "expected a log, the file is empty")
+            raise FormatError(path, "expected a log, got an empty file")
     for other in others:
         if other is not None and not other.is_dir():
             existing(other)
@@ -351,7 +351,7 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
         return list(logs)
     if len({station.attrs.get("observatory") for station in stations}) > 1:
         names = " and ".join(str(station.attrs["source"]) for station in stations)
-        raise WrongUse(f"{names} are of several observatories: give one of them, the nearest")
+        raise WrongUse(f"{names}: expected logs of one observatory, got several; give that of the nearest")
     station = join(stations)
     note_losses(station.attrs)
     return with_daily_variation(own, station)
@@ -372,7 +372,9 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
     if AUTO not in named:
         return tuple(named)
     if len(named) > 1:
-        raise WrongUse(f"--parameter {AUTO}: chooses all parameters; name no other")
+        raise WrongUse(
+            f"--parameter {AUTO}: expected no other --parameter, because {AUTO} chooses among all columns"
+        )
     offered = [*movers(deployment), *conditions(deployment)]
     taken, offers = best_parameters(deployment, offered, **options)
     for line in lines(offers) or [
@@ -395,7 +397,7 @@ def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
     """Warn on stderr of logs that hold a reference in every row: a grid is only added to the IGRF."""
     for log in logs if grid else ():
         if "reference_field" in log and log["reference_field"].notnull().all():
-            complain(f"{log.attrs['source']}: has reference_field in every row: --grid {grid} is not used")
+            complain(f"{log.attrs['source']}: has reference_field in every row, so --grid {grid} is not used")
 
 
 def note_no_date(deployment: xr.Dataset) -> None:
@@ -404,7 +406,7 @@ def note_no_date(deployment: xr.Dataset) -> None:
 
     if counts_from_boot(deployment):
         source = deployment.attrs["source"]
-        complain(f"{source}: its times count from the boot: no anomaly without --date YYYY-MM-DD")
+        complain(f"{source}: its times count from the boot, so no anomaly is written; give --date YYYY-MM-DD")
 
 
 def note_settings(*pieces: Mapping[str, Any]) -> None:
@@ -428,7 +430,9 @@ def refuse_unsuited(calibration: mb.Calibration, deployment: xr.Dataset) -> None
 
     source, sensor = deployment.attrs["source"], str(deployment.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):
-        raise FormatError(source, f"sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
+        raise FormatError(
+            source, f"expected a log of sensor {calibration.sensor.name!r}, the calibration's, got {sensor!r}"
+        )
     require_units(deployment, calibration.units)
     channels = deployment[list(CHANNELS)].to_array().to_numpy().T
     if wrong := other_units(channels, calibration.reference.field):

@@ -87,7 +87,9 @@ def correct(
     for doubt in cli.warnings_of(known, source):
         cli.complain(doubt)
     if save is not None and not learn:
-        raise WrongUse("--save writes the learned calibration: give --learn, too")
+        raise WrongUse(
+            "--save: expected --learn with it, because it writes the learned calibration; add --learn"
+        )
     tally = Tally()
     correction: mb.Correction | None = None
     pieces: list[dict[str, Any]] = []
@@ -138,7 +140,9 @@ def _scalar_too(
 def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Path:
     """Return the file that describes the vehicle: the calibration, or the configuration."""
     if config is not None and not learn:
-        raise WrongUse("--config says how to learn: give --learn, too")
+        raise WrongUse(
+            "--config: expected --learn with it, because only learning uses a bridge.toml; add --learn"
+        )
     source = calibration or config
     if source is None:
         raise WrongUse("expected --calibration cal.json, or --learn with --config bridge.toml")
@@ -190,7 +194,9 @@ def _corrected(
         yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
         whole = whole or bool(sampled.all("variable").any())
     if not whole:
-        raise DataError(f"{', '.join(map(str, files))}: no row has all of {' '.join(CHANNELS)}")
+        raise DataError(
+            f"{', '.join(map(str, files))}: expected rows with all of {' '.join(CHANNELS)}, got none"
+        )
 
 
 def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learner:

@@ -68,10 +68,12 @@ def add(
     from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, logs_of, read_fleet
 
     if not files and not (vehicle and parameter):
-        raise WrongUse("expected a fleet.toml or logs, or --vehicle with its --parameter")
+        raise WrongUse("expected FILE (a fleet.toml or logs), or --vehicle NAME with its --parameter")
     described, made, logs = _sorted(files)
     if (logs or made) and not (vehicle and deployment):
-        raise WrongUse("logs: give --vehicle and --deployment, or put them into a fleet.toml")
+        raise WrongUse(
+            "logs: expected --vehicle and --deployment with them; add these, or list the logs in a fleet.toml"
+        )
     if logs:
         cli.logs_to_read(tuple(logs))
     plans = {file: read_fleet(file) for file in described}
@@ -181,7 +183,9 @@ def process(
         json,
     )
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
-        raise cli.FailedResult(f"{there.name}: not one deployment could be calibrated")
+        raise cli.FailedResult(
+            f"{there.name}: none of {len(todo)} deployments could be calibrated; see the lines above"
+        )
 
 
 @fleet.command

@@ -165,7 +165,7 @@ def convert(
     """
     cli.logs_to_read(files, output, metadata)
     if metadata and output.suffix.lower() != ".nc":
-        raise WrongUse(f"--metadata: goes with a netCDF (.nc), not with {output}")
+        raise WrongUse(f"--metadata: expected a netCDF (.nc) to write, got {output}")
 
     from magbridge.logs import Writer, read_chunks
 

@@ -72,8 +72,8 @@ def navigate(
     if bound:
         if map is None:
             raise WrongUse(
-                "--bound: expected --map, what the track is worth depends on it; without one, navigate FILE "
-                "--calibration cal.json says what a survey that was flown is worth, and its bound"
+                "--bound: expected --map, on which the bound depends; without a map, magbridge navigate FILE "
+                "--calibration cal.json gives the accuracy of a survey that was flown"
             )
         _bound(files, map, output, options, known, sample_interval, plot, reading, json)
         return
@@ -120,7 +120,7 @@ def _scalar(
     """Return logs that hold the total field; WrongUse: they hold what must be corrected first."""
     log = cli.read_log(files, reading, heading_reference)
     if "total_field" not in log:
-        raise WrongUse(f"expected --calibration: {log.attrs['source']} has no total_field")
+        raise WrongUse(f"{log.attrs['source']}: expected a column total_field, or --calibration cal.json")
     return log
 
 
@@ -221,9 +221,9 @@ def _continued(
     if there is not grid and known != options:
         side = "above" if there.altitude > 0.0 else "below"
         cli.complain(
-            f"{grid.name}: at {round(grid.altitude)} m; continued to {abs(there.altitude):.0f} m {side} the "
-            f"surface; with what that leaves out, the map's error is typically {known.map_sigma:.1f} nT over "
-            f"{known.map_length:.0f} m"
+            f"{grid.name}: the map at {round(grid.altitude)} m is continued to {abs(there.altitude):.0f} m "
+            f"{side} the surface; short wavelengths are lost, so its error is typically "
+            f"{known.map_sigma:.1f} nT over {known.map_length:.0f} m"
         )
     return there, known
 

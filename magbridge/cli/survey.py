@@ -123,9 +123,9 @@ def survey(
 
     cli.logs_to_read(logs, output, correction.base, products.predict, *correction.calibration)
     if products.predict is None and output.suffix.lower() != ".nc":
-        raise WrongUse(f"{output}: a map's name must end in .nc")
+        raise WrongUse(f"{output}: expected a map's name that ends in .nc")
     if (correction.calibration or scalar.scalar) and correction.save:
-        raise WrongUse("--save: with --calibration or --scalar no calibration is found; leave --save out")
+        raise WrongUse("--save: --calibration and --scalar find no calibration to write; leave --save out")
     scalar.check()
     with waiting("surveying"):
         if scalar.scalar:
@@ -165,7 +165,7 @@ def _scalar_survey(
     for path, found in zip(correction.calibration, known, strict=True):
         if all(sensor.column != column for sensor in found.sensors):
             cli.complain(
-                f"{path}: has no scalar sensor {column!r}, which is not compensated; fit it with "
+                f"{path}: expected a scalar sensor {column!r}, got none: it is not compensated; fit with "
                 f"magbridge calibrate --scalar {column}"
             )
     names = [name for name in correction.parameter if name != "auto"]
@@ -226,7 +226,8 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
         cli.complain(warning.text)
     if strict and not found.supported:
         raise DataError(
-            "the survey does not support a calibration (see the warnings), and --strict was given"
+            f"{together.attrs['source']}: the survey does not support a calibration, for the reasons "
+            "above; leave --strict out to use it all the same"
         )
     if correction.save:
         mb.save(found.calibration, correction.save)

@@ -129,7 +129,7 @@ class Catalogue(ABC):
         if found > CATALOGUE_FORMAT:
             raise FormatError(
                 self.name,
-                f"a catalogue of format {found}; this magbridge reads up to {CATALOGUE_FORMAT}: update it",
+                f"expected a catalogue of format {CATALOGUE_FORMAT} at most, got {found}; update magbridge",
             )
 
 
@@ -208,7 +208,9 @@ class FolderCatalogue(Catalogue):
             try:
                 part = pl.read_parquet(path, columns=list(schema))
             except pl.exceptions.PolarsError as error:
-                raise FormatError(path, f"expected a catalogue's Parquet: {error}") from error
+                raise FormatError(
+                    path, f"expected a Parquet file of the catalogue, got a damaged one: {error}"
+                ) from error
             for name, kind in schema.items():
                 if part.schema[name] != kind:
                     expected = f"expected a column of {kind}, got {part.schema[name]}"

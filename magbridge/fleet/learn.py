@@ -169,7 +169,9 @@ def learn_fleet(
     DataError: there is no lesson.
     """
     if not lessons:
-        raise DataError("nothing to learn from: no deployment of such a vehicle has been calibrated")
+        raise DataError(
+            "no deployment of a vehicle with these masses has been calibrated; run magbridge fleet process"
+        )
     lessons = sorted(lessons, key=lambda one: (one.time, one.vehicle, one.deployment))
     exponents = lessons[0].exponents
     parameters = _whole_range(lessons)

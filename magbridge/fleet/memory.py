@@ -23,9 +23,9 @@ from magbridge.fleet.learn import Fleet, Lesson, learn_fleet, packed, unpacked
 from magbridge.fleet.register import (
     GIVEN,
     Deployment,
+    current,
     current_files,
     jobs,
-    last_attempts,
     masses,
     vehicle_named,
     vehicles,
@@ -35,7 +35,6 @@ from magbridge.wording import counted
 
 if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import Fit
-    from magbridge.fleet.catalogue import Catalogue, Row
 
 
 class _Taught(NamedTuple):
@@ -45,21 +44,6 @@ class _Taught(NamedTuple):
     inputs: frozenset[str]
     sensor: str
     given: bool
-
-
-def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> list[Row]:
-    """Return the rows of a table of results that are made of what the catalogue's logs are now.
-
-    Rows of a deployment that was tried again, those of the last attempt; and all that was made elsewhere.
-    """
-    names = {job.name for job in jobs(catalogue)}
-    last = last_attempts(catalogue.rows("done"))
-    wanted = [*columns, "job", "attempt"] if columns else ()
-    return [
-        row
-        for row in catalogue.rows(table, wanted)
-        if row["job"] == GIVEN or (row["job"] in names and row["attempt"] == last.get(row["job"], 1))
-    ]
 
 
 def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> list[Lesson]:
@@ -102,7 +86,9 @@ def fleet_of(catalogue: Catalogue, vehicle: str, excluded: Collection[str] = ())
     units = {tuple(one.unit for one in lesson.parameters) for lesson in found}
     if len(units) > 1:
         both = " and ".join(", ".join(one) for one in sorted(units))
-        raise DataError(f"{catalogue.name}: {vehicle}'s fleet gives its positions in different units: {both}")
+        raise DataError(
+            f"{catalogue.name}: expected one unit for each parameter of {vehicle}'s fleet, got {both}"
+        )
     mounted = {name: masses(row) for name, row in vehicles(catalogue).items()}
     of = _name(found, mounted)
     stored = {
@@ -174,8 +160,8 @@ def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
     rows = [row for row in current_files(catalogue.rows("files")) if row["sha256"] in wanted]
     found = {(row["vehicle"], row["refit"]) for row in rows}
     if len({vehicle for vehicle, _ in found}) != 1:
-        note = "of several of its vehicles" if found else "in its catalogue of none"
-        raise WrongUse(f"--fleet {catalogue.name}: the logs are {note}: name the vehicle (--vehicle)")
+        note = "of several vehicles" if found else "of none of its vehicles"
+        raise WrongUse(f"--fleet {catalogue.name}: the logs are {note}; name the vehicle with --vehicle")
     return sorted(found)[-1]
 
 
@@ -223,12 +209,12 @@ def add_calibration(
     names = [one.name for one in calibration.parameters]
     if names != of["parameters"]:
         both = [", ".join(each) or "none" for each in (names, of["parameters"])]
-        raise WrongUse(f"the calibration's parameters are {both[0]}, and {vehicle}'s {both[1]}")
+        raise WrongUse(f"{vehicle}: expected a calibration with the parameters {both[1]}, got {both[0]}")
     sensor = deployment.sensor or of["sensor"]
     if not calibration.sensor.may_be(sensor):
         raise WrongUse(
-            f"a calibration of sensor {calibration.sensor.name!r}, but {vehicle} {deployment.name} carries "
-            f"{sensor!r}"
+            f"{vehicle} {deployment.name}: expected a calibration of sensor {sensor!r}, got one of "
+            f"{calibration.sensor.name!r}"
         )
     row = _row(vehicle, deployment, calibration.sensor.name or sensor, start, calibration, of["order"])
     before = [
@@ -237,7 +223,9 @@ def add_calibration(
         if one["job"] == GIVEN and (one["vehicle"], one["deployment"]) == (vehicle, deployment.name)
     ]
     if any(one["calibration"] != row["calibration"] for one in before):
-        raise WrongUse(f"{vehicle} {deployment.name}: has another calibration; name another deployment")
+        raise WrongUse(
+            f"{vehicle} {deployment.name}: has another calibration already; name another deployment"
+        )
     return catalogue.add("calibrations", [row])
 
 

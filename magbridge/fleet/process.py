@@ -87,7 +87,7 @@ def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
             one = {"sensor": sensor, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment}
             tables["sensors"].append(one)
     if not logs:
-        raise DataError("none of its logs can be used")
+        raise DataError("none of its logs can be used, for the reasons above")
     together = join(list(logs.values()))
     require(together, (*CHANNELS, *job.vehicle["parameters"]))
     data = observations(together, tuple(job.vehicle["parameters"]))
@@ -114,10 +114,14 @@ def _checked(path: Path, job: Job) -> xr.Dataset:
     log = read(path, required=CHANNELS)
     if counts_from_boot(log):
         first = str(np.datetime64(int(log["time"][0]), "s"))
-        raise FormatError(path, f"its clock says {first}: give it a date (magbridge convert --date)")
+        raise FormatError(
+            path, f"expected times of a known day, got {first}; give it one with magbridge convert --date"
+        )
     sensor, expected = str(log.attrs.get("sensor", "")), job.sensor
     if "" not in (sensor, expected) and sensor != expected:
-        raise FormatError(path, f"sensor {sensor!r}, but {_named(job)} carries {expected!r}")
+        raise FormatError(
+            path, f"expected a log of sensor {expected!r}, which {_named(job)} carries, got {sensor!r}"
+        )
     return log
 
 
@@ -263,7 +267,9 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[l
             line = f"{job.vehicle['vehicle']} {job.deployment}: its workers were killed (out of memory?)"
             done = Done({}, line)
         except CancelledError as error:
-            raise PortError(address, "the dask scheduler was lost: run again to do the rest") from error
+            raise PortError(
+                address, "the dask scheduler was lost; run magbridge fleet process again to do the rest"
+            ) from error
         future.release()
         for table, rows in done.tables.items():
             catalogue.add(table, rows)

@@ -21,7 +21,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
@@ -86,7 +86,7 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
             both = " and ".join(_described(one) for one in (last, row))
             raise FormatError(
                 catalogue.name,
-                f"two vehicles are named {row['vehicle']!r}: {both}; the row of one of them has to go",
+                f"expected one vehicle {row['vehicle']!r}, got two: {both}; remove a row",
             )
         found[row["vehicle"]] = row
     return found
@@ -108,7 +108,7 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
     known = vehicles(catalogue)
     if name not in known:
         if not known:
-            raise WrongUse(f"{name}: {catalogue.name} has no vehicle yet")
+            raise WrongUse(f"{name}: {catalogue.name} has no vehicle yet; add one with magbridge fleet add")
         raise WrongUse(f"{catalogue.name}: vehicle: {one_of(name, known)}")
     return known[name]
 
@@ -120,7 +120,9 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     """
     _check_name(name, "a vehicle")
     if vehicle.mass and (odd := sorted(vehicle.mass.keys() ^ set(vehicle.parameters))):
-        raise WrongUse(f"{name}: mass: a place for each of parameters, or none; not so for {', '.join(odd)}")
+        raise WrongUse(
+            f"{name}: mass: expected a place for each parameter or none; not so for {', '.join(odd)}"
+        )
     row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
     row["parameters"] = list(vehicle.parameters)
     row["mass"] = msgspec.json.encode(vehicle.mass, order="sorted").decode()
@@ -185,7 +187,11 @@ def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
     found: list[Path] = []
     for pattern in deployment.logs:
         if not (named := sorted(fleet.parent.glob(pattern))):
-            raise ConfigError(fleet, f"deployment {deployment.name}: logs", f"nothing is named {pattern}")
+            raise ConfigError(
+                fleet,
+                f"deployment {deployment.name}: logs",
+                f"expected files that match {pattern!r}, got none",
+            )
         found += named
     return found
 
@@ -291,20 +297,34 @@ def last_attempts(done: Iterable[Row]) -> dict[str, int]:
     return last
 
 
+def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> list[Row]:
+    """Return the rows of a table of results that are made of what the catalogue's logs are now.
+
+    Rows of a deployment that was tried again, those of the last attempt; and all that was made elsewhere.
+    """
+    names = {job.name for job in jobs(catalogue)}
+    last = last_attempts(catalogue.rows("done"))
+    wanted = [*columns, "job", "attempt"] if columns else ()
+    return [
+        row
+        for row in catalogue.rows(table, wanted)
+        if row["job"] == GIVEN or (row["job"] in names and row["attempt"] == last.get(row["job"], 1))
+    ]
+
+
 def status(catalogue: Catalogue) -> dict[str, Any]:
     """Return, as a dictionary that JSON can hold, each vehicle's counts and the failures on record."""
     every = {job.name: job for job in jobs(catalogue)}
     done = catalogue.rows("done")
-    last = last_attempts(done)
     new = {job.name for job in new_jobs(catalogue, list(every.values()))}
     counts = {row["vehicle"]: Counter[str]() for row in catalogue.rows("vehicles", ["vehicle"])}
     for job in every.values():
         counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=int(job.name in new))
     calibrated = set[str]()
-    for row in catalogue.rows("calibrations", ["job", "attempt", "vehicle", "supported"]):
+    for row in current(catalogue, "calibrations", ["vehicle", "supported"]):
         if row["job"] == GIVEN:
             counts[row["vehicle"]].update(given=1)
-        elif row["job"] in every and row["attempt"] == last.get(row["job"], 1):
+        else:
             calibrated.add(row["job"])
             counts[row["vehicle"]].update(calibrated=1, unsupported=int(not row["supported"]))
     for name in every.keys() - calibrated - new:
@@ -312,11 +332,7 @@ def status(catalogue: Catalogue) -> dict[str, Any]:
     for what in ("diagnosed", "mapped"):
         for name in {row["job"] for row in done if row[what]} & every.keys():
             counts[every[name].vehicle["vehicle"]].update({what: 1})
-    failures = [
-        row["line"]
-        for row in catalogue.rows("failures")
-        if row["job"] in every and row["attempt"] == last.get(row["job"], 1)
-    ]
+    failures = [row["line"] for row in current(catalogue, "failures")]
     sensors: dict[str, set[str]] = {}
     for row in catalogue.rows("sensors"):
         sensors.setdefault(row["sensor"], set()).add(row["vehicle"])

@@ -30,6 +30,7 @@ from magbridge.monitor.widgets import (
     clock,
     fact,
     nothing,
+    show_facts,
     slanted,
 )
 
@@ -134,10 +135,7 @@ class SensorPanel:
                 }
                 with ui.column().classes("w-full gap-0"):
                     ui.label(row.name).classes("font-medium")
-                    for name, (text, well) in texts.items():
-                        label = fact(name)
-                        label.set_text(text)
-                        label.style(f"color: {INK if well else RED}")
+                    show_facts([fact(name) for name in texts], texts)
 
 
 class NavigationPanel:
@@ -154,9 +152,7 @@ class NavigationPanel:
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show the last MAG_NAVIGATION."""
         self._box.set_visibility(bool(state.navigation))
-        for label, (text, well) in zip(self._labels, words.whereabouts(state, now_s).values(), strict=True):
-            label.set_text(text)
-            label.style(f"color: {INK if well else RED}")
+        show_facts(self._labels, words.whereabouts(state, now_s))
 
 
 class Texts:
@@ -347,9 +343,7 @@ class LearningPanel:
     def show(self, state: BridgeState, _now_s: float) -> None:
         """Show the last MAG_LEARNING."""
         self._box.set_visibility(bool(state.learning))
-        for label, (text, well) in zip(self._labels, words.learnt(state).values(), strict=True):
-            label.set_text(text)
-            label.style(f"color: {INK if well else RED}")
+        show_facts(self._labels, words.learnt(state))
         for one in self._buttons:
             one.set_enabled(DO in state.parameters)
         self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -58,6 +58,13 @@ def fact(name: str) -> ui.label:
     with ui.row().classes("w-full justify-between text-sm gap-x-2"):
         ui.label(name).classes(MUTED)
         return ui.label().classes("font-medium tabular-nums")
+
+
+def show_facts(labels: Iterable[ui.label], facts: Mapping[str, tuple[str, bool]]) -> None:
+    """Show the text of each fact, in red if it is not in order."""
+    for label, (text, is_well) in zip(labels, facts.values(), strict=True):
+        label.set_text(text)
+        label.style(f"color: {INK if is_well else RED}")
 
 
 def slanted(old: bool) -> str:

@@ -143,7 +143,7 @@ def test_init_writes_what_run_would_start_with(
     assert config.telemetry["battpos"].unit == "in"
     assert not [one for one in findings(Path("bridge.toml")) if one.fatal]
     assert "would start" in command("run", "--check", "--config", "bridge.toml").out
-    assert "is there already" in command.refuses("init", code=2)
+    assert "exists already and is not overwritten" in command.refuses("init", code=2)
     assert not (here / "logs").exists()
 
 
@@ -183,9 +183,9 @@ def test_what_is_wrong_is_one_line(arguments: str, words: str, command: Command)
         (b"hmr2300\nloop://\n\n7\nbattpos [in]\n", "bridge.toml: written; next: magbridge run --check"),
         (
             b"hmr2300\nloop://\n\nseven\n",
-            "expected a system id from 1 to 255, not 'seven': nothing is written",
+            "system id: expected a number from 1 to 255, got 'seven'; nothing is written",
         ),
-        (b"hmr2300\nloop://\n\x04", "no answer: nothing is written"),
+        (b"hmr2300\nloop://\n\x04", "expected an answer, got the end of the input; nothing is written"),
     ],
     ids=["answered", "no number", "Ctrl-D"],
 )

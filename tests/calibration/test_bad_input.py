@@ -109,7 +109,7 @@ def test_positions_outside_the_grid(good: tuple[Path, Path], command: Command) -
 def test_a_run_given_twice_counts_once(good: tuple[Path, Path], command: Command) -> None:
     Path("again.csv").write_bytes(good[0].read_bytes())
     output = command("calibrate", good[0], "again.csv", *PARAMETERS, "-o", "cal.json").err
-    assert f"again.csv: identical to {good[0]}; its samples are counted once" in output
+    assert f"again.csv: has the same content as {good[0]}; its samples are used once" in output
     assert "in the logs: 563 duplicate rows" in output
     once, twice = (json.loads(path.read_text()) for path in (good[1], Path("cal.json")))
     assert once["coefficients"] == twice["coefficients"]

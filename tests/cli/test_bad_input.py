@@ -38,8 +38,8 @@ def test_what_is_read_is_not_written_over(deployment: Path, command: Command) ->
         (folder, ["diagnose", deployment, "--calibration", folder, "-o", "."]),
     ):
         line = command.refuses(*arguments, code=2)
-        assert line.endswith(": is among the files to read; choose another file to write")
-        assert Path(line.partition(": is among")[0]).resolve() == written.resolve()
+        assert line.endswith(": is one of the files to read; choose another file to write")
+        assert Path(line.partition(": is one of")[0]).resolve() == written.resolve()
     assert log.read_bytes() == deployment.read_bytes()
     loop = Path("loop.csv")
     loop.symlink_to(loop)
@@ -50,7 +50,7 @@ def test_a_log_without_a_whole_reading_is_not_corrected(command: Command) -> Non
     Path("log.csv").write_text("time,mag_x,mag_y,mag_z\n1386201601,,2,3\n1386201602,1,,\n")
     save_calibration(identity(), "cal.json")
     line = command.refuses("correct", "log.csv", "--calibration", "cal.json", "-o", "x.csv")
-    assert line == "log.csv: no row has all of mag_x mag_y mag_z"
+    assert line == "log.csv: expected rows with all of mag_x mag_y mag_z, got none"
     assert not Path("x.csv").exists()
 
 
@@ -72,7 +72,7 @@ def test_a_log_of_another_sensor_is_not_corrected(deployment: Path, command: Com
     write(read(deployment).isel(time=slice(0, 60)).assign_attrs(sensor="hmr2300"), "log.nc")
     save_calibration(replace(identity(), sensor=CalibratedSensor("digitizer")), "cal.json")
     line = command.refuses("correct", "log.nc", "--calibration", "cal.json", "-o", "x.nc")
-    assert line.endswith(": sensor 'hmr2300', but the calibration is of 'digitizer'")
+    assert line.endswith(": expected a log of sensor 'digitizer', the calibration's, got 'hmr2300'")
     assert not Path("x.nc").exists()
 
 
@@ -150,7 +150,7 @@ def test_a_position_in_another_unit_is_refused(
         ("replay {d} --log /proc/self/new", 2, "The folder /proc/self cannot be written to"),
         ("demo --out /proc/self/new/demo", 2, "The folder /proc/self cannot be written to"),
         ("simulate demo -o x.nc --seed -1", 2, "--seed"),
-        ("simulate demo -o x.nc --seed 1.5", 2, "--seed: expected a whole number, not 1.5"),
+        ("simulate demo -o x.nc --seed 1.5", 2, "--seed: expected a whole number, got 1.5"),
         ("replay {d} --config none.toml", 1, "none.toml: expected a file, there is none"),
         ("demo --out /dev/null/demo", 2, "/dev/null is a file"),
         ("diagnose {d} --calibration {d} -o {d}/found", 2, "deployment.csv is a file"),
@@ -225,7 +225,7 @@ def test_a_name_that_is_not_of_the_locale(deployment: Path, here: Path) -> None:
     write(read(deployment).isel(time=slice(0, 60)), "log.nc")
     Path("log.nc").rename(name)
     done = run("convert", name, "-o", "x.csv", PYTHONUTF8="1")
-    output = rb"magbridge: m\udce4.nc: a name that cannot be written in utf-8: rename it" + b"\n"
+    output = rb"magbridge: m\udce4.nc: expected a name in utf-8; rename the file" + b"\n"
     assert (done.returncode, done.stderr) == (1, output)
     assert len(list(here.iterdir())) == 1
 

@@ -212,7 +212,7 @@ def test_a_grid_that_is_not_used_is_reported(deployment: Path, calibration: Path
     write(rows, "log.nc")
     write(rows.drop_vars("reference_field"), "bare.nc")
     asked = ("--calibration", calibration, "--grid", "grid.nc", "-o", "doubt")
-    words = "has reference_field in every row: --grid grid.nc is not used"
+    words = "has reference_field in every row, so --grid grid.nc is not used"
     assert words in command("diagnose", "log.nc", *asked, code=1).err
     assert words not in command("diagnose", "bare.nc", *asked, code=1).err
     assert words in command("calibrate", deployment, "--grid", "grid.nc", "-o", "x.json").err

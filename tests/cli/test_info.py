@@ -176,4 +176,4 @@ def test_a_log_without_a_date_is_given_one(here: Path, command: Command) -> None
     assert facts["start"] == np.datetime64("2024-06-01", "s").astype(float)
     assert facts["references"]["time_reference"] == "utc"
     for wrong in ("2024-06-01T10:00", "1717200000", "yesterday"):
-        assert f"expected YYYY-MM-DD, not {wrong}" in command("info", "boot.csv", "--date", wrong, code=2).err
+        assert f"expected YYYY-MM-DD, got {wrong}" in command("info", "boot.csv", "--date", wrong, code=2).err

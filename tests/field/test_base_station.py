@@ -84,7 +84,7 @@ def test_two_observatories_are_not_one_base_station() -> None:
         deployment(f"{code}.min", time, {"total_field": np.full(9, 5e4)}, attrs={"observatory": code})
         for code in ("A", "B")
     )
-    with pytest.raises(WrongUse, match=r"A\.min and B\.min are of several observatories: give one of them"):
+    with pytest.raises(WrongUse, match=r"A\.min and B\.min: expected logs of one observatory, got several"):
         by_base_station([log, first, second], None)
     (found,) = by_base_station([log, first, first.assign_coords(time=time + 9)], None)
     assert (found["daily_variation"] == 0).all()

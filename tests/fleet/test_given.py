@@ -73,14 +73,14 @@ def test_what_does_not_fit_is_a_line(
     when = "--date", "2026-05-01"
     assert "expected --date YYYY-MM-DD, the day on which its deployment began" in output()
     reported = output(*when, "--sensor", "HMR 9")
-    assert "a calibration of sensor 'HMR 1', but comet may carries 'HMR 9'" in reported
+    assert "comet may: expected a calibration of sensor 'HMR 9', got one of 'HMR 1'" in reported
     add_vehicle(catalogue, "other", Vehicle(parameters=("ballast",)))
     of = "--vehicle", "other", "--deployment", "may", "--catalogue", catalogue.name
     assert main(["fleet", "add", str(cal), *of, *when]) == 2
-    assert "the calibration's parameters are battpos, and other's ballast" in capsys.readouterr().err
+    assert "other: expected a calibration with the parameters ballast, got battpos" in capsys.readouterr().err
     assert add(catalogue, cal, *when) == 0
     (other := tmp_path / "other.json").write_text(cal.read_text().replace('"auto"', '"mine"'))
     assert add(catalogue, other, *when) == 2
-    assert "comet may: has another calibration; name another deployment" in capsys.readouterr().err
+    assert "comet may: has another calibration already; name another deployment" in capsys.readouterr().err
     (broken := tmp_path / "broken.json").write_text("{")
     assert add(catalogue, broken, *when) == 1

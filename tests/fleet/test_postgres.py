@@ -103,7 +103,7 @@ def test_a_newer_one_and_a_server_that_is_gone_are_a_line_each(url: str) -> None
     open_catalogue(url, create=True)
     with psycopg.connect(url) as connection:
         connection.execute("insert into magbridge_fleet.catalogue values (9)")
-    with pytest.raises(FormatError, match="a catalogue of format 9; this magbridge reads up to 1"):
+    with pytest.raises(FormatError, match="expected a catalogue of format 1 at most, got 9"):
         open_catalogue(url)
     with pytest.raises(PortError, match=r"^postgresql:///nothing: ") as refused:
         open_catalogue("postgresql://someone:secret@/nothing?host=/no/such/folder")

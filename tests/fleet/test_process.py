@@ -65,7 +65,7 @@ def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(tmp_path: Pat
     tables = work(job, tmp_path / "results").tables
     assert len(tables["calibrations"]) == len(tables["corrected"]) == 1
     lines = " | ".join(sorted(row["line"] for row in tables["failures"]))
-    assert "boot.nc: its clock says 1970-01-01T00:01:40: give it a date" in lines
+    assert "boot.nc: expected times of a known day, got 1970-01-01T00:01:40; give it one" in lines
     assert "other.nc: sensor 'HMR 2', but comet may carries 'HMR 1'" in lines
     assert "text.nc" in lines
     assert len(tables["failures"]) == 3

@@ -98,7 +98,7 @@ def test_a_log_without_depths_is_refused(here: Path, metadata: Path, command: Co
     logs.write(mission().drop_vars("depth"), "raw.nc")
     line = command.refuses("convert", "raw.nc", "-o", "mission.nc", "--metadata", metadata)
     assert "column 'depth': expected this column: OG1.0 demands it" in line
-    assert "goes with a netCDF" in command.refuses(
+    assert "expected a netCDF (.nc) to write" in command.refuses(
         "convert", "raw.nc", "-o", "mission.csv", "--metadata", metadata, code=2
     )
     assert sorted(path.name for path in here.iterdir()) == ["metadata.toml", "raw.nc"]

@@ -109,7 +109,7 @@ def test_a_log_that_is_corrected_needs_no_calibration(command: Command, here: Pa
 
 
 def test_wrong_use_is_one_line(command: Command) -> None:
-    assert "expected --calibration" in command.refuses(*TRACK, code=2)
+    assert "expected a column total_field, or --calibration" in command.refuses(*TRACK, code=2)
     for text, line in (
         ("start_sgma = 1.0", "start_sgma: unknown key"),
         ("start_sigma = -1.0", "start_sigma: expected `float` > 0.0"),
@@ -131,7 +131,7 @@ def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, her
     assert Path("own.png").stat().st_size > 40_000
     texts = command("navigate", "--bound", "log.nc", *CALIBRATED, "-o", "none.nc", code=2)
     assert "expected --map" in texts.err
-    assert "says what a survey that was flown is worth, and its bound" in texts.err
+    assert "gives the accuracy of a survey that was flown" in texts.err
     assert not Path("none.nc").exists()
 
 
