@@ -194,9 +194,7 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     except UnicodeEncodeError as error:
         if path.name not in error.object:
             raise FormatError(path, f"cannot be read, damaged? {error}"[:300]) from error
-        raise FormatError(
-            path, f"expected a name that can be written in {error.encoding}; rename the file"
-        ) from error
+        raise FormatError(path, f"expected a name in {error.encoding}; rename the file") from error
     except Exception as error:
         # whatever a library raises on bytes that it was not made for; the traceback goes with the error
         first = next(iter(str(error).splitlines()), "")

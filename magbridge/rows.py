@@ -65,12 +65,13 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
     level, age = np.full((2, len(results)), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
-    vectors, places, attitudes = main_field(deployment), _places(deployment), _attitudes(deployment)
+    vectors, places = main_field(deployment), _places(deployment)
+    attitudes = _angles(deployment, "roll", "pitch", "heading")
     if correction.learner is None:
         main_fields = magnitude(vectors)
     else:
         main_fields = _as_live(correction.held_field, deployment)
-    known, tilt = main_fields.tolist(), _tilt(deployment)
+    known, tilt = main_fields.tolist(), _angles(deployment, "roll", "pitch")
     fields, values = np.full((len(results), 3), nan), np.full((len(results), len(correction.names)), nan)
     added = np.zeros(len(results))
     depth = (
@@ -79,7 +80,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     for row, reading, stamp in _readings(correction, deployment):
         if correction.direction is not None and attitudes is not None:
             correction.direction.expect(*vectors[row].tolist())
-            correction.direction.attitude(stamp, *attitudes[row])
+            correction.direction.attitude(stamp, *attitudes[row].tolist())
         sample, one = correction.reading(
             reading, stamp, main_field=known[row], position=places[row], depth=float(depth[row])
         )
@@ -104,11 +105,11 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     )
 
 
-def _tilt(deployment: xr.Dataset) -> FloatArray | None:
-    """Return roll and pitch of every row, (n, 2) rad; None if the log lacks one."""
-    if not {"roll", "pitch"} <= set(deployment):
+def _angles(deployment: xr.Dataset, *names: str) -> FloatArray | None:
+    """Return columns in deg as (n, k) rad; None if the log lacks one."""
+    if not set(names) <= set(deployment):
         return None
-    columns = [deployment[name].to_numpy().astype(float) for name in ("roll", "pitch")]
+    columns = [deployment[name].to_numpy().astype(float) for name in names]
     return np.asarray(np.radians(np.stack(columns, axis=1)))
 
 
@@ -150,16 +151,6 @@ def _places(deployment: xr.Dataset) -> list[tuple[float, float] | None]:
         return [None] * deployment.sizes["time"]
     both = (deployment[name].to_numpy().astype(float).tolist() for name in ("latitude", "longitude"))
     return [(lat, lon) if isfinite(lat + lon) else None for lat, lon in zip(*both, strict=True)]
-
-
-def _attitudes(deployment: xr.Dataset) -> list[list[float]] | None:
-    """Return roll, pitch and heading of every row, rad; None where a log has none."""
-    names = ["roll", "pitch", "heading"]
-    if not set(names) <= set(deployment):
-        return None
-    degrees = np.stack([deployment[name].to_numpy().astype(float) for name in names], axis=1)
-    attitudes: list[list[float]] = np.radians(degrees).tolist()
-    return attitudes
 
 
 def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:

@@ -88,7 +88,7 @@ def test_another_encoding(tmp_path: Path) -> None:
         ('unit = "in"', "max_age = inf", "telemetry.battpos.max_age: expected `float` <= 1000000000"),
         ('unit = "in"', "scale = 0.0", "telemetry.battpos: scale: expected a finite number other than 0"),
         ('unit = "in"', "offset = nan", "telemetry.battpos: offset: expected a finite number, got nan"),
-        ('unit = "in"', "delay = 1e4", "telemetry.battpos: delay: expected at most 600 s either way, got 10000.0"),
+        ('unit = "in"', "delay = 1e4", "battpos: delay: expected at most 600 s either way, got 10000.0"),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = 'fast'", "publish.HIGHRES_IMU: expected `float`, got `str`"),
         (
             'url = "udpout:192.0.2.1:14550"',
@@ -103,7 +103,11 @@ def test_another_encoding(tmp_path: Path) -> None:
             "sensor.baudrate: expected `int` <= 20",
         ),
         ("[telemetry", "signing_key = ''\n[telemetry", "link.signing_key: expected `str` of length >= 1"),
-        ("[telemetry", "component = 1\n[telemetry", "link: component: expected another number than the autopilot's, got 1"),
+        (
+            "[telemetry",
+            "component = 1\n[telemetry",
+            "component: expected another number than the autopilot's, got 1",
+        ),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = nan", "publish.HIGHRES_IMU: expected `float` "),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = inf", "publish.HIGHRES_IMU: expected `float` <= 1000000000"),
         ("[sensor]", "path = 'x'\n[sensor]", "path: unknown key"),

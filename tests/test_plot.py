@@ -55,7 +55,7 @@ def test_a_corrected_log(found: tuple[mb.Calibration, Observations]) -> None:
     good = np.isfinite(line)
     np.testing.assert_array_equal(line[good], corrected["total_field"].to_numpy()[good])
     assert "nT" in mb.plot.corrected(corrected, "total_field_sigma").get_ylabel()
-    with pytest.raises(mb.MagbridgeError, match="expected a column 'total_field'.*correct the log first"):
+    with pytest.raises(mb.MagbridgeError, match=r"expected a column 'total_field'.*correct the log first"):
         mb.plot.corrected(log)
 
 

@@ -15,22 +15,10 @@ from zipfile import ZIP_DEFLATED, ZipFile
 from nicegui import ui
 
 from magbridge.mavlink import spec
-from magbridge.monitor import words
+from magbridge.monitor import panels, words
 from magbridge.monitor.charts import Background, TelemetryChart, TotalField, TrackMap
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.link import StationLink, monotonic_s
-from magbridge.monitor.panels import (
-    AlarmPanel,
-    CompassRose,
-    Figures,
-    Flags,
-    Health,
-    LearningPanel,
-    NavigationPanel,
-    ParameterPanel,
-    SensorPanel,
-    Texts,
-)
 from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, MONITOR_STYLE, RED, Changes, slanted
 from magbridge.version import __version__
@@ -155,24 +143,24 @@ class Page:
         with self._body:
             with ui.element().classes(f"{GRID} md:grid-cols-[18rem_minmax(0,1fr)]"):
                 with ui.column().classes("w-full gap-4"):
-                    self._figures = Figures(state)
-                    self._rose = CompassRose()
+                    self._figures = panels.Figures(state)
+                    self._rose = panels.CompassRose()
                 self._total = TotalField(self._tier, self._set_tier)
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 with ui.column().classes("w-full gap-4"):
-                    self._alarms = AlarmPanel(self._station, state, sound=self._sound)
-                    self._flags = Flags()
+                    self._alarms = panels.AlarmPanel(self._station, state, sound=self._sound)
+                    self._flags = panels.Flags()
                 with ui.element().classes(f"{GRID} sm:grid-cols-2 content-start"):
-                    self._health = Health(state, moment)
-            self._sensors = SensorPanel()
-            self._navigation = NavigationPanel(state, moment)
-            self._learning = LearningPanel(self._station, state)
+                    self._health = panels.Health(state, moment)
+            self._sensors = panels.SensorPanel()
+            self._navigation = panels.NavigationPanel(state, moment)
+            self._learning = panels.LearningPanel(self._station, state)
             with ui.element().classes(f"{GRID} lg:grid-cols-[minmax(0,2fr)_minmax(0,3fr)] items-start"):
                 self._track = TrackMap(self._background)
                 self._telemetry = TelemetryChart()
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
-                self._texts = Texts()
-                self._parameters = ParameterPanel(self._station, state)
+                self._texts = panels.Texts()
+                self._parameters = panels.ParameterPanel(self._station, state)
 
     def _set_tier(self, tier: str) -> None:
         self._tier = tier
@@ -189,8 +177,8 @@ class Page:
         self._offer(list(states))
         state, moment = self._state, monotonic_s()
         self._show_stream(state, moment)
-        panels = self._figures, self._rose, self._flags, self._health, self._sensors, self._navigation
-        for panel in (*panels, self._learning, self._texts, self._parameters):
+        shown = self._figures, self._rose, self._flags, self._health, self._sensors, self._navigation
+        for panel in (*shown, self._learning, self._texts, self._parameters):
             panel.show(state, moment)
         self._sound = self._alarms.sound
         self._alarms.show(state, moment)

@@ -15,10 +15,19 @@ from magbridge.cli import main
 from magbridge.errors import WriteError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
-from magbridge.fleet.memory import current, lessons
+from magbridge.fleet.memory import lessons
 from magbridge.fleet.page import PAGE_COLOURS
 from magbridge.fleet.process import work
-from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, jobs, new_jobs, status
+from magbridge.fleet.register import (
+    Deployment,
+    Vehicle,
+    add_logs,
+    add_vehicle,
+    current,
+    jobs,
+    new_jobs,
+    status,
+)
 from magbridge.logs import read, write
 
 MAY = Deployment("may", ())
