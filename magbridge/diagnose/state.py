@@ -142,7 +142,8 @@ class SearchState:
                 under.setdefault(group, []).append(best)
         # The likeliest of each group are fitted jointly with calibration and noise
         listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
-        least = WORTH_FITTING * max(best.score.evidence for best in listed[0])
+        top = max(best.score.evidence for best in listed[0])
+        least = min(top, WORTH_FITTING * top)
         listed = [
             won for won in listed[:JOINTLY_FITTED_CAUSES] if max(best.score.evidence for best in won) >= least
         ]
