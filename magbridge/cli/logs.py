@@ -292,7 +292,7 @@ def map(  # noqa: A001 - the command's name
     plot
         A PNG, PDF or SVG to draw, with every step.
     """
-    from magbridge.field.prepare import draw_steps, prepare, surveyed_at
+    from magbridge.field.continuation import draw_steps, prepare, surveyed_at
     from magbridge.field.read import read_grid, read_polygon
 
     cli.check_inputs(grids, output, mask)

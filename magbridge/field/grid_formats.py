@@ -15,11 +15,19 @@ import numpy as np
 
 from magbridge.arrays import RealArray
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.field.coordinates import LATITUDE, LONGITUDE, PROJECTED, Axes, stated
-from magbridge.field.grid_netcdf import ANOMALY_VARIABLES, Parts, netcdf
+from magbridge.field.grid_netcdf import (
+    ANOMALY_VARIABLES,
+    LATITUDE,
+    LONGITUDE,
+    PROJECTED,
+    Axes,
+    Parts,
+    netcdf,
+    stated,
+)
 from magbridge.wording import counted
 
-__all__ = ["TEXT_OPTIONS", "ascii_grid", "folder", "geotiff", "grd", "libraries", "table"]
+__all__ = ["ascii_grid", "folder", "geotiff", "grd", "libraries", "table"]
 
 BAD_GEOSOFT = (ValueError, NotImplementedError, OSError, IndexError, UnboundLocalError, OverflowError)
 """Exceptions that harmonica raises for a file of another format or a damaged one, in addition to zlib's."""

@@ -18,10 +18,9 @@ import numpy as np
 from magbridge.arrays import RealArray
 from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
-from magbridge.field.coordinates import Axes, geographic
 from magbridge.field.grid import HOLE, AnomalyGrid
 from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, libraries, table
-from magbridge.field.grid_netcdf import Parts, netcdf
+from magbridge.field.grid_netcdf import Axes, Parts, geographic, netcdf
 from magbridge.files import contents, existing
 from magbridge.guard import guarded
 
@@ -70,7 +69,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     Notes
     -----
     The units, names, reference system and range of the axes determine their meaning
-    (:mod:`~magbridge.field.coordinates`). If the file does not state its projection, a ``.prj`` file next to
+    (:mod:`~magbridge.field.grid_netcdf`). If the file does not state its projection, a ``.prj`` file next to
     it may. A library reads the file in a process of its own (:mod:`magbridge.guard`).
     """
     path = Path(path)

@@ -23,20 +23,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "MAIN_FIELD_RANGE_NT",
-    "about_mean",
-    "earth_field",
-    "main_field",
-    "other_units",
-    "placed",
-    "positions",
-    "reference_field",
-    "require_date",
-    "separate_observatories",
-    "sphere_radius",
-    "with_daily_variation",
+    "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
+    "reference_field", "require_date", "separate_observatories", "sphere_radius", "with_daily_variation",
     "with_true_heading",
-]
+]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
 """Range of the total field, nT: 22,000 to 67,000 at the surface (IGRF), and thousands of the crust."""

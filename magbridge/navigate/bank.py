@@ -63,18 +63,10 @@ class Bank:
     Hypotheses come last in every array, weights ``w`` (n,), states ``x`` (6, n) and covariances ``P``
     (6, 6, n): each operation then runs along memory, three times as fast as on n small matrices.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-    x, P : ndarray, (6,), (6, 6)
-        The Gaussian to begin with.
-    resolution : float
-        m, the position sigma to which a hypothesis is cut; infinite: there is one hypothesis.
-    gate : float
-        Innovation squared over variance beyond which a hypothesis does not learn from a measurement.
-    level : float, optional
-        nT. If it exceeds the bias's 1-sigma in P, half of the weight goes to copies of the hypotheses whose
-        bias has this 1-sigma.
+    The bank begins with the Gaussian `x` (6,), `P` (6, 6). A hypothesis is cut to a position sigma of
+    `resolution` m; if that is infinite, there is one hypothesis. It does not learn from an innovation whose
+    square over its variance exceeds `gate`. If `level` (nT) exceeds the bias's 1-sigma in P, half of the
+    weight goes to copies of the hypotheses whose bias has this 1-sigma.
     """
 
     def __init__(
@@ -128,14 +120,8 @@ class Bank:
             left = value - self.resolution**2
             if left <= 0.0:
                 continue
-            n = max(
-                3,
-                int(
-                    np.ceil(
-                        2.0 * LATTICE_EXTENT_SIGMA * np.sqrt(left) / (LATTICE_SPACING_SIGMA * self.resolution)
-                    )
-                ),
-            )
+            width = 2.0 * LATTICE_EXTENT_SIGMA * np.sqrt(left)
+            n = max(3, int(np.ceil(width / (LATTICE_SPACING_SIGMA * self.resolution))))
             s = np.linspace(-LATTICE_EXTENT_SIGMA, LATTICE_EXTENT_SIGMA, n)
             # States that are correlated with the position shift by g for each metre along the axis.
             g = P[:, :2] @ axis / value

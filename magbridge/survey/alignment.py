@@ -39,10 +39,9 @@ from magbridge.estimation.elimination import eliminate_field
 from magbridge.estimation.hyperparameters import maximise_evidence
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.residual import rms, robust_scale
-from magbridge.survey.crossovers import crossovers
 from magbridge.survey.gridding import FINE_NOISE_NT, FINER_NODES, level_blocks
-from magbridge.survey.samples import Roughness, Rows, Samples
-from magbridge.survey.scalar import COMPENSATION, ScalarRows
+from magbridge.survey.read import COMPENSATION, ScalarRows
+from magbridge.survey.samples import Roughness, Rows, Samples, crossovers
 
 __all__ = ["ScalarTerms", "align"]
 

@@ -12,8 +12,7 @@ from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.pictures import save
-from magbridge.survey.crossovers import Crossovers
-from magbridge.survey.samples import Samples
+from magbridge.survey.samples import Crossovers, Samples
 
 __all__ = ["draw_survey"]
 

@@ -15,9 +15,8 @@ from magbridge.field.continuation import continued, raised
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
-from magbridge.survey.crossovers import Crossovers
 from magbridge.survey.gridding import Gridded
-from magbridge.survey.samples import Samples
+from magbridge.survey.samples import Crossovers, Samples
 
 __all__ = ["anomaly_map", "write_crossovers", "write_geotiff", "write_points", "write_tracks"]
 

@@ -25,11 +25,9 @@ from magbridge.columns import CHANNELS
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, DataError
 from magbridge.survey.alignment import ScalarTerms, align
-from magbridge.survey.crossovers import Crossovers, crossovers
 from magbridge.survey.gridding import Gridded, gridded
-from magbridge.survey.read import corrected_by_others, from_vector, joined
-from magbridge.survey.samples import Samples
-from magbridge.survey.scalar import scalar_rows
+from magbridge.survey.read import corrected_by_others, from_vector, joined, scalar_rows
+from magbridge.survey.samples import Crossovers, Samples, crossovers
 from magbridge.wording import counted
 
 if TYPE_CHECKING:

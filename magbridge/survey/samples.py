@@ -1,4 +1,4 @@
-"""Corrected samples of a survey, the roughness of their field, and their rows in a linear model.
+"""Corrected samples of a survey: roughness of their field, rows in a linear model, crossovers of lines.
 
 A single amplitude for a whole survey is too small over an intrusion that crops out, and too large elsewhere.
 The field's second differences along the lines, smoothed over some of its lengths, show where it is rougher:
@@ -11,15 +11,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import csr_array, diags_array
+from scipy.spatial import cKDTree
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.estimation.blocks import BLOCK_ROWS, BlockColumns, ParameterBlock, in_chunks
 from magbridge.estimation.elimination import LinearisedRows, SampleSums, sum_rows
 from magbridge.estimation.gaussian_field import GaussianField
 
-__all__ = ["Roughness", "Rows", "Samples"]
+__all__ = ["Crossovers", "Roughness", "Rows", "Samples", "crossovers"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +121,9 @@ class Roughness:
         """Return the roughness (n,) at places (n, 2), m."""
         if min(self.scale.shape) < 2:
             return np.full(len(place), float(self.scale.mean()))
+        # Bilinear interpolation between the centres of the cells, constant beyond them.
         u = (place - self.low) / self.cell - 0.5
-        i = np.clip(np.floor(u).astype(int), 0, np.array(self.scale.shape) - 2)
-        t = np.clip(u - i, 0.0, 1.0)
-        # Bilinear interpolation between the centres of the cells.
-        a = self.scale[i[:, 0], i[:, 1]] * (1 - t[:, 1]) + self.scale[i[:, 0], i[:, 1] + 1] * t[:, 1]
-        b = self.scale[i[:, 0] + 1, i[:, 1]] * (1 - t[:, 1]) + self.scale[i[:, 0] + 1, i[:, 1] + 1] * t[:, 1]
-        return np.asarray(a * (1 - t[:, 0]) + b * t[:, 0])
+        return np.asarray(map_coordinates(self.scale, u.T, order=1, mode="nearest"))
 
 
 def _bends(samples: Samples, lag: float) -> FloatArray:
@@ -194,3 +191,75 @@ class Rows:
             rows_of[:, 0] *= -weight
             B = csr_array(diags_array(weight) @ self.basis(field, mine))
             yield LinearisedRows(rows_of, B, follows[first : start + BLOCK_ROWS], overlap=start > 0)
+
+
+SEGMENTS = 60_000
+"""Largest number of segments of all lines: a longer track is processed in longer steps."""
+LONGEST_SEGMENT_QUANTILE = 0.99
+"""Quantile of the segments' lengths up to which crossovers are sought."""
+MIN_SEGMENTS_BETWEEN = 20
+"""Segments of one line between two that can be a crossover."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crossovers:
+    """Places where two lines cross."""
+
+    place: FloatArray
+    """(m, 2), m north and east."""
+    first: IndexArray
+    second: IndexArray
+    """`first`, `second`, (m,): Samples that begin the two segments."""
+    share: FloatArray
+    """(m, 2): How far along each segment, 0 to 1."""
+    step: int
+    """Samples of a segment."""
+
+    def misties(self, value: FloatArray) -> FloatArray:
+        """Return the difference (m,) of `value` (n,) between the lines, the first minus the second."""
+
+        def interpolate(start: IndexArray, share: FloatArray) -> FloatArray:
+            end = np.minimum(start + self.step, len(value) - 1)
+            return np.asarray((1.0 - share) * value[start] + share * value[end])
+
+        return interpolate(self.first, self.share[:, 0]) - interpolate(self.second, self.share[:, 1])
+
+
+def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
+    """Find where the lines cross.
+
+    Parameters
+    ----------
+    place : (n, 2) array
+        m north and east.
+    line : (n,) array
+        Label of each sample's line.
+    """
+    # Segments of several samples: their number bounds the work.
+    step = max(len(place) // SEGMENTS, 1)
+    start = np.arange(0, len(place) - step, step)
+    start = start[line[start] == line[start + step]]
+    a, way = place[start], place[start + step] - place[start]
+    i, j = _nearby_pairs(a, way, line[start])
+    # Segments a + s w and b + t v meet where s = (b - a) x v / (w x v) and t = (b - a) x w / (w x v).
+    cross = way[i, 0] * way[j, 1] - way[i, 1] * way[j, 0]
+    off = a[j] - a[i]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = (off[:, 0] * way[j, 1] - off[:, 1] * way[j, 0]) / cross
+        t = (off[:, 0] * way[i, 1] - off[:, 1] * way[i, 0]) / cross
+    # Both parameters within the segments: they cross.
+    met = (s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)
+    i, j, s, t = i[met], j[met], s[met], t[met]
+    return Crossovers(a[i] + s[:, None] * way[i], start[i], start[j], np.stack([s, t], axis=1), step)
+
+
+def _nearby_pairs(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """Return pairs of segments that may meet, from `a` (m, 2) along `way` (m, 2), not adjacent on a line."""
+    if len(a) < 2:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    # Segments that meet have their middles within the mean of their lengths; longer ones are gaps of a track.
+    longest = max(float(np.quantile(np.linalg.norm(way, axis=1), LONGEST_SEGMENT_QUANTILE)), 1.0)
+    pairs = cKDTree(a + 0.5 * way).query_pairs(longest, output_type="ndarray")
+    i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
+    distant = (line[i] != line[j]) | (j - i >= MIN_SEGMENTS_BETWEEN)
+    return i[distant], j[distant]

@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 
 from magbridge.errors import OutOfRange, WrongUse
-from magbridge.field.continuation import continued, smoothed
+from magbridge.field.continuation import (
+    continue_upward,
+    continued,
+    draw_steps,
+    merge,
+    prepare,
+    smoothed,
+    surveyed_at,
+)
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write
-from magbridge.field.prepare import continue_upward, draw_steps, merge, prepare, surveyed_at
 from magbridge.field.read import read_grid
 
 LON, LAT = np.linspace(-58.1, -57.9, 81), np.linspace(49.45, 49.55, 61)

@@ -17,11 +17,10 @@ from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.read import read_grid
 from magbridge.survey import gridding
-from magbridge.survey.crossovers import crossovers
 from magbridge.survey.maps import anomaly_map
 from magbridge.survey.read import read_table
 from magbridge.survey.run import Result, survey
-from magbridge.survey.samples import Samples
+from magbridge.survey.samples import Samples, crossovers
 
 ORIGIN = 49.5, -57.9
 NOISE = 1.5
