@@ -114,6 +114,15 @@ TRACK_TEXTS = {
 }
 """Texts of a localisation in the log's own survey."""
 
+SCALAR_TEXTS = {
+    "scalar.lag": "{column} is {lag_s:.2f} s late (1-sigma {sigma_s:.1f} s): correct its clock",
+    "scalar.shift": "{column} reads the field {shift_m:.2f} m ahead of the position (1-sigma "
+    "{sigma_m:.1f} m): a lag or a lever arm",
+    "scalar.heading_error": "{column} has a heading error of {effect_nT:.1f} nT (standard deviation)",
+    "scalar.channel": "{channel} disturbs {column} by {effect_nT:.2f} nT (standard deviation)",
+}
+"""Of a scalar magnetometer."""
+
 DIAGNOSIS_TEXTS = {
     # Notes on one finding
     "several_terms": "A number in brackets: several such terms were needed to describe the cause; they act "
@@ -216,7 +225,7 @@ DIAGNOSIS_TEXTS = {
 }
 """Texts of a diagnosis."""
 
-TEXTS = {**FIT_TEXTS, **TRACK_TEXTS, **DIAGNOSIS_TEXTS}
+TEXTS = {**FIT_TEXTS, **TRACK_TEXTS, **SCALAR_TEXTS, **DIAGNOSIS_TEXTS}
 CONDITION_CODES = tuple(code.removeprefix("condition.") for code in TEXTS if code.startswith("condition."))
 """Codes of objections that a condition removes, the weightiest first."""
 

@@ -377,6 +377,7 @@ def _with_scalar(
         "rms_nT": fit.rms_after,
         "contribution_nT": fit.contribution,
         "left_out": fit.left_out,
+        "findings": [finding.text for finding in fit.findings],
         "figure_of_merit": fit.merit and {**fit.merit, "fitted": True},
     }
     largest = sorted(fit.contribution.items(), key=lambda one: -one[1])[:MAX_LISTED_CONTRIBUTIONS]
@@ -387,6 +388,7 @@ def _with_scalar(
     )
     if fit.merit:
         text += f"; {merit_text(fit.merit)} (fitted)"
+    text += "".join(f"; {finding.text}" for finding in fit.findings[:MAX_LISTED_CONTRIBUTIONS])
     return replace(calibration, sensors=(fit.sensor,)), text
 
 

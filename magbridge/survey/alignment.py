@@ -33,6 +33,8 @@ from magbridge.calibration.fitting.field_search import (
     ladder,
     nodes_for,
 )
+from magbridge.calibration.fitting.scalar_fit import is_beyond_chance
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
 from magbridge.estimation.elimination import eliminate_field
@@ -95,6 +97,8 @@ class ScalarTerms:
     """Crustal field and noise of the joint fit, for the map."""
     merit: dict[str, Any] | None
     """Figure of merit of a box that was not fitted; None without one."""
+    findings: tuple[Diagnostic, ...] = ()
+    """Lag or shift, heading error and channels that differ from zero beyond chance."""
 
     def facts(self) -> dict[str, Any]:
         """Return the numbers to print as JSON."""
@@ -113,6 +117,7 @@ class ScalarTerms:
             "contribution_nT": self.contribution,
             "misties_as_read_nT": self.misties_raw,
             "figure_of_merit": self.merit and {**self.merit, "fitted": False},
+            "findings": [finding.text for finding in self.findings],
         }
 
     def summary(self) -> str:
@@ -130,6 +135,7 @@ class ScalarTerms:
         parts.append(f"crossings {self.misties_raw:.2f} nT RMS as read")
         if self.merit:
             parts.append(merit_text(self.merit))
+        parts += [finding.text for finding in self.findings if finding.code == "scalar.channel"]
         return f"scalar {self.column}: " + ", ".join(parts)
 
 
@@ -379,8 +385,34 @@ class _JointFit:
         return ScalarTerms(
             self.rows.column, self.shift, sigma, float(along @ self.shift),
             float(np.sqrt(along @ covariance @ along)), self.speed, not both or bool(known.all()), parts[0],
-            contribution, misties, self._every_sample(), merit,
+            contribution, misties, self._every_sample(), merit, self._findings(parts, contribution),
         )  # fmt: skip
+
+    def _findings(self, parts: list[FloatArray], contribution: dict[str, float]) -> tuple[Diagnostic, ...]:
+        """Return the terms that differ from zero beyond chance: shift, heading error, channels."""
+        names = ["heading error", *(term.name for term in self.rows.terms)]
+        covariance, column = self.solution.covariance, self.rows.column
+        tests, found = len(names) + 1, []
+        if len(self.free):
+            # At one speed only the shift along the track is known: forward lever arm minus speed times lag.
+            along = np.array([-self.speed, 1.0, 0.0])[self.free]
+            metres = np.array([along @ self.shift[self.free]])
+            many = len(self.free)
+            variance = np.array([[along @ covariance[-many:, -many:] @ along]])
+            if is_beyond_chance(metres, variance, tests):
+                values = {
+                    "column": column,
+                    "shift_m": float(metres[0]),
+                    "sigma_m": float(variance[0, 0] ** 0.5),
+                }
+                found.append(Diagnostic("scalar.shift", values))
+        edges = np.cumsum([0, *(len(part) for part in parts)])
+        for name, part, first, last in zip(names, parts, edges[:-1], edges[1:], strict=True):
+            if name != COMPENSATION and is_beyond_chance(part, covariance[first:last, first:last], tests):
+                code = "scalar.heading_error" if name == "heading error" else "scalar.channel"
+                values = {"column": column, "channel": name, "effect_nT": contribution[name]}
+                found.append(Diagnostic(code, values))
+        return tuple(found)
 
 
 def _is_effect(block: ParameterBlock) -> bool:

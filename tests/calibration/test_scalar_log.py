@@ -110,6 +110,16 @@ def test_a_disturbance_that_cancels_the_crust_is_not_taken_for_the_truth() -> No
 
 
 @pytest.mark.filterwarnings("error")
+def test_channels_that_disturb_are_named_and_an_idle_one_is_not() -> None:
+    series = half(flown(6), False)
+    idle = np.random.default_rng(1).normal(size=len(series.time))
+    series = series._replace(channels=np.column_stack([series.channels, idle]))
+    found = fit_scalar(series, (*CHANNELS, "fan"), map_known=True).findings
+    assert {finding.code for finding in found} == {"scalar.channel"}
+    assert {finding.values["channel"] for finding in found} <= set(CHANNELS)
+    assert found[0].values["effect_nT"] == max(finding.values["effect_nT"] for finding in found)
+
+
 def test_samples_of_one_time_are_fitted_and_corrected() -> None:
     series = half(flown(8), False)
     pairs = np.repeat(np.arange(len(series.time)), 1 + (np.arange(len(series.time)) % 7 == 0))

@@ -114,6 +114,8 @@ def test_shift_and_heading_error_are_found(flown: Grid) -> None:
     assert "lever - v * lag = -3.0" in found.scalar.summary()
     assert "cannot be separated at one speed" in found.scalar.summary()
     assert set(found.scalar.contribution) == {"heading error", "lag and lever arm"}
+    # Levels of 3 nT on 14 lines hide a heading error of 2 nT.
+    assert {finding.code for finding in found.scalar.findings} == {"scalar.shift"}
 
 
 def test_command_with_a_known_shift(flown: Grid, tmp_path: Path, command: Command) -> None:

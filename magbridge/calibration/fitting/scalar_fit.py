@@ -31,6 +31,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve, solve_discrete_are
 from scipy.optimize import minimize
 from scipy.signal import sosfilt, zpk2sos
+from scipy.special import chdtrc
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import BoolArray, FloatArray
@@ -44,13 +45,14 @@ from magbridge.calibration.scalar import (
     scalar_design,
     term_columns,
 )
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
 from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.priors import PriorFamily
 
-__all__ = ["ScalarFit", "adapt_to_log", "fit_scalar"]
+__all__ = ["ScalarFit", "adapt_to_log", "fit_scalar", "is_beyond_chance"]
 
 WIDTH_CENTRES_NT = {"permanent": 1000.0, "induced": 100.0, "eddy": 10.0}
 """Centres of the priors of the widths, nT (eddy: nT s)."""
@@ -85,6 +87,10 @@ OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 """Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
 
 
+CHANCE = 1e-3
+"""Probability of a finding by chance, over all terms that are tested."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScalarFit:
     """A fitted compensation and its effect on the samples."""
@@ -99,6 +105,8 @@ class ScalarFit:
     left_out: int
     """Samples that were left out as outliers."""
     log_evidence: float
+    findings: tuple[Diagnostic, ...] = ()
+    """A lag that was estimated, and channels that disturb the scalar, beyond chance."""
     merit: dict[str, Any] | None = None
     """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
 
@@ -172,6 +180,41 @@ def _agreeing(
         usual = max(1.4826 * float(np.median(residual[valid])), 1e-3)
         weight = 1.0 / np.maximum(residual, usual)
     return np.asarray(valid & (residual <= WITNESS_SIGMA * usual))
+
+
+def is_beyond_chance(values: FloatArray, covariance: FloatArray, tests: int) -> bool:
+    """Return True if the coefficients (k,) of one of several `tests` differ from zero beyond chance.
+
+    Notes
+    -----
+    ``c^T C^-1 c`` of k coefficients that are zero, with their covariance C (k, k), is a chi-square of k
+    degrees.
+    """
+    squared = float(values @ np.linalg.solve(covariance, values))
+    return bool(chdtrc(len(values), squared) < CHANCE / max(tests, 1))
+
+
+def _findings(
+    column: str, state: _Posterior, contribution: dict[str, float], channels: tuple[ScalarChannel, ...]
+) -> tuple[Diagnostic, ...]:
+    """Return the lag if it is not zero, then the channels that disturb the scalar, the strongest first."""
+    names = [channel.name for channel in channels]
+    beyond = {
+        name: is_beyond_chance(state.mean[term], state.covariance[term, term], len(names) + 1)
+        for name, term in term_columns(channels).items()
+        if name == "lag" or name in names
+    }
+    found = []
+    if beyond["lag"]:
+        # The coefficient of the rate of change is negative if the scalar is late.
+        late, k = -float(state.mean[PLATFORM_TERMS - 1]), PLATFORM_TERMS - 1
+        sigma = float(np.sqrt(state.covariance[k, k]))
+        found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": late, "sigma_s": sigma}))
+    for name in sorted(names, key=lambda name: -contribution[name]):
+        if beyond[name]:
+            values = {"column": column, "channel": name, "effect_nT": contribution[name]}
+            found.append(Diagnostic("scalar.channel", values))
+    return tuple(found)
 
 
 def _channel(name: str, values: FloatArray, unit: str) -> ScalarChannel:
@@ -557,4 +600,5 @@ def _result(
     return ScalarFit(
         sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
         int((~kept).sum()) * problem.averaged, -state.cost,
+        _findings(column, state, contribution, channels),
     )  # fmt: skip
