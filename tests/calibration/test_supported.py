@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.errors import NoSolutionError
+from magbridge.calibration.fitting.solve import check_scales
+from magbridge.errors import CalibrationError, NoSolutionError
+from magbridge.estimation.residual import ResidualSamples
 from magbridge.field.reference import other_units
 from magbridge.logs import write
 from magbridge.logs.deployment import deployment
@@ -81,3 +83,25 @@ def test_a_hard_iron_of_many_times_the_field_is_not_another_unit() -> None:
     assert "expected nT" in other_units(1000.0 * (field + far), FIELD)
     found = fit(Observations(field + far, np.full(400, FIELD), np.empty((400, 0))))
     np.testing.assert_allclose(found.calibration.coefficients[6:9], far, atol=30.0)
+
+
+# ---- hard iron beyond twice the field ----------------------------------------------------------------------
+
+
+def samples(directions: np.ndarray, offset: float) -> ResidualSamples:
+    field = 5e4 * directions + np.array([0.0, 0.0, offset])
+    reference = np.full(len(field), 5e4)
+    return ResidualSamples(field, reference, np.ones((len(field), 1)), np.ones(len(field)), 5e4)
+
+
+def test_it_is_the_attitudes_that_decide() -> None:
+    rng = np.random.default_rng(0)
+    around = rng.normal(size=(800, 3))
+    around /= np.linalg.norm(around, axis=1)[:, None]
+    turn = rng.uniform(0.0, 2.0 * np.pi, 800)
+    level = np.column_stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(800, np.sqrt(0.75))])
+    fit = np.zeros(9)
+    fit[8] = 1.1e5
+    check_scales(samples(around, 1.1e5), fit)
+    with pytest.raises(CalibrationError, match="too few attitudes"):
+        check_scales(samples(level, 1.1e5), fit)

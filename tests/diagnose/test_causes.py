@@ -13,6 +13,7 @@ import magbridge
 from magbridge.diagnose import causes
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.problem import Problem
+from magbridge.learning import alarms
 
 ROOM = Path(causes.__file__).parent
 ELSEWHERE = {"magbridge/learning"}
@@ -67,3 +68,11 @@ def test_what_a_row_puts_forward_has_its_name_and_can_be_written(name: str, prob
     made = CAUSES[name].candidates(problem)
     assert {one.cause for one in made} <= {name}
     msgspec.to_builtins([one.effects for one in made])
+
+
+# ---- one vocabulary of causes ------------------------------------------------------------------------------
+
+
+def test_a_cause_learned_in_flight_has_a_name_of_the_diagnosis() -> None:
+    assert set(alarms.CAUSE_UNITS) <= set(CAUSES)
+    assert set(alarms.FROM_ZERO) <= set(alarms.CAUSE_UNITS)

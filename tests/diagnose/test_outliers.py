@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from demos import demo
+from posed import missed
 from reported import section
 from scipy.signal import lfilter
 
-from magbridge.diagnose.joint import Joint
+from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.noise import fit_noise
+from magbridge.diagnose.packets import passage
+from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.search import Outliers, outliers
 from magbridge.diagnose.survey import MAX_LAG, Past
@@ -115,3 +120,23 @@ def test_a_relay_gets_no_name(beside_runs: bool) -> None:
     true = survey["time"].to_numpy().astype(float)[at]
     assert sum(np.abs(found - one).min() < 40.0 for one in true) >= 10
     assert f"The level shifts at {found.size} places, " in section(reported, "What is left")
+
+
+# ---- a source that passes is described by few numbers ------------------------------------------------------
+
+
+def test_a_dipole_that_passes_is_reported_by_three_numbers(problem: Problem) -> None:
+    """Against a dipole's field on a straight course, along the Earth's: Anderson's functions hold it."""
+    t = problem.survey.time - problem.survey.time[0]
+    speed, nearest = 900.0 / (0.02 * t[-1]), 0.6 * t[-1]
+    r = np.column_stack([speed * (t - nearest), np.full(len(t), 900.0), np.full(len(t), -50.0)])
+    far = np.linalg.norm(r, axis=1)[:, None]
+    m, earth = np.array([0.3, -0.8, 0.5]), np.array([0.5, 0.1, 0.85])
+    field = (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3
+    planted = problem.reference_jacobian * (field @ earth)
+    planted *= 6.0 / np.abs(planted).max()
+    noise = np.random.default_rng(5).normal(size=len(problem))
+    given = replace(problem, residual=planted + noise)
+    columns, look_elsewhere = passage(given, fit_joint(given, [], 1))
+    assert missed(planted, columns(slice(None))) < 0.1
+    assert 100 < look_elsewhere < 10 * len(problem)

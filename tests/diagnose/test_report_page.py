@@ -166,7 +166,7 @@ def test_wrong_samples_alone_promise_no_gain(clear: Diagnosis) -> None:
 
 def test_the_page_is_whole(clear: Diagnosis) -> None:
     """Every figure has a caption, and no line ends between a number and its unit."""
-    page = page_of(clear)
+    page = page_of(clear, drawn=True)
     assert page.count("<figure>") == page.count("<figcaption>") == page.count('alt="')
     assert page.index('class="box doubt"') < page.index("<h2")
     assert not re.search(r"\d (nT|%)", re.sub(r"base64,[^\"]*|<style>.*?</style>", "", page, flags=re.DOTALL))
@@ -174,14 +174,14 @@ def test_the_page_is_whole(clear: Diagnosis) -> None:
 
 def test_the_answer_is_read_in_a_minute(clear: Diagnosis) -> None:
     """Unfolded, the page is a screen: at most 250 words and one figure."""
-    first = page_of(clear).partition("<details")[0].partition("<body>")[2]
+    first = page_of(clear, drawn=True).partition("<details")[0].partition("<body>")[2]
     assert first.count("<figure>") == 1
     assert len(re.sub(r"<[^>]*>", " ", first).split()) <= 250
 
 
 def test_the_page_is_small_enough_to_send(clear: Diagnosis) -> None:
     """Even with eight causes: each picture has a palette (colour type 3 in a PNG's header)."""
-    page = page_of(replace(clear, findings=clear.findings * 8))
+    page = page_of(replace(clear, findings=clear.findings * 8), drawn=True)
     pictures = [b64decode(text) for text in re.findall(r'base64,([^"]*)', page)]
     assert {picture[25] for picture in pictures} == {3}
     assert len(page) < 800_000

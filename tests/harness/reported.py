@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from html import unescape
+from unittest.mock import patch
 
 from magbridge.diagnose.assessment import assess
 from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.report import page
 from magbridge.diagnose.report.page import report_html
 
 __all__ = ["page_of", "section"]
 
+NO_PICTURES = dict.fromkeys(("measured", "terms", "channels", "spectrum", "track"))
+"""The page's figures, none of which has anything to draw: to draw them takes a second."""
 
-def page_of(diagnosis: Diagnosis) -> str:
-    """The page of a diagnosis."""
-    return report_html(assess(diagnosis))
+
+def page_of(diagnosis: Diagnosis, *, drawn: bool = False) -> str:
+    """The page of a diagnosis, with its figures only if they are to be `drawn`."""
+    if drawn:
+        return report_html(assess(diagnosis))
+    with patch.object(page, "_pictures", return_value=NO_PICTURES):
+        return report_html(assess(diagnosis))
 
 
 def section(diagnosis: Diagnosis, title: str) -> str:

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
+import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
+from demos import demo_log
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import magbridge as mb
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
 from magbridge.logs.checks import MAX_CHANNEL_DELAY_S, MAX_MAGNITUDE, MIN_VALUE, REFERENCE_FIELD_RANGE_NT
@@ -307,3 +314,117 @@ def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
     assert first["/field"]["total_field"] == whole["total_field"][0]
     flags = [body for _, channel, _, body in found if channel.topic == "/quality"][9]
     assert [name for name, value in flags.items() if value is True] == ["extrapolated", "gap"]
+
+
+# ---- data frames in and out --------------------------------------------------------------------------------
+
+
+def test_there_and_back_keeps_every_number_and_unit() -> None:
+    log = demo_log().isel(time=slice(0, 50))
+    frame = mb.to_frame(log)
+    assert str(frame.index.tz) == "UTC"
+    back = mb.from_frame(frame, frame.attrs)
+    assert set(back) == set(log)
+    np.testing.assert_allclose(back["time"], log["time"], atol=1e-6)  # a data frame's moments are in us
+    for name in log:
+        np.testing.assert_array_equal(back[name], log[name])
+        assert back[name].attrs["units"] == log[name].attrs["units"]
+
+
+@pytest.mark.parametrize(
+    "time",
+    [
+        [1.7e9, 1.7e9 + 1],
+        ["2023-11-14T22:13:20Z", "2023-11-14T22:13:21Z"],
+        pd.to_datetime(["2023-11-14 22:13:20", "2023-11-14 22:13:21"]),
+        pd.to_datetime(["2023-11-14 23:13:20", "2023-11-14 23:13:21"]).tz_localize("Europe/Berlin"),
+    ],
+    ids=["seconds", "texts", "moments", "moments with a zone"],
+)
+@pytest.mark.parametrize("index", [False, True], ids=["column", "index"])
+def test_time_as_users_have_it(time: list[object], index: bool) -> None:
+    frame = pd.DataFrame({"mag_x [uT]": [16.0, 17.0], "battpos [in]": [1.0, 2.0]})
+    frame = frame.set_index(pd.Index(time)) if index else frame.assign(time=time)
+    log = mb.from_frame(frame, heading_reference="magnetic")
+    np.testing.assert_array_equal(log["time"], [1.7e9, 1.7e9 + 1])
+    np.testing.assert_allclose(log["mag_x"], [16_000.0, 17_000.0])
+    assert log["battpos"].attrs["units"] == "in"
+    assert log.attrs["heading_reference"] == "magnetic"
+
+
+@pytest.mark.parametrize(
+    ("frame", "line"),
+    [
+        (pd.DataFrame({"mag_x": [1.0]}), "column 'time': expected a column or an index of times"),
+        (pd.DataFrame({"time": [1.0], "mag_x": ["a"]}), "column 'mag_x': expected numbers"),
+        (pd.DataFrame({"time": [1.0], "mag_x [m]": [1.0]}), "column 'mag_x': expected nT, not m"),
+    ],
+    ids=["no time", "texts", "unit"],
+)
+def test_a_frame_that_is_not_a_log(frame: pd.DataFrame, line: str) -> None:
+    with pytest.raises(mb.MagbridgeError, match=f"the data frame: {line}"):
+        mb.from_frame(frame)
+
+
+# ---- what must not be there --------------------------------------------------------------------------------
+
+
+def run(script: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_slocum_leaves_the_home_alone(tmp_path: Path) -> None:
+    pytest.importorskip("dbdreader")
+    assert run("import os, magbridge.logs.slocum; print(os.environ['HOME'])", HOME=str(tmp_path)) == str(
+        tmp_path
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "package", "extra"),
+    [
+        (".parquet", "pyarrow", "formats"),
+        (".ulg", "pyulog", "formats"),
+        (".dbd", "dbdreader", "formats"),
+        (".nc", "netCDF4", "analysis"),
+        (".mcap", "rosbags", "ros"),
+    ],
+)
+def test_a_missing_extra_is_named(suffix: str, package: str, extra: str, tmp_path: Path) -> None:
+    path = tmp_path / f"log{suffix}"
+    path.write_bytes(b"x")
+    script = f"""
+import sys
+sys.modules[{package!r}] = None
+from magbridge import logs
+from magbridge.errors import MissingExtra
+try:
+    logs.read({str(path)!r})
+except MissingExtra as error:
+    print(error)
+"""
+    assert re.fullmatch(rf"{package} is not installed: pip install '.+\[{extra}\]'", run(script))
+
+
+def test_a_package_can_bring_a_format(tmp_path: Path) -> None:
+    """An entry point: the suffix, and a module with ``chunks``."""
+    info = tmp_path / "other-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[magbridge.formats]\nother = other_format\n")
+    (tmp_path / "other_format.py").write_text(
+        "from magbridge.logs.deployment import deployment\n"
+        "def chunks(path, rows):\n    yield deployment(path, [1.0], {'mag_x': [float(path.read_text())]})\n"
+    )
+    (tmp_path / "log.other").write_text("5")
+    script = f"from magbridge import logs; print(logs.read({str(tmp_path / 'log.other')!r})['mag_x'].item())"
+    assert run(script, PYTHONPATH=str(tmp_path)) == "5.0"

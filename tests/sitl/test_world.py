@@ -6,6 +6,7 @@ import choclo
 import numpy as np
 import pytest
 
+from sitl.platform import MOUNTINGS, Mass, Vehicle, draw_vehicle
 from sitl.world import Geology, Rock, Water, World, dipole_field
 
 MAIN = np.array([17000.0, -6000.0, 49600.0])
@@ -63,3 +64,38 @@ def test_without_crustal_field_there_is_only_the_main_field() -> None:
     field = world.field(np.full(2, WINTER), np.array([49.52, 49.53]), np.full(2, -57.87), np.zeros(2))
     assert 52_500 < np.linalg.norm(field[0]) < 53_200  # nT, ppigrf: 52 880
     np.testing.assert_allclose(world.anomaly_map(WINTER, 90.0, 500.0, 250.0).anomaly, 0.0, atol=1e-9)
+
+
+# ---- the simulated vehicle's magnetic masses ---------------------------------------------------------------
+
+
+EARTH = np.array([17000.0, -6000.0, 49600.0])
+
+
+def test_a_mass_that_moves_changes_the_reading_and_a_vehicle_without_masses_does_not_care() -> None:
+    vehicle = draw_vehicle(np.random.default_rng(2))
+    battery, ballast = np.linspace(-0.5, 0.5, 50), np.full(50, 200.0)
+    ambient = np.tile(EARTH, (50, 1))
+    reading = vehicle.field(ambient, {"battpos": battery, "ballast": ballast})
+    assert np.ptp(reading, axis=0).max() > 20
+    bare = Vehicle(vehicle.hard_iron, vehicle.soft_iron)
+    assert np.ptp(bare.field(ambient, {"battpos": battery}), axis=0).max() == 0
+
+
+def test_an_induced_moment_follows_the_field() -> None:
+    mass = Mass(
+        at=(0.0, 0.0, 1.0), travel=(0.0, 0.0, 0.01), moment=(0.0, 0.0, 0.0), volume=(1e-3, 1e-3, 1e-3)
+    )
+    ambient = np.array([[0.0, 0.0, 50_000.0], [0.0, 0.0, -50_000.0]])
+    field = mass.field(ambient, np.zeros(2))
+    # a sphere of susceptibility volume V below the sensor: B_z = 2 V B / (4 pi r^3)
+    np.testing.assert_allclose(field[:, 2], 2 * 1e-3 * ambient[:, 2] / (4 * np.pi))
+
+
+def test_vehicles_are_drawn_from_the_seed_with_the_masses_asked_for() -> None:
+    for masses in (("battpos",), ("battpos", "ballast"), tuple(MOUNTINGS)):
+        vehicle = draw_vehicle(np.random.default_rng(7), masses)
+        assert vehicle == draw_vehicle(np.random.default_rng(7), masses)
+        assert vehicle != draw_vehicle(np.random.default_rng(8), masses)
+        assert tuple(vehicle.mass) == masses
+    assert np.linalg.norm(vehicle.mass["battpos"].at) == pytest.approx(0.5, abs=0.2)
