@@ -300,7 +300,7 @@ def test_whatever_a_file_holds_the_answer_is_a_grid_or_one_line(
 
 
 @pytest.mark.real
-@settings(max_examples=60, deadline=None, derandomize=True)  # HDF5 itself may not live through any damage
+@settings(max_examples=25, deadline=None, derandomize=True)  # HDF5 itself may not live through any damage
 @given(places=st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 255)), min_size=1, max_size=30))
 def test_a_damaged_grid_is_a_grid_or_one_line(
     tmp_path_factory: pytest.TempPathFactory, places: list[tuple[int, int]]
