@@ -323,6 +323,7 @@ class LiveCheck:
         self._values: Counter[str] = Counter()
         self._unknown_values: Counter[str] = Counter()
         self._clock_difference_s = 0.0
+        self._edge: LiveEdge | None = None
 
     def listen(self) -> None:
         """Read the ports, then fill the attributes."""
@@ -335,7 +336,7 @@ class LiveCheck:
         pipeline.component.streams.interval_us = self._duration_us // RATE_INTERVALS
         self._begin_us = start.time_us
         link_port, sensor_ports = ports(config)
-        edge = LiveEdge({Channel.LINK: link_port, **sensor_ports}, clock)
+        edge = self._edge = LiveEdge({Channel.LINK: link_port, **sensor_ports}, clock)
         keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
 
         def finish_event(time_us: int) -> None:
@@ -344,11 +345,32 @@ class LiveCheck:
                 edge.stop()
 
         try:
-            drive(pipeline, _Tap(edge, self._receive), None, finish_event)
+            drive(pipeline, self, None, finish_event)
         finally:
             keeper.save(pipeline, last=True)
             edge.close()
         self._compare(pipeline)
+
+    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
+        """Yield the events of the ports; count the messages in those of the link."""
+        assert self._edge is not None
+        for event in self._edge.events(deadline):
+            if event.channel is Channel.LINK:
+                self._receive(event)
+            yield event
+
+    def send(self, number: int, data: bytes) -> None:
+        """Send to a sensor; send only the messages of :data:`SENT` to the link."""
+        assert self._edge is not None
+        if number == Channel.LINK:
+            data = b"".join(frame for frame in cut(data) if int.from_bytes(frame[7:10], "little") in SENT)
+        if data:
+            self._edge.send(number, data)
+
+    def credit(self, frames: list[bytes]) -> None:
+        """Report to the link which frames are signed with the key."""
+        assert self._edge is not None
+        self._edge.credit(frames)
 
     def _receive(self, event: Event) -> None:
         """Count the messages and the values of telemetry in an event of the link."""
@@ -455,28 +477,3 @@ def _too_rare(arrived: Arrived, denied: str, *, is_autopilot: bool) -> str:
     elif group := ARDUPILOT_GROUPS.get(arrived.name):
         remedy = f"set SRn_{group} (MAVn_{group} since ArduPilot 4.7) to {arrived.needed_hz:g}, or {remedy}"
     return f"{arrived.name} {arrives} and is needed at {arrived.needed_hz:g} Hz{why}: {remedy}"
-
-
-class _Tap:
-    """An edge whose link events are counted, and over which only :data:`SENT` goes out."""
-
-    def __init__(self, edge: LiveEdge, receive: Callable[[Event], None]) -> None:
-        self._edge, self._receive = edge, receive
-
-    def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield the events of the edge."""
-        for event in self._edge.events(deadline):
-            if event.channel is Channel.LINK:
-                self._receive(event)
-            yield event
-
-    def send(self, number: int, data: bytes) -> None:
-        """Send to a sensor; send only permitted messages to the link."""
-        if number == Channel.LINK:
-            data = b"".join(frame for frame in cut(data) if int.from_bytes(frame[7:10], "little") in SENT)
-        if data:
-            self._edge.send(number, data)
-
-    def credit(self, frames: list[bytes]) -> None:
-        """Report to the link which frames are signed with the key."""
-        self._edge.credit(frames)

@@ -250,7 +250,15 @@ class Component:
         self._service = ParameterService(
             self.parameters, self.outbox, self.timers, self.announcer, self._authority
         )
-        self._commands = Commands(
+        self._commands = self._open_commands(by_clock)
+        self._handlers = self._open_handlers()
+        for name, report in by_clock.items():
+            self._message_rates.send_by_clock(name, report)
+        self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
+
+    def _open_commands(self, by_clock: Mapping[str, Callable[[], None]]) -> Commands:
+        """Return the service that executes commands."""
+        return Commands(
             self.outbox,
             self._requestable(by_clock),
             lambda number: self._message_rates.interval_us(number, self._reports.sample_interval_us),
@@ -258,7 +266,10 @@ class Component:
             self._authority,
             self.announcer,
         )
-        self._handlers = by_id(
+
+    def _open_handlers(self) -> dict[int, Callable[[Message], None]]:
+        """Return the handler of each message that is a request, an answer or a heartbeat."""
+        return by_id(
             PARAM_REQUEST_LIST=self._if_ours(self._service.list),
             PARAM_REQUEST_READ=self._if_ours(self._service.read),
             PARAM_SET=self._if_ours(self._service.write),
@@ -268,9 +279,6 @@ class Component:
             **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), self._command),
             **dict.fromkeys(FILE_REQUESTS, self._if_to_us_alone(self.file_requests.append)),
         )
-        for name, report in by_clock.items():
-            self._message_rates.send_by_clock(name, report)
-        self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
     def _report_status(self) -> None:
         """Send MAG_STATUS and the messages of the same rate."""
@@ -308,7 +316,7 @@ class Component:
 
         Requests are answered into the outbox. :meth:`advance` has been called for `t_us` before.
         """
-        self._begin(t_us)
+        self.codec.now_us = t_us
         ours = []
         messages = self.codec.parse(data, final=self._whole)
         self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
