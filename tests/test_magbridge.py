@@ -57,17 +57,24 @@ def test_a_type_checker_sees_the_same_names() -> None:
     assert {name for name, _ in seen} == set(mb.__all__)
 
 
+RUN_COMMAND = (
+    "import magbridge.bridge.run as bridge; bridge.run = lambda path: None; "
+    "from magbridge.__main__ import main; main(['run', '--config', 'bridge.toml'])"
+)
+
+
 @pytest.mark.parametrize(
     ("imports", "heavy"),
     [
         ("import magbridge", {"numpy", "msgspec", *ASHORE}),
         ("import magbridge.bridge.run", ASHORE - {"pymavlink"}),
+        (RUN_COMMAND, {"cyclopts", "magbridge.cli"}),
         ("from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)", ASHORE),
         ("from magbridge.cli import main; main(['--help'])", {"numpy", *ASHORE}),
         ("from magbridge.cli import main; main(['calibrate', 'none', '-o', 'x'])", {"numpy", *ASHORE}),
         ("from magbridge.field import grid, nearby, prepare, read, reference", ASHORE),
     ],
-    ids=["the package", "the live path", "the main field", "help", "a log that is not there", "maps"],
+    ids=["the package", "the live path", "run", "the main field", "help", "a log that is not there", "maps"],
 )
 def test_importing_brings_nothing_heavy(imports: str, heavy: set[str]) -> None:
     script = f"{imports}\nimport sys; print(sorted({heavy} & set(sys.modules)))"
