@@ -9,7 +9,7 @@ from typing import Any
 
 from magbridge.calibration.model import Calibration
 from magbridge.columns import TEMPERATURE
-from magbridge.logs.telemetry_fields import MAVLINK_FIELDS
+from magbridge.logs.fields import field_maps
 from magbridge.sensors.options import options_of
 
 __all__ = ["PLACEHOLDER", "Answers", "bridge_toml"]
@@ -124,10 +124,10 @@ def _telemetry(units: dict[str, str]) -> list[str]:
 def _source(name: str, unit: str) -> list[str]:
     """Return the keys of the message that carries a parameter: the autopilot's own one if known.
 
-    The columns that magbridge reads from a telemetry log are named in
-    :mod:`magbridge.logs.telemetry_fields`; a calibration that was fitted to such a log has these names.
+    The columns that magbridge reads from a telemetry log are named in ``logs/fields.csv``; a calibration that
+    was fitted to such a log has these names.
     """
-    for fields in MAVLINK_FIELDS.values():
+    for fields in field_maps("mavlink").values():
         for one in fields:
             if one.column == name and unit in ("", one.unit):
                 scale = [f"scale = {one.factor:g}"] if one.factor != 1.0 else []

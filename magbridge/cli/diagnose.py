@@ -58,7 +58,7 @@ def diagnose(
     cli.logs_to_read(files, output / "calibration.json", calibration, grid)
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
-    from magbridge.logs.sensor_log import combine
+    from magbridge.logs.merge import combine
 
     known = mb.load(calibration)
     with waiting("reading") as step:

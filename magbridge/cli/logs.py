@@ -42,8 +42,8 @@ def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.
     cli.logs_to_read(files)
     from magbridge.logs.deployment import join
     from magbridge.logs.info import info as facts_of
+    from magbridge.logs.merge import combine
     from magbridge.logs.reading import without_companions
-    from magbridge.logs.sensor_log import combine
 
     logs = {}
     with waiting("reading"):

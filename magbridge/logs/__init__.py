@@ -11,7 +11,7 @@ magnetometer sample; every other column holds the values known at that time:
 
 :mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.reading` and
 :mod:`.writing` are for all formats; :mod:`.mapping` is what a user can say about a log. The formats share
-:mod:`.fields` (telemetry brought to the rows; :mod:`.autopilot` does so for autopilots and robots),
+:mod:`.fields` (telemetry brought to the rows; :mod:`.compasses` does so for autopilots and robots),
 :mod:`.deployment` (what they return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one
 stream of several. :mod:`.tlog` is separate: it writes the bridge's log.
 """

@@ -31,13 +31,12 @@ import xarray as xr
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
-from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
 from magbridge.logs.checks import boots
 from magbridge.logs.clocks import GPS_EPOCH, WEEK, leap_seconds
-from magbridge.logs.compasses import LogCompass, rate
+from magbridge.logs.compasses import BootRun, LogCompass, Magnetometer, Series, pieces, rate
 from magbridge.logs.dataflash import OWN_SCALE, Flash, Records, read_binary, read_text
 from magbridge.logs.deployment import NOTES
-from magbridge.logs.fields import DEG_PER_RAD, FieldMap, by_record, fields_of
+from magbridge.logs.fields import DEG_PER_RAD, FieldMap, field_maps, fields_of
 
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
@@ -54,10 +53,7 @@ ID_PARAMETERS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows; the values that are read are held whole.
-
-    FormatError: no magnetometer in it.
-    """
+    """Yield the log in pieces; the values that are read are held whole."""
     with path.open("rb") as file:
         text = b"FMT," in file.read(4096)
     flash = (read_text if text else read_binary)(path, WANTED)
@@ -233,57 +229,19 @@ def _utc_offset(records: dict[str, Records]) -> float | None:
     offsets = []
     for gps in (one.fields for one in _instances(records, "GPS").values()):
         if {"GWk", "GMS"} <= gps.keys():
-            fixed = (gps["GWk"] > 0) & (
-                gps.get("Status", np.full(len(gps["GWk"]), MIN_GPS_STATUS)) >= MIN_GPS_STATUS
-            )
+            fixed = (gps["GWk"] > 0) & (gps.get("Status", MIN_GPS_STATUS) >= MIN_GPS_STATUS)
             ahead = GPS_EPOCH + gps["GWk"] * WEEK + gps["GMS"] * 1e-3 - gps["TimeUS"] * 1e-6
             offsets.append(ahead[fixed])
     known = np.concatenate(offsets) if offsets else np.empty(0)
     if not len(known):
         return None
-    offset = np.array([np.median(known)])
+    offset = np.median(known, keepdims=True)
     return float((offset - leap_seconds(offset))[0])
 
 
 Fields = dict[str, list[FieldMap]]
 """Kind of record to its fields."""
-ARDUPILOT_FIELDS: Fields = by_record(
-    (
-        FieldMap("ATT", "Roll", "roll", "deg"),
-        FieldMap("ATT", "Pitch", "pitch", "deg"),
-        FieldMap("ATT", "Yaw", "heading", "deg"),
-        FieldMap("AHR2", "Roll", "roll", "deg"),
-        FieldMap("AHR2", "Pitch", "pitch", "deg"),
-        FieldMap("AHR2", "Yaw", "heading", "deg"),
-        FieldMap("POS", "Lat", "latitude", "deg"),
-        FieldMap("POS", "Lng", "longitude", "deg"),
-        FieldMap("POS", "RelHomeAlt", "depth", "m", -1.0),
-        FieldMap("GPS", "Lat", "latitude", "deg"),
-        FieldMap("GPS", "Lng", "longitude", "deg"),
-        FieldMap("CTUN", "Alt", "depth", "m", -1.0),
-        FieldMap("CTUN", "ThO", "throttle", "1"),
-        FieldMap("THR", "ThrOut", "throttle", "%"),
-        FieldMap("MOTB", "ThrOut", "motor_throttle", "1"),
-        FieldMap("BAT", "Curr", "battery#_current", "A"),
-        FieldMap("BAT", "Volt", "battery#_voltage", "V"),
-        FieldMap("CURR", "Curr", "battery#_current", "A"),
-        FieldMap("CURR", "Volt", "battery#_voltage", "V"),
-        FieldMap("BARO", "Press", "pressure#", "hPa", 0.01),
-        FieldMap("BARO", "Temp", "pressure#_temperature", "degC"),
-        FieldMap("BARO", "Alt", "depth", "m", -1.0),
-        FieldMap("ESC", "Curr", "esc#_current", "A"),
-        FieldMap("ESC", "Volt", "esc#_voltage", "V"),
-        FieldMap("ESC", "RPM", "esc#_rpm", "rpm"),
-        FieldMap("ESC", "Temp", "esc#_temperature", "degC"),
-        FieldMap("RPM", "RPM", "rpm#", "rpm"),
-        FieldMap("RPM", "rpm1", "rpm", "rpm"),
-        FieldMap("RPM", "rpm2", "rpm2", "rpm"),
-        FieldMap("IMU", "T", "imu#_temperature", "degC"),
-        *(FieldMap("RCOU", f"C{k}", f"servo{k}", "us") for k in range(1, 15)),
-        *(FieldMap("RCO2", f"C{k}", f"servo{k}", "us") for k in range(15, 19)),
-        *(FieldMap("RCO3", f"C{k}", f"servo{k}", "us") for k in range(19, 33)),
-    )
-)
+ARDUPILOT_FIELDS: Fields = field_maps("ardupilot")
 """Of records with one column, the first that the log has is taken. Sub's and Copter's CTUN have height and
 throttle, Rover's throttle is in THR, that of all motors together in MOTB."""
 INSTANCE = ("I", "Instance", "Inst")
@@ -294,14 +252,12 @@ SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My",
 POWER_MESSAGES = "CURR", "BAT"
 MAX_VOLTAGE_V = 100.0
 """Larger integers in a log that does not declare its units are in hundredths of V and A."""
-MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health", *INSTANCE}
+MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health"}
+NUMBERED = {"MAG": MAG, **{kind: {one.field for one in fields} for kind, fields in ARDUPILOT_FIELDS.items()}}
 WANTED: dict[str, set[str]] = {
     **{
         f"{name}{k}": {*TIME_FIELDS, *INSTANCE, *fields}
-        for name, fields in {
-            **{kind: {one.field for one in fields} for kind, fields in ARDUPILOT_FIELDS.items()},
-            "MAG": MAG,
-        }.items()
+        for name, fields in NUMBERED.items()
         for k in ("", *range(2, MAX_KIND_NUMBER + 1))
     },
     SURVEY: {*TIME_FIELDS, *SURVEY_ID, *SURVEY_AXES},
@@ -353,9 +309,8 @@ def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
         if (name, "Curr") in declared or not len(volts) or not is_whole or np.median(volts) < MAX_VOLTAGE_V:
             continue
         found[name] = [one._replace(factor=0.01 * one.factor) for one in found[name]]
-        notes.append(
-            f"{name}: current and voltage are read in hundredths of A and V: {np.median(volts):g} V else"
-        )
+        otherwise = f"{np.median(volts):g} V else"
+        notes.append(f"{name}: current and voltage are read in hundredths of A and V: {otherwise}")
     return found, notes
 
 
@@ -394,5 +349,5 @@ def _declared(flash: Flash) -> dict[tuple[str, str], tuple[str, float]]:
     return found
 
 
-def _characters(codes: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:
+def _characters(codes: FloatArray) -> list[str]:
     return [chr(int(code) & 0xFF) for code in codes]

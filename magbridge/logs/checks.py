@@ -1,29 +1,43 @@
-"""Drop and count impossible data: times that do not increase, and values beyond physical limits.
+"""Drop and count data that cannot be, and values that a file states not to be valid.
 
 One damaged record costs only itself. The longest increasing series of times is kept: a clock
 that was set back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time
 become one. A value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units,
 or in another order, and is refused. Each kind of fault is counted, and the first of each column is named.
+
+A column ``Valid`` is 0 in rows that are not valid, ``MagValid`` where the field is not. A column ``X_QC`` has
+the quality flags of column ``X``, of which 3, 4 and 9 are bad or missing. A column ``Flag`` with the values 0
+and 1 marks the rarer of the two. Programs without NaN write codes such as -999 for "not known".
+
+References
+----------
+Argo Quality Control Manual, reference table 2, https://doi.org/10.13155/33951
 """
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
-from magbridge.columns import CHANNEL_TIMES, usual
+from magbridge.columns import CHANNEL_TIMES, CHANNELS, usual
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
+from magbridge.logs.mapping import bare
 
-__all__ = ["MEDIAN_ROWS", "Faults", "boots", "checked", "in_order", "increasing"]
+__all__ = [
+    "MEDIAN_ROWS", "Faults", "Validity", "boots", "checked", "in_order", "increasing", "known",
+    "mark_invalid", "states_validity", "validity_of",
+]  # fmt: skip
 
 Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
@@ -74,21 +88,24 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
     FormatError: at least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names
     the first. Or the error of `pieces`, after the pieces before it.
     """
-    checks = _Checks(file, strict)
+    faults = Faults(file, strict=strict)
+    previous = -np.inf
     last: xr.Dataset | None = None
     broken: list[FormatError] = []
     for piece, following in pairwise(chain(_up_to_error(pieces, broken), [None])):
         if piece is None:  # only the last is
             break
-        part = checks.sound(*piece, following[0]["time"].values if following else np.empty(0))
+        next_times = following[0]["time"].values if following else np.empty(0)
+        part = _sound(faults, *piece, previous, next_times)
         if part.sizes["time"]:
+            previous = float(part["time"].values[-1])
             if last is not None:
                 yield last
-            last = checks.counted(part)
+            last = with_losses(part, *faults.since_last())
     if not broken:
-        checks.finish()
+        faults.finish()
     if last is not None:
-        yield checks.counted(last)  # with the losses behind it
+        yield with_losses(last, *faults.since_last())  # with the losses behind it
     for error in broken:
         raise error
 
@@ -101,68 +118,58 @@ def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator
         broken.append(error)
 
 
-class _Checks:
-    """The faults of a file so far."""
+def _sound(
+    faults: Faults, dataset: xr.Dataset, rows: Sequence[int], previous: float, next_times: FloatArray
+) -> xr.Dataset:
+    """Return a piece without impossible data, between the last time before it and the times after it."""
+    index, duplicates = _times(faults, dataset["time"].values, rows, previous, next_times)
+    dropped = dataset.sizes["time"] - len(index)
+    if dropped:
+        dataset, rows = dataset.isel(time=index), [rows[k] for k in index.tolist()]
+    dataset, values = _plausible(faults, dataset, rows)
+    faults.lost(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
+    return merged(dataset) if duplicates else dataset
 
-    def __init__(self, file: str | Path, strict: bool) -> None:
-        self._faults = Faults(file, strict=strict)
-        self._last = -np.inf
-        self.finish = self._faults.finish
 
-    def sound(self, dataset: xr.Dataset, rows: Sequence[int], next_times: FloatArray) -> xr.Dataset:
-        """Return the piece without impossible data. `next_times` are the times of the next piece."""
-        index, duplicates = self._times(dataset["time"].values, rows, next_times)
-        dropped = dataset.sizes["time"] - len(index)
-        if dropped:
-            dataset, rows = dataset.isel(time=index), [rows[k] for k in index.tolist()]
-        dataset, values = self._plausible(dataset, rows)
-        if duplicates:
-            dataset = merged(dataset)
-        if dataset.sizes["time"]:
-            self._last = float(dataset["time"].values[-1])
-        self._faults.lost(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
-        return dataset
+def _times(
+    faults: Faults, time: FloatArray, rows: Sequence[int], previous: float, next_times: FloatArray
+) -> tuple[IndexArray, int]:
+    """Return the indices of the rows to keep, and how many of these have the time of the one before."""
+    faults.count("time", len(time))
+    time = np.where(np.isfinite(time), time, np.nan)  # an infinite time has no difference from another
+    whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
+    if not len(_wrong(whole, previous)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
+        return np.arange(len(time)), 0
+    index = _rows_to_keep(whole, previous)
+    then = [*whole[index].tolist(), np.inf]
+    index = index[index < len(time)]
+    repeated = index[1:][np.diff(time[index]) == 0]
+    wrong = np.union1d(np.setdiff1d(np.arange(len(time)), index), repeated)
+    if len(wrong):
+        k = int(wrong[0])
+        place = int(np.searchsorted(index, k))
+        before = float(time[index[place - 1]]) if place else previous
+        expected = _disorder(time) or _expected(float(time[k]), before, then[place])
+        faults.note("time", len(wrong), rows[k], expected)
+    return index, len(repeated)
 
-    def counted(self, dataset: xr.Dataset) -> xr.Dataset:
-        """Return a piece with the losses since the last one was returned."""
-        return with_losses(dataset, *self._faults.since_last())
 
-    def _times(self, time: FloatArray, rows: Sequence[int], next_times: FloatArray) -> tuple[IndexArray, int]:
-        """Return the indices of the rows to keep, and how many of these have the time of the one before."""
-        self._faults.count("time", len(time))
-        time = np.where(np.isfinite(time), time, np.nan)  # an infinite time has no difference from another
-        whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
-        if not len(_wrong(whole, self._last)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
-            return np.arange(len(time)), 0
-        index = _rows_to_keep(whole, self._last)
-        then = [*whole[index].tolist(), np.inf]
-        index = index[index < len(time)]
-        repeated = index[1:][np.diff(time[index]) == 0]
-        wrong = np.union1d(np.setdiff1d(np.arange(len(time)), index), repeated)
-        if len(wrong):
-            k = int(wrong[0])
-            place = int(np.searchsorted(index, k))
-            before = float(time[index[place - 1]]) if place else self._last
-            expected = _disorder(time) or _expected(float(time[k]), before, then[place])
-            self._faults.note("time", len(wrong), rows[k], expected)
-        return index, len(repeated)
-
-    def _plausible(self, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
-        """Return the piece with NaN for impossible values, and how many there were."""
-        count, time = 0, dataset["time"].values
-        for name, column in dataset.data_vars.items():
-            values = column.values
-            wrong, expected = _impossible(str(name), column.attrs.get("units", ""), values, time)
-            if expected:
-                self._faults.count(str(name), int(np.isfinite(values).sum()))
-            if expected and wrong.any():
-                k = int(wrong.argmax())
-                self._faults.note(
-                    str(name), int(wrong.sum()), rows[k], f"{expected}, not {float(values[k])!r}"
-                )
-                count += int(wrong.sum())
-                dataset = dataset.assign({name: column.copy(data=np.where(wrong, np.nan, values))})
-        return dataset, count
+def _plausible(faults: Faults, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
+    """Return the piece with NaN for impossible values, and how many there were."""
+    count, time = 0, dataset["time"].values
+    for name, column in dataset.data_vars.items():
+        values = column.values
+        wrong, expected = _impossible(str(name), column.attrs.get("units", ""), values, time)
+        if not expected:
+            continue
+        faults.count(str(name), int(np.isfinite(values).sum()))
+        if wrong.any():
+            k = int(wrong.argmax())
+            expected = f"{expected}, not {float(values[k])!r}"
+            faults.note(str(name), int(wrong.sum()), rows[k], expected)
+            count += int(wrong.sum())
+            dataset = dataset.assign({name: column.copy(data=np.where(wrong, np.nan, values))})
+    return dataset, count
 
 
 def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
@@ -173,11 +180,10 @@ def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> t
     if name == "reference_field":
         low, high = REFERENCE_FIELD_RANGE_NT
         expected = f"expected {low:g} to {high:g} nT, or nothing where it is not known"
-        return (values < REFERENCE_FIELD_RANGE_NT[0]) | (values > REFERENCE_FIELD_RANGE_NT[1]), expected
+        return (values < low) | (values > high), expected
     if name in CHANNEL_TIMES:
-        return np.abs(
-            values - time
-        ) > MAX_CHANNEL_DELAY_S, f"expected a time within {MAX_CHANNEL_DELAY_S:g} s of the row's"
+        expected = f"expected a time within {MAX_CHANNEL_DELAY_S:g} s of the row's"
+        return np.abs(values - time) > MAX_CHANNEL_DELAY_S, expected
     if unit in MIN_VALUE:
         expected = f"expected at least {MIN_VALUE[unit]:g} {unit}, or nothing where it is not known"
         return values < MIN_VALUE[unit], expected
@@ -196,10 +202,8 @@ def _disorder(time: FloatArray) -> str:
         return "expected times that increase, they run backwards: sort the rows by time"
     if len(steps) > 1 and np.mean(steps == 0.0) > 0.5:
         each = round(len(time) / len(np.unique(time)))
-        rate = '--column time="row [RATE Hz]"'
-        return (
-            f"expected a time for each row, {each} have the same: if in whole seconds, give the rate, {rate}"
-        )
+        remedy = 'if in whole seconds, give the rate, --column time="row [RATE Hz]"'
+        return f"expected a time for each row, {each} have the same: {remedy}"
     return ""
 
 
@@ -209,9 +213,8 @@ def _expected(time: float, previous: float, following: float = np.inf) -> str:
         return f"expected seconds since 1970, not {time!r}"
     if previous < time and following <= time:
         return f"expected a time before {following!r}, not {time!r}"
-    return (
-        f"expected a {f'time after {previous!r}' if np.isfinite(previous) else 'finite time'}, not {time!r}"
-    )
+    wanted = f"time after {previous!r}" if np.isfinite(previous) else "finite time"
+    return f"expected a {wanted}, not {time!r}"
 
 
 def _rows_to_keep(time: FloatArray, previous: float) -> IndexArray:
@@ -235,13 +238,7 @@ MAX_WRONG_FRACTION = 0.5
 
 
 class Faults:
-    """The faults of a file so far.
-
-    Attributes
-    ----------
-    rows : int
-        Rows seen, also the wrong ones.
-    """
+    """The faults of a file so far; `rows` counts the rows seen, also the wrong ones."""
 
     def __init__(self, file: str | Path, *, strict: bool) -> None:
         self._file, self._strict = file, strict
@@ -304,20 +301,10 @@ MEDIAN_ROWS = 5
 
 
 def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
-    """Return the rows to keep so that time increases and the fewest rows are dropped.
+    """Return the rows (n,) to keep so that `time` (n,), s, increases and the fewest rows are dropped.
 
-    A single time that is ahead costs its own row, and not all that follow; so does one set back.
-
-    Parameters
-    ----------
-    time : (n,) array of float
-        s, in the order of the file; NaN is never kept.
-    strictly : bool
-        Of several rows with one time, only the first is kept.
-
-    Returns
-    -------
-    (n,) array of bool
+    A single time that is ahead costs its own row, and not all that follow; so does one set back. NaN is never
+    kept; of several rows with one time, `strictly` keeps only the first.
 
     Notes
     -----
@@ -349,16 +336,173 @@ def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
 
 
 def boots(time: FloatArray) -> IndexArray:
-    """Return the rows at which the clock restarted, including the first row.
-
-    Parameters
-    ----------
-    time : (n,) array of float
-        s since the boot, in the order of the file.
-    """
+    """Return the rows at which the clock restarted, including the first; `time` (n,) is s since the boot."""
     found = [0]
     for k in (1 + np.flatnonzero(np.diff(time) < -MIN_SET_BACK_S)).tolist():
         before, after = time[max(found[-1], k - MEDIAN_ROWS) : k], time[k : k + MEDIAN_ROWS]
         if np.median(after) < np.median(before) - MIN_SET_BACK_S:
             found.append(k)
     return np.array(found, dtype=np.intp)
+
+
+VALID = re.compile("(is|data|row|sample)?valid(ity)?")
+MAG_VALID = re.compile("(mag|field|tmi)(is)?valid(ity)?")
+QUALITY_OF = re.compile(r"(.+?)[ _.]?(QC|qc|quality_flag)")
+FLAG = re.compile("(mag|qc|quality|data)?flag")
+BAD_QUALITY = frozenset({3.0, 4.0, 9.0})
+MAX_FLAGGED = 0.2
+"""Largest fraction of rows that a column Flag may mark."""
+
+
+class Validity(NamedTuple):
+    """Statement of a column about other columns."""
+
+    column: str
+    targets: tuple[str, ...]
+    """Columns whose values are not valid where `column` is bad; empty: the whole row."""
+    bad: frozenset[float]
+    """Values of `column` that mean so."""
+
+    @property
+    def text(self) -> str:
+        """The rule, for the user."""
+        what = " ".join(self.targets) or "rows"
+        bad = " or ".join(f"{value:g}" for value in sorted(self.bad))
+        return f"{what} not valid where {self.column} is {bad}"
+
+
+def states_validity(name: str) -> bool:
+    """Return True if a column of this name is about the validity of others."""
+    word = bare(name)
+    named = any(pattern.fullmatch(word) for pattern in (VALID, MAG_VALID, FLAG))
+    return named or bool(QUALITY_OF.fullmatch(name))
+
+
+def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Validity]:
+    """Return the rules by which columns state which values are valid, from the cells of the first `rows`.
+
+    A column that is not read has the name ''.
+    """
+    found = []
+    words = [bare(name) if name else None for name in names]
+    for k, name in enumerate(names):
+        word = bare(name)
+        if VALID.fullmatch(word):
+            found.append(Validity(name, (), frozenset({0.0})))
+        elif MAG_VALID.fullmatch(word):
+            targets = ("total_field",) if "total_field" in names else CHANNELS
+            found.append(Validity(name, targets, frozenset({0.0})))
+        elif (match := QUALITY_OF.fullmatch(name)) and bare(match[1]) in words:
+            found.append(Validity(name, (names[words.index(bare(match[1]))],), BAD_QUALITY))
+        elif FLAG.fullmatch(word):
+            cells = [row[k] for row in rows if k < len(row) and row[k]]
+            marked = sum(cell in {"1", "1.0"} for cell in cells)
+            binary = bool(cells) and all(cell in {"0", "0.0", "1", "1.0"} for cell in cells)
+            if binary and marked <= MAX_FLAGGED * len(cells):
+                found.append(Validity(name, (), frozenset({1.0})))
+            elif binary and len(cells) - marked <= MAX_FLAGGED * len(cells):
+                found.append(Validity(name, (), frozenset({0.0})))
+    return found
+
+
+def invalid(
+    rules: Sequence[Validity], columns: Mapping[str, FloatArray]
+) -> Iterator[tuple[str, BoolArray, str]]:
+    """Yield what rules mark as not valid: column ("" for whole rows), values (n,), and the rule's column."""
+    for rule in rules:
+        bad = np.isin(columns[rule.column], list(rule.bad))
+        if bad.any() and not rule.targets:
+            yield "", bad, rule.column
+        for name in rule.targets:
+            if name in columns and (there := bad & np.isfinite(columns[name])).any():
+                yield name, there, rule.column
+
+
+EXPECTED_VALUE = "expected a value, or nothing where it is not known, not "
+
+CODES = np.outer([-1.0, 1.0], [
+    9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
+    2_147_483_647.0, 69_696_969.0, 999.0, 999.9, 999.99,
+])  # fmt: skip
+"""As they are met, with either sign."""
+ONLY_AMONG_OTHERS = 1_000.0
+"""Smaller codes count only where the column has other values, too."""
+MIN_FILL_VALUE = 1e30
+"""A larger number is one, too, whatever it measures: 1e31, 1e34, 9.97e36."""
+
+
+def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
+    """Return the undeclared missing-value codes among columns (n,) as masks.
+
+    They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
+    three axes are 0, or the same code, is none, nor is a place at 0, 0: a receiver without a fix writes it.
+    """
+    found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
+    for together in (CHANNELS, ("latitude", "longitude")):
+        if set(together) <= set(columns):
+            first, *others = (columns[name] for name in together)
+            alike = np.all([first == other for other in others], axis=0)
+            alike &= (first == 0.0) | np.isin(first, CODES)
+            found |= {name: found[name] | alike for name in together}
+    return {name: wrong for name, wrong in found.items() if wrong.any()}
+
+
+def _is_code(values: FloatArray) -> BoolArray:
+    wrong: BoolArray = np.abs(values) > MIN_FILL_VALUE
+    codes = np.isin(values, CODES)
+    others = values[np.isfinite(values) & ~codes & ~wrong]
+    if not len(others):
+        codes &= np.abs(values) >= ONLY_AMONG_OTHERS
+    if codes.any():
+        low, high = (others.min(), others.max()) if len(others) else (0.0, 0.0)
+        wrong |= codes & (np.maximum(low - values, values - high) > max(0.5 * (high - low), 1.0))
+    return wrong
+
+
+def mark_invalid(
+    columns: dict[str, FloatArray],
+    rules: Sequence[Validity],
+    note: Callable[[str, BoolArray, str], None],
+    *,
+    codes: bool = True,
+) -> BoolArray:
+    """Set the values that are not valid to NaN, in place, and return the rows (n,) to keep.
+
+    These are missing-value `codes`, and what the rules mark. `note` takes a column ("" for whole rows), its
+    wrong values (n,) and what was expected.
+    """
+    for name, wrong in (unknown(columns) if codes else {}).items():
+        note(name, wrong, f"{EXPECTED_VALUE}{float(columns[name][wrong][0])!r}")
+        columns[name][wrong] = np.nan
+    keep = np.ones(len(next(iter(columns.values()), [])), bool)
+    for name, wrong, column in invalid(rules, columns):
+        note(name, wrong, f"not valid by {column!r}")
+        if name:
+            columns[name][wrong] = np.nan
+        else:
+            keep &= ~wrong
+    return keep
+
+
+def known(path: Path, dataset: xr.Dataset, numbers: Sequence[int]) -> tuple[xr.Dataset, Sequence[int]]:
+    """Return a deployment of another program and the numbers of its rows without what is not valid.
+
+    Missing-value codes, and what a column such as ``Valid`` marks, are counted and named.
+    """
+    columns = {str(name): column.to_numpy().copy() for name, column in dataset.data_vars.items()}
+    lines: list[str] = []
+    dropped = {"values_dropped": 0, "rows_dropped": 0}
+
+    def note(name: str, wrong: BoolArray, expected: str) -> None:
+        row = None if expected.startswith(EXPECTED_VALUE) else numbers[int(wrong.argmax())]
+        lines.append(str(FormatError(path, expected, row=row, column=name or None)))
+        dropped["values_dropped"] += int(wrong.sum()) if name else 0
+
+    keep = mark_invalid(columns, validity_of([*columns], ()), note)
+    if lines:
+        dataset = dataset.assign({name: dataset[name].copy(data=columns[name]) for name in columns})
+    if columns and not keep.all():
+        dropped["rows_dropped"] = int((~keep).sum())
+        dataset = dataset.isel(time=keep)
+        numbers = [number for number, is_valid in zip(numbers, keep.tolist(), strict=True) if is_valid]
+    return with_losses(dataset, dropped, lines), numbers

@@ -180,9 +180,8 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     numbers = _numbers(pd.Series(present, dtype="str"))
     if not unit and _on_a_clock(heading, present):
         return TimeFormat("%H%M%S", OF_A_DAY, boot=True)
-    digits = (
-        not unit and bool(present) and all(re.fullmatch(r"(19|20)\d{12}(\.\d+)?", one) for one in present)
-    )
+    date_digits = re.compile(r"(19|20)\d{12}(\.\d+)?")
+    digits = not unit and bool(present) and all(map(date_digits.fullmatch, present))
     if not digits and (not present or np.isfinite(numbers).any()):
         whole = all(re.fullmatch(r"\d+", one) for one in present)
         return _counted(heading, unit, numbers[np.isfinite(numbers)], integers=whole)
@@ -204,15 +203,9 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, integers: bool) ->
         kind, assumed = _kind(heading, numbers, declared=unit == "s")
     start, scale = EPOCHS[kind]
     since = start + scale * float(np.median(numbers)) if len(numbers) else 0.0
-    dated = since >= YEAR_1980
     step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
-    if (
-        kind == "s"
-        and not unit
-        and integers
-        and step >= MIN_CLOCK_STEP
-        and not (dated and since < UNIX_TIME_RANGE_S[1] and step < DAY)
-    ):
+    is_unix_time = YEAR_1980 <= since < UNIX_TIME_RANGE_S[1] and step < DAY
+    if kind == "s" and not unit and integers and step >= MIN_CLOCK_STEP and not is_unix_time:
         ways = " or ".join(f'--column time="{heading} [{one}]"' for one in ("ms", "us", "ns", "s"))
         raise ValueError(f"a count with steps of {step:g}, in a unit that the file does not tell: {ways}")
     boot = bool(len(numbers)) and abs(since) < YEAR_1980 and heading != "time"
@@ -268,16 +261,9 @@ def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bo
 
 
 def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray:
-    """Return the cells in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
+    """Return the cells (n,) in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
 
-    Parameters
-    ----------
-    clock : TimeFormat
-        As :func:`clock_of` returns it.
-    cells : (n,) Series
-        Numbers or texts.
-    zone : str or None
-        Zone of times that do not say theirs; UTC if None.
+    `zone` is that of times that do not say theirs; UTC if None.
     """
     if clock.kind in EPOCHS:
         start, scale = EPOCHS[clock.kind]
@@ -306,12 +292,8 @@ def _numbers(cells: pd.Series) -> FloatArray:
 def patterns(texts: Sequence[str]) -> list[str]:
     """Return the patterns that fit all of these texts, one of each set of equivalent patterns."""
     whole, _ = _plain(pd.Series(list(texts), dtype="string"))
-    candidates = [
-        *WHOLE_MOMENTS,
-        *map(" ".join, product(DATES, (*HOURS, SECONDS_SUFFIX.strip()))),
-        *DATES,
-        *HOURS,
-    ]
+    dates_with_times = map(" ".join, product(DATES, (*HOURS, SECONDS_SUFFIX.strip())))
+    candidates = [*WHOLE_MOMENTS, *dates_with_times, *DATES, *HOURS]
     found: dict[tuple[float, ...], str] = {}
     for pattern in candidates:
         if _fits(whole.iloc[0], pattern):
@@ -341,16 +323,10 @@ def _plain(texts: pd.Series) -> tuple[pd.Series, FloatArray]:
 
 
 def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray:
-    """Return the texts in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
+    """Return the texts (n,) in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
 
-    Parameters
-    ----------
-    texts : (n,) Series
-        As they are written.
-    pattern : str
-        One of :func:`patterns`, ``iso``, or one with a fraction of its own, ``%f``.
-    zone : str or None
-        Zone of times that do not say theirs; UTC if None.
+    `pattern` is one of :func:`patterns`, ``iso``, or one with a fraction of its own, ``%f``; `zone` is that
+    of times that do not say theirs, UTC if None.
     """
     seconds: FloatArray = np.zeros(len(texts))
     texts = texts.astype("string").str.strip()

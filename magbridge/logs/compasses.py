@@ -1,30 +1,44 @@
-"""The compasses of a log, their descriptions, and the choice of the one that is read as ``mag_x``.
+"""Logs with several magnetometers: their compasses, the choice of one, and rows at its samples.
 
 A log tells which compass was in use by the vehicle's settings and by its state: the one that the estimator
 names, that is enabled and healthy. Unless the user asks for another, this one becomes ``mag_x``, ``mag_y``,
 ``mag_z``; the others keep their number, as in ``mag2_x`` of the second.
+
+In the logs of ArduPilot, PX4 and ROS, a row is a sample of that magnetometer; every other column is the last
+value before it. A log that does not tell UTC counts from the boot, and has the attribute
+``time_reference = "boot"``. Each boot is a run with its own UTC.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import xarray as xr
 
+from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
+from magbridge.logs.checks import in_order
+from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
+from magbridge.logs.fields import latest
 from magbridge.wording import counted
 
 __all__ = [
-    "COMPASSES_ATTRIBUTE", "HEALTHY", "LogCompass", "by_columns", "choose", "compass_notes", "compasses_in",
-    "compasses_of", "further", "listed", "rate",
+    "COMPASSES_ATTRIBUTE", "HEALTHY", "BootRun", "LogCompass", "Magnetometer", "Series", "by_columns",
+    "choose", "compass_notes", "compasses_in", "compasses_of", "further", "listed", "pieces", "rate",
 ]  # fmt: skip
 
+Series = tuple[FloatArray, str, str, FloatArray]
+"""Times (m,), s; column, unit and values (m,)."""
+MIN_BOOT_INTERVAL_S = 60.0
+"""s between two boots whose times would overlap: no value is carried from one to the other."""
 OTHER = re.compile(r"mag[1-9]\d*_x$")
 """Name of the first axis of another compass than the first."""
 AXIS = re.compile(r"mag([1-9]\d*)?_[xyz]$")
@@ -72,6 +86,27 @@ class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
         return f"compass {self.number}: {', '.join(facts)}"
 
 
+class Magnetometer(NamedTuple):
+    """The samples of a magnetometer."""
+
+    compass: LogCompass
+    time: FloatArray
+    """(n,), s of the log."""
+    field: Mapping[str, FloatArray]
+    """(n,) each, nT, by axis (``x``, ``y``, ``z``)."""
+
+
+class BootRun(NamedTuple):
+    """The records between one boot and the next."""
+
+    magnetometers: list[Magnetometer]
+    """At least one."""
+    telemetry: Iterable[Series]
+    """The first of several with one name is taken."""
+    offset: float | None
+    """UTC minus the log's time, s; None where it is not known."""
+
+
 def rate(time: Sequence[float] | np.ndarray[Any, Any]) -> float:
     """Return the median rate, Hz, of times in s; 0 of fewer than two."""
     steps = np.diff(np.asarray(time, dtype=np.float64))
@@ -82,19 +117,9 @@ def rate(time: Sequence[float] | np.ndarray[Any, Any]) -> float:
 def choose(path: Path, found: Sequence[LogCompass], wanted: str | None) -> list[LogCompass]:
     """Return the compasses with one marked as chosen.
 
-    Parameters
-    ----------
-    path : path
-        Named in the error.
-    found : sequence of LogCompass
-        At least one.
-    wanted : str or None
-        A number or an id; None: the one in use, else the first that is enabled and healthy.
+    `wanted` is a number or an id; None: the one in use, else the first that is enabled and healthy.
 
-    Raises
-    ------
-    FormatError
-        No compass has that number or id.
+    FormatError: no compass has that number or id.
     """
     if wanted is None:
         best = min(found, key=lambda one: (not one.fit, not one.in_use, one.number))
@@ -136,9 +161,8 @@ def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
     numbers = [one.number for one in _by_names(deployment)]
     if not wanted.isdecimal() or int(wanted) not in numbers:
         known = " ".join(str(number) for number in numbers)
-        raise FormatError(
-            deployment.attrs.get("source", ""), f"expected a compass {wanted!r}; there are: {known}"
-        )
+        source = deployment.attrs.get("source", "")
+        raise FormatError(source, f"expected a compass {wanted!r}; there are: {known}")
     moved = {f"mag_{axis}": f"mag1_{axis}" for axis in "xyz"}
     moved |= {f"mag{int(wanted) + 1}_{axis}": f"mag_{axis}" for axis in "xyz"}
     renamed = deployment.rename({old: new for old, new in moved.items() if old in deployment})
@@ -180,3 +204,69 @@ def compasses_of(attrs: Mapping[Any, Any]) -> list[LogCompass]:
     """
     text = attrs.get(COMPASSES_ATTRIBUTE)
     return msgspec.json.decode(text, type=list[LogCompass]) if isinstance(text, str) else []
+
+
+def pieces(
+    path: Path, rows: int, runs: Sequence[BootRun], attrs: Mapping[str, Any], compass: str | None = None
+) -> Iterator[xr.Dataset]:
+    """Yield the log in pieces of at most `rows` rows, run by run.
+
+    `attrs` are of the whole log: its first piece has what they count. Runs without a date are left out, and
+    counted, where others have one.
+    """
+    dated = [run for run in runs if run.offset is not None]
+    chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)
+    notes = [*noted(attrs), *compass_notes(chosen, compass)]
+    if len(runs) > 1:
+        notes.append(f"{len(runs)} boots, each a run of its own")
+    counts = {name: value for name, value in attrs.items() if name != NOTES}
+    if dated and len(dated) < len(runs):
+        lost = sum(len(run.magnetometers[0].time) for run in runs if run.offset is None)
+        counts["rows_dropped"] = counts.get("rows_dropped", 0) + lost
+        notes.append(f"{len(runs) - len(dated)} of them without GPS time are left out: they have no date")
+    own = next(one for one in chosen if one.chosen)
+    found = [_assembled(path, run, own) for run in dated or runs]
+    notes += _one_after_the_other(found)
+    kept = {**listed(chosen), **({} if dated else {"time_reference": "boot"})}
+    first: dict[str, Any] = {**counts, **({NOTES: "\n".join(notes)} if notes else {})}
+    columns = {str(name): dict(one.attrs) for data in found for name, one in data.data_vars.items()}
+    for k, data in enumerate(found):
+        whole = same_columns(data, columns).assign_attrs(kept | first)
+        yield from sliced(uncounted(whole) if k else whole, rows)
+
+
+def _assembled(path: Path, run: BootRun, wanted: LogCompass) -> xr.Dataset:
+    """Return a run at the times of a compass; without that compass, at those of the run's own choice."""
+    there = [one.compass for one in run.magnetometers]
+    same = [one for one in there if (one.id, one.number) == (wanted.id, wanted.number)]
+    compass = same[0] if same else next(one for one in choose(path, there, None) if one.chosen)
+    mag = next(one for one in run.magnetometers if one.compass.number == compass.number)
+    columns = {f"mag_{axis}": values for axis, values in mag.field.items()}
+    units = dict.fromkeys(columns, "nT")
+    further = (
+        (other.time, f"mag{other.compass.number + 1}_{axis}", "nT", values)
+        for other in run.magnetometers
+        if other is not mag
+        for axis, values in other.field.items()
+    )
+    for when, column, unit, values in chain(further, run.telemetry):
+        if column not in columns:
+            keep = in_order(when, strictly=False)
+            columns[column], units[column] = latest(mag.time, when[keep], values[keep]), unit
+    return deployment(path, mag.time + (run.offset or 0.0), columns, units)
+
+
+def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
+    """Shift runs that begin before the end of the previous run, in place; return a note for each."""
+    notes, ended = [], -inf
+    for k, run in enumerate(runs):
+        time = run["time"].values
+        kept = time[in_order(time)]
+        if len(kept) and kept[0] <= ended:
+            later = ended + MIN_BOOT_INTERVAL_S - float(kept[0])
+            runs[k] = run.assign_coords(time=run["time"].copy(data=time + later))
+            why = "begins by its own clock before the end of the last"
+            notes.append(f"boot {k + 1} {why}: moved by {later:.0f} s")
+        if len(kept):
+            ended = float(runs[k]["time"].values[in_order(time)][-1])
+    return notes

@@ -126,16 +126,13 @@ def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
     kinds = []
     for start, one in zip(at, _gather(data, at, FORMAT_LAYOUT), strict=True):
         name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
+        size = int(one["length"])
         known = all(letter in LETTERS for letter in letters)
-        size = (
-            RECORD_HEADER_BYTES + sum(np.dtype(LETTERS[letter]).itemsize for letter in letters)
-            if known
-            else one["length"]
-        )
-        if size == one["length"] > RECORD_HEADER_BYTES and name.isalnum():
-            kinds.append(
-                _Kind(int(start), int(one["type"]), int(size), name, letters, tuple(columns.split(",")))
-            )
+        sizes = [np.dtype(LETTERS[letter]).itemsize for letter in letters] if known else []
+        is_sound = not known or RECORD_HEADER_BYTES + sum(sizes) == size
+        if is_sound and size > RECORD_HEADER_BYTES and name.isalnum():
+            names = tuple(columns.split(","))
+            kinds.append(_Kind(int(start), int(one["type"]), size, name, letters, names))
     return kinds
 
 
@@ -209,9 +206,8 @@ def _decoded(data: Bytes, kind: _Kind, starts: IndexArray, wanted: Collection[st
         if letter not in LETTERS or offset + layout.itemsize > kind.length:
             break  # how long a field of an unknown letter is, and so where the next begins, is not known
         if name in wanted and layout.kind in "iuf":
-            fields[name] = _gather(data, starts, layout, offset).astype(np.float64) / OWN_SCALE.get(
-                letter, 1.0
-            )
+            numbers = _gather(data, starts, layout, offset).astype(np.float64)
+            fields[name] = numbers / OWN_SCALE.get(letter, 1.0)
         elif name in wanted and layout.kind == "S":
             texts[name] = [text.decode("latin-1") for text in _gather(data, starts, layout, offset)]
         offset += layout.itemsize
@@ -229,7 +225,7 @@ def _joined(first: Records, second: Records) -> Records:
 
 
 def number_of(text: str) -> float:
-    """Return the number of a text; NaN for another text."""
+    """Return the number of a text; NaN for another text, which is damaged."""
     try:
         return float(text)
     except ValueError:
@@ -262,7 +258,6 @@ def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
     kept: dict[tuple[str, str], str] = {}
     for name, rows in lines.items():
         letters, columns = described[name]
-
         kept |= {(name, one): letter for one, letter in zip(columns, letters, strict=False)}
         records[name] = _records(at[name], rows, letters, columns, wanted[name])
     return Flash(records, kept, skipped)
@@ -276,8 +271,5 @@ def _records(
         if name in wanted and letter in TEXT_TYPES:
             texts[name] = list(values)
         elif name in wanted:
-            try:
-                fields[name] = np.array(values, dtype=np.float64)
-            except ValueError:  # one of them is damaged
-                fields[name] = np.array([number_of(value) for value in values])
+            fields[name] = np.array([number_of(value) for value in values])
     return Records(np.array(rows_at, dtype=np.intp), fields, texts)

@@ -99,14 +99,10 @@ def deployment(
         if scale is None:
             raise FormatError(file, f"expected {COLUMNS[name].units}, not {unit}", column=name)
         array = np.asarray(values, dtype=np.float64)
-        variables[name] = (
-            "time",
-            array if scale == 1.0 else array * scale,
-            _describe(name, unit, long_names.get(name)),
-        )
-    return xr.Dataset(
-        variables, coords={"time": variables.pop("time")}, attrs={"source": Path(file).name, **attrs}
-    )
+        described = _describe(name, unit, long_names.get(name))
+        variables[name] = ("time", array if scale == 1.0 else array * scale, described)
+    coords = {"time": variables.pop("time")}
+    return xr.Dataset(variables, coords=coords, attrs={"source": Path(file).name, **attrs})
 
 
 def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
@@ -134,14 +130,11 @@ def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
 def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     """Return the deployment with exactly the columns of `like` (name to attributes), missing ones all NaN."""
     empty = np.full(dataset.sizes["time"], np.nan)
-    return xr.Dataset(
-        {
-            name: dataset[name] if name in dataset else ("time", empty, dict(attrs))
-            for name, attrs in like.items()
-        },
-        coords={"time": dataset["time"]},
-        attrs=dataset.attrs,
-    )
+    variables = {
+        name: dataset[name] if name in dataset else ("time", empty, dict(attrs))
+        for name, attrs in like.items()
+    }
+    return xr.Dataset(variables, coords={"time": dataset["time"]}, attrs=dataset.attrs)
 
 
 def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -161,22 +154,17 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
             own = part.variables[name].attrs
             attrs = described.setdefault(str(name), own)
             if attrs.get("units") != own.get("units"):
-                raise FormatError(
-                    part.attrs.get("source", ""),
-                    f"expected {attrs.get('units')!r} as in the files before, not {own.get('units')!r}",
-                    column=str(name),
-                )
+                expected = f"expected {attrs.get('units')!r} as in the files before, not {own.get('units')!r}"
+                raise FormatError(part.attrs.get("source", ""), expected, column=str(name))
     time = np.concatenate([part["time"].values for part in parts])
     order = np.argsort(time, kind="stable")
     variables = {}
     for name, attrs in described.items():
-        values = np.concatenate(
-            [
-                part.variables[name].values if name in part else np.full(part.sizes["time"], np.nan)
-                for part in parts
-            ]
-        )
-        variables[name] = ("time", values[order], attrs)
+        columns = [
+            part.variables[name].values if name in part else np.full(part.sizes["time"], np.nan)
+            for part in parts
+        ]
+        variables[name] = ("time", np.concatenate(columns)[order], attrs)
     joined = merged(xr.Dataset(variables, coords={"time": ("time", time[order], parts[0]["time"].attrs)}))
     joined.attrs = join_attrs(parts)
     return with_losses(joined, {"duplicate_rows": len(time) - joined.sizes["time"]})
@@ -190,16 +178,16 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
         name: ("time", _first_known(column.values, starts), column.attrs)
         for name, column in dataset.data_vars.items()
     }
-    return xr.Dataset(
-        variables, coords={"time": ("time", time.values[starts], time.attrs)}, attrs=dataset.attrs
-    )
+    coords = {"time": ("time", time.values[starts], time.attrs)}
+    return xr.Dataset(variables, coords=coords, attrs=dataset.attrs)
 
 
 def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[str] = ()) -> xr.Dataset:
     """Return the deployment with its :data:`COUNTERS` raised by `counts`, and `lines` that name them."""
-    raised: dict[str, int | str] = {
-        name: int(dataset.attrs.get(name, 0)) + count for name, count in counts.items() if count
-    }
+    raised: dict[str, int | str] = {}
+    for name, count in counts.items():
+        if count:
+            raised[name] = int(dataset.attrs.get(name, 0)) + count
     if named := [*named_losses(dataset.attrs), *lines]:
         raised[LOSSES_ATTRIBUTE] = "\n".join(named)
     return dataset.assign_attrs(raised)
@@ -258,10 +246,7 @@ def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
 
     What headings refer to counts only for parts that have headings.
 
-    Raises
-    ------
-    FormatError
-        Two parts disagree on an attribute that changes what values mean.
+    FormatError: two parts disagree on an attribute that changes what values mean.
     """
     headed = [part.attrs for part in parts if "heading" in part] or [part.attrs for part in parts]
     all_attrs: list[Mapping[Any, Any]] = [part.attrs for part in parts]

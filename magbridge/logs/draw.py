@@ -20,25 +20,15 @@ LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_fie
 
 
 def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
-    """Draw the total field with its 2-sigma band, the anomaly where there is one, and flagged samples.
+    """Draw what ``magbridge correct`` writes as PNG, PDF or SVG.
 
-    Parameters
-    ----------
-    log : Dataset (time)
-        With what ``magbridge correct`` writes.
-    path : path
-        PNG, PDF or SVG.
+    It is the total field with its 2-sigma band, the anomaly where there is one, and flagged samples.
 
-    Raises
-    ------
-    WriteError
-        The file cannot be written.
+    WriteError: the file cannot be written.
     """
-    names = [
-        "total_field",
-        *(["anomaly"] if bool(log["anomaly"].notnull().any()) else []),
-        "total_field_sigma",
-    ]
+    names = ["total_field", "anomaly", "total_field_sigma"]
+    if not bool(log["anomaly"].notnull().any()):
+        names.remove("anomaly")
     figure = Figure(figsize=(9.0, 1.0 + 2.2 * len(names)), layout="constrained")
     axes = figure.subplots(len(names), 1, sharex=True)
     for axis, name in zip(axes, names, strict=True):
@@ -53,14 +43,7 @@ def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
 def corrected_panel(axis: Axes, log: xr.Dataset, name: str) -> None:
     """Draw a column of a corrected log against time, with flagged samples and the 2-sigma band of a field.
 
-    Parameters
-    ----------
-    axis : Axes
-        What to draw on.
-    log : Dataset (time)
-        With what ``magbridge correct`` writes.
-    name : str
-        ``total_field``, ``anomaly``, ``total_field_sigma`` or ``level_sigma``.
+    `name` is ``total_field``, ``anomaly``, ``total_field_sigma`` or ``level_sigma``.
     """
     log = log.isel(time=slice(None, None, max(1, log.sizes["time"] // DRAWN_SAMPLES)))
     time = np.array(log["time"].to_numpy() * 1e6, "datetime64[us]")
@@ -71,9 +54,8 @@ def corrected_panel(axis: Axes, log: xr.Dataset, name: str) -> None:
     axis.plot(time[doubtful], values[doubtful], ".", ms=3, mew=0, color="C1", label="flagged")
     spread = name.endswith("sigma")
     if not spread:
-        axis.fill_between(
-            time, clear - 2.0 * sigma, clear + 2.0 * sigma, color="C0", alpha=0.25, lw=0, label="2-sigma"
-        )
+        low, high = clear - 2.0 * sigma, clear + 2.0 * sigma
+        axis.fill_between(time, low, high, color="C0", alpha=0.25, lw=0, label="2-sigma")
     if np.isfinite(clear).any():  # flagged samples must not set the scale
         bottom, top = np.nanpercentile(clear, [0.5, 99.5])
         margin = 0.15 * (top - bottom) + 2.0 * float(np.nanmedian(sigma))

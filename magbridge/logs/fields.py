@@ -1,13 +1,16 @@
 """The table of a format: which field of its records becomes which column, in which unit.
 
-Each format lists its fields as :class:`FieldMap` records. If several fields fill one column, the first that a
-log has is read. Telemetry with times of its own is brought to the rows by :func:`latest`, as known live, or
-by :func:`linear`.
+``fields.csv`` lists the fields of each format: the record (message, topic, kind) that holds one, its column
+and the column's unit, the value in this unit of one unit of the field, and the numbers that stand for a
+missing value. If several fields fill one column, the first that a log has is read. Telemetry with
+times of its own is brought to the rows by :func:`latest`, as known live, or by :func:`linear`.
 """
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +19,11 @@ from numpy.typing import ArrayLike
 from magbridge.arrays import FloatArray
 
 __all__ = [
-    "CIRCLES", "DEG_PER_RAD", "MAX_AGE", "FieldMap", "Track", "by_record", "degrees", "fields_of",
+    "CIRCLES", "DEG_PER_RAD", "MAX_AGE", "FieldMap", "Track", "degrees", "field_maps", "fields_of",
     "interpolated", "latest", "linear",
 ]  # fmt: skip
 
+FIELDS_FILE = Path(__file__).with_name("fields.csv")
 DEG_PER_RAD = 180.0 / np.pi
 MAX_AGE = 30.0
 """Age from which on a value is not carried to a row, s."""
@@ -58,27 +62,24 @@ class FieldMap(NamedTuple):
         return values * self.factor
 
 
-def by_record(fields: Iterable[FieldMap]) -> dict[str, list[FieldMap]]:
-    """Return the fields of each record, in their order."""
+def field_maps(name: str) -> dict[str, list[FieldMap]]:
+    """Return the fields of each record of a format, in the order of ``fields.csv``."""
     found: dict[str, list[FieldMap]] = {}
-    for one in fields:
-        found.setdefault(one.record, []).append(one)
+    with FIELDS_FILE.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if row.pop("format") == name:
+                factor, missing = float(row.pop("factor")), map(float, row.pop("missing").split())
+                one = FieldMap(**row, factor=factor, missing=tuple(missing))
+                found.setdefault(one.record, []).append(one)
     return found
 
 
 def fields_of(
     fields: Iterable[FieldMap], table: Mapping[str, FloatArray], instance: int = 0
 ) -> Iterator[tuple[str, str, FloatArray]]:
-    """Yield column, unit and values (n,) of each of the fields that a table holds.
+    """Yield column, unit and values (n,) of each of the fields that a table, field to numbers (n,), holds.
 
-    Parameters
-    ----------
-    fields : iterable of FieldMap
-        Those of the table's record.
-    table : mapping of str to (n,) array
-        Field to its numbers.
-    instance : int
-        Number of the table among those of its record, from 0.
+    `instance` is the number of the table among those of its record, from 0.
     """
     number = str(instance + 1) if instance else ""
     for one in fields:
@@ -89,18 +90,9 @@ def fields_of(
 def interpolated(
     fields: Iterable[FieldMap], tracks: Mapping[str, Track], time: FloatArray, max_gap_s: float
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return columns (n,) and their units of fields with times of their own, interpolated linearly.
+    """Return columns (n,) and units of fields with `tracks` of their own, at the rows' `time` (n,), s.
 
-    Parameters
-    ----------
-    fields : iterable of FieldMap
-        Fields to read.
-    tracks : mapping of str to (times, values)
-        Field to its times (m,), s, and values (m,).
-    time : (n,) array
-        s, of the rows.
-    max_gap_s : float
-        s between two values across which nothing is interpolated.
+    Nothing is interpolated across more than `max_gap_s` between two values.
     """
     columns: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
@@ -113,21 +105,10 @@ def interpolated(
 
 
 def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
-    """Return the last value at or before each time, as known live.
+    """Return the last value at or before each time `target` (n,), s, as known live, (n,).
 
-    Parameters
-    ----------
-    target : (n,) array
-        s, the rows.
-    time, values : (m,) array
-        s, not decreasing, and the values received then; NaN is a missing value.
-    max_age : float
-        s, of the oldest value that is still used.
-
-    Returns
-    -------
-    (n,) array
-        NaN before the first value, and once the last is older than `max_age`.
+    `time` (m,), s, does not decrease; NaN among the `values` (m,) received then is a missing value. The
+    result is NaN before the first value, and once the last is older than `max_age`, s.
     """
     known = np.isfinite(values)
     time, values = time[known], values[known]
@@ -139,29 +120,13 @@ def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: fl
 
 
 def linear(
-    target: FloatArray,
-    time: FloatArray,
-    values: FloatArray,
-    max_gap: float,
-    column: str,
+    target: FloatArray, time: FloatArray, values: FloatArray, max_gap: float, column: str
 ) -> FloatArray:
-    """Return the values of a column interpolated linearly in time, along the shorter arc of a circle.
+    """Return the values of a column at `target` (n,), s, interpolated linearly in `time` (m,), s, (n,).
 
-    Parameters
-    ----------
-    target : (n,) array
-        s, the rows.
-    time, values : (m,) array
-        s, increasing, and the values measured then; NaN is a missing value.
-    max_gap : float
-        s; the result is NaN between neighbours with a longer interval, except at the neighbours' own times,
-        and farther beyond an end. Nearer to an end, the value there is held.
-    column : str
-        Its name; the values of :data:`CIRCLES` lie on a circle.
-
-    Returns
-    -------
-    (n,) array
+    The values of a column in :data:`CIRCLES` go along the shorter arc. NaN among `values` (m,) is a missing
+    value. The result is NaN between neighbours with an interval longer than `max_gap`, s, except at the
+    neighbours' own times, and farther beyond an end. Nearer to an end, the value there is held.
     """
     known = np.isfinite(values) & np.isfinite(time)
     time, values = time[known], values[known]

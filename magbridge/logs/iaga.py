@@ -22,8 +22,6 @@ from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.registry import opened
 
-__all__ = ["chunks"]
-
 MIN_CODE_NT = 88_888.0
 """Code for values that were not recorded, as 99,999 for those not observed, nT."""
 TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
@@ -31,7 +29,7 @@ TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file in pieces of at most `rows` rows; FormatError: no header of the format, or no rows."""
+    """Yield the file in pieces; it is held whole."""
     with opened(path) as file:
         lines = file.read().decode("ascii", "replace").splitlines()
     first = next((k for k, line in enumerate(lines) if line.startswith("DATE ")), None)

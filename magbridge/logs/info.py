@@ -11,10 +11,10 @@ from msgspec import to_builtins
 from magbridge.arrays import FloatArray
 from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot, in_seconds
 from magbridge.field.igrf import magnitude
+from magbridge.logs.checks import states_validity
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
 from magbridge.logs.naming import READING_RANGE_NT
-from magbridge.logs.validity import states_validity
 
 __all__ = ["INFO_GAP_INTERVALS", "USES", "conditions", "info", "lacking", "movers", "telemetry"]
 

@@ -18,12 +18,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import nan
 from pathlib import Path
-from typing import NamedTuple
 
 from magbridge.errors import FormatError
+from magbridge.logs.checks import Validity
 from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.mapping import CELL_NUMBER, ColumnMapping, declared_by_maker, is_unit
-from magbridge.logs.validity import Validity
 from magbridge.wording import counted
 
 __all__ = ["BLANKS", "LAYOUT_LINES", "Layout", "Rows", "cells", "header_of", "is_remark", "rows_among"]
@@ -107,17 +106,6 @@ class Layout:
         return cell.replace(",", ".") if self.decimal == "," else cell
 
 
-class Comments(NamedTuple):
-    """The comments above the headings."""
-
-    lines: int
-    """Number of lines that they take."""
-    attrs: Mapping[str, str | float]
-    """What they declare."""
-    fill: float
-    """The number that stands for a missing value; NaN where they do not say."""
-
-
 def cells(line: str, separator: str) -> list[str]:
     """Return the fields of a line, without the blanks around them."""
     if separator == BLANKS:
@@ -139,22 +127,22 @@ def header_of(
 
     FormatError: no headings, or too many.
     """
-    comments = _comments(path, lines)
-    body = rows_among(lines[comments.lines :])
-    if not body or not lines[comments.lines].strip():
-        raise FormatError(path, "expected a header row, the file is empty", row=comments.lines + 1)
+    comments, attrs, fill = _comments(path, lines)
+    body = rows_among(lines[comments:])
+    if not body or not lines[comments].strip():
+        raise FormatError(path, "expected a header row, the file is empty", row=comments + 1)
     separator = declared.separator or _separator(body)
     if (width := _count(body[0], separator)) > MAX_COLUMNS:
         expected = f"expected at most {MAX_COLUMNS} columns, got {width}"
-        raise FormatError(path, expected, row=comments.lines + 1)
+        raise FormatError(path, expected, row=comments + 1)
     guesses = []
-    if passed := _preamble(lines[comments.lines :], separator):
+    if passed := _preamble(lines[comments:], separator):
         guesses.append(f"{counted(passed, 'line')} above the headings passed over")
-    start = comments.lines + passed
+    start = comments + passed
     headings, first = cells(lines[start].lstrip("#% "), separator), start + 1
-    if _are_values(headings) or (comments.lines and _mostly_digits(headings)):
+    if _are_values(headings) or (comments and _mostly_digits(headings)):
         first = start
-        start, headings = _headings_elsewhere(path, lines, comments.lines, start, separator, declared)
+        start, headings = _headings_elsewhere(path, lines, comments, start, separator, declared)
         guesses += [f"headings from the comment in line {start + 1}"] if start < first else []
     units = _units_row(lines[first], separator) if first < len(lines) else []
     first += bool(units)
@@ -172,7 +160,7 @@ def header_of(
     guesses += [f"columns as {maker} writes them"] if maker else []
     layout = Layout(
         separator, decimal, headings=tuple(headings), declared=declared, open_ended=open_ended, row=start + 1,
-        first=first, attrs=comments.attrs, fill=comments.fill, foreign=foreign, guesses=tuple(guesses),
+        first=first, attrs=attrs, fill=fill, foreign=foreign, guesses=tuple(guesses),
     )  # fmt: skip
     return layout, units, rows
 
@@ -193,13 +181,16 @@ def _mostly_digits(row: Sequence[str]) -> bool:
     return sum(cell.lstrip("+-.")[:1].isdigit() for cell in row) > len(row) / 2
 
 
-def _comments(path: Path, lines: Sequence[str]) -> Comments:
-    """Return the comments above the headings; FormatError: a setting that is not a number."""
+def _comments(path: Path, lines: Sequence[str]) -> tuple[int, dict[str, str | float], float]:
+    """Return the number of comments above the headings, what they declare, and the code of missing values.
+
+    The code is NaN where they do not say. FormatError: a setting that is not a number.
+    """
     attrs: dict[str, str | float] = {}
     fill = nan
     for k, line in enumerate(lines):
         if not is_remark(line):
-            return Comments(k, attrs, fill)
+            return k, attrs, fill
         if match := ATTRIBUTE_LINE.fullmatch(line.strip()):
             name, text = match.groups()
             if name == "fill_value":
@@ -207,7 +198,7 @@ def _comments(path: Path, lines: Sequence[str]) -> Comments:
             else:
                 number = name.startswith(SETTINGS)
                 attrs[name] = _declared_number(path, name, text, k + 1) if number else text
-    return Comments(len(lines) - 1, attrs, fill)
+    return len(lines) - 1, attrs, fill
 
 
 def _declared_number(path: Path, name: str, text: str, row: int) -> float:

@@ -1,6 +1,6 @@
 """Columns of other programs under our names: headings, units, and what user and maker declare of them.
 
-A user declares columns by ``--column`` and ``columns.toml``; :data:`MAKERS` has the same for instruments and
+A user declares columns by ``--column`` and ``columns.toml``; ``makers.toml`` has the same for instruments and
 autopilots whose makers state what the columns mean. PX4's topics as ``ulog2csv`` writes them are in
 microseconds since the boot and in gauss (PX4, msg/SensorMag.msg, msg/VehicleMagnetometer.msg). Geometrics'
 MagMap writes the month first. DatCon's ``offsetTime`` counts seconds from the start of a DJI flight.
@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -34,6 +34,7 @@ __all__ = [
     "renamed", "split",
 ]  # fmt: skip
 
+MAKERS_FILE = Path(__file__).with_name("makers.toml")
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
 CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
@@ -56,42 +57,19 @@ VECTORS = (
 """What the three axes are called elsewhere, with neither capitals nor punctuation."""
 ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
 """What they end in, behind the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
+TIME_NAMES = (
+    "timestamp ts datetime timeutc utctime datetimeutc dateandtime isotime unixtime unixtimestamp posixtime"
+    " epoch epochtime utc gpstime gpsseconds jd mjd juliandate julianday julian exceltime exceldate datenum"
+    " timeiso isoformat zeit zeitstempel uhrzeit heure hora timeofday secondsofday sod tod seconds t tempo"
+)
 ALIASES = {
-    "time": (
-        *(
-            "timestamp",
-            "ts",
-            "datetime",
-            "timeutc",
-            "utctime",
-            "datetimeutc",
-            "dateandtime",
-            "isotime",
-            "unixtime",
-        ),
-        *("unixtimestamp", "posixtime", "epoch", "epochtime", "utc", "gpstime", "gpsseconds", "jd", "mjd"),
-        *("juliandate", "julianday", "julian", "exceltime", "exceldate", "datenum", "timeiso", "isoformat"),
-        *(
-            "zeit",
-            "zeitstempel",
-            "uhrzeit",
-            "heure",
-            "hora",
-            "timeofday",
-            "secondsofday",
-            "sod",
-            "tod",
-            "seconds",
-            "t",
-            "tempo",
-        ),
-    ),
-    "roll": ("rollangle",),
-    "pitch": ("pitchangle",),
-    "heading": ("yaw", "hdg", "compassheading", "trueheading", "magneticheading"),
-    "latitude": ("lat", "breite", "geobreite"),
-    "longitude": ("lon", "long", "lng", "laenge", "lnge", "geolaenge"),
-    "depth": ("depthm", "tiefe", "profondeur", "profundidad"),
+    "time": TIME_NAMES.split(),
+    "roll": ["rollangle"],
+    "pitch": ["pitchangle"],
+    "heading": ["yaw", "hdg", "compassheading", "trueheading", "magneticheading"],
+    "latitude": ["lat", "breite", "geobreite"],
+    "longitude": ["lon", "long", "lng", "laenge", "lnge", "geolaenge"],
+    "depth": ["depthm", "tiefe", "profondeur", "profundidad"],
 }
 """Our name -> names in other programs, the surest first."""
 TOWED = "magnetometer", "mag", "sensor", "towfish", "fish", "tow", "layback"
@@ -177,30 +155,16 @@ class Options:
 
 
 def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:
-    """Return the combined declarations of a mapping file and of ``--column``.
+    """Return the declarations of a ``columns.toml``, and of ``--column``, which overrule it.
 
-    Parameters
-    ----------
-    column : sequence of str
-        ``NAME="THEIRS [unit]"``; each overrules the file.
-    file : path or None
-        A ``columns.toml``.
-
-    Raises
-    ------
-    ConfigError
-        A key of the mapping file that is wrong.
-    WrongUse
-        A text without its name.
+    ConfigError: a key of the mapping file is wrong. WrongUse: a text without its name.
     """
-    declaration = _load(file) if file else ColumnMapping()
+    declaration = ColumnMapping()
+    if file:
+        table = load_toml(file)
+        check_entries(table, "columns", ColumnSource, file)
+        declaration = convert(table, ColumnMapping, file)
     return msgspec.structs.replace(declaration, columns={**declaration.columns, **dict(map(_named, column))})
-
-
-def _load(path: Path) -> ColumnMapping:
-    table = load_toml(path)
-    check_entries(table, "columns", ColumnSource, path)
-    return convert(table, ColumnMapping, path)
 
 
 def _named(text: str) -> tuple[str, ColumnSource]:
@@ -228,9 +192,8 @@ def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
         taken[name] = part[name]
     used = {_column(dataset, name, source)[0] for name, source in declaration.columns.items()}
     named = dataset.drop_vars(used - declaration.columns.keys()).assign(taken)
-    return named.assign_attrs(
-        {"heading_reference": declaration.heading_reference} if declaration.heading_reference else {}
-    )
+    reference = declaration.heading_reference
+    return named.assign_attrs({"heading_reference": reference}) if reference else named
 
 
 def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, str]:
@@ -242,55 +205,16 @@ def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, 
     return theirs, source.unit or unit
 
 
-MAKERS: dict[str, tuple[set[str], dict[str, ColumnSource]]] = {
-    "MagArrow": (
-        {"Counter", "Date", "Time", "Mag", "MagValid"},
-        {
-            "total_field": ColumnSource(heading="Mag", unit="nT", valid="MagValid"),
-            "mag_x": ColumnSource(heading="CompassY", unit="nT", scale=-1.0),
-            "mag_y": ColumnSource(heading="CompassX", unit="nT"),
-            "mag_z": ColumnSource(heading="CompassZ", unit="nT"),
-            "sensor_temperature": ColumnSource(heading="CompassTemperature", unit="degC"),
-        },
-    ),
-    "MagMap": (
-        {"READING_1", "DATE", "TIME", "LINE", "MARK"},
-        {
-            "total_field": ColumnSource(heading="READING_1", unit="nT"),
-            "time": ColumnSource(heading="TIME", unit="%m/%d/%y %H:%M:%S"),
-        },
-    ),
-    "DJI's DatCon": (
-        {"Tick#", "offsetTime"},
-        {
-            "time": ColumnSource(heading="offsetTime", unit="s"),
-            "latitude": ColumnSource(heading="GPS:Lat", unit="deg"),
-            "longitude": ColumnSource(heading="GPS:Long", unit="deg"),
-            "roll": ColumnSource(heading="IMU_ATTI(0):roll:C", unit="deg"),
-            "pitch": ColumnSource(heading="IMU_ATTI(0):pitch:C", unit="deg"),
-            "heading": ColumnSource(heading="IMU_ATTI(0):yaw:C", unit="deg"),
-        },
-    ),
-    "an RM3100 logger": (
-        {"ts", "rt", "lt", "x", "y", "z", "rx", "ry", "rz"},
-        {f"mag_{axis}": ColumnSource(heading=axis, unit="uT") for axis in "xyz"}
-        | {"sensor_temperature": ColumnSource(heading="rt", unit="degC")},
-    ),
-    "PX4's vehicle_magnetometer": (
-        {"timestamp", "device_id", "magnetometer_ga[0]"},
-        {"time": ColumnSource(heading="timestamp", unit="us")}
-        | {
-            f"mag_{axis}": ColumnSource(heading=f"magnetometer_ga[{k}]", unit="G")
-            for k, axis in enumerate("xyz")
-        },
-    ),
-    "PX4's sensor_mag": (
-        {"timestamp", "device_id", "x", "error_count"},
-        {"time": ColumnSource(heading="timestamp", unit="us")}
-        | {f"mag_{axis}": ColumnSource(heading=axis, unit="G") for axis in "xyz"},
-    ),
-}
-"""Instrument -> headings by which its files are known, and what its columns are."""
+class Maker(Table, frozen=True):
+    """What the maker of an instrument states: headings by which its files are known, and the columns."""
+
+    headings: frozenset[str]
+    columns: dict[str, ColumnSource]
+
+
+@cache
+def _makers() -> dict[str, Maker]:
+    return convert(load_toml(MAKERS_FILE), dict[str, Maker], MAKERS_FILE)
 
 
 def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple[str, ColumnMapping]:
@@ -298,10 +222,10 @@ def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple
 
     The name is empty where the headings are of no known instrument.
     """
-    bare = {heading.replace(" ", "") for heading in headings}
-    for name, (known, columns) in MAKERS.items():
-        if known <= bare:
-            there = {ours: source for ours, source in columns.items() if source.heading in bare}
+    names = {heading.replace(" ", "") for heading in headings}
+    for name, maker in _makers().items():
+        if maker.headings <= names:
+            there = {ours: source for ours, source in maker.columns.items() if source.heading in names}
             return name, msgspec.structs.replace(declared, columns={**there, **declared.columns})
     return "", declared
 
@@ -352,11 +276,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
         for pattern in VECTORS:
             places = [only(pattern.format(axis)) for axis in AXES]
             if None not in places:
-                found |= {
-                    place: f"mag_{axis}"
-                    for place, axis in zip(places, AXES, strict=True)
-                    if place is not None
-                }
+                found |= {int(k or 0): f"mag_{axis}" for k, axis in zip(places, AXES, strict=True)}
                 break
         else:
             others = ["" if name in COLUMNS else word for name, word in zip(names, words, strict=True)]
@@ -369,7 +289,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     for name in COLUMNS:
         if name in names or name in pair.values() or name == "quality":  # a foreign one is not our flags
             continue
-        aliases_of = (name.replace("_", ""), *ALIASES.get(name, ()))
+        aliases_of = [name.replace("_", ""), *ALIASES.get(name, [])]
         places = [only(word) for word in aliases_of]
         if name in PREFIXED_COLUMNS:
             places += [only(word, inner) for word in aliases_of]
@@ -388,7 +308,7 @@ def _position(words: Sequence[str]) -> dict[int, str]:
     for k, word in enumerate(words):
         match = PREFIXED_NAME.fullmatch(word)
         for name in ("latitude", "longitude"):
-            if match and match[2] in (name, *ALIASES[name]):
+            if match and match[2] in [name, *ALIASES[name]]:
                 pairs.setdefault((match[1] or "", match[3] or ""), {}).setdefault(name, k)
     whole = {around: pair for around, pair in pairs.items() if len(pair) == 2}
     if not whole:

@@ -36,8 +36,6 @@ try:
 except ImportError:
     raise MissingExtra("mcap", "formats") from None
 
-__all__ = ["FileWriter", "chunks"]
-
 PROFILE = "magbridge"
 """By which a file is known to be of this form."""
 RAW, FIELD, FLAGS, VEHICLE, OTHER_TOPIC = "/magnetometer", "/field", "/quality", "/vehicle", "/telemetry"
@@ -72,10 +70,7 @@ def topic_of(name: str) -> str:
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file in pieces of at most `rows` rows; it is held whole.
-
-    FormatError: no whole MCAP file as :class:`FileWriter` writes it.
-    """
+    """Yield a file of :class:`FileWriter` in pieces; it is held whole."""
     try:
         with path.open("rb") as file:
             whole = _read(path, make_reader(file, validate_crcs=True))

@@ -1,24 +1,59 @@
-"""Merge several logs into one stream, sorted in time, in bounded memory."""
+"""Bring several logs together: a stream sorted in time, and a vehicle's telemetry at a sensor's times.
+
+Logs are merged into one stream in bounded memory.
+
+A fluxgate with a logger of its own records the field, but neither attitude nor position; the vehicle's logs
+have these, on another time base. The sensor's rows stay as they are. Each column of the vehicle is brought to
+them by the rule for its kind:
+
+- a column on a circle (heading, roll, longitude) is interpolated along the shorter arc;
+- a column with few integer values (a switch, a mode, a counter of dives) is held until its next value;
+- any other column is interpolated linearly.
+
+A column has no value in a gap: an interval longer than `MIN_GAP_S` and than `GAP_INTERVALS` of its usual
+intervals. Rows outside the vehicle's logs, and rows in gaps of these logs, stay and are counted.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from itertools import chain, pairwise
 
 import numpy as np
 import xarray as xr
 
-from magbridge.logs.deployment import join, same_columns, uncounted
-from magbridge.logs.sensor_log import VehicleTelemetry, refuse_offset, sensor_logs, with_note
+from magbridge.arrays import FloatArray
+from magbridge.columns import CHANNEL_TIMES, CHANNELS, COLUMNS, counts_from_boot
+from magbridge.errors import FormatError, WrongUse
+from magbridge.logs.compasses import COMPASSES_ATTRIBUTE, further
+from magbridge.logs.deployment import (
+    NOTES,
+    join,
+    join_attrs,
+    noted,
+    same_columns,
+    uncounted,
+    with_losses,
+)
+from magbridge.logs.fields import CIRCLES, latest, linear
 
-__all__ = ["merge"]
+__all__ = ["combine", "merge", "refuse_offset"]
 
 Open = Callable[[int], Iterator[xr.Dataset]]
 Opened = tuple[xr.Dataset, Iterator[xr.Dataset]]
 """A piece of a log, and those after it."""
 MAX_BUFFERED_BYTES = 1 << 28
 """Bytes of first pieces that are kept while the others are opened: of small logs, all."""
+MIN_GAP_S = 30.0
+"""Shortest gap between two values of a column, s, across which it is not interpolated."""
+GAP_INTERVALS = 4.0
+"""Shortest gap in median intervals of the column, for columns that are updated rarely."""
+MAX_STATES = 8
+"""Largest number of different integers in a column that is taken for a switch, and held."""
+SCALAR_COLUMN, POSITION = "total_field", {"latitude", "longitude"}
+MAGNETIC_COLUMNS = {name for name, column in COLUMNS.items() if column.units == "nT"}
 
 
 def merge(
@@ -30,8 +65,8 @@ def merge(
     suffice for that, it is opened again when the stream has reached its start. Short pieces, as of many short
     logs, are joined to pieces of `rows` rows. A log without a piece is left out.
 
-    A sensor's own logs, those `named` or found by :func:`~magbridge.logs.sensor_log.sensor_logs`, get the
-    telemetry of the vehicle's logs, which are held whole.
+    A sensor's own logs, those `named` or found by :func:`_sensor_logs`, get the telemetry of the vehicle's
+    logs, which are held whole.
     """
     firsts: dict[int, xr.Dataset] = {}
     opened: dict[int, Opened] = {}
@@ -45,18 +80,20 @@ def merge(
         if room > 0:
             opened[k] = first, pieces
     places = list(firsts)
-    kinds = sensor_logs([firsts[k] for k in places], [k < len(named) and named[k] for k in places])
+    kinds = _sensor_logs([firsts[k] for k in places], [k < len(named) and named[k] for k in places])
     if kinds[0]:
         sensors, vehicles = ([places[k] for k in kind] for kind in kinds)
-        logs = [part for k in vehicles for part in _pieces(sources[k], opened.get(k), rows)]
+        logs = []
+        for k in vehicles:
+            first_piece, pieces = opened.get(k, (None, iter(())))
+            logs += [*sources[k](rows)] if first_piece is None else [first_piece, *pieces]
         telemetry = VehicleTelemetry(join(logs), clock_offset_s)
         combined = {k: telemetry.opener(sources[k], is_first=k == sensors[0]) for k in sensors}
-        opened.clear()
         stream = merge([combined.get(k, sources[k]) for k in places if k not in vehicles], rows)
-        names = ", ".join(str(firsts[k].attrs["source"]) for k in sensors)
+        note_of = ", ".join(str(firsts[k].attrs["source"]) for k in sensors)
         for piece, following in pairwise(chain(stream, [None])):
             if piece is not None:
-                yield piece if following is not None else with_note(piece, telemetry.note(names))
+                yield piece if following is not None else telemetry.noted(piece, note_of)
         return
     refuse_offset(clock_offset_s)
     whole = join(list(firsts.values()))  # also checks that they agree on units and on what heading means
@@ -78,15 +115,6 @@ def merge(
             parts, held = [], 0
     if parts:
         yield joined(parts)
-
-
-def _pieces(source: Open, opened: Opened | None, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the pieces of a log, of which the first may have been read."""
-    if opened is None:
-        yield from source(rows)
-    else:
-        yield opened[0]
-        yield from opened[1]
 
 
 def _in_order(
@@ -125,3 +153,170 @@ def _in_order(
                 parts.append(piece.isel(time=slice(0, n)))
                 active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
         yield parts
+
+
+def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: float) -> list[xr.Dataset]:
+    """Return the sensors' logs among `logs` with the vehicle's telemetry, and the logs that have both.
+
+    `named` are those that the user calls a sensor's log; `clock_offset_s` is added to the sensors' times, s.
+
+    FormatError: no time in common; times of which only one kind counts from 1970. WrongUse: a clock offset is
+    given, but no sensor's log next to a vehicle's.
+    """
+    sensors, vehicles = _sensor_logs(logs, named)
+    if not sensors:
+        refuse_offset(clock_offset_s)
+        return list(logs)
+    telemetry = VehicleTelemetry(join([logs[k] for k in vehicles]), clock_offset_s)
+    combined = [
+        telemetry.add_to(log, is_first=k == sensors[0]) if k in sensors else log
+        for k, log in enumerate(logs)
+        if k not in vehicles
+    ]
+    sources = ", ".join(dict.fromkeys(str(logs[k].attrs.get("source", "")) for k in sensors))
+    return [telemetry.noted(combined[0], sources), *combined[1:]]
+
+
+def refuse_offset(clock_offset_s: float) -> None:
+    """Raise WrongUse if a clock offset is given without a sensor's log next to a vehicle's."""
+    if clock_offset_s:
+        raise WrongUse("--clock-offset: expected a sensor's log next to a vehicle's logs; see --sensor-log")
+
+
+def _sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[list[int], list[int]]:
+    """Return the indices of the sensors' own logs, and of the vehicle's; both empty where there are not both.
+
+    `named` are those that the user calls a sensor's log. If none: a log with the field and without a position
+    is a sensor's, a log without any magnetic column is the vehicle's.
+
+    FormatError: the user calls a log a sensor's that has no field.
+    """
+    if any(named):
+        sensors = [k for k, is_named in enumerate(named) if is_named]
+        vehicles = [k for k, is_named in enumerate(named) if not is_named]
+        for k in sensors:
+            if not _has_field(logs[k]):
+                source = logs[k].attrs.get("source", "the sensor's log")
+                raise FormatError(source, "expected mag_x mag_y mag_z, or total_field, in a sensor's log")
+    else:
+        sensors = [k for k, log in enumerate(logs) if _has_field(log) and not set(log.data_vars) >= POSITION]
+        vehicles = [k for k, log in enumerate(logs) if not MAGNETIC_COLUMNS & set(log.data_vars)]
+    return (sensors, vehicles) if sensors and vehicles else ([], [])
+
+
+def _has_field(log: xr.Dataset) -> bool:
+    vector = all(name in log for name in CHANNELS)
+    return (vector or SCALAR_COLUMN in log) and "observatory" not in log.attrs
+
+
+class VehicleTelemetry:
+    """The telemetry of a vehicle's joined logs, interpolated to the times of sensors' logs, in pieces."""
+
+    def __init__(self, vehicle: xr.Dataset, clock_offset_s: float) -> None:
+        self._vehicle, self._offset_s = vehicle, clock_offset_s
+        self._time = vehicle["time"].to_numpy()
+        self._max_gap_s = _max_gap(self._time)
+        self._start, self._end = np.inf, -np.inf  # of the rows with telemetry
+
+    def add_to(self, sensor: xr.Dataset, *, is_first: bool) -> xr.Dataset:
+        """Return a piece of a sensor's log with the vehicle's columns that it lacks.
+
+        Losses of the vehicle's logs are counted with the first piece.
+
+        FormatError: the sensor's times count from a boot and the vehicle's do not, or the other way round.
+        """
+        sensor = self._shifted(sensor)
+        time = sensor["time"].to_numpy()
+        vehicle = further(self._vehicle) if set(CHANNELS) <= set(sensor.data_vars) else self._vehicle
+        columns = {}
+        for name, column in vehicle.data_vars.items():
+            if name not in sensor and name not in CHANNEL_TIMES:
+                values = _interpolated(time, self._time, str(name), column.to_numpy())
+                columns[str(name)] = ("time", values, dict(column.attrs))
+        outside = (time < self._time[0]) | (time > self._time[-1])
+        right = np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
+        widths = np.diff(self._time, prepend=self._time[0])[np.minimum(right, len(self._time) - 1)]
+        in_gaps = ~outside & (widths > self._max_gap_s) & ~np.isin(time, self._time)
+        covered = time[~outside]
+        if len(covered):
+            self._start, self._end = min(self._start, covered[0]), max(self._end, covered[-1])
+        attrs = join_attrs([sensor, vehicle if is_first else uncounted(vehicle)])
+        attrs.pop(COMPASSES_ATTRIBUTE, None)
+        combined = sensor.assign(columns)
+        combined.attrs = attrs
+        return with_losses(combined, {"rows_outside": int(outside.sum()), "rows_in_gaps": int(in_gaps.sum())})
+
+    def opener(self, source: Open, *, is_first: bool) -> Open:
+        """Return a function that opens a sensor's log as `source` does, with the vehicle's columns."""
+
+        def combined(rows: int) -> Iterator[xr.Dataset]:
+            for k, piece in enumerate(source(rows)):
+                yield self.add_to(piece, is_first=is_first and not k)
+
+        return combined
+
+    def noted(self, log: xr.Dataset, source: str) -> xr.Dataset:
+        """Return the last piece of the sensors' logs `source` with a note on how the logs were combined.
+
+        FormatError: the sensor's and the vehicle's logs have no time in common.
+        """
+        names = str(self._vehicle.attrs.get("source", "the vehicle's logs")).split(", ")
+        vehicle = " and ".join(names)
+        if len(names) > 2:
+            vehicle = f"{names[0]} to {names[-1]} ({len(names)} logs)"
+        first, last = (_moment(self._vehicle, time) for time in self._time[[0, -1]])
+        if self._end < self._start:
+            raise FormatError(
+                source,
+                f"expected times from {first} to {last}, those of {vehicle}; "
+                "--clock-offset S adds S seconds to the sensor's times",
+            )
+        clocks = f"with {self._offset_s:+g} s on the sensor's clock (--clock-offset)"
+        if not self._offset_s:
+            clocks = "the clocks are assumed to agree (--clock-offset S shifts the sensor's)"
+        note = (
+            f"{source}: with the telemetry of {vehicle}, from {first} to {last}; "
+            f"{self._end - self._start:.0f} s in common; {clocks}"
+        )
+        return log.assign_attrs({NOTES: "\n".join([*noted(log.attrs), note])})
+
+    def _shifted(self, sensor: xr.Dataset) -> xr.Dataset:
+        """Return a sensor's log on the vehicle's clock."""
+        from_boot, vehicle_from_boot = counts_from_boot(sensor), counts_from_boot(self._vehicle)
+        if self._offset_s:
+            sensor = sensor.assign_coords(time=sensor["time"].copy(data=sensor["time"] + self._offset_s))
+            for name in set(CHANNEL_TIMES) & set(sensor.data_vars):
+                sensor[name] = sensor[name].copy(data=sensor[name] + self._offset_s)
+            if from_boot and not vehicle_from_boot:
+                sensor.attrs.pop("time_reference", None)
+        elif from_boot != vehicle_from_boot:
+            which = "the sensor's" if from_boot else "the vehicle's"
+            raise FormatError(
+                sensor.attrs.get("source", "the sensor's log"),
+                f"{which} times count from a start that the log does not state: "
+                "--clock-offset S is added to the sensor's times",
+            )
+        return sensor
+
+
+def _interpolated(target: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:
+    """Return a column (m,) with times (m,), s, at the times `target` (n,), s, by the rule for its kind."""
+    known = np.isfinite(values)
+    time, values = time[known], values[known]
+    distinct = np.unique(values)
+    is_state = len(distinct) <= MAX_STATES and bool((distinct == np.round(distinct)).all())
+    if name not in CIRCLES and is_state:
+        return latest(target, time, values, _max_gap(time))
+    return linear(target, time, values, _max_gap(time), name)
+
+
+def _max_gap(time: FloatArray) -> float:
+    """Return the longest interval, s, of times (m,), s, that is not a gap."""
+    steps = np.diff(time)
+    return max(MIN_GAP_S, GAP_INTERVALS * float(np.median(steps)) if len(steps) else 0.0)
+
+
+def _moment(log: xr.Dataset, time: float) -> str:
+    if counts_from_boot(log):
+        return f"{time:.1f} s"
+    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M:%S} UTC"

@@ -60,25 +60,12 @@ HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -> Layout:
     """Return a layout with name and unit of each column: as declared, by its heading, or by another name.
 
-    Parameters
-    ----------
-    path : path
-        Named in errors.
-    layout : Layout
-        With the headings.
-    units : sequence of str
-        Those of a row of units, or empty.
-    rows : sequence of sequence of str
-        Cells of the first rows.
+    `units` are those of a row of units, or empty; `rows` the cells of the first rows.
 
-    Raises
-    ------
-    FormatError
-        A declared column that is not there, or two of one name of ours.
+    FormatError: a declared column that is not there, or two of one name of ours.
     """
     if layout.separator != ",":
-        signs = {"\t": "tabs", " ": "blanks"}
-        sign = signs.get(layout.separator, repr(layout.separator))
+        sign = {"\t": "tabs", " ": "blanks"}.get(layout.separator, repr(layout.separator))
         layout = layout.guessing(f"fields separated by {sign}")
     parts = [split(heading) for heading in layout.headings]
     declares = [parts[k][1] or (units[k] if k < len(units) else "") for k in range(len(parts))]

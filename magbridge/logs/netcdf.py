@@ -38,9 +38,9 @@ from magbridge.columns import COLUMNS, factor
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
 from magbridge.logs import seaglider
+from magbridge.logs.checks import known
 from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.mapping import aliases
-from magbridge.logs.validity import known
 from magbridge.records import Quality
 from magbridge.version import __version__
 
@@ -94,10 +94,7 @@ GENERATED = ("Conventions", "featureType", "title", "start_date", "time_coverage
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset | tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file as deployments of at most `rows` rows, those of a trajectory with their numbers.
-
-    FormatError: not netCDF or cut short, or no time in it.
-    """
+    """Yield the file in pieces, those of a trajectory with the numbers of their rows."""
     try:
         with netCDF4.Dataset(path) as file:
             if seaglider.DIMENSION in file.dimensions:
@@ -121,10 +118,7 @@ class CfColumn(NamedTuple):
 
 
 def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the rows of an open file in pieces of at most `rows`, each with their numbers.
-
-    FormatError: nothing in it is a time, or no rows.
-    """
+    """Yield the rows of an open file in pieces of at most `rows`, each with their numbers."""
     clock = _clock(path, file)
     dimension = _along(clock)
     total = len(file.dimensions[dimension])
@@ -132,18 +126,26 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
         raise FormatError(path, "expected rows, there are none")
     start, scale = _epoch(path, clock)
     columns, left_out = _columns(path, file, dimension, clock)
-    units = {one.name: _unit(one.variable) for one in columns}
+    units = {one.name: str(getattr(one.variable, "units", "1")) for one in columns}
+    # UDUNITS, and so a file of ours, has degree for an angle
+    units = {name: "deg" if unit == "degree" else unit for name, unit in units.items()}
     meanings = {one.name: str(getattr(one.variable, "long_name", "")) for one in columns}
     try:
-        attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
+        attrs = {key: value for key, value in file.__dict__.items() if key not in GENERATED}
     except AttributeError as error:  # netCDF4's, of a damaged attribute
         raise FormatError(path, f"its attributes cannot be read: {error}") from None
-    if "heading_reference" not in attrs and any(_is_magnetic(one) for one in columns):
-        attrs["heading_reference"] = "magnetic"
+    attrs = {key: value.item() if isinstance(value, np.generic) else value for key, value in attrs.items()}
+    heading = next((one.variable for one in columns if one.name == "heading"), None)
+    stated = [str(heading.getncattr(name)).lower() for name in heading.ncattrs()] if heading else []
+    if any("magnetic" in text for text in stated):
+        attrs.setdefault("heading_reference", "magnetic")
     for row in range(0, total, rows):
         part = slice(row, row + rows)
         time = _values(clock, part) * scale + start
-        values = {one.name: _sound(one, part) for one in columns}
+        values = {one.name: one.factor * _values(one.variable, part) for one in columns}
+        for one in columns:
+            if one.flags is not None:
+                values[one.name][_bad(one.flags, part)] = np.nan
         piece = deployment(path, time, values, units, attrs, meanings)
         yield with_losses(piece, {}, () if row else left_out), range(row + 1, row + 1 + len(time))
 
@@ -151,10 +153,8 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
 def _along(variable: Any) -> str | None:
     """Return the one dimension of a variable that is longer than 1, or its last; None: there are several."""
     sizes = dict(zip(variable.dimensions, variable.shape, strict=True))
-    long = [name for name, size in sizes.items() if size != 1]
-    return (
-        long[0] if len(long) == 1 else variable.dimensions[-1] if variable.dimensions and not long else None
-    )
+    long = [name for name, size in sizes.items() if size != 1] or [*variable.dimensions[-1:]]
+    return long[0] if len(long) == 1 else None
 
 
 def _is_number(variable: Any) -> bool:
@@ -204,9 +204,8 @@ def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[
             column, sign = name.lower(), 1.0
         unit = str(getattr(variable, "units", ""))
         if factor(unit, column) is None:
-            left_out.append(
-                f"{path}: column {name!r}: expected {COLUMNS[column].units}, not {unit}: left out"
-            )
+            expected = f"expected {COLUMNS[column].units}, not {unit}"
+            left_out.append(f"{path}: column {name!r}: {expected}: left out")
             continue
         while column in found or column == "time":
             column += "_"
@@ -236,12 +235,6 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
     return column, sign
 
 
-def _is_magnetic(column: CfColumn) -> bool:
-    """Return True if a heading is stated to be measured from magnetic north."""
-    text = " ".join(str(column.variable.getncattr(name)) for name in column.variable.ncattrs())
-    return column.name == "heading" and "magnetic" in text.lower()
-
-
 def _flags(file: Any, name: str) -> Any | None:
     """Return the variable with the flags of another; None where there is none."""
     ancillary = str(getattr(file[name], "ancillary_variables", "")).split()
@@ -252,12 +245,6 @@ def _flags(file: Any, name: str) -> Any | None:
         if FLAG_VARIABLE.fullmatch(other) or hasattr(one, "flag_meanings"):
             return one
     return None
-
-
-def _sound(column: CfColumn, rows: slice) -> FloatArray:
-    """Return rows of a column, NaN where its own flags call the value bad."""
-    values = column.factor * _values(column.variable, rows)
-    return values if column.flags is None else np.where(_bad(column.flags, rows), np.nan, values)
 
 
 def _values(variable: Any, rows: slice) -> FloatArray:
@@ -281,16 +268,6 @@ def _bad(flags: Any, rows: slice) -> BoolArray:
         text = zip(np.atleast_1d(flags.flag_values), str(flags.flag_meanings).split(), strict=False)
         codes = [int(value) for value, meaning in text if BAD.search(meaning.lower())]
     return np.isin(stored, codes)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def _unit(variable: Any) -> str:
-    """Return the unit, which a file of ours spells as UDUNITS does where it is an angle's."""
-    unit = str(getattr(variable, "units", "1"))
-    return "deg" if unit == "degree" else unit
 
 
 def _seaglider(path: Path, file: Any) -> seaglider.Dive:
@@ -396,15 +373,7 @@ def _as_stored(declared: Any, kind: np.dtype[Any]) -> list[Any]:
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one.
-
-    Parameters
-    ----------
-    path : Path
-        The file to write.
-    og1 : bool
-        The names are those of OG1.0, instead of the documented ones.
-    """
+    """Write successive deployments with the columns of the first one, with the names of OG1.0 if `og1`."""
 
     def __init__(self, path: Path, *, og1: bool = False) -> None:
         self._path, self._og1 = path, og1
@@ -434,6 +403,8 @@ class FileWriter:
         file.set_auto_mask(False)
         file.createDimension(self._dimension, None)
         first = float(dataset["time"][0]) if dataset.sizes["time"] else 0.0
+        history = str(dataset.attrs.get("history", "")).splitlines()
+        written = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by magbridge {__version__}"
         file.setncatts(
             {
                 key: value
@@ -446,7 +417,7 @@ class FileWriter:
                 "Conventions": "CF-1.11, ACDD-1.3",
                 "start_date": _iso(first),
                 "time_coverage_start": _iso(first),
-                "history": _history(str(dataset.attrs.get("history", ""))),
+                "history": "\n".join(line for line in (*history, written) if line),
             }
         )
         trajectory = file.createVariable(self._written("trajectory"), str)
@@ -489,12 +460,6 @@ class FileWriter:
         """Write everything to the file and close it."""
         with systems_reason(self._path):
             self._file.close()
-
-
-def _history(previous: str) -> str:
-    """Return the history, one entry per line, with an entry for this file."""
-    written = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by magbridge {__version__}"
-    return "\n".join(line for line in (*previous.splitlines(), written) if line)
 
 
 def _iso(time: float) -> str:

@@ -37,10 +37,7 @@ PLATFORM = {
 }
 """Mandatory variables of the platform, and their long names."""
 SENSOR_ATTRIBUTES = (
-    "sensor_model",
-    "sensor_model_vocabulary",
-    "sensor_type_vocabulary",
-    "sensor_serial_number",
+    *("sensor_model", "sensor_model_vocabulary", "sensor_type_vocabulary", "sensor_serial_number"),
 )
 """Mandatory attributes of the sensor's variable, and the serial number that is part of its name."""
 GLIDERS = {
@@ -137,9 +134,8 @@ def _fixes(file: Any, known: dict[str, Any]) -> None:
     fixed = {name: nothing if one is None else floats(one) for name, one in there.items()}
     when = np.where(np.isfinite(fixed["LATITUDE"]), known["TIME"], np.nan)
     for name, values in {"TIME": when, **fixed}.items():
-        variable = file.createVariable(
-            f"{name}_GPS", "f8", file[name].dimensions, zlib=True, complevel=1, fill_value=np.nan
-        )
+        stored = {"zlib": True, "complevel": 1, "fill_value": np.nan}
+        variable = file.createVariable(f"{name}_GPS", "f8", file[name].dimensions, **stored)
         kept = ("standard_name", "calendar", "units")
         variable.setncatts({key: file[name].getncattr(key) for key in kept if key in file[name].ncattrs()})
         variable.long_name = f"{name.lower()} of each GPS location"

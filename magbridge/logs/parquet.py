@@ -17,11 +17,11 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
+from magbridge.logs.checks import known
 from magbridge.logs.clocks import TimeFormat, clock_of, seconds
 from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, plain_attrs
 from magbridge.logs.layout import LAYOUT_LINES, Layout
 from magbridge.logs.naming import name_columns, on_side
-from magbridge.logs.validity import known
 
 try:
     import pyarrow as pa
@@ -29,19 +29,12 @@ try:
 except ImportError:
     raise MissingExtra("pyarrow", "formats") from None
 
-__all__ = ["FileWriter", "chunks"]
-
 MAX_EXPANDED, MAX_EXPANSION = 100_000_000, 200
 """Bytes of values that are always read, and per byte of a larger file: times alone take one byte a row."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file as deployments of at most `rows` rows, each with their numbers.
-
-    ``time`` may be numbers or timestamps.
-
-    FormatError: not Parquet or cut short, no column ``time``, a column that does not hold numbers.
-    """
+    """Yield the file in pieces, each with the numbers of its rows; times may be numbers or timestamps."""
     try:
         with pq.ParquetFile(path) as file:
             yield from _chunks(path, file, rows)
@@ -59,9 +52,8 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
     size = file.metadata.num_rows * file.metadata.num_columns * 8
     if size > max(MAX_EXPANDED, MAX_EXPANSION * path.stat().st_size):
         claimed = f"{file.metadata.num_rows} rows of {file.metadata.num_columns} columns"
-        raise FormatError(
-            path, f"{claimed} in {path.stat().st_size} bytes: expected a file that is not damaged"
-        )
+        claimed += f" in {path.stat().st_size} bytes"
+        raise FormatError(path, f"{claimed}: expected a file that is not damaged")
     layout, clock = _layout(path, file, foreign=b"magbridge" not in (schema.metadata or {}))
     row = 1
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
@@ -150,12 +142,10 @@ class FileWriter:
         """Write the rows as one row group, and before the first ones the schema."""
         columns = [dataset["time"], *(dataset[name] for name in dataset.data_vars)]
         if first:
-            fields = [
-                pa.field(
-                    str(column.name), pa.float64(), metadata={k: str(v) for k, v in column.attrs.items()}
-                )
-                for column in columns
-            ]
+            fields = []
+            for column in columns:
+                described = {key: str(value) for key, value in column.attrs.items()}
+                fields.append(pa.field(str(column.name), pa.float64(), metadata=described))
             schema = pa.schema(fields, metadata={"magbridge": json.dumps(plain_attrs(dataset.attrs))})
             self._writer = pq.ParquetWriter(self._path, schema)
         arrays = [pa.array(np.asarray(column.values, dtype=np.float64)) for column in columns]

@@ -28,9 +28,8 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
-from magbridge.logs.compasses import LogCompass, rate
-from magbridge.logs.fields import FieldMap, by_record, fields_of
+from magbridge.logs.compasses import BootRun, LogCompass, Magnetometer, Series, pieces, rate
+from magbridge.logs.fields import field_maps, fields_of
 
 try:
     from pyulog import ULog
@@ -41,45 +40,14 @@ except ImportError:
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
 
-__all__ = ["chunks"]
-
 Table = dict[str, FloatArray]
 Topics = dict[str, dict[int, Table]]
 Parameters = Mapping[str, float]
 
-PX4_FIELDS = by_record(
-    (
-        FieldMap("vehicle_global_position", "lat", "latitude", "deg"),
-        FieldMap("vehicle_global_position", "lon", "longitude", "deg"),
-        FieldMap("vehicle_global_position", "alt", "depth", "m", -1.0),
-        FieldMap("sensor_gps", "latitude_deg", "latitude", "deg"),
-        FieldMap("sensor_gps", "longitude_deg", "longitude", "deg"),
-        FieldMap("sensor_gps", "lat", "latitude", "deg", 1e-7),
-        FieldMap("sensor_gps", "lon", "longitude", "deg", 1e-7),
-        FieldMap("sensor_gps", "altitude_msl_m", "depth", "m", -1.0),
-        FieldMap("sensor_gps", "alt", "depth", "m", -1e-3),
-        # -1 A: the current is not measured
-        FieldMap("battery_status", "current_a", "battery#_current", "A", missing=(-1.0,)),
-        FieldMap("battery_status", "voltage_v", "battery#_voltage", "V"),
-        FieldMap("vehicle_air_data", "baro_pressure_pa", "pressure", "hPa", 0.01),
-        FieldMap("sensor_baro", "pressure", "pressure", "hPa", 0.01),
-        FieldMap("sensor_baro", "temperature", "pressure_temperature", "degC"),
-        *(FieldMap("actuator_outputs", f"output[{k}]", f"servo{k + 1}", "us") for k in range(16)),
-        *(FieldMap("actuator_motors", f"control[{k}]", f"motor{k + 1}", "1") for k in range(12)),
-        *(
-            FieldMap("esc_status", f"esc[{k}].{field}", f"esc{k + 1}_{column}", unit)
-            for k in range(8)
-            for field, column, unit in (
-                ("esc_current", "current", "A"),
-                ("esc_voltage", "voltage", "V"),
-                ("esc_rpm", "rpm", "rpm"),
-            )
-        ),
-    )
-)
-PX4_FIELDS["vehicle_gps_position"] = PX4_FIELDS["sensor_gps"]
+PX4_FIELDS = field_maps("px4")
 # heights are above the sea; that of the local position is above the start, and the last choice
-PX4_FIELDS["vehicle_local_position"] = [FieldMap("vehicle_local_position", "z", "depth", "m")]
+PX4_FIELDS["vehicle_gps_position"] = PX4_FIELDS["sensor_gps"]
+PX4_FIELDS["vehicle_local_position"] = PX4_FIELDS.pop("vehicle_local_position")
 GAUSS_AXES = tuple(f"magnetometer_ga[{k}]" for k in range(3))
 """The three axes in ``vehicle_magnetometer`` and ``sensor_combined``."""
 NEEDED_FIELDS = {
@@ -100,10 +68,7 @@ FASTER = 1.5
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows; it is held whole.
-
-    FormatError: not a ULog, or no magnetometer in it.
-    """
+    """Yield the log in pieces; it is held whole."""
     try:
         with path.open("rb") as file, redirect_stdout(None):  # pyulog prints a line for each damage
             log = ULog(file, [*PX4_FIELDS, *NEEDED_FIELDS])
@@ -233,9 +198,8 @@ def _telemetry(topics: Topics) -> Iterator[Series]:
                     yield _time(table), column, unit, np.where(fixed, values, np.nan)
     for table in topics.get("debug_key_value", {}).values():
         letters = [table[f"key[{k}]"].astype(np.uint8) for k in range(10) if f"key[{k}]" in table]
-        names = np.array(
-            [bytes(key).split(b"\0")[0].decode("ascii", "replace") for key in zip(*letters, strict=True)]
-        )
+        keys = [bytes(key).split(b"\0")[0] for key in zip(*letters, strict=True)]
+        names = np.array([key.decode("ascii", "replace") for key in keys])
         for name in dict.fromkeys(names.tolist()):
             yield _time(table)[names == name], name, "1", table["value"][names == name]
 

@@ -8,7 +8,7 @@ Bad rows and values are dropped, counted and named in attributes
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from inspect import signature
 from itertools import accumulate, chain, pairwise
@@ -36,11 +36,7 @@ DEFAULTS = Options()
 
 
 def read(
-    paths: Paths,
-    *,
-    required: Iterable[str] = (),
-    options: Options = DEFAULTS,
-    decode_times: bool = False,
+    paths: Paths, *, required: Iterable[str] = (), options: Options = DEFAULTS, decode_times: bool = False
 ) -> xr.Dataset:
     """Return one deployment from one file or several, sorted in time.
 
@@ -51,7 +47,7 @@ def read(
     required : iterable of str
         Columns that the result must have, as :data:`magbridge.columns.CHANNELS`.
     options : Options
-        What the user says about the logs.
+        Declarations of the user about the logs.
     decode_times : bool
         Times are datetime64 (UTC), as xarray decodes them, and not s since 1970.
 
@@ -82,11 +78,11 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
     """Return the deployment of each file; a Slocum's flight and science file are one.
 
     A sensor's own logs get the telemetry of the vehicle's logs, which are then not among the results
-    (:mod:`magbridge.logs.sensor_log`). Files that were skipped are counted in the first.
+    (:mod:`magbridge.logs.merge`). Files that were skipped are counted in the first.
 
     FormatError, MissingExtra: as :func:`read`.
     """
-    from magbridge.logs.sensor_log import combine  # noqa: PLC0415 - xarray is for ashore
+    from magbridge.logs.merge import combine  # noqa: PLC0415 - xarray is for ashore
 
     files = _Files(_paths(paths, options), options)
     whole, named = [], []
@@ -109,8 +105,7 @@ def read_chunks(
 
     FormatError, MissingExtra: as :func:`read`.
     """
-    from magbridge.logs.merge import merge  # noqa: PLC0415 - xarray is for ashore
-    from magbridge.logs.sensor_log import refuse_offset  # noqa: PLC0415
+    from magbridge.logs.merge import merge, refuse_offset  # noqa: PLC0415 - xarray is for ashore
 
     files = _Files(_paths(paths, options), options)
     sources = [partial(files.pieces, k) for k in range(len(files.paths))]
@@ -198,10 +193,14 @@ def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[i
 
 
 def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]:
-    """Yield the pieces of a file from the module of its format."""
+    """Yield the pieces of a file from its format; what another package's code raises names that package."""
     chunks = form.load().chunks
     more = (options,) if "options" in signature(chunks).parameters else ()
-    return _blamed(form, partial(chunks, path, rows, *more))
+    with form.blamed():
+        for piece in chunks(path, rows, *more):
+            if form.plugin and not hasattr(piece[0] if isinstance(piece, tuple) else piece, "sizes"):
+                raise TypeError(f"chunks: expected deployments (xarray.Dataset), not {type(piece).__name__}")
+            yield piece
 
 
 def _chunks(
@@ -242,15 +241,6 @@ def _chunks(
         raise FormatError(path, "expected rows, there are none")
 
 
-def _blamed(form: Format, pieces: Callable[[], Iterator[Any]]) -> Iterator[Any]:
-    """Yield the pieces of a format; what another package's code raises names that package."""
-    with form.blamed():
-        for piece in pieces():
-            if form.plugin and not hasattr(piece[0] if isinstance(piece, tuple) else piece, "sizes"):
-                raise TypeError(f"chunks: expected deployments (xarray.Dataset), not {type(piece).__name__}")
-            yield piece
-
-
 def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield each piece with the numbers of its rows: those that it came with, or counted from 1."""
     row = 1
@@ -277,7 +267,7 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
 def _origin(source: str) -> str:
     """Return the origin of the file in `source` (``a.csv`` for ``b.nc (a.csv)``), or `source`."""
     name, opened, inside = source.partition(" (")
-    depths = accumulate((char == "(") - (char == ")") for char in inside)
-    closed = next((k for k, depth in enumerate(depths) if depth < 0), None)
-    one = opened and "," not in name and closed == len(inside) - 1  # not several files
-    return inside[:-1] if one else source
+    depths = list(accumulate((char == "(") - (char == ")") for char in inside))
+    # one pair of brackets around the rest, and not several files
+    is_whole = opened and "," not in name and min(depths, default=0) == -1 == depths[-1]
+    return inside[:-1] if is_whole and -1 not in depths[:-1] else source

@@ -7,10 +7,11 @@ package).
 
 A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
 :class:`~magbridge.logs.mapping.Options` make a difference to it. It yields deployments of at most `rows` rows
-in the order of the file, or pairs of a deployment and the numbers of its rows in the file. Faults in their
-times and values are found by :mod:`magbridge.logs.checks`. A format that can be written also has
-``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``; where its file has no room for
-attributes, also ``metadata``, bytes that are written next to it.
+in the order of the file, or pairs of a deployment and the numbers of its rows in the file; it raises
+FormatError for a file that it cannot read. Faults in their times and values are found by
+:mod:`magbridge.logs.checks`. A format that can be written also has ``FileWriter(path)`` with
+``append(dataset, first=...)`` and ``close()``; where its file has no room for attributes, also ``metadata``,
+bytes that are written next to it.
 """
 
 from __future__ import annotations
@@ -173,7 +174,9 @@ def format_of(path: Path, *, write: bool = False) -> Format:
     FormatError: neither its first bytes nor its name are those of a known format.
     """
     start = b"" if write or is_bag(path) else _start(path)
-    found = FORMATS["ros"] if is_bag(path) else _recognised(start)
+    signed = [one for one in FORMATS.values() if one.signature is not None]
+    found = next((one for one in signed if re.match(one.signature or b"", start, re.DOTALL)), None)
+    found = FORMATS["ros"] if is_bag(path) else found
     packed = not write and path.is_file() and is_packed(path)
     if found is None and (
         other := next((text for mark, text in UNREADABLE.items() if re.match(mark, start)), None)
@@ -205,12 +208,6 @@ def _start(path: Path) -> bytes:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     except DECOMPRESSION_ERRORS as error:
         raise FormatError(path, f"expected a whole compressed file: {error}") from None
-
-
-def _recognised(start: bytes) -> Format | None:
-    """Return the format with the signature of these first bytes, or None."""
-    signed = (one for one in FORMATS.values() if one.signature is not None)
-    return next((one for one in signed if re.match(one.signature or b"", start, re.DOTALL)), None)
 
 
 def metadata_path(path: Path) -> Path:

@@ -30,10 +30,9 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
-from magbridge.logs.compasses import LogCompass, rate
+from magbridge.logs.compasses import BootRun, LogCompass, Magnetometer, Series, pieces, rate
 from magbridge.logs.deployment import NOTES, noted
-from magbridge.logs.fields import FieldMap, by_record, fields_of
+from magbridge.logs.fields import field_maps, fields_of
 
 try:
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -48,8 +47,6 @@ except ImportError:
 
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
-
-__all__ = ["chunks"]
 
 STORAGES = {".mcap": McapReader, ".db3": Sqlite3Reader}
 """Readers of one file of a ROS 2 bag, without its folder."""
@@ -76,10 +73,7 @@ class _Stream(NamedTuple):
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the bag in pieces of at most `rows` rows; the values that are read are held whole.
-
-    FormatError: not a bag, or no ``MagneticField`` in it.
-    """
+    """Yield the bag in pieces; the values that are read are held whole."""
     try:
         with _opened(path) as bag:
             streams, lost = _streams(bag)
@@ -87,9 +81,8 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         raise FormatError(path, f"expected a ROS bag: {error}") from None
     except (OSError, EOFError, KeyError, IndexError, ValueError, AssertionError) as error:
         # what rosbags raises where the file, not a message, is damaged
-        raise FormatError(
-            path, f"expected a ROS bag; it is damaged: {str(error) or type(error).__name__}"
-        ) from None
+        reason = str(error) or type(error).__name__
+        raise FormatError(path, f"expected a ROS bag; it is damaged: {reason}") from None
     fields = [stream for stream in streams if stream.kind is MESSAGE_KINDS[MAGNETIC_FIELD]]
     if not fields:
         topics = " ".join(stream.topic for stream in streams) or "nothing that is read"
@@ -179,9 +172,8 @@ def _streams(bag: _Bag) -> tuple[list[_Stream], int]:
             good, values = _decoded(bag, connection.msgtype, kind, messages)
             lost += len(messages) - len(good)
             if len(good):
-                when = _times(
-                    kind, np.array(stamps, dtype=np.float64)[good] * 1e-9, [messages[k] for k in good]
-                )
+                recorded = np.array(stamps, dtype=np.float64)[good] * 1e-9
+                when = _times(kind, recorded, [messages[k] for k in good])
                 found.append(_Stream(topic, kind, when, values))
     return found, lost
 
@@ -219,7 +211,7 @@ def _decoded(
 def _doubles(
     bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
 ) -> dict[str, FloatArray] | None:
-    """Return the values of messages that end with doubles only, read at once; None where they are not such.
+    """Return the values of messages that end with doubles only, read together; None for other messages.
 
     What stands before them is of any length (the frame's name). The first and the last message as rosbags
     reads them prove the layout.
@@ -237,26 +229,13 @@ def _doubles(
     return {key: table[:, k] for k, key in enumerate(row)}
 
 
-FRAMES_HISTORY = (
-    "ROS frames turned: ENU to NED, FLU to FRD; BatteryState.current counted positive when discharging"
-)
+CURRENT_NOTE = "BatteryState.current counted positive when discharging"
+FRAMES_HISTORY = f"ROS frames turned: ENU to NED, FLU to FRD; {CURRENT_NOTE}"
 MAGNETIC_FIELD = "sensor_msgs/MagneticField"
 FIX = "sensor_msgs/NavSatFix"
 TOPIC = "@"
 """Stands for the name of the topic in the name of a column."""
-ROS_FIELDS = by_record(
-    (
-        FieldMap(FIX, "latitude", "latitude", "deg"),
-        FieldMap(FIX, "longitude", "longitude", "deg"),
-        FieldMap(FIX, "altitude", "altitude", "m"),
-        # ROS counts a current as negative when the battery discharges
-        FieldMap("sensor_msgs/BatteryState", "current", "battery#_current", "A", -1.0),
-        FieldMap("sensor_msgs/BatteryState", "voltage", "battery#_voltage", "V"),
-        FieldMap("sensor_msgs/FluidPressure", "fluid_pressure", "pressure#", "hPa", 0.01),
-        FieldMap("std_msgs/Float32", "data", TOPIC, "1"),
-        FieldMap("std_msgs/Float64", "data", TOPIC, "1"),
-    )
-)
+ROS_FIELDS = field_maps("ros")
 ABSOLUTE = ("map", "earth", "utm", "enu")
 """Names of frames whose x axis points east."""
 
@@ -305,10 +284,6 @@ def _axes(prefix: str, vector: Any, axes: str = "xyz") -> dict[str, float]:
     return {f"{prefix}{axis}": getattr(vector, axis) for axis in axes}
 
 
-def _imu_row(m: Any) -> dict[str, float]:
-    return {**_axes("q", m.orientation, "xyzw"), "unknown": float(m.orientation_covariance[0])}
-
-
 def _odometry_row(m: Any) -> dict[str, float]:
     pose, linear = m.pose.pose, m.twist.twist.linear
     absolute = float(m.header.frame_id.rpartition("/")[2].lower() in ABSOLUTE)
@@ -332,17 +307,6 @@ def _odometry(topic: str, number: int, v: Values) -> Columns:
     yield from _angles(v)
 
 
-def _joints(_: str, __: int, v: Values) -> Columns:
-    for name, values in v.items():
-        yield _name(name), "1", values  # rad, or m of a joint that slides: the message does not say
-
-
-def _channels(_: str, __: int, v: Values) -> Columns:
-    for name, values in v.items():
-        if np.any(values):
-            yield name, "us", values
-
-
 def _fields(name: str, *, header: bool = True) -> MessageKind:
     """Return a type of message that is read by :data:`ROS_FIELDS`."""
     fields = ROS_FIELDS[name]
@@ -363,26 +327,28 @@ def _temperature(topic: str, _: int, v: Values) -> Columns:
     yield name if "temp" in name else f"{name}_temperature", "degC", v["temperature"]
 
 
-def _nothing(_: str, __: int, ___: Values) -> Columns:
-    yield from ()
-
-
 MESSAGE_KINDS = {
     kind.name: kind
     for kind in (
-        MessageKind(MAGNETIC_FIELD, lambda m: _axes("", m.magnetic_field), _nothing, doubles=12),
-        MessageKind("sensor_msgs/Imu", _imu_row, lambda _, __, v: _angles(v), doubles=37),
+        MessageKind(MAGNETIC_FIELD, lambda m: _axes("", m.magnetic_field), lambda *_: iter(()), doubles=12),
+        MessageKind(
+            "sensor_msgs/Imu",
+            lambda m: _axes("q", m.orientation, "xyzw") | {"unknown": float(m.orientation_covariance[0])},
+            lambda _, __, v: _angles(v),
+            doubles=37,
+        ),
         MessageKind("nav_msgs/Odometry", _odometry_row, _odometry),
         MessageKind(
             "sensor_msgs/JointState",
             lambda m: dict(zip(m.name, map(float, m.position), strict=False)),
-            _joints,
+            # rad, or m of a joint that slides: the message does not say
+            lambda _, __, v: ((_name(name), "1", values) for name, values in v.items()),
         ),
         MessageKind("sensor_msgs/Temperature", lambda m: {"temperature": float(m.temperature)}, _temperature),
         MessageKind(
             "mavros_msgs/RCOut",
             lambda m: {f"servo{k}": float(value) for k, value in enumerate(m.channels, 1)},
-            _channels,
+            lambda _, __, v: ((name, "us", values) for name, values in v.items() if np.any(values)),
         ),
         *(_fields(name, header=not name.startswith("std_msgs/")) for name in ROS_FIELDS),
     )

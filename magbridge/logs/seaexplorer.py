@@ -29,11 +29,9 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import epoch
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
-from magbridge.logs.fields import FieldMap, degrees, linear
+from magbridge.logs.fields import FieldMap, degrees, field_maps, linear
 from magbridge.logs.mapping import aliases
 from magbridge.logs.registry import opened
-
-__all__ = ["chunks"]
 
 PAYLOAD = re.compile(r"(?P<mission>.+)\.pld\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
 """Name of a payload's file: sea035.12.pld1.raw.36.gz. That of the navigation is sea035.12.gli.sub.36.gz."""
@@ -44,27 +42,7 @@ DATE = "%d/%m/%Y %H:%M:%S"
 UNKNOWN_CODES = 9999.0, -9999.0
 """Codes for "not known"."""
 DEGREE_MINUTE_COLUMNS = "Lat", "Lon", "NAV_LATITUDE", "NAV_LONGITUDE"
-SEAEXPLORER_FIELDS = (
-    FieldMap("", "Lat", "latitude", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "Lon", "longitude", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "NAV_LATITUDE", "latitude", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "NAV_LONGITUDE", "longitude", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "NAV_DEPTH", "depth", "m", missing=UNKNOWN_CODES),
-    FieldMap("", "Depth", "depth", "m", missing=UNKNOWN_CODES),
-    FieldMap("", "Heading", "heading", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "Pitch", "pitch", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "Roll", "roll", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "Temperature", "vehicle_temperature", "degC", missing=UNKNOWN_CODES),
-    FieldMap("", "Pa", "vehicle_pressure", "Pa", missing=UNKNOWN_CODES),
-    FieldMap("", "BallastPos", "ballast", "cc", missing=UNKNOWN_CODES),
-    FieldMap("", "LinPos", "battpos", "mm", missing=UNKNOWN_CODES),
-    FieldMap("", "AngPos", "battery_roll", "deg", missing=UNKNOWN_CODES),
-    FieldMap("", "Voltage", "battery_voltage", "V", missing=UNKNOWN_CODES),
-    FieldMap("", "GPCTD_TEMPERATURE", "water_temperature", "degC", missing=UNKNOWN_CODES),
-    FieldMap("", "GPCTD_PRESSURE", "water_pressure", "dbar", missing=UNKNOWN_CODES),
-    FieldMap("", "LEGATO_TEMPERATURE", "water_temperature", "degC", missing=UNKNOWN_CODES),
-    FieldMap("", "LEGATO_PRESSURE", "water_pressure", "dbar", missing=UNKNOWN_CODES),
-)
+SEAEXPLORER_FIELDS = {one.field: one for one in field_maps("seaexplorer")[""]}
 NAV_ONLY = {
     *("Altitude", "DesiredH", "BallastCmd", "LinCmd", "AngCmd", "NavState", "SecurityLevel", "Declination")
 }
@@ -72,13 +50,7 @@ NAV_ONLY = {
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file in pieces of at most `rows` rows; it is held whole.
-
-    The rows of a payload's file have what only the navigation file of its dive knows, which is in the same
-    folder: attitude and masses, linearly between two samples of the navigation.
-
-    FormatError: not a SeaExplorer's file, or cut short while it was compressed.
-    """
+    """Yield the file in pieces; it is held whole."""
     whole = _read(path)
     if navigation := _navigation_of(path):
         whole = _with_navigation(whole, _read(navigation), navigation)
@@ -118,19 +90,17 @@ def _read(path: Path) -> xr.Dataset:
     columns: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
     known = aliases([str(name) for name in numbers])
-    fields = {one.field: one for one in SEAEXPLORER_FIELDS}
     for k, theirs in enumerate(map(str, numbers)):
         if theirs in NAV_ONLY:
             continue
         own = FieldMap("", theirs, known.get(k, theirs.lower()), "", missing=UNKNOWN_CODES)
-        one = fields.get(theirs, own)
+        one = SEAEXPLORER_FIELDS.get(theirs, own)
         values = one.values(numbers[theirs].to_numpy(float))
         columns.setdefault(one.column, degrees(values) if theirs in DEGREE_MINUTE_COLUMNS else values)
         units[one.column] = one.unit
     whole = deployment(path, time, columns, units)
-    remarks = (
-        [f"{path}: headings are taken as true, which the file does not say"] if "heading" in columns else []
-    )
+    taken_as_true = f"{path}: headings are taken as true, which the file does not say"
+    remarks = [taken_as_true] if "heading" in columns else []
     return with_losses(whole, {"rows_dropped": lost}, remarks)
 
 

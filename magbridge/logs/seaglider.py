@@ -39,7 +39,7 @@ from magbridge.errors import FormatError
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import sphere_radius
 from magbridge.logs.deployment import deployment, sliced, with_losses
-from magbridge.logs.fields import FieldMap, Track, degrees, fields_of, interpolated, linear
+from magbridge.logs.fields import Track, degrees, field_maps, fields_of, interpolated, linear
 
 __all__ = ["CTD_FIELDS", "DIMENSION", "Dive", "chunks", "dive"]
 
@@ -50,25 +50,8 @@ SECOND_COMPASS_BIT = 2048
 """Bit of ``COMPASS_USE``: the second compass is in use."""
 MAX_CTD_GAP_S = 120.0
 """s between samples of the CTD across which nothing is interpolated."""
-SAMPLED = (
-    # the channels are in counts, before they are multiplied by what a count is worth
-    FieldMap("eng", "mag_x", "mag_x", "nT"),
-    FieldMap("eng", "mag_y", "mag_y", "nT"),
-    FieldMap("eng", "mag_z", "mag_z", "nT"),
-    FieldMap("eng", "rollAng", "roll", "deg"),
-    FieldMap("eng", "pitchAng", "pitch", "deg"),
-    FieldMap("eng", "head", "heading", "deg"),
-    FieldMap("eng", "pitchCtl", "pitchCtl", "cm"),
-    FieldMap("eng", "rollCtl", "rollCtl", "deg"),
-    FieldMap("eng", "vbdCC", "vbdCC", "cc"),
-    FieldMap("eng", "depth", "depth", "m"),
-)
-CTD_FIELDS = (
-    FieldMap("ctd", "latitude", "latitude", "deg"),
-    FieldMap("ctd", "longitude", "longitude", "deg"),
-    FieldMap("ctd", "temperature", "water_temperature", "degC"),
-    FieldMap("ctd", "ctd_pressure", "water_pressure", "dbar"),
-)
+# the channels are in counts, before they are multiplied by what a count is worth
+SAMPLED, CTD_FIELDS = field_maps("seaglider").values()
 PLACE = "longitude", "latitude"
 MASSES = {"pitchCtl": ("pitch", "C_PITCH"), "rollCtl": ("roll", "C_ROLL_DIVE"), "vbdCC": ("vbd", "C_VBD")}
 """Column to the name of its motor, and of the parameter that holds its centre in AD counts."""
@@ -101,9 +84,8 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
     raw = [name for name in CHANNELS if name in known.sampled]
     for axis in "xyz":
         if raw and f"mag_{axis}" not in raw:
-            raise FormatError(
-                path, "expected this variable, as of a Seaglider with a raw compass", column=f"eng_mag_{axis}"
-            )
+            expected = "expected this variable, as of a Seaglider with a raw compass"
+            raise FormatError(path, expected, column=f"eng_mag_{axis}")
     columns = {column: values for column, _, values in fields_of(SAMPLED, known.sampled)}
     units = {one.column: one.unit for one in (*SAMPLED, *CTD_FIELDS)}
     columns |= interpolated(CTD_FIELDS, known.elsewhere, known.time, known.max_gap)[0]
@@ -194,10 +176,7 @@ GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the dive in pieces of at most `rows` rows.
-
-    FormatError: no samples, or no magnetometer among them.
-    """
+    """Yield the dive that a glider sent in pieces; it is held whole."""
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():
         raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")

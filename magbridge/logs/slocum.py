@@ -29,10 +29,8 @@ import xarray as xr
 
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.deployment import deployment, sliced
-from magbridge.logs.fields import DEG_PER_RAD, FieldMap, Track, degrees, interpolated
+from magbridge.logs.fields import Track, degrees, field_maps, interpolated
 from magbridge.logs.registry import FLIGHT
-
-__all__ = ["check_header", "chunks"]
 
 TAG = re.compile(rb"(\w+):\s*(.*)")
 SENSOR_LINE = re.compile(rb"s:\s+[TF]\s+-?\d+\s+-?\d+\s+[1248]\s+[!-~]+\s+[!-~]+\s*")
@@ -52,25 +50,7 @@ CLOCK_SENSORS = b"m_present_time", b"sci_m_present_time"
 FILL = 69_696_969.0
 """Code of a position that was never known, deg and min."""
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
-SLOCUM_FIELDS = (
-    FieldMap("", "m_roll", "roll", "deg", DEG_PER_RAD),
-    FieldMap("", "m_pitch", "pitch", "deg", DEG_PER_RAD),
-    FieldMap("", "m_heading", "heading", "deg", DEG_PER_RAD),
-    FieldMap("", "m_lat", "latitude", "deg"),
-    FieldMap("", "m_lon", "longitude", "deg"),
-    FieldMap("", "m_depth", "depth", "m"),
-    FieldMap("", "m_battpos", "battpos", "in"),
-    FieldMap("", "m_ballast_pumped", "ballast", "cc"),
-    FieldMap("", "m_de_oil_vol", "oil_volume", "cc"),
-    FieldMap("", "m_fin", "fin", "deg", DEG_PER_RAD),
-    FieldMap("", "m_coulomb_current", "coulomb_current", "A"),
-    FieldMap("", "m_battery", "battery_voltage", "V"),
-    FieldMap("", "m_veh_temp", "vehicle_temperature", "degC"),
-    FieldMap("", "m_vacuum", "vacuum", "inHg"),
-    FieldMap("", "m_pressure", "flight_pressure", "bar"),
-    FieldMap("", "sci_water_temp", "water_temperature", "degC"),
-    FieldMap("", "sci_water_pressure", "water_pressure", "bar"),
-)
+SLOCUM_FIELDS = field_maps("slocum")[""]
 SENSORS = [one.field for one in SLOCUM_FIELDS]
 
 
@@ -95,10 +75,7 @@ dbdreader = _import()
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the flight file, with its science file where there is one, in pieces of at most `rows` rows.
-
-    FormatError: not a Slocum file, no ``.cac`` for it, or no rows in it.
-    """
+    """Yield the flight file, with its science file where there is one, in pieces."""
     flight, science = _pair(path)
     tracks = {**_read(flight), **_measured(_read(science))}
     base = "m_present_time" if "m_present_time" in tracks else "sci_m_present_time"
@@ -146,7 +123,7 @@ def _read(path: Path | None) -> Tracks:
     with path.open("rb") as file:
         if b"DBD_ASC" in file.readline():
             return _read_ascii(path)
-    lists = check_header(path)
+    lists = _check_header(path)
     # dbdreader writes the list of sensors where it looks for it
     with tempfile.TemporaryDirectory() as scratch:
         for cache in reversed(lists):  # of two, the one nearest to the file stays
@@ -160,9 +137,8 @@ def _read(path: Path | None) -> Tracks:
         except dbdreader.DbdError as error:
             if error.value == dbdreader.DBD_ERROR_CACHE_NOT_FOUND:
                 cache_id = next(iter(error.data.missing_cache_files))
-                raise FormatError(
-                    path, f"expected {cache_id}.cac, the list of its sensors, next to it or in a folder cac"
-                ) from None
+                expected = f"expected {cache_id}.cac, the list of its sensors, next to it or in a folder cac"
+                raise FormatError(path, expected) from None
             raise FormatError(path, f"expected a Slocum file: {error}") from None
         except (ValueError, KeyError, IndexError, UnicodeDecodeError, RuntimeError, OverflowError) as error:
             raise FormatError(path, f"expected a whole Slocum file: {error}") from None
@@ -180,9 +156,8 @@ def _read_ascii(path: Path) -> Tracks:
         values = np.array([row for row in rows if len(row) == len(names)], float).reshape(-1, len(names)).T
         clock = next(values[names.index(name)] for name in CLOCK_SENSORS if name in names)
     except (ValueError, StopIteration):
-        raise FormatError(
-            path, "expected names, units, sizes and rows of numbers, as dbd2asc writes them"
-        ) from None
+        expected = "expected names, units, sizes and rows of numbers, as dbd2asc writes them"
+        raise FormatError(path, expected) from None
     tracks = {}
     for name, unit, written in zip(names, units, values, strict=True):
         if (ours := name.decode("ascii", "replace")) in {*SENSORS, "m_present_time", "sci_m_present_time"}:
@@ -193,7 +168,7 @@ def _read_ascii(path: Path) -> Tracks:
     return tracks
 
 
-def check_header(path: Path) -> list[Path]:
+def _check_header(path: Path) -> list[Path]:
     """Check the header of a Slocum's file, and the list of its sensors; return where that list may be.
 
     FormatError: the header is cut off, or a line of the ``.cac`` is damaged. A compressed file is not looked

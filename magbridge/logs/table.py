@@ -14,11 +14,10 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
-from magbridge.logs.checks import Faults
+from magbridge.logs.checks import Faults, Validity, mark_invalid
 from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
-from magbridge.logs.validity import EXPECTED_VALUE, Validity, invalid, unknown
 from magbridge.records import Quality
 from magbridge.wording import counted
 
@@ -26,19 +25,14 @@ __all__ = ["TextTable"]
 
 EMPTY_CELLS = "-", "--", "*", "---"
 """Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
+UNCLOSED_QUOTE = "expected every quote to be closed in its line"
 
 
 class TextTable:
     """Read lines of one layout into columns.
 
-    Attributes
-    ----------
-    guesses : list of str
-        Assumptions about the times.
-    attrs : dict
-        What that means for the deployment.
-    faults : Faults
-        Rows and values that were dropped.
+    `guesses` are the assumptions about the times, `attrs` what they mean for the deployment; `faults` counts
+    the rows and values that were dropped.
     """
 
     def __init__(self, path: Path, layout: Layout, first_lines: Sequence[str], *, strict: bool) -> None:
@@ -131,42 +125,25 @@ class TextTable:
             if (unsure := np.isnan(columns[name]) & np.isfinite(values)).any():
                 expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
                 self._note(name, unsure, kept, expected, wrong=False)
-        for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
-            value = float(columns[name][int(codes.argmax())])
-            self._note(name, codes, kept, f"{EXPECTED_VALUE}{value!r}", wrong=False)
-            columns[name][codes] = np.nan
         rules = []
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:
                 rules.append(Validity(source.valid, (name,), frozenset({0.0})))
-        return self._valid(times, columns, kept, [*rules, *self._layout.validity])
+        rules += self._layout.validity
 
-    def _valid(
-        self,
-        times: FloatArray,
-        columns: dict[str, FloatArray],
-        numbers: list[int],
-        rules: Sequence[Validity],
-    ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-        """Return times, columns and numbers without values that a column of the file marks as invalid."""
-        keep = np.ones(len(times), bool)
-        for name, bad, column in invalid(rules, columns):
-            self._note(name, bad, numbers, f"not valid by {column!r}", wrong=False)
-            if name:
-                columns[name][bad] = np.nan
-            else:
-                keep &= ~bad
-        if keep.all():
-            return times, columns, numbers
-        kept = [number for number, is_valid in zip(numbers, keep.tolist(), strict=True) if is_valid]
+        def note(name: str, marked: BoolArray, expected: str) -> None:
+            self._note(name, marked, kept, expected, wrong=False)
+
+        keep = mark_invalid(columns, rules, note, codes=self._layout.foreign)
+        if not columns or keep.all():
+            return times, columns, kept
+        kept = [number for number, is_valid in zip(kept, keep.tolist(), strict=True) if is_valid]
         return times[keep], {name: values[keep] for name, values in columns.items()}, kept
 
     def _complete_lines(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
         """Return the lines that have as many fields as there are headings, and their numbers."""
         open_quotes = [line.count('"') % 2 == 1 for line in lines]
-        lines, numbers = self._dropping(
-            open_quotes, lines, numbers, "expected every quote to be closed in its line"
-        )
+        lines, numbers = self._dropping(open_quotes, lines, numbers, UNCLOSED_QUOTE)
         separator, width = self._layout.separator, len(self._layout.headings)
         counts = [
             len(cells(line, separator)) if separator == BLANKS or '"' in line else line.count(separator) + 1
@@ -200,9 +177,8 @@ class TextTable:
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
         layout = self._layout
-        texts = {k for k, name in enumerate(layout.names) if name == "quality"} | {
-            *layout.hemispheres.values()
-        }
+        texts = {k for k, name in enumerate(layout.names) if name == "quality"}
+        texts |= {*layout.hemispheres.values()}
         texts |= {*layout.stamp} if self._clock.is_text or len(layout.stamp) > 1 else set()
         kept = [k for k, name in enumerate(layout.names) if name or k in texts]
         if not lines:
@@ -222,7 +198,7 @@ class TextTable:
             low_memory=False,
         )
         if len(frame) != len(lines):
-            raise FormatError(self._path, "expected every quote to be closed in its line", row=numbers[0])
+            raise FormatError(self._path, UNCLOSED_QUOTE, row=numbers[0])
         return frame
 
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:

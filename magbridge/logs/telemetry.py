@@ -1,7 +1,7 @@
 """MAVLink telemetry logs (``.tlog``) as deployments.
 
 A row is a magnetometer message of the best kind that the log holds
-(:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the component that sent most of them; every other
+(:data:`~magbridge.logs.telemetry_survey.SOURCES`), from the component that sent most of them; every other
 column is the last value from this vehicle before it (NaN once older than
 :data:`~magbridge.logs.fields.MAX_AGE`).
 
@@ -14,7 +14,7 @@ column is the last value from this vehicle before it (NaN once older than
 - Without any of these, each ``ATTITUDE`` or position makes a row, and there is no ``mag_x``.
 
 Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, with the age of each value; one
-from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_fields.TELEMETRY` lists, and every
+from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_survey.TELEMETRY` lists, and every
 ``NAMED_VALUE_FLOAT`` by its name.
 Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
 Attitude and position are the autopilot's, not a gimbal's, and a named value never takes the place of a column
@@ -37,17 +37,21 @@ from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
 from magbridge.logs.compasses import LogCompass, by_columns, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted
 from magbridge.logs.fields import MAX_AGE
-from magbridge.logs.telemetry_fields import TELEMETRY, DeclaredField, are_of_main_sensor, source_columns
-from magbridge.logs.telemetry_survey import AUTOPILOT, LogContents, survey
-from magbridge.logs.telemetry_writer import FileWriter
+from magbridge.logs.telemetry_survey import (
+    AUTOPILOT,
+    TELEMETRY,
+    DeclaredField,
+    LogContents,
+    are_of_main_sensor,
+    source_columns,
+    survey,
+)
 from magbridge.mavlink import Source, spec
 from magbridge.mavlink.tlog import RecordBlock, blocks
 from magbridge.records import Channel
 
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
-
-__all__ = ["FileWriter", "chunks"]
 
 NAMED = spec("NAMED_VALUE_FLOAT")
 FIELD, STEP = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id
@@ -61,10 +65,7 @@ Updates = tuple[IndexArray, FloatArray]
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log as deployments of at most `rows` rows; it is read twice.
-
-    FormatError: nothing in it makes a row.
-    """
+    """Yield the log in pieces; it is read twice."""
     status = path.stat()
     found = survey(path, status.st_mtime_ns, status.st_size)
     wanted = options.compass if options else None
@@ -135,10 +136,7 @@ def _bring_to_rows(time: FloatArray, columns: dict[str, FloatArray], names: list
 class TelemetryTable:
     """The rows of a log, block by block; the last value of each column is carried to the next block.
 
-    Attributes
-    ----------
-    rows : int
-        Rows that are complete, or wait for their correction.
+    `rows` counts those that are complete, or wait for their correction.
     """
 
     def __init__(self, found: LogContents) -> None:
@@ -155,17 +153,15 @@ class TelemetryTable:
             number: [one for one in fields if one.column in self._place and one.column not in declared]
             for number, fields in TELEMETRY.items()
         }
-        self._exact = [
-            one for one in found.declared if one.message == self._source and SENSOR_ID not in one.match
-        ]
         self._further = _of_other_sensors(found)
+        in_source = [one for one in found.declared if one.message == self._source]
+        self._exact = [one for one in in_source if SENSOR_ID not in one.match]
         self._elsewhere = [one for one in found.declared if one.message != self._source]
-        self._sources = {  # as live: of several components that send a value, one counts
-            column: Source(
-                AUTOPILOT, round(1e6 * found.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)), wanted
-            )
-            for column, wanted in found.wanted.items()
-        }
+        self._sources: dict[str, Source] = {}
+        for column, component in found.wanted.items():
+            max_age_s = found.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)
+            # as live: of several components that send a value, one counts
+            self._sources[column] = Source(AUTOPILOT, round(1e6 * max_age_s), component)
         self._to_step_us = found.stepped_us
         self._last: dict[str, tuple[int, float]] = {}
         self._parts: list[FloatArray] = []

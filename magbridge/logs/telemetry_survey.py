@@ -1,4 +1,4 @@
-"""First pass through a telemetry log: find its contents."""
+"""First pass through a telemetry log: the fields of its messages that become columns, and its contents."""
 
 from __future__ import annotations
 
@@ -12,25 +12,51 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.arrays import IndexArray
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import AGE, CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass
 from magbridge.logs.deployment import CHANGES_SETTING
-from magbridge.logs.telemetry_fields import (
-    SOURCES,
-    TELEMETRY,
-    DeclaredField,
-    MessageField,
-    are_of_main_sensor,
-    source_columns,
-)
+from magbridge.logs.fields import FieldMap, field_maps
 from magbridge.mavlink import Message, spec
+from magbridge.mavlink.enums import MAG_RAW_FLAGS
+from magbridge.mavlink.messages import split_index
 from magbridge.mavlink.tlog import RecordBlock, blocks
 from magbridge.records import Channel
 
-__all__ = ["AUTOPILOT", "LogContents", "survey"]
+__all__ = [
+    "AUTOPILOT", "POWER_CYCLE", "TELEMETRY", "UNKNOWN_INT", "DeclaredField", "LogContents",
+    "are_of_main_sensor", "source_columns", "survey",
+]  # fmt: skip
 
+Payloads = NDArray[np.uint8]
+"""(n, size): the payloads of messages of one kind, without zeros cut off."""
+UNKNOWN_INT = 0x7FFFFFFF
+FIELD_NAMES = {"field_x": "x", "field_y": "y", "field_z": "z", "quality": "flags"}
+"""Column to its field of MAG_FIELD, where that has another name."""
+MAVLINK_FIELDS = field_maps("mavlink")
+"""Message to its fields; the values that the dialect declares to be invalid are missing, too."""
+SOURCES = {
+    "MAG_RAW": (
+        *(FieldMap("MAG_RAW", axis, f"mag_{axis}", "nT") for axis in "xyz"),
+        FieldMap("MAG_RAW", "temperature", "sensor_temperature", "degC"),
+        FieldMap("MAG_RAW", "supply", "sensor_supply", "V"),
+        FieldMap("MAG_RAW", "power_cycle", "power_cycle", ""),
+    ),
+    "MAG_FIELD": tuple(
+        FieldMap("MAG_FIELD", FIELD_NAMES.get(column, column), column, "") for column in CORRECTED
+    ),
+    "HIGHRES_IMU": tuple(FieldMap("HIGHRES_IMU", f"{axis}mag", f"mag_{axis}", "nT", 1e5) for axis in "xyz"),
+    **{
+        message: tuple(FieldMap(message, f"{axis}mag", f"mag_{axis}", "nT", 1e2) for axis in "xyz")
+        for message in ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
+    },
+    "ATTITUDE": (),
+    "GLOBAL_POSITION_INT": (),
+}
+"""The messages that make a row, the best first, and the fields whose values the row has from them."""
+POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
+"""Flag of MAG_RAW: its power cycle is counted."""
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
@@ -45,37 +71,111 @@ RESERVED_COLUMNS = {"time", *CHANNELS}
 """Columns that a named value never is."""
 
 
+class MessageField:
+    """How a column is read from the payloads of a message: ``factor * field + offset``, in `unit`."""
+
+    def __init__(self, source: FieldMap, offset: float = 0.0) -> None:
+        name, index = split_index(source.field)
+        field = spec(source.record).fields[name]
+        if field.code == "s":
+            raise ValueError(f"{source.record}.{name}: expected a field of numbers")
+        self.message = spec(source.record).id
+        self.column, self.unit, self.factor, self.offset = source.column, source.unit, source.factor, offset
+        self._layout = np.dtype(f"<{field.code}")
+        self._start = field.offset + (index or 0) * self._layout.itemsize
+        unknown = source.missing if field.invalid is None else (*source.missing, field.invalid)
+        self._source = source._replace(missing=unknown)
+
+    def values(self, payloads: Payloads) -> FloatArray:
+        """Return the values (n,) of the column in payloads (n, size); NaN where the sender knows none."""
+        raw = payloads[:, self._start : self._start + self._layout.itemsize].copy().view(self._layout)[:, 0]
+        return self._source.values(raw) + self.offset
+
+
+class DeclaredField(MessageField):
+    """A column that the log itself declares, by a ``MAG_COLUMN``.
+
+    `match` has the values that other fields of the message must have, as text; `component` is the only sender
+    that counts.
+    """
+
+    def __init__(self, declaration: Message) -> None:
+        layout = spec(declaration["message"])
+        unit, scale = declaration["unit"] or "1", declaration["scale"]
+        source = FieldMap(layout.name, declaration["field"], declaration["column"], unit, scale)
+        super().__init__(source, declaration["offset"])
+        self.component: int | None = declaration["component"] or None
+        self.match = dict(part.split("=", 1) for part in declaration["match"].split(",") if part)
+        self._others = [(layout.fields[name], text) for name, text in self.match.items()]
+
+    def matches(self, payloads: Payloads) -> BoolArray:
+        """Return the payloads (n,) of the messages that hold the column."""
+        found = np.ones(len(payloads), bool)
+        for field, text in self._others:
+            part = payloads[:, field.offset : field.offset + field.struct.size]
+            kinds, first, kind = np.unique(part, axis=0, return_index=True, return_inverse=True)
+            equal = [str(field.get(payloads[k].tobytes())) == text for k in first.tolist()]
+            found &= np.array(equal, bool)[kind.ravel()] if len(kinds) else found
+        return found
+
+
+TELEMETRY = {
+    spec(message).id: [MessageField(one) for one in fields] for message, fields in MAVLINK_FIELDS.items()
+}
+"""Message id to the columns in the message."""
+SOURCE_FIELDS = {
+    spec(message).id: [MessageField(one) for one in fields] for message, fields in SOURCES.items()
+}
+SENSOR_IDS = {spec(name).id: spec(name).fields["sensor_id"].offset for name in ("MAG_RAW", "MAG_FIELD")}
+STAMP_FIELDS = {
+    spec(name).id: MessageField(FieldMap(name, "time_usec", "time", "us"))
+    for name in ("MAG_RAW", "MAG_FIELD")
+}
+DELAY_FIELDS = [
+    MessageField(FieldMap("MAG_RAW", f"delay_{axis}", name, "us"))
+    for axis, name in zip("xyz", CHANNEL_TIMES, strict=True)
+]
+RAW_FLAGS = MessageField(FieldMap("MAG_RAW", "flags", "flags", ""))
+
+
+def are_of_main_sensor(number: int, payloads: Payloads) -> BoolArray:
+    """Return the messages (n,) of one id that are not samples of a sensor after the first."""
+    if number not in SENSOR_IDS:
+        return np.ones(len(payloads), bool)
+    return np.asarray(payloads[:, SENSOR_IDS[number]] == 0)
+
+
+def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
+    """Return the columns (n,) of the rows that messages of one id make; those of a bridge have ``time``."""
+    columns = {one.column: one.values(payloads) for one in SOURCE_FIELDS[number]}
+    if number not in SENSOR_IDS:
+        return columns
+    time_us = STAMP_FIELDS[number].values(payloads)
+    columns["time"] = time_us / 1e6
+    if number == RAW:
+        delays_us = [field.values(payloads) for field in DELAY_FIELDS]
+        in_turn = np.any(delays_us, axis=0)
+        for one, delay_us in zip(DELAY_FIELDS, delays_us, strict=True):
+            columns[one.column] = np.where(in_turn, (time_us + delay_us) / 1e6, np.nan)
+        counted = RAW_FLAGS.values(payloads).astype(np.int64) & POWER_CYCLE
+        columns["power_cycle"] = np.where(counted > 0, columns["power_cycle"], np.nan)
+    return columns
+
+
 class LogContents:
     """Contents of a log, found in a first pass, so that all pieces of a stream have the same columns.
 
-    Attributes
-    ----------
-    source : str
-        The message that makes the rows.
-    system, component : int
-        Its sender.
-    senders : dict of int to int
-        Of the other messages: the component whose values are taken. It is the sender of the rows
-        or the autopilot (1) where they send it, and hardly a gimbal.
-    columns : dict of str to str
-        Column to unit, of each column that has a value at least once.
-    named : dict of bytes to list of (str, float, float)
-        ``NAMED_VALUE_FLOAT.name`` to columns, each with scale and offset.
-    speakers : dict of bytes to int
-        ``NAMED_VALUE_FLOAT.name`` to the component that it is taken from: the autopilot (1), else who sent
-        most.
-    wanted : dict of str to int or None
-        Each telemetry column, with the only component that it may come from, if there is one.
-    declared : list of DeclaredField
-        Columns that the log itself declares to be in other messages.
-    attrs : dict
-        Attributes that the log declares, and ``notes``.
-    ours : bool
-        A bridge's own log: the time stamps carry the :class:`~magbridge.records.Channel`.
-    stepped_us : int
-        µs by which the bridge's clock was set in the course of the log.
-    span_s : float
-        s from the first to the last of the messages that make the rows.
+    The messages `source` of the sender `system`, `component` make the rows. `senders` are the components
+    whose other messages are taken: the sender of the rows or the autopilot (1) where they send it, and hardly
+    a gimbal; `speakers` are those of a ``NAMED_VALUE_FLOAT.name``.
+
+    `columns` has the unit of each column that has a value at least once, `named` the columns of each
+    ``NAMED_VALUE_FLOAT.name`` with scale and offset, `declared` the columns that the log itself declares to
+    be in other messages, and `wanted` the only component that a column may come from, if there is one.
+    `attrs` are attributes that the log declares, and ``notes``.
+
+    `ours` is a bridge's own log, whose time stamps carry the :class:`~magbridge.records.Channel`; its clock
+    was set by `stepped_us` in the course of the log.
     """
 
     def __init__(self, path: Path) -> None:
@@ -132,9 +232,8 @@ class LogContents:
     @property
     def plain(self) -> bool:
         """Return True if no bridge wrote the log."""
-        return self.source not in ("MAG_RAW", "MAG_FIELD") and not (
-            self.ours or self.declared or self.stepped_us
-        )
+        is_of_bridge = self.source in ("MAG_RAW", "MAG_FIELD")
+        return not (is_of_bridge or self.ours or self.declared or self.stepped_us)
 
     def _chosen(self) -> dict[int, int]:
         """Return the component that each message of :data:`TELEMETRY` is taken from."""
@@ -175,9 +274,8 @@ class LogContents:
             if letters not in self.named:
                 own = f"named_{name}" if name in self.columns or name in RESERVED_COLUMNS else name
                 if own != name:
-                    notes.append(
-                        f"NAMED_VALUE_FLOAT {name!r} is read as {own}: the log has a {name} of its own"
-                    )
+                    why = f"the log has a {name} of its own"
+                    notes.append(f"NAMED_VALUE_FLOAT {name!r} is read as {own}: {why}")
                 self.named[letters] = [(own, 1.0, 0.0)]
                 self.wanted[own] = None
                 self.columns.setdefault(own, "1")
@@ -215,9 +313,8 @@ class LogContents:
             if message.id == SET:
                 self._asked[name] = value
             elif block.channel[k] == Channel.SENT and self._asked.pop(name, None) == value:
-                aligns = name.startswith("MB_") and not name.startswith(
-                    "MB_R_"
-                )  # which are rates of messages
+                # MB_R_ are rates of messages
+                aligns = name.startswith("MB_") and not name.startswith("MB_R_")
                 self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
     def _look(self, block: RecordBlock, number: int, records: IndexArray) -> bool:
@@ -247,12 +344,11 @@ class LogContents:
             return False
         return True
 
-    def _raw(self, known: dict[str, str], payloads: NDArray[np.uint8]) -> bool:
+    def _raw(self, known: dict[str, str], payloads: Payloads) -> bool:
         """Note which columns samples of a bridge have; return whether they have all."""
         columns = source_columns(RAW, payloads)
-        there = [
-            name for name in (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS) if not np.isnan(columns[name]).all()
-        ]
+        possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
+        there = [name for name in possible if not np.isnan(columns[name]).all()]
         there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
         for name in there:
             known.setdefault(name, RAW_COLUMNS.get(name, ""))
@@ -268,7 +364,7 @@ class LogContents:
             with suppress(KeyError, ValueError):  # of a dialect that we do not know
                 self._declared[message["column"]] = DeclaredField(message)
 
-    def _values(self, sender: tuple[int, int, int], payloads: NDArray[np.uint8]) -> bool:
+    def _values(self, sender: tuple[int, int, int], payloads: Payloads) -> bool:
         """Note which fields of a message have a value; return whether all have."""
         known = self._known.setdefault(sender, {})
         still = self._open.setdefault(sender, list(TELEMETRY[sender[2]]))

@@ -22,7 +22,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.logs.deployment import lasting
-from magbridge.logs.telemetry_fields import POWER_CYCLE, UNKNOWN_INT
+from magbridge.logs.telemetry_survey import POWER_CYCLE, UNKNOWN_INT
 from magbridge.mavlink import Codec, Spec, pack_record, spec
 from magbridge.mavlink.messages import east_e7
 from magbridge.records import Channel, Quality
@@ -106,9 +106,8 @@ class FileWriter:
 
     def _attitude(self, time_us: int, row: Row) -> None:
         angles = [radians(row.get(name, nan)) for name in ATTITUDE]
-        self._write_message(
-            time_us, Channel.LINK, self._autopilot, ATTITUDE_, self._boot_ms(time_us), *angles, nan, nan, nan
-        )
+        fields = self._boot_ms(time_us), *angles, nan, nan, nan
+        self._write_message(time_us, Channel.LINK, self._autopilot, ATTITUDE_, *fields)
 
     def _position(self, time_us: int, row: Row) -> None:
         # autopilots send 0 for an unknown position
@@ -127,7 +126,8 @@ class FileWriter:
 
     def _raw(self, time_us: int, row: Row) -> None:
         x, y, z, temperature, supply, cycle = (row.get(name, nan) for name in SAMPLE)
-        delays = [_delay(row.get(name, nan), time_us) for name in CHANNEL_TIMES]
+        delays_us = [row.get(name, nan) * 1e6 - time_us for name in CHANNEL_TIMES]
+        delays = [round(delay) if abs(delay) < UNKNOWN_INT else 0 for delay in delays_us]
         fields = time_us, 0, x, y, z, 0, 0, 0, *delays, temperature, supply
         power = (int(cycle) & 0xFFFF, 0, POWER_CYCLE) if isfinite(cycle) else (0, 0, 0)
         self._write_message(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
@@ -159,8 +159,3 @@ def _single(name: str, values: FloatArray) -> FloatArray:
 
 def _integer(value: float) -> int:
     return round(value) if abs(value) < UNKNOWN_INT else UNKNOWN_INT
-
-
-def _delay(time: float, time_us: int) -> int:
-    delay = time * 1e6 - time_us
-    return round(delay) if abs(delay) < UNKNOWN_INT else 0

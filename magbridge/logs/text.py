@@ -36,13 +36,13 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
+from magbridge.logs.checks import validity_of
 from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, lasting, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout, cells, header_of, is_remark, rows_among
 from magbridge.logs.mapping import ColumnMapping, Options
 from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.registry import metadata_path, opened
 from magbridge.logs.table import TextTable
-from magbridge.logs.validity import validity_of
 from magbridge.records import Quality
 
 DEFAULTS = Options()
@@ -65,11 +65,7 @@ class TableNotes(msgspec.Struct):
 
 
 def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file as deployments of at most `rows` rows, each with their numbers.
-
-    FormatError: no header, a row of another length, a field that is not a number, or a declared column that
-    is not there.
-    """
+    """Yield the file in pieces, each with the numbers of its rows."""
     encoding, guess = _encoding(path)
     with io.TextIOWrapper(opened(path), encoding) as file:
         try:
@@ -171,10 +167,7 @@ def _lines(file: TextIO) -> Iterator[str]:
 class _LineMarks:
     """Lines such as ``LINE 100`` and ``TIE 9000``, which Geosoft writes before the rows of a survey line.
 
-    Attributes
-    ----------
-    rows : list of int
-        Number of each mark's row.
+    `rows` has the number of each mark's row.
     """
 
     def __init__(self, preamble: Sequence[str]) -> None:
@@ -205,13 +198,7 @@ class _LineMarks:
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one.
-
-    Attributes
-    ----------
-    metadata : bytes
-        Text of the file to write next to it.
-    """
+    """Write successive deployments with the columns of the first one; `metadata` is written next to it."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")

@@ -49,29 +49,13 @@ class TlogWriter:
     `start` is that of the run, so that the files of one run are sorted together even if others write to the
     directory; it is some seconds late where another run has taken the name.
 
-    Parameters
-    ----------
-    directory : path
-        Created if it does not exist, or no longer. Existing files are never changed.
-    max_size : float
-        MB after which a new file begins.
-    max_age : float
-        h of the events' time after which a new file begins.
-    header : sequence of bytes
-        Frames written to every file after its first record: what a reader needs to read that file alone.
-    beginning : sequence of bytes
-        Frames at the beginning of the first file after a failure: the record of the run's start.
+    `directory` is created if it does not exist, or no longer; existing files are never changed. A new file
+    begins after `max_size` MB, or `max_age` h of the events' time. The frames of `header` are written to
+    every file after its first record: what a reader needs to read that file alone. Those of `beginning`,
+    which the live thread may replace, begin the first file after a failure: the record of the run's start.
 
-    Attributes
-    ----------
-    beginning : sequence of bytes
-        As given; the live thread may replace it.
-    records : int
-        Records written so far.
-    lost : int
-        Records dropped so far, because the disk stalled or the log had failed.
-    failure : str
-        The operating system's reason why the log has stopped; empty while it is being written.
+    `records` counts the records written so far, `lost` those dropped because the disk stalled or the log had
+    failed; `failure` is the operating system's reason why the log has stopped, empty while it is written.
     """
 
     def __init__(
@@ -146,11 +130,8 @@ class TlogWriter:
                 self._dropped += 1
 
     def _fits(self, size: int, time_us: int) -> bool:
-        return (
-            self._file >= 0
-            and self._size + size <= self._max_size
-            and time_us - self._start_us <= self._max_age_us
-        )
+        is_small = self._size + size <= self._max_size
+        return self._file >= 0 and is_small and time_us - self._start_us <= self._max_age_us
 
     def _begin_file(self, time_us: int) -> bool:
         if self.failure and 0 <= time_us - self._failed_us < LOG_RETRY_US:

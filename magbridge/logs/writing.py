@@ -22,21 +22,12 @@ __all__ = ["Writer", "write"]
 
 
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a deployment; `path` is complete or as it was before.
+    """Write a deployment in the format of the suffix of `path`, which is complete or as it was before.
 
-    Parameters
-    ----------
-    dataset : Dataset (time)
-        With columns as :func:`read` returns them; times in s since 1970, or datetime64.
-    path : path
-        Its suffix chooses the format.
+    Times are s since 1970, or datetime64.
 
-    Raises
-    ------
-    FormatError
-        The suffix is not that of a format that can be written.
-    WriteError
-        The file cannot be written.
+    FormatError: the suffix is not that of a format that can be written. WriteError: the file cannot be
+    written.
     """
     with Writer(path) as writer:
         writer.append(dataset)
@@ -94,9 +85,8 @@ class Writer:
             self._last = float("-inf")
         for name in dataset.data_vars:
             if name not in self._columns:
-                raise FormatError(
-                    self._path, "expected only columns that the first rows had", column=str(name)
-                )
+                expected = "expected only columns that the first rows had"
+                raise FormatError(self._path, expected, column=str(name))
         time = dataset["time"].values
         increasing(self._path, time, previous=self._last)
         if len(time):
