@@ -40,10 +40,10 @@ def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.
         The logs.
     """
     cli.logs_to_read(files)
+    from magbridge.logs.access import without_companions
     from magbridge.logs.deployment import join
     from magbridge.logs.info import info as facts_of
     from magbridge.logs.merge import combine
-    from magbridge.logs.reading import without_companions
 
     logs = {}
     with waiting("reading"):

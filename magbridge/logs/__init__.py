@@ -9,16 +9,15 @@ magnetometer sample; every other column holds the values known at that time:
 - logs that were assembled ashore (Slocum, Seaglider): interpolated linearly, headings on the circle, NaN
   across gaps.
 
-:mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.reading` and
-:mod:`.writing` are for all formats; :mod:`.mapping` is what a user can say about a log. The formats share
+:mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.access`
+reads and writes all of them; :mod:`.mapping` is what a user can say about a log. The formats share
 :mod:`.fields` (telemetry brought to the rows; :mod:`.compasses` does so for autopilots and robots),
 :mod:`.deployment` (what they return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one
 stream of several. :mod:`.tlog` is separate: it writes the bridge's log.
 """
 
+from magbridge.logs.access import Writer, read, read_chunks, read_each, write
 from magbridge.logs.mapping import Options
-from magbridge.logs.reading import read, read_chunks, read_each
 from magbridge.logs.registry import FORMATS, suffixes
-from magbridge.logs.writing import Writer, write
 
 __all__ = ["FORMATS", "Options", "Writer", "read", "read_chunks", "read_each", "suffixes", "write"]

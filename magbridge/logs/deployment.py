@@ -11,7 +11,6 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, in_seconds, usual
 from magbridge.errors import FormatError
 from magbridge.logs.mapping import split
@@ -173,13 +172,14 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 def merged(dataset: xr.Dataset) -> xr.Dataset:
     """Return a deployment sorted in time with one row for each time: the first, NaNs filled from later."""
     time = dataset["time"]
-    starts = np.flatnonzero(np.diff(time.values, prepend=-np.inf) > 0)
+    times, group = np.unique(time.values, return_inverse=True)
+    values = {name: column.values for name, column in dataset.data_vars.items()}
+    table = pd.DataFrame(values, index=range(len(group)))
+    known = table.groupby(group).first()  # the first value that is not NaN
     variables = {
-        name: ("time", _first_known(column.values, starts), column.attrs)
-        for name, column in dataset.data_vars.items()
+        name: ("time", known[name].to_numpy(), column.attrs) for name, column in dataset.data_vars.items()
     }
-    coords = {"time": ("time", time.values[starts], time.attrs)}
-    return xr.Dataset(variables, coords=coords, attrs=dataset.attrs)
+    return xr.Dataset(variables, coords={"time": ("time", times, time.attrs)}, attrs=dataset.attrs)
 
 
 def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[str] = ()) -> xr.Dataset:
@@ -229,16 +229,6 @@ def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
 def noted(*pieces: Mapping[str, Any]) -> list[str]:
     """Return notes for the user on how the pieces of a deployment were read."""
     return [line for attrs in pieces for line in str(attrs.get(NOTES, "")).splitlines()]
-
-
-def _first_known(values: FloatArray, starts: IndexArray) -> FloatArray:
-    """Return the first value that is not NaN in each group of rows that begins at `starts`."""
-    result = values[starts]
-    sizes = np.diff(starts, append=len(values))
-    for k in range(1, int(sizes.max(initial=1))):
-        fill = np.flatnonzero(np.isnan(result) & (sizes > k))
-        result[fill] = values[starts[fill] + k]
-    return result
 
 
 def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:

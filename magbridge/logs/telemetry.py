@@ -46,12 +46,15 @@ from magbridge.logs.telemetry_survey import (
     source_columns,
     survey,
 )
+from magbridge.logs.telemetry_writer import FileWriter
 from magbridge.mavlink import Source, spec
 from magbridge.mavlink.tlog import RecordBlock, blocks
 from magbridge.records import Channel
 
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
+
+__all__ = ["FileWriter", "chunks"]
 
 NAMED = spec("NAMED_VALUE_FLOAT")
 FIELD, STEP = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id

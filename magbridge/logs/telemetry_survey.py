@@ -32,28 +32,9 @@ __all__ = [
 Payloads = NDArray[np.uint8]
 """(n, size): the payloads of messages of one kind, without zeros cut off."""
 UNKNOWN_INT = 0x7FFFFFFF
-FIELD_NAMES = {"field_x": "x", "field_y": "y", "field_z": "z", "quality": "flags"}
-"""Column to its field of MAG_FIELD, where that has another name."""
 MAVLINK_FIELDS = field_maps("mavlink")
 """Message to its fields; the values that the dialect declares to be invalid are missing, too."""
-SOURCES = {
-    "MAG_RAW": (
-        *(FieldMap("MAG_RAW", axis, f"mag_{axis}", "nT") for axis in "xyz"),
-        FieldMap("MAG_RAW", "temperature", "sensor_temperature", "degC"),
-        FieldMap("MAG_RAW", "supply", "sensor_supply", "V"),
-        FieldMap("MAG_RAW", "power_cycle", "power_cycle", ""),
-    ),
-    "MAG_FIELD": tuple(
-        FieldMap("MAG_FIELD", FIELD_NAMES.get(column, column), column, "") for column in CORRECTED
-    ),
-    "HIGHRES_IMU": tuple(FieldMap("HIGHRES_IMU", f"{axis}mag", f"mag_{axis}", "nT", 1e5) for axis in "xyz"),
-    **{
-        message: tuple(FieldMap(message, f"{axis}mag", f"mag_{axis}", "nT", 1e2) for axis in "xyz")
-        for message in ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
-    },
-    "ATTITUDE": (),
-    "GLOBAL_POSITION_INT": (),
-}
+SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": []}
 """The messages that make a row, the best first, and the fields whose values the row has from them."""
 POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
 """Flag of MAG_RAW: its power cycle is counted."""
