@@ -36,11 +36,12 @@ from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.estimation.residual import rms
 from magbridge.estimation.sequential import ALARM_LOG_RATIO
+from magbridge.estimation.track_process import CORRELATION_LENGTH_M, TRACK_STATES
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
-from magbridge.learning.estimator import LENGTH, STATES, Nuisance
+from magbridge.learning.estimator import Nuisance
 from magbridge.records import Quality, Reading
 from sitl import load, segments, simulate
 from sitl.dataset import channels, side_by_side
@@ -164,7 +165,7 @@ def best_delay(
     the whitened energy of the effect, reaches the threshold of the bridge.
     """
     nuisance = Nuisance(calibration.noise, Align().reference_sigma)
-    P, m, h = nuisance.initial.copy(), np.zeros(STATES), -nuisance.row(1.0)
+    P, m, h = nuisance.initial.copy(), np.zeros(TRACK_STATES), -nuisance.row(1.0)
     energy, count = 0.0, 0
     for k, (F, Q) in enumerate(transitions(nuisance, log)):
         P, m = F @ P @ F.T + Q, F @ m
@@ -192,8 +193,11 @@ def best_field(
     by_axis = [correct(calibration, seen + one, values, time).total - total for one in np.eye(3)]
     by_change = np.stack(by_axis, axis=1) * amount[:, None]
     nuisance = Nuisance(calibration.noise, Align().reference_sigma)
-    x, P = np.zeros(3 + STATES), np.diag(np.r_[np.full(3, CHANGE_SIGMA_NT**2), np.diag(nuisance.initial)])
-    A, h, best = np.eye(3 + STATES), np.r_[np.zeros(3), -nuisance.row(1.0)], total.copy()
+    x, P = (
+        np.zeros(3 + TRACK_STATES),
+        np.diag(np.r_[np.full(3, CHANGE_SIGMA_NT**2), np.diag(nuisance.initial)]),
+    )
+    A, h, best = np.eye(3 + TRACK_STATES), np.r_[np.zeros(3), -nuisance.row(1.0)], total.copy()
     for k, (F, Q) in enumerate(transitions(nuisance, log)):
         A[3:, 3:], h[:3] = F, by_change[k]
         x, P = A @ x, A @ P @ A.T
@@ -324,7 +328,7 @@ def field_model(log: xr.Dataset) -> tuple[float, float]:
     latitude, longitude, time = (log[name].to_numpy() for name in ("latitude", "longitude", "time"))
     metres = separation(latitude[0], longitude[0], latitude[100], longitude[100])
     speed = float(np.hypot(*metres)) / (time[100] - time[0])
-    return Align().reference_sigma, LENGTH / speed
+    return Align().reference_sigma, CORRELATION_LENGTH_M / speed
 
 
 STUDY = Study(

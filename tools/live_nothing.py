@@ -22,7 +22,7 @@ from study_worlds import MASSES
 from magbridge.calibration.model import Parameter
 from magbridge.estimation.residual import rms
 from magbridge.learning import Learner
-from magbridge.learning.start import class_prior
+from magbridge.learning.estimator import class_prior
 
 STRETCH_ENDS_H = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.25, 3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0)
 SENSOR_NOISE_NT = 1.0

@@ -43,10 +43,9 @@ TESTS = {
     "estimation/noise": "estimation/test_noise.py",
     "diagnose/evidence": "diagnose/test_evidence.py",
     "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
-    "health/axes": "health/test_monitor.py health/test_consistency.py",
+    "health/checks": "health/test_monitor.py health/test_consistency.py",
     "health/consistency": "health/test_consistency.py",
     "health/direction": "health/test_direction.py",
-    "health/level": "health/test_monitor.py",
     "health/scatter": "health/test_monitor.py",
     "health/trend": "health/test_monitor.py health/test_consistency.py",
 }

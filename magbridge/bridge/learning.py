@@ -42,7 +42,7 @@ def first_calibration(config: Config) -> Calibration | None:
                   0.5 * (low + high), 0.5 * (high - low))
         for name, (low, high) in settings.ranges.items()
     ]  # fmt: skip
-    from magbridge.learning.start import class_prior  # noqa: PLC0415 - only with [learning]
+    from magbridge.learning.estimator import class_prior  # noqa: PLC0415 - only with [learning]
 
     return class_prior(tuple(parameters))
 

@@ -51,12 +51,7 @@ class ComparedSample(NamedTuple):
 
 
 class SensorComparison:
-    """Compare the samples of two sensors as they come.
-
-    Parameters
-    ----------
-    names : tuple of 2 str
-        What messages call the sensors.
+    """Compare the samples of two sensors as they come; `names` is what messages call the sensors.
 
     Attributes
     ----------
@@ -88,18 +83,9 @@ class SensorComparison:
     ) -> tuple[float, int]:
         """Compare a sample; return the variance (nT²) and the flags to add to it.
 
-        Parameters
-        ----------
-        side : int
-            0 or 1: which of the sensors.
-        time_us : int
-            Time, µs.
-        total_field : tuple of 2 float
-            Total field and its 1-sigma, nT.
-        main_field : tuple of 2 float
-            Main field, NaN where unknown, and 1-sigma of the Earth's field about it, nT.
-        quality : int
-            The sample's :class:`~magbridge.records.Quality` bits.
+        `side` (0 or 1) is the sensor; `total_field` is the total field and its 1-sigma, nT; `main_field` the
+        main field, NaN where unknown, and the 1-sigma of the Earth's field about it, nT; `quality` the
+        sample's :class:`~magbridge.records.Quality` bits.
         """
         total, sigma = total_field
         if isfinite(total + sigma):

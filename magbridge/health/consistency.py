@@ -29,7 +29,8 @@ from magbridge.calibration.model import Noise
 from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.sequential import SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
-from magbridge.health.messages import Messages
+from magbridge.health.checks import Messages
+from magbridge.records import Vector
 
 __all__ = ["MASS_FRACTION", "ConsistencyCheck", "TestedSample"]
 
@@ -77,37 +78,29 @@ SCALE_GAIN: Final = 0.02
 
 
 class TestedSample(NamedTuple):
-    """A sample to test."""
+    """A sample to test.
+
+    `time_us` is µs, `unit` the direction of the corrected field, `anomaly` the corrected total field less the
+    main field where that is known (nT), `sigma` the part of its 1-sigma that is not common to all samples
+    (nT), `temperature` that of the sensor (degC; NaN where it is not known), `mass_changes` the change of the
+    total field where each mass moves by :data:`MASS_FRACTION` of its range (nT), `speed` that at which the
+    crustal field is crossed (m/s), and `course` the vehicle's (rad; NaN where it is not known).
+    """
 
     time_us: int
-    """Time, µs."""
-    unit: tuple[float, float, float]
-    """Direction of the corrected field."""
+    unit: Vector
     anomaly: float
-    """Corrected total field less the main field where that is known, nT."""
     sigma: float
-    """Part of its 1-sigma that is not common to all samples, nT."""
     temperature: float
-    """Temperature of the sensor, degC; NaN where it is not known."""
     mass_changes: tuple[float, ...]
-    """Change of the total field where each mass moves by :data:`MASS_FRACTION` of its range, nT."""
     speed: float
-    """Speed at which the crustal field is crossed, m/s."""
     course: float
-    """Course of the vehicle, rad; NaN where it is not known."""
 
 
 class ConsistencyCheck:
     """Test the total field for dependence on attitude, temperature, time and mass positions.
 
-    Parameters
-    ----------
-    noise : Noise
-        The calibration's noise model.
-    masses : int
-        Number of mass positions that the calibration depends on.
-    messages : Messages
-        Receives the messages.
+    `noise` is the calibration's noise model, `masses` the number of mass positions that it depends on.
 
     Attributes
     ----------

@@ -16,7 +16,7 @@ from __future__ import annotations
 from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, remainder, sin, sqrt
 from typing import Final
 
-from magbridge.health.messages import Messages
+from magbridge.health.checks import Messages
 from magbridge.records import Quality
 
 __all__ = ["DirectionCheck"]
@@ -40,11 +40,6 @@ IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 
 class DirectionCheck:
     """Check the vector at intervals.
-
-    Parameters
-    ----------
-    messages : Messages, optional
-        Receives the messages.
 
     Attributes
     ----------
@@ -77,12 +72,7 @@ class DirectionCheck:
     def check(self, time_us: int, x: float, y: float, z: float) -> float:
         """Judge a corrected vector: set :attr:`flags`, return the variance (nT²) to add to each component's.
 
-        Parameters
-        ----------
-        time_us : int
-            µs.
-        x, y, z : float
-            nT, body axes.
+        `time_us` is µs; `x`, `y` and `z` are nT, body axes.
         """
         if time_us < self._next_us and self._next_us - time_us <= EVERY_US:
             return self._variance

@@ -9,10 +9,8 @@ from typing import Final
 from magbridge.calibration.model import Noise
 from magbridge.estimation.track_process import Course, ReferenceSteps
 from magbridge.field.geodesy import separation
-from magbridge.health.axes import RepetitionCheck
+from magbridge.health.checks import LevelCheck, Messages, RepetitionCheck
 from magbridge.health.consistency import ConsistencyCheck, TestedSample
-from magbridge.health.level import LevelCheck
-from magbridge.health.messages import Messages
 from magbridge.health.scatter import Scatter
 from magbridge.health.trend import TrendCheck
 from magbridge.records import Quality, Vector
@@ -97,27 +95,11 @@ class HealthMonitor:
     ) -> float:
         """Check a sample: set :attr:`flags`, return the variance (nT²) to add to the field's.
 
-        Parameters
-        ----------
-        time_us : int
-            Time, µs.
-        raw : tuple of 3 float
-            Reading, nT.
-        field : tuple of 3 float
-            Corrected vector, nT.
-        total_field : tuple of 2 float
-            Corrected total field and its 1-sigma, nT.
-        quality : int
-            Flags so far.
-        main_field : tuple of 2 float
-            Main field, NaN where the position is not known, and 1-sigma of the Earth's field about it, nT.
-        temperature : float
-            Temperature of the sensor, degC; NaN where it is not known.
-        age : float
-            Age of the oldest telemetry, s.
-        mass_changes : callable
-            Returns by how much the total field changes where each mass moves, see
-            :class:`.consistency.TestedSample`.
+        `raw` and `field` are the reading and the corrected vector, `total_field` the corrected total field
+        and its 1-sigma, nT; `quality` has the flags so far. `main_field` is NaN where the position is not
+        known, with the 1-sigma of the Earth's field about it, nT. `temperature` is that of the sensor (degC;
+        NaN where it is not known), `age` that of the oldest telemetry (s). `mass_changes` returns by how much
+        the total field changes where each mass moves, see :class:`.consistency.TestedSample`.
         """
         self.flags = 0
         self.is_fault = True

@@ -23,7 +23,7 @@ from typing import Final
 
 from magbridge.calibration.model import Noise
 from magbridge.field.geodesy import separation
-from magbridge.health.messages import Messages
+from magbridge.health.checks import Messages
 
 __all__ = ["MIN_NOISE_NT", "Scatter"]
 
@@ -97,14 +97,7 @@ class MedianDifference:
 
 
 class Scatter:
-    """Estimate the noise of a total field.
-
-    Parameters
-    ----------
-    noise : Noise
-        The calibration's noise model.
-    messages : Messages
-        Receives the messages.
+    """Estimate the noise of a total field, beyond the calibration's noise model.
 
     Attributes
     ----------

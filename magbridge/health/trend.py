@@ -26,7 +26,7 @@ from collections import deque
 from math import exp, log, nan
 from typing import Final, NamedTuple
 
-from magbridge.health.messages import Messages
+from magbridge.health.checks import Messages
 from magbridge.health.scatter import Scatter
 
 __all__ = ["GATE_SIGMA", "TrendCheck"]
@@ -84,14 +84,7 @@ class TrendState(NamedTuple):
 
 
 class TrendCheck:
-    """Follow the total field and find outliers and jumps.
-
-    Parameters
-    ----------
-    scatter : Scatter
-        Noise of the samples.
-    messages : Messages
-        Receives the messages.
+    """Follow the total field and find outliers and jumps; `scatter` gives the noise of the samples.
 
     Attributes
     ----------
@@ -139,16 +132,9 @@ class TrendCheck:
     def check(self, time_us: int, total: float, sigma: float, turned: float, *, learn: bool) -> float:
         """Follow the trend; return the variance (nT²) to add to that of a sample that is an outlier.
 
-        Parameters
-        ----------
-        time_us : int
-            Time, µs.
-        total, sigma : float
-            Corrected total field and the part of its 1-sigma that is not common to all samples, nT.
-        turned : float
-            Change of the field's direction since the last sample, rad.
-        learn : bool
-            Whether the sample may be another level of the field.
+        `total` and `sigma` are the corrected total field and the part of its 1-sigma that is not common to
+        all samples, nT; `turned` is the change of the field's direction since the last sample, rad. Without
+        `learn`, the sample cannot be another level of the field.
         """
         self.is_outlier = False
         scatter, now = self._scatter, self._now
@@ -283,6 +269,9 @@ class TrendCheck:
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
+        # a jump that repeats the sum so far: the return was missed, at a motion or a turn
+        if jump * now.jump_sum > largest_zero and (jump - now.jump_sum) ** 2 <= 2.0 * largest_zero:
+            total = jump
         # jumps at motions come with every motion, so that they are remembered for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))

@@ -35,18 +35,17 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import TEMPERATURE
 from magbridge.estimation.sequential import ALARM_LOG_RATIO, SequentialTest
 from magbridge.learning.estimator import Estimator
-from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import Observation
+from magbridge.learning.samples import LearnedTerms, LearningSample, Observation
 from magbridge.records import Quality, Vector
 
 __all__ = [
     "CAUSE_UNITS",
     "NO_COEFFICIENT",
     "AlarmState",
+    "CauseRegressors",
     "ChangeDetector",
     "LateTelemetryTest",
     "LearningAlarm",
-    "Signs",
     "StoredSample",
     "named",
 ]
@@ -73,21 +72,22 @@ def named(causes: Sequence[str]) -> str:
     return " or ".join(causes[:2]).replace("_", " ")
 
 
-class Signs(NamedTuple):
-    """What a sample's causes would do to its residual."""
+class CauseRegressors(NamedTuple):
+    """Regressors of the causes at one sample, and what a change adds to its residual.
+
+    `time` is s since 1970 UTC, `positions` are the parameters, scaled, and `watched` the temperature (degC)
+    and the currents (A), NaN where unknown.
+    """
 
     time: float
-    """Time of the sample, s since 1970 UTC."""
-    offset: FloatArray
+    by_offset: FloatArray
     """(3,): Derivative of the residual by the offset of each axis."""
     positions: tuple[float, ...]
-    """Parameters, scaled to their range."""
     watched: tuple[float, ...]
-    """Temperature, degC, and currents, A; NaN where unknown."""
-    clock: float
+    by_delay: float
     """Change of the residual with the telemetry's time, nT/s."""
-    level: float
-    """By the reference's level."""
+    by_level: float
+    """Derivative of the residual by the reference's level."""
 
 
 class AlarmCause(NamedTuple):
@@ -99,18 +99,18 @@ class AlarmCause(NamedTuple):
 
 
 class LearningAlarm(NamedTuple):
-    """The model no longer explains the data."""
+    """The model no longer explains the data.
+
+    `causes` are those that fit, the likeliest first, and `channels` the telemetry that each follows, or "".
+    Of the likeliest one, `since` is the onset (s since 1970 UTC), `size` the RMS of its effect on the total
+    field (nT), and `strength` the log-likelihood ratio L.
+    """
 
     causes: tuple[str, ...]
-    """Which fit, the likeliest first."""
     channels: tuple[str, ...]
-    """The telemetry that each follows; empty for none."""
     since: float
-    """Onset of the likeliest cause, s since 1970 UTC."""
     size: float
-    """Root mean square of the likeliest cause's effect on the total field, nT."""
     strength: float
-    """Log-likelihood ratio L of the likeliest cause."""
     mapless: bool = False
     """True for a map alarm: an unmapped crustal field explains the data. The corrected field is not affected,
     and the alarm lasts as long as the bank raises it."""
@@ -121,14 +121,7 @@ MAX_CAUSE_LOG_RATIO: Final = log(20.0)
 
 
 class ChangeDetector:
-    """Tests every cause with every sample.
-
-    Parameters
-    ----------
-    model : LearnedTerms
-    estimator : Estimator
-        Estimator whose innovations are tested; another that learns from the same samples may replace it.
-    """
+    """Test the innovations of an estimator for every cause; another estimator may replace it."""
 
     def __init__(self, model: LearnedTerms, estimator: Estimator) -> None:
         self._offsets, self._states, self._origin = estimator.offsets, estimator.states, model.origin
@@ -161,16 +154,23 @@ class ChangeDetector:
         """Propagate the absorbed part by `F` (4, 4), the transition of :meth:`.Estimator.propagate`."""
         estimator.advance(self._test.absorbed, F, seconds)
 
-    def test(self, estimator: Estimator, signs: Signs) -> LearningAlarm | None:
+    def test(self, estimator: Estimator, regressors: CauseRegressors) -> LearningAlarm | None:
         """Test the estimator's prediction; return an alarm if a cause exceeds the threshold."""
-        self._now = signs.time
-        now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
+        self._now = regressors.time
+        now = [
+            1.0,
+            regressors.time / 3600.0,
+            *regressors.positions,
+            *regressors.watched,
+            regressors.by_delay,
+            regressors.by_level,
+        ]
         # each cause adds its regressor times the derivative by the offset of each axis; telemetry delay and
         # level act on the total field alone, not on an axis
-        effects = np.outer(self._unit, signs.offset)
+        effects = np.outer(self._unit, regressors.by_offset)
         effects[self._no_vector] = 0.0
         effects[self._no_vector, 0] = self._unit[self._no_vector]
-        largest = self._test.test(estimator.filter, signs.time, np.nan_to_num(np.array(now)), effects)
+        largest = self._test.test(estimator.filter, regressors.time, np.nan_to_num(np.array(now)), effects)
         return self._alarm() if largest > ALARM_LOG_RATIO else None
 
     def updated(self, gain: FloatArray) -> None:
@@ -236,7 +236,7 @@ class ChangeDetector:
         return np.asarray(G)
 
 
-LATE_US: Final = (8_000_000, 16_000_000, 32_000_000)
+DELAYS_US: Final = (8_000_000, 16_000_000, 32_000_000)
 """D, µs: shorter ones are those of telemetry that comes seldom."""
 MAX_DELAY_ERROR: Final = 0.25
 """By how much of d a later report may be off."""
@@ -246,18 +246,14 @@ MAX_HINDSIGHT_SQUARE: Final = 36.0
 """v²/S at most: two samples are needed in any case, and the last before a motion is none of them."""
 MAX_STORED_SAMPLES: Final = 41
 """Samples kept, at most one a second."""
-MOVED: Final = 0.01
+MIN_MOTION: Final = 0.01
 """Of its scale, by which a parameter has moved."""
 
 
 class StoredSample(NamedTuple):
-    """A sample of masses at rest, with its innovation (nT) and that one's variance (nT²)."""
+    """A sample of masses at rest, with its innovation (nT) and the innovation's variance (nT²)."""
 
-    time_us: int
-    field: Vector
-    reference: float
-    phi: FloatArray
-    positions: list[float]
+    sample: LearningSample
     innovation: float
     variance: float
 
@@ -271,16 +267,16 @@ class LateTelemetryTest:
     def restart(self) -> None:
         """Forget all evidence."""
         self._kept: deque[StoredSample] = deque(maxlen=MAX_STORED_SAMPLES)
-        self._ratio = [0.0] * len(LATE_US)
-        self._square = [0.0] * len(LATE_US)
-        self._count = [0] * len(LATE_US)
-        self._since_us = [0] * len(LATE_US)
-        self._tested_us = [0] * len(LATE_US)
+        self._ratio = [0.0] * len(DELAYS_US)
+        self._square = [0.0] * len(DELAYS_US)
+        self._count = [0] * len(DELAYS_US)
+        self._since_us = [0] * len(DELAYS_US)
+        self._tested_us = [0] * len(DELAYS_US)
 
-    def keep(self, sample: StoredSample) -> None:
+    def keep(self, stored: StoredSample) -> None:
         """Keep a sample."""
-        if not self._kept or sample.time_us - self._kept[-1].time_us >= 1_000_000:
-            self._kept.append(sample)
+        if not self._kept or stored.sample.time_us - self._kept[-1].sample.time_us >= 1_000_000:
+            self._kept.append(stored)
             self._count = [count + 1 for count in self._count]
 
     def test(
@@ -294,14 +290,16 @@ class LateTelemetryTest:
 
         `observe` compares a field (nT), measured at some regressors, with a reference (nT).
         """
-        for k in range(len(LATE_US)):
+        for k in range(len(DELAYS_US)):
             one = self._reported_since(time_us, k)
             if one is None:
                 continue
-            self._tested_us[k] = one.time_us
-            if np.abs(np.subtract(positions, one.positions)).max(initial=0.0) < MOVED:
+            self._tested_us[k] = one.sample.time_us
+            sample = one.sample
+            if np.abs(np.subtract(positions, sample.positions)).max(initial=0.0) < MIN_MOTION:
                 continue
-            then, now = (observe(one.field, at, one.reference).e for at in (one.phi, phi))
+            then = observe(sample.field, sample.phi, sample.reference).e
+            now = observe(sample.field, phi, sample.reference).e
             # Page's test: the innovation at the positions reported now, against that of then
             S = one.variance
             # the delay is known to a share only, which widens S
@@ -310,7 +308,7 @@ class LateTelemetryTest:
             late = (one.innovation + now - then) ** 2 / more + log(more / S)
             # a ratio of 0 begins a new onset
             if self._ratio[k] == 0.0:
-                self._square[k], self._count[k], self._since_us[k] = 0.0, 1, one.time_us
+                self._square[k], self._count[k], self._since_us[k] = 0.0, 1, one.sample.time_us
             self._ratio[k] = max(0.0, self._ratio[k] + 0.5 * (v - late))
             self._square[k] += (now - then) ** 2 * (v > late)
             if self._ratio[k] > ALARM_LOG_RATIO:
@@ -320,27 +318,27 @@ class LateTelemetryTest:
 
     def _reported_since(self, time_us: int, k: int) -> StoredSample | None:
         """Return the stored sample that the present report would match at the k-th d, or None."""
-        late_us = LATE_US[k]
-        one = min(self._kept, key=lambda one: abs(time_us - one.time_us - late_us), default=None)
-        if one is None or abs(time_us - one.time_us - late_us) > MAX_DELAY_ERROR * late_us:
+        late_us = DELAYS_US[k]
+        one = min(self._kept, key=lambda one: abs(time_us - one.sample.time_us - late_us), default=None)
+        if one is None or abs(time_us - one.sample.time_us - late_us) > MAX_DELAY_ERROR * late_us:
             return None
-        return one if one.time_us > self._tested_us[k] else None
+        return one if one.sample.time_us > self._tested_us[k] else None
 
 
-SURE: Final = 6.0
+MIN_GROWTH: Final = 6.0
 """Least growth of an alarm's log-likelihood ratio before its cause is learned (6 = a factor of 400)."""
 LOG_RATIO_PER_CAUSE: Final = 3.0
 """Additional growth required for each further cause that fits: more evidence often excludes causes, whereas
 separating them after all were learned takes hours."""
 MAX_WAIT_SAMPLES: Final = 128
 """Informative samples for each cause that fits, after which the decision is made at the latest."""
-MIN_ALARM_GROWTH: Final = 2.0
+MIN_UPDATE_GROWTH: Final = 2.0
 """Least growth of an alarm's log-likelihood ratio that updates the alarm."""
-QUIET: Final = 300
+SILENT_SAMPLES: Final = 300
 """Informative samples without an alarm after which its cause is cleared."""
 
 
-SLOWER: Final = 4
+RELAPSE_FACTOR: Final = 4
 """Factor by which each relapse multiplies the evidence and the samples required."""
 SIGNIFICANT_SQUARE: Final = 16.0
 """Squared normalised error from which on a prediction error is significant."""
@@ -349,9 +347,9 @@ SIGNIFICANT_SQUARE: Final = 16.0
 class AlarmState:
     """The current alarm, if any; `mapped` is True if the reference is a map.
 
-    A relapse is an alarm that comes before the last learned cause has explained :data:`QUIET` informative
-    samples. Alarms after a relapse continue the first one: it is announced once, and ends once a learned
-    calibration has explained as many samples.
+    A relapse is an alarm that comes before the last learned cause has explained :data:`SILENT_SAMPLES`
+    informative samples. Alarms after a relapse continue the first one: it is announced once, and ends once a
+    learned calibration has explained as many samples.
 
     Attributes
     ----------
@@ -363,10 +361,9 @@ class AlarmState:
         Variance of the unexplained residual, nT².
     relapses : int
         Number of relapses.
-    tried : bool
-        True if the cause was learned and no alarm has followed.
-    pending : bool
-        True if, in addition, the learned calibration is not published, as no later samples have confirmed it.
+    is_tried, is_pending : bool
+        True if the cause was learned and no alarm has followed; and if, in addition, the learned calibration
+        is not published, as no later samples have confirmed it.
     """
 
     def __init__(self, *, mapped: bool = False) -> None:
@@ -378,55 +375,55 @@ class AlarmState:
         """Close the alarm."""
         self.alarm: LearningAlarm | None = None
         self.flags, self.variance, self.relapses = 0, 0.0, 0
-        self.tried = self.pending = False
-        self._sure = 0.0
-        self._doubted = self._quiet = 0
-        self._explained = QUIET + 1
+        self.is_tried = self.is_pending = False
+        self._required = 0.0
+        self._informative = self._silent = 0
+        self._explained = SILENT_SAMPLES + 1
 
     @property
     def _slower(self) -> int:
-        return int(SLOWER**self.relapses)
+        return int(RELAPSE_FACTOR**self.relapses)
 
-    def raised(self, alarm: LearningAlarm) -> str:
+    def update(self, alarm: LearningAlarm) -> str:
         """Update the state with an alarm of the change detector; return the notification, or ""."""
         before = self.alarm
         # an alarm after its cause was learned is another one, or a relapse
-        anew = before is None or self.tried
+        is_new = before is None or self.is_tried
         if before is not None and (alarm.mapless or before.mapless):
             if alarm.mapless and before.causes == alarm.causes:
-                self.alarm, self._quiet = alarm, 0
+                self.alarm, self._silent = alarm, 0
             return ""  # a map error explains every further alarm
-        if before is not None and not anew and alarm.strength < before.strength + MIN_ALARM_GROWTH:
+        if before is not None and not is_new and alarm.strength < before.strength + MIN_UPDATE_GROWTH:
             return ""
         # a relapse: the last learned cause has not explained enough samples
-        if anew and self._explained <= QUIET:
+        if is_new and self._explained <= SILENT_SAMPLES:
             self.relapses += 1
         self._since = self._since if self.relapses else alarm.since
-        self.alarm, self._quiet = alarm._replace(since=self._since), 0
-        self.tried = self.pending = False
+        self.alarm, self._silent = alarm._replace(since=self._since), 0
+        self.is_tried = self.is_pending = False
         self.flags = int(Quality.UNEXPLAINED)
         self._cover()
-        if anew:
-            self._doubted, self._sure = 0, alarm.strength + self._slower * SURE
+        if is_new:
+            self._informative, self._required = 0, alarm.strength + self._slower * MIN_GROWTH
         if before is not None:
             return ""
         return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {named(alarm.causes)}"
 
-    def take_up(self) -> None:
+    def try_cause(self) -> None:
         """Record that the alarm's cause was learned, but is not published until it is confirmed."""
-        self.tried = self.pending = True
-        self._quiet = self._explained = 0
+        self.is_tried = self.is_pending = True
+        self._silent = self._explained = 0
         self._cover()
 
     def restart(self) -> None:
         """Require new evidence to learn the alarm's cause, because learning restarts."""
         if self.alarm is not None:
             self.alarm = self.alarm._replace(strength=0.0)
-        self._sure, self._doubted = self._slower * SURE, 0
+        self._required, self._informative = self._slower * MIN_GROWTH, 0
 
-    def confirmed(self) -> bool:
+    def confirm(self) -> bool:
         """Record that the learned calibration is published; return True if the alarm is closed."""
-        self.pending, self._quiet = False, 0
+        self.is_pending, self._silent = False, 0
         if self.relapses:
             self._cover()
             return False
@@ -434,58 +431,58 @@ class AlarmState:
         self._explained = 0
         return True
 
-    def mistaken(self) -> None:
+    def mark_mistaken(self) -> None:
         """Record that the learned calibration was rolled back."""
-        if self.alarm is not None and not self.mapless:
-            self.relapses, self.tried, self.pending = max(1, self.relapses), True, False
-            self._explained = self._quiet = 0
+        if self.alarm is not None and not self.is_mapless:
+            self.relapses, self.is_tried, self.is_pending = max(1, self.relapses), True, False
+            self._explained = self._silent = 0
 
-    def count(self, error: float, variance: float, *, telling: bool) -> None:
+    def count(self, error: float, variance: float, *, informative: bool) -> None:
         """Count a sample, with the published calibration's error (nT) and its predicted variance (nT²).
 
-        `telling` is True if the sample is informative about the coefficients.
+        `informative` is True if the sample is informative about the coefficients.
         """
         # only informative samples count: the others cannot show an effect
-        self._quiet += telling
-        self._doubted += telling
-        self._explained += telling
-        # largest error that is beyond chance, forgotten over QUIET informative samples
+        self._silent += informative
+        self._informative += informative
+        self._explained += informative
+        # largest error that is beyond chance, forgotten over SILENT_SAMPLES informative samples
         seen = error * error - SIGNIFICANT_SQUARE * variance
-        self._peak = max(self._peak * (1.0 - telling / QUIET), seen)
+        self._peak = max(self._peak * (1.0 - informative / SILENT_SAMPLES), seen)
         if self.relapses and seen > 0.0:
-            self._quiet = 0
+            self._silent = 0
         self._cover()
 
     def _cover(self) -> None:
         """Set the variance to that of the likeliest cause, and of the errors once a cause was learned."""
         # until the cause is published, sigma includes its effect; later the errors that are seen
-        learned = self.tried and not self.pending
-        size = 0.0 if self.alarm is None or learned or self.mapless else self.alarm.size
-        self.variance = max(size * size, self._peak if self.relapses or self.pending else 0.0)
+        learned = self.is_tried and not self.is_pending
+        size = 0.0 if self.alarm is None or learned or self.is_mapless else self.alarm.size
+        self.variance = max(size * size, self._peak if self.relapses or self.is_pending else 0.0)
 
     @property
-    def mapless(self) -> bool:
+    def is_mapless(self) -> bool:
         """True during a map alarm: an unmapped crustal field explains the data."""
         return self.alarm is not None and self.alarm.mapless
 
     @property
-    def gone(self) -> bool:
-        """True if the alarm has not been raised for :data:`QUIET` informative samples."""
-        return self.alarm is not None and self._quiet > QUIET
+    def is_silent(self) -> bool:
+        """True if the alarm has not been raised for :data:`SILENT_SAMPLES` informative samples."""
+        return self.alarm is not None and self._silent > SILENT_SAMPLES
 
     @property
-    def learnable(self) -> bool:
+    def is_learnable(self) -> bool:
         """True if there is an alarm whose cause coefficients can represent."""
         return self.alarm is not None and not NO_COEFFICIENT.issuperset(self.alarm.causes)
 
     @property
-    def ripe(self) -> bool:
+    def is_certain(self) -> bool:
         """True if the evidence suffices to learn the alarm's cause."""
-        if self.alarm is None or self.tried or not self.learnable:
+        if self.alarm is None or self.is_tried or not self.is_learnable:
             return False
         # each further candidate needs more growth, so that the attitudes to come separate them
         fit, slower = len(self.alarm.channels), self._slower
-        sure = self.alarm.strength > self._sure + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
+        sure = self.alarm.strength > self._required + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
         if self._mapped and "map_error" in self.alarm.causes:
             sure = False  # maps have sheets: the attitudes to come tell an offset from another level
-        return sure or self._doubted > slower * MAX_WAIT_SAMPLES * fit
+        return sure or self._informative > slower * MAX_WAIT_SAMPLES * fit

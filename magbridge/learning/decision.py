@@ -1,4 +1,4 @@
-"""Decide when to publish the learned calibration, when to roll it back, and when to close an alarm."""
+"""Estimate and test sample by sample, decide what to publish and when to roll back, and close alarms."""
 
 from __future__ import annotations
 
@@ -12,50 +12,201 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration, Noise
-from magbridge.learning.alarms import NO_COEFFICIENT, AlarmState, LearningAlarm, named
-from magbridge.learning.estimator import Estimator, Nuisance
-from magbridge.learning.judge import BEYOND_CHANCE, CANDIDATE, FIRST, PUBLISHED, Judge
-from magbridge.learning.knowledge import Knowledge
-from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import LearningSample, Observation, Way
+from magbridge.estimation.track_process import ReferenceSteps
+from magbridge.learning.alarms import (
+    NO_COEFFICIENT,
+    AlarmState,
+    CauseRegressors,
+    ChangeDetector,
+    LateTelemetryTest,
+    LearningAlarm,
+    StoredSample,
+    named,
+)
+from magbridge.learning.estimator import BEYOND_CHANCE, BatchFit, Estimator, EstimatorBank, Nuisance
+from magbridge.learning.judge import CANDIDATE, FIRST, PUBLISHED, Coverage, Judge
+from magbridge.learning.samples import LearnedTerms, LearningSample, Observation, Way, observe
+from magbridge.records import Vector
 
-__all__ = ["NO_METHOD", "Decision", "Publication"]
+__all__ = ["NO_METHOD", "Decision", "Knowledge", "Publication"]
+
+MAX_LINEAR_SIGMA_NT: Final = 300.0
+"""Offset uncertainty from which on the batch fit repeats the whole estimate, nT, 1-sigma of an axis."""
+OFFSET_WALK: Final = 3.0 / 86_400.0**0.5
+"""nT per square root of a second: an offset walks by 3 nT a day."""
+LEARNING_OUTLIER_SIGMA: Final = 5.0
+MIN_AGREEING_SAMPLES: Final = 3
+"""An innovation beyond so many sigmas says nothing, unless it is the third in a row."""
+
+
+class Knowledge:
+    """Estimators, tests and batch fit of one learning period.
+
+    It begins with a calibration, whose offsets may have changed at this power-on by `turn_on` (nT, 1-sigma),
+    and with the nuisance of the reference, and of the main field alone if the reference is a map.
+    """
+
+    def __init__(
+        self,
+        model: LearnedTerms,
+        first: Calibration,
+        nuisance: Nuisance,
+        mapless: Nuisance | None,
+        turn_on: float,
+    ) -> None:
+        self._model, self._mapless, self.nuisance, self.noise = model, mapless, nuisance, first.noise
+        self._field, offsets = first.reference.field, model.offsets
+        coefficients, covariance = model.coefficients(first)
+        quiet = Estimator(coefficients, covariance, offsets, nuisance, OFFSET_WALK)
+        quiet.open(turn_on**2)
+        self.bank, self.detector = EstimatorBank(model, quiet, mapless), ChangeDetector(model, quiet)
+        self.late_telemetry, self._outliers = LateTelemetryTest(), 0
+        self.coverage = Coverage(model.size)
+        self._before: FloatArray | None = None
+        self._reference_steps = ReferenceSteps()
+        self.start: BatchFit | None = None
+        if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * MAX_LINEAR_SIGMA_NT**2:
+            self.start = BatchFit(model, coefficients, covariance, self._field)
+        else:
+            self.bank.suppose()
+
+    @property
+    def believed(self) -> Nuisance:
+        """Nuisance in use: the one without the map during a map alarm."""
+        return self._mapless if self.bank.map_doubted and self._mapless else self.nuisance
+
+    def observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
+        """Return the observation of a field (nT) with nine coefficients (9,)."""
+        return observe(field, nine, self._field, reference)
+
+    def _observation_with(self, estimator: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
+        """Return the observation of a field at regressors (m,) with an estimator's coefficients."""
+        return lambda field, phi, reference: self.observe(
+            field, phi @ self._model.weights(estimator.coefficients), reference
+        )
+
+    def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> LearningAlarm | None:
+        """Test whether the regressors (m,) reported now fit earlier samples better than those of then."""
+        if self.start is not None:
+            return None
+        return self.late_telemetry.test(time_us, phi, positions, self._observation_with(self.bank.quiet))
+
+    def keep(self, sample: LearningSample, innovation: float) -> None:
+        """Keep a sample that is wrong by an innovation (nT), to look back at."""
+        self.late_telemetry.keep(StoredSample(sample, innovation, self.bank.quiet.filter.variance))
+
+    def keep_faulty(self, sample: LearningSample) -> None:
+        """Keep a sample that is not predicted."""
+        quiet = self.bank.quiet
+        now = self._observation_with(quiet)(sample.field, sample.phi, sample.reference)
+        self.keep(sample, now.e - quiet.expected)
+
+    def predict(self, sample: LearningSample, way: Way) -> tuple[Observation, CauseRegressors]:
+        """Predict a sample with every estimator, on the way from the previous one.
+
+        Return the selected estimator's residual and derivatives, and the regressors of the causes to test.
+        """
+        before, self._before = self._before, sample.phi
+        self._reference_steps.follow(sample.time_us, sample.reference)
+        quiet = self.bank.quiet
+        # time update of all estimators, and of what the tests have absorbed
+        for other in self.bank.all[1:]:
+            other.propagate(way)
+        seconds = way.seconds
+        self.detector.propagate(quiet, quiet.propagate(way), seconds)
+        # relinearise every estimator at its own coefficients
+        live = {id(one): self._predict(one, sample) for one in self.bank.all}
+        best = live[id(self.bank.best)]
+        self.coverage.add(best.s * self._model.derivative(sample.phi, best.by_nine), best.direction)
+        self.keep(sample, quiet.filter.innovation)
+        now, clock = live[id(quiet)], 0.0
+        if before is not None and 0.0 < seconds < 30.0:  # the residual if telemetry were a second late
+            clock = (
+                self._observation_with(quiet)(sample.field, before, sample.reference).e - now.e
+            ) / seconds
+        # the main field's model alone is smooth: without a map and without a step it has no error to test
+        may_step = self._mapless is not None or self._reference_steps.total != 0.0
+        offset, level = now.by_nine[6:], -1.0 / now.s if may_step else 0.0
+        regressors = CauseRegressors(
+            sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level
+        )
+        return best, regressors
+
+    def _predict(self, estimator: Estimator, sample: LearningSample) -> Observation:
+        live = self._observation_with(estimator)(sample.field, sample.phi, sample.reference)
+        estimator.predict(live.e, live.s, self._model.derivative(sample.phi, live.by_nine))
+        estimator.follow(live.s)
+        return live
+
+    def outlying(self, *, learnable: bool) -> bool:
+        """Return True for an outlier that no estimator predicts and no `learnable` alarm explains."""
+        if self.start is not None:
+            return False
+        best = self.bank.best
+        far = abs(best.filter.innovation) > LEARNING_OUTLIER_SIGMA * best.filter.sigma
+        self._outliers = self._outliers + 1 if far else 0
+        return far and self._outliers < MIN_AGREEING_SAMPLES and not learnable
+
+    def learn(self, regressors: CauseRegressors, *, frozen: bool) -> tuple[LearningAlarm | None, bool]:
+        """Test the prediction, then learn from it; return the alarm, and True if the sample was used."""
+        quiet = self.bank.quiet
+        # test the innovation first: the update absorbs a part of every change
+        alarm = self.detector.test(quiet, regressors)
+        for other in self.bank.all[1:]:
+            other.update(learn=other.is_informative and not frozen)
+        learn = quiet.is_informative and not frozen
+        self.detector.updated(quiet.update(learn=learn))
+        return alarm, learn
+
+    def begin(self, sample: LearningSample, way: Way) -> bool:
+        """Add a sample to the batch fit; return True if the fit of all samples was repeated."""
+        assert self.start is not None
+        quiet = self.bank.quiet
+        if not self.start.add(sample.field, sample.phi, sample.reference, way):
+            quiet.update(learn=True)
+            return False
+        # all samples so far, from the prior: no linearisation of a poor start stays
+        fitted = self.start.fit(quiet.coefficients, self.nuisance)
+        self.noise = msgspec.structs.replace(self.noise, sensor=fitted.noise)
+        self.nuisance = Nuisance(self.noise, self.nuisance.spread, self.nuisance.constant)
+        quiet.know(fitted.coefficients, fitted.nuisances, fitted.covariance, self.nuisance)
+        return True
+
+    def go_on(self) -> None:
+        """End the batch fit and continue with the filters, if they can be linearised."""
+        if self.start is not None and self.start.is_over:
+            self.start = None
+            self.bank.suppose()
+
 
 NO_METHOD: Final = "none"
 """The method of a calibration that is none."""
 MAX_PUBLISHED_DIFFERENCE: Final = 0.3
 """Difference of learned and published total field that causes an update, as a fraction of the noise."""
-RENEW: Final = 32, 256
-"""Samples after which it may be, and is in any case."""
+MIN_UPDATE_SAMPLES: Final = 32
+MAX_UPDATE_SAMPLES: Final = 256
+"""Samples after which it may be updated, and is in any case."""
 
 
 class Publication:
-    """Holds the first calibration and the published one, and judges between them.
-
-    Parameters
-    ----------
-    model : LearnedTerms
-    first : Calibration
-        Initial calibration.
-    nuisance : Nuisance
+    """Hold the first (initial or accepted) calibration and the published one, and judge between them.
 
     Attributes
     ----------
-    first : Calibration
-        Initial or accepted calibration.
-    calibration : Calibration
-        Published calibration.
+    first, calibration : Calibration
+        First and published calibration.
     coefficients : (K,) array
         Coefficients of the published calibration.
     judge : Judge
-    renewed : bool
+        Compares both, and the candidate.
+    is_update : bool
         True if the last change of the published calibration was a routine update.
     age : int
         Samples used since that change.
     """
 
     def __init__(self, model: LearnedTerms, first: Calibration, nuisance: Nuisance) -> None:
-        self._model, self.first, self.renewed = model, first, False
+        self._model, self.first, self.is_update = model, first, False
         self.forget(nuisance)
 
     def forget(self, nuisance: Nuisance) -> None:
@@ -112,16 +263,15 @@ class Publication:
 
     def stale(self, difference: float) -> bool:
         """Return True if `difference`, learned less published total field (nT), requires an update."""
-        least, most = RENEW
         far = abs(difference) > MAX_PUBLISHED_DIFFERENCE * self.calibration.noise.sensor
-        return self.learned and ((far and self.age >= least) or self.age >= most)
+        return self.learned and ((far and self.age >= MIN_UPDATE_SAMPLES) or self.age >= MAX_UPDATE_SAMPLES)
 
     def renew(self, calibration: Calibration) -> None:
         """Update the published calibration with the learned one, without a notification."""
         self.calibration = calibration
         self.coefficients = self._model.coefficients(calibration)[0]
         self._replace(PUBLISHED, self._model.weights(self.coefficients))
-        self.age, self.renewed = 0, True
+        self.age, self.is_update = 0, True
 
     def publish(self, calibration: Calibration, how: str) -> str:
         """Publish it for another reason; return the message."""
@@ -144,7 +294,7 @@ class Publication:
         return self._change("rolled back: the first calibration predicts better", PUBLISHED, FIRST)
 
     def _change(self, how: str, previous: int, following: int) -> str:
-        self.renewed = False
+        self.is_update = False
         rms = np.sqrt(self.judge.mean_square)
         said = f"{how} {calibration_id(self.calibration):08x}"
         if previous == FIRST and self.first.method == NO_METHOD:  # no errors to compare with
@@ -152,25 +302,17 @@ class Publication:
         return f"{said}: {rms[previous]:.1f} to {rms[following]:.1f} nT"
 
 
-GONE: Final = 9.0
-"""Log-likelihood ratio below which an alarm's cause is closed as gone instead of learned."""
-
-
+MIN_CAUSE_LOG_RATIO: Final = 9.0
+"""Log-likelihood ratio below which an alarm is closed instead of its cause learned."""
 MAX_MISFIT: Final = 2.0
 """Mean normalised square of the innovations that a cause leaves, up to which it explains them. A cause that
 leaves more is not the true one, as where a current has no telemetry."""
 
 
 class Decision:
-    """Evaluates every sample and decides what to publish.
+    """Evaluate every sample and decide what to publish.
 
-    Parameters
-    ----------
-    publication : Publication
-    standing : AlarmState
-        State of the alarm.
-    notify : callable
-        Called with the text of a notification, and True if its severity is WARNING.
+    `notify` is called with the text of a notification, and True if its severity is WARNING.
 
     Attributes
     ----------
@@ -192,13 +334,13 @@ class Decision:
         return self._publication.made(knowledge.bank.best, self.samples, knowledge.noise)
 
     def raise_alarm(self, alarm: LearningAlarm | None) -> None:
-        """Pass an alarm, if there is one, to the alarm's state, and send the notification that results."""
+        """Update the alarm's state with an alarm, if there is one, and send the notification that results."""
         if alarm is None:
             return
-        pending = self._standing.pending
-        if news := self._standing.raised(alarm):
+        pending = self._standing.is_pending
+        if news := self._standing.update(alarm):
             self._notify(news, True)
-        self._refuted = self._refuted or (pending and not self._standing.pending)
+        self._refuted = self._refuted or (pending and not self._standing.is_pending)
 
     def publish(self, knowledge: Knowledge, how: str) -> None:
         """Publish the learned calibration; `how` is the reason in the notification."""
@@ -215,7 +357,7 @@ class Decision:
         knowledge.late_telemetry.restart()
         self._notify(f"explained again: {how}", False)
 
-    def gone(self, knowledge: Knowledge) -> None:
+    def close_unexplained(self, knowledge: Knowledge) -> None:
         """Close an alarm that no coefficient explained, and restart the judge, which its cause affected."""
         self._publication.judge.restart()
         self.settle(knowledge, "gone")
@@ -226,17 +368,17 @@ class Decision:
         `way` leads from the previous sample to this one. Return True if learning has to
         restart from the first calibration.
         """
-        now, signs = knowledge.predict(sample, way)
+        now, regressors = knowledge.predict(sample, way)
         best = knowledge.bank.best
-        if knowledge.outlying(learnable=self._standing.learnable):
-            self._standing.count(best.residual, best.variance, telling=False)
+        if knowledge.outlying(learnable=self._standing.is_learnable):
+            self._standing.count(best.filter.innovation, best.filter.variance, informative=False)
             return False
         published = self._judge(knowledge, sample, way)
         difference = published.e - now.e
         if knowledge.start is None:
             # compare and test before learning: a prediction must not know its own sample
-            self._compare(knowledge, signs.time, difference)
-            alarm, learned = knowledge.learn(signs, frozen=frozen)
+            self._compare(knowledge, regressors.time, difference)
+            alarm, learned = knowledge.learn(regressors, frozen=frozen)
             self.raise_alarm(alarm)
             self._count(learned=learned)
         elif not frozen:
@@ -268,11 +410,21 @@ class Decision:
     def _compare(self, knowledge: Knowledge, time: float, difference: float) -> None:
         """Select the best estimator; `difference` (nT): published residual less the best's."""
         bank, publication = knowledge.bank, self._publication
-        best, doubted = bank.best, bank.map_doubted
-        seen = (best.residual + difference, best.variance) if publication.learned else publication.judge.last
-        self._standing.count(*seen, telling=bank.quiet.telling)
-        self.raise_alarm(bank.judge(time))
-        if bank.map_doubted != doubted:
+        best, was_doubted = bank.best, bank.map_doubted
+        seen = (
+            (best.filter.innovation + difference, best.filter.variance)
+            if publication.learned
+            else publication.judge.last
+        )
+        self._standing.count(*seen, informative=bank.quiet.is_informative)
+        bank.judge(time)
+        if bank.map_doubted and bank.without_map is not None:
+            size = abs(bank.without_map.crust)
+            map_alarm = LearningAlarm(
+                ("map_error",), ("",), bank.map_since, size, bank.map_lead, mapless=True
+            )
+            self.raise_alarm(map_alarm)
+        if bank.map_doubted != was_doubted:
             publication.judge.restart(knowledge.believed)
 
     def _begin(self, knowledge: Knowledge, sample: LearningSample, way: Way) -> None:
@@ -284,7 +436,7 @@ class Decision:
         self._publication.judge.restart(knowledge.nuisance)
         if self._publication.learned:
             self._publication.renew(self.learned(knowledge))
-            self._publication.renewed = False  # the previous fit may have caused the jump
+            self._publication.is_update = False  # the previous fit may have caused the jump
         knowledge.go_on()
 
     def _count(self, *, learned: bool) -> None:
@@ -304,7 +456,7 @@ class Decision:
         if worse and not publication.learned and self._standing.alarm is None:
             publication.judge.discard()  # the learned calibration may improve yet
         elif worse or (relapsed and publication.judge.improves < -BEYOND_CHANCE):
-            self._standing.mistaken()
+            self._standing.mark_mistaken()
             if worse and publication.learned:
                 self._notify(publication.roll_back(), False)
             publication.judge.restart()
@@ -313,7 +465,7 @@ class Decision:
         if frozen or not self._trusted(knowledge):
             return False
         # the first publication needs the judge; later ones follow the estimator
-        pending = self._standing.pending
+        pending = self._standing.is_pending
         if pending or not publication.learned:
             if self._holds(knowledge):
                 self._publish_learned(knowledge)
@@ -328,14 +480,14 @@ class Decision:
             return publication.judge.better > BEYOND_CHANCE
         # better in the last blocks, and known at all attitudes so far
         change = best.coefficients - publication.coefficients
-        expected = self._standing.pending and self._expected
+        expected = self._standing.is_pending and self._expected
         return publication.judge.adopt(expected=expected) and knowledge.coverage.is_significant(
             change, best.covariance
         )
 
     def _publish_learned(self, knowledge: Knowledge) -> None:
         """Publish the learned calibration; close the alarm that it explains."""
-        if not self._standing.pending:
+        if not self._standing.is_pending:
             for one in knowledge.bank.all:
                 one.keep_level(self._publication.coefficients)
             self.publish(knowledge, "learned")
@@ -343,15 +495,15 @@ class Decision:
         self._publication.publish(self.learned(knowledge), "learned")
         self._unconfirmed = False
         how = self._explained
-        if self._standing.confirmed():
+        if self._standing.confirm():
             self._notify(f"explained again: {how}", False)
 
     def _trusted(self, knowledge: Knowledge) -> bool:
         """Return True without an alarm, or if the best estimator's hypothesis explains the alarm."""
         standing, bank = self._standing, knowledge.bank
-        if standing.alarm is None or standing.mapless or standing.tried:
+        if standing.alarm is None or standing.is_mapless or standing.is_tried:
             return True
-        return standing.learnable and not standing.relapses and bank.best is not bank.quiet
+        return standing.is_learnable and not standing.relapses and bank.best is not bank.quiet
 
     def _end(self, knowledge: Knowledge) -> bool:
         """Close an alarm that has been silent for long, or learn the cause of one that is certain enough.
@@ -360,17 +512,17 @@ class Decision:
         """
         standing, publication = self._standing, self._publication
         judge = publication.judge
-        if standing.pending and (judge.improves > 0.0 or not judge.is_complete):
+        if standing.is_pending and (judge.improves > 0.0 or not judge.is_complete):
             return False
-        if not standing.gone:
-            if standing.ripe:
+        if not standing.is_silent:
+            if standing.is_certain:
                 self._take_up(knowledge)
             return False
         # learning that nothing has confirmed restarts from the published calibration
-        restart = self._unconfirmed or (standing.relapses > 0 and not standing.tried)
-        if not standing.tried:
-            self.gone(knowledge)
-        elif publication.learned and not standing.pending:
+        restart = self._unconfirmed or (standing.relapses > 0 and not standing.is_tried)
+        if not standing.is_tried:
+            self.close_unexplained(knowledge)
+        elif publication.learned and not standing.is_pending:
             self.settle(knowledge, self._explained)
         else:
             name = "learned" if publication.learned else "first"
@@ -388,8 +540,8 @@ class Decision:
         """Learn the cause of the alarm, if coefficients can represent it, on trial."""
         bank, alarm = knowledge.bank, self._standing.alarm
         strength = knowledge.detector.strength
-        if strength < GONE:
-            self.gone(knowledge)
+        if strength < MIN_CAUSE_LOG_RATIO:
+            self.close_unexplained(knowledge)
             return
         assert alarm is not None
         # a cause that explains the samples needs less confirmation than a change without an alarm
@@ -401,5 +553,5 @@ class Decision:
             bank.explained(*moved, strength)
         knowledge.detector.restart()
         self._publication.judge.discard()
-        self._standing.take_up()
+        self._standing.try_cause()
         self._unconfirmed = True

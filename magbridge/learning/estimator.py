@@ -1,47 +1,74 @@
-"""A Kalman filter whose state is the calibration's coefficients and the nuisance of the reference field.
+r"""Estimate the coefficients: one Kalman filter for each hypothesis, and a batch fit at the start.
 
-The state is the coefficients, the slope of the offset (nT/s, an axis), and the states of :class:`Nuisance`.
+The state of an :class:`Estimator` is the coefficients, the slope of the offset (nT/s, an axis), and the
+states of :class:`Nuisance`, the error of the reference. It is relinearised at each sample. If the crustal
+field could explain a sample as well as the coefficients, the filter *considers* the coefficients and does not
+learn them (:mod:`magbridge.estimation.kalman`).
 
-The filter uses the covariance form. The variance of every prediction, which comparison and alarm need with
-each sample, is then a by-product. A singular prior needs no inverse, for example after a fit that could not
-estimate some combinations. The state is relinearised at each sample.
+Without a hypothesis, a change is learned only once its test is significant. Until then, the estimator
+attributes the change to the wrong coefficients, which is hard to undo: for example a change of temperature to
+the turn-on offset, or a drift to a step. The baseline estimator of the :class:`EstimatorBank` assumes no
+change. Further estimators assume from the start that
 
-If the crustal field could explain a sample as well as the coefficients, the filter *considers* the
-coefficients and does not learn them (:mod:`magbridge.estimation.kalman`).
+- the offset follows the sensor's temperature;
+- the offset drifts, at a rate that changes within hours;
+- the map, if there is one, does not show the crustal field. A map error no larger than the crustal field
+  hardly moves single samples, so no test of innovations shows it. If this estimator predicts significantly
+  better, the bank selects it until its lead is lost.
+
+The selection is dynamic model selection (Raftery, Karny & Ettler 2010, Technometrics 52:52): with each
+innovation v of variance S,
+
+.. math:: \log w \leftarrow \alpha \log w - \tfrac12 (v^2 / S + \log S)
+
+A vehicle's hard iron moves the reading by thousands of nanotesla, over which the field's magnitude is not
+linear: a Kalman filter that was linearised at a wrong guess stays wrong. While the calibration is too
+uncertain, a :class:`BatchFit` therefore stores the samples and refits them by Gauss-Newton when their number
+has doubled. Residuals and derivatives are whitened by the filter of :class:`Nuisance`; with
+:math:`c = c_0 + L z, z \sim N(0, I)`, a step solves
+
+.. math:: (I + L^T J^T J L)\, z = -L^T J^T (r + J (c_0 - c))
 """
 
 from __future__ import annotations
 
-from math import exp
-from typing import Final
+from copy import deepcopy
+from math import exp, log
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.model import Noise
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.columns import TEMPERATURE
 from magbridge.estimation.kalman import KalmanFilter
-from magbridge.estimation.track_process import CORRELATION_LENGTH_M as LENGTH
-from magbridge.estimation.track_process import TRACK_STATES as STATES
-from magbridge.estimation.track_process import TrackProcess
-from magbridge.learning.samples import Way
+from magbridge.estimation.priors import polynomial_prior
+from magbridge.estimation.sequential import ALARM_LOG_RATIO
+from magbridge.estimation.track_process import CORRELATION_LENGTH_M, TRACK_STATES, TrackProcess
+from magbridge.learning.samples import LearnedTerms, Way, observe
+from magbridge.records import Vector
 
-__all__ = ["EXTRA_STATES", "LENGTH", "SLOPE_STATES", "STATES", "Estimator", "Nuisance"]
+__all__ = [
+    "BEYOND_CHANCE",
+    "LAST_FIT_SAMPLES",
+    "BatchFit",
+    "Estimator",
+    "EstimatorBank",
+    "Nuisance",
+    "class_prior",
+]
 
 
 class Nuisance(TrackProcess):
     """Dynamics of the reference's error for the samples of a calibration.
 
-    Parameters
-    ----------
-    noise : Noise
-        The calibration's noise model.
-    spread, level : float
-        1-sigma of the crustal field and of the reference's constant error, nT.
-    length : float
-        Correlation length of the crustal field, m.
+    `spread` and `level` are the 1-sigma of the crustal field and of the reference's constant error, nT.
     """
 
-    def __init__(self, noise: Noise, spread: float, level: float = 0.0, length: float = LENGTH) -> None:
+    def __init__(
+        self, noise: Noise, spread: float, level: float = 0.0, length: float = CORRELATION_LENGTH_M
+    ) -> None:
         super().__init__(
             noise.sensor, spread, level, length,
             noise.autocorrelation, noise.interval, noise.white, noise.reference,
@@ -50,9 +77,9 @@ class Nuisance(TrackProcess):
 
 SLOPE_STATES: Final = 3
 """States of the offset's slope."""
-EXTRA_STATES: Final = SLOPE_STATES + STATES
+EXTRA_STATES: Final = SLOPE_STATES + TRACK_STATES
 """Number of states that are not coefficients."""
-TELLING: Final = 0.01
+MIN_INFORMATIVE_SHARE: Final = 0.01
 """Fraction of a prediction's variance that comes from the coefficients and varies along the track: from here
 on the sample is informative about the coefficients."""
 AVERAGING_DISTANCE_M: Final = 250.0
@@ -70,26 +97,17 @@ STEEPEST: Final = 20.0 / 3600.0
 
 
 class Estimator:
-    """Learns coefficients sample by sample.
-
-    Parameters
-    ----------
-    coefficients, covariance : (K,), (K, K) arrays
-        The prior.
-    offsets : (3,) int array
-        Which coefficients are the sensor's constant offset: they creep.
-    nuisance : Nuisance
-    creep : float
-        nT per square root of a second, by which offsets walk.
+    """Learn coefficients sample by sample, from their prior (K,) and its covariance (K, K).
 
     Attributes
     ----------
-    coefficients : (K,) array
-        As learned so far.
     filter : KalmanFilter
         Its state.
-    telling : bool
-        Whether the last sample says something of the coefficients.
+    offsets, slope : (3,) int array
+        The states of the constant offset, which walk by `creep` (nT per square root of a second), and of its
+        slope.
+    is_informative : bool
+        Whether the last sample contributes to the coefficients.
     """
 
     def __init__(
@@ -105,7 +123,7 @@ class Estimator:
         # state: coefficients, slope of the offset, states of the nuisance
         P = np.zeros((self.states, self.states))
         P[:K, :K] = covariance
-        P[-STATES:, -STATES:] = nuisance.initial
+        P[-TRACK_STATES:, -TRACK_STATES:] = nuisance.initial
         self.filter = KalmanFilter(np.concatenate([coefficients, np.zeros(EXTRA_STATES)]), P)
         self.offsets, self.slope = offsets, np.arange(K, K + SLOPE_STATES)
         self._nuisance, self._creep = nuisance, creep
@@ -113,14 +131,14 @@ class Estimator:
         self._near: FloatArray | None = None
         self._mean, self._share, self._kept = np.zeros(K), 0.0, np.zeros(K)
         self._stay = 1.0
-        self.telling = False
+        self.is_informative = False
 
     def know(
         self, coefficients: FloatArray, nuisances: FloatArray, covariance: FloatArray, nuisance: Nuisance
     ) -> None:
         """Set the state and covariance to a fit's joint result for coefficients (K,) and nuisance (4,)."""
         self._nuisance = nuisance
-        both = np.r_[: self.size, self.states - STATES : self.states]
+        both = np.r_[: self.size, self.states - TRACK_STATES : self.states]
         self.filter.mean[both] = np.concatenate([coefficients, nuisances])
         self.filter.covariance[:] = self._kept[:] = 0.0
         self.filter.covariance[np.ix_(both, both)] = covariance
@@ -197,8 +215,8 @@ class Estimator:
 
     def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
         """Move `state` (n, ...) on in place, over a time; F (4, 4) is the nuisance's transition."""
-        beside = state[-STATES:]
-        beside[:] = (F @ beside.reshape(STATES, -1)).reshape(beside.shape)
+        beside = state[-TRACK_STATES:]
+        beside[:] = (F @ beside.reshape(TRACK_STATES, -1)).reshape(beside.shape)
         if self._sloping:
             state[self.offsets] += seconds * state[self.slope]
 
@@ -211,7 +229,7 @@ class Estimator:
         self.advance(self.filter.mean, F, seconds)
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)
-        P[-STATES:, -STATES:] += Q
+        P[-TRACK_STATES:, -TRACK_STATES:] += Q
         # a drift's slope is forgotten: its variance grows by exponential forgetting, up to a bound
         if self._sloping:
             known = P[self.slope, self.slope]
@@ -237,23 +255,23 @@ class Estimator:
         self.filter.innovate(known, h, self._nuisance.white_variance)
         # share of the variance S that the coefficients explain and the crustal field does not
         varying = by_coefficients - self._near
-        self.telling = float(varying @ self.filter.covariance[:K, :K] @ varying) > TELLING * self.variance
+        self.is_informative = (
+            float(varying @ self.filter.covariance[:K, :K] @ varying)
+            > MIN_INFORMATIVE_SHARE * self.filter.variance
+        )
 
     def update(self, *, learn: bool) -> FloatArray:
         """Update the state with the predicted sample; return the gain (n,).
 
-        Parameters
-        ----------
-        learn : bool
-            Whether coefficients and slope may learn from it; else they are considered.
+        Without `learn`, the coefficients and the slope are considered.
         """
-        return self.filter.update(None if learn else slice(None, -STATES))
+        return self.filter.update(None if learn else slice(None, -TRACK_STATES))
 
     def leave_map(self, nuisance: Nuisance) -> None:
         """Replace the nuisance by `nuisance`, of a reference without a map, in its initial state."""
         # the nuisance starts again, uncorrelated with the coefficients
         self._nuisance = nuisance
-        P, states = self.filter.covariance, slice(-STATES, None)
+        P, states = self.filter.covariance, slice(-TRACK_STATES, None)
         self.filter.mean[states] = 0.0
         P[states] = P[:, states] = 0.0
         P[states, states] = nuisance.initial
@@ -261,24 +279,262 @@ class Estimator:
     @property
     def crust(self) -> float:
         """Crustal field as estimated, nT."""
-        return float(self.filter.mean[-STATES])
+        return float(self.filter.mean[-TRACK_STATES])
 
     @property
     def expected(self) -> float:
         """Expected residual of the last sample's successor from the nuisance states alone, nT."""
-        return -float(self.filter.row[-STATES:] @ self.filter.mean[-STATES:])
+        return -float(self.filter.row[-TRACK_STATES:] @ self.filter.mean[-TRACK_STATES:])
+
+
+BEYOND_CHANCE: Final = 13.5
+"""Log-likelihood ratio that is exceeded by chance once in 30 days of 0.25 Hz (Ville's inequality)."""
+BANK_MEMORY_SAMPLES: Final = 2000.0
+"""Samples over which predictions are weighted (exponential forgetting)."""
+MIN_LEAD: Final = 3.0
+"""Lead in log w that changes the selected estimator. To leave the baseline estimator the lead has to reach
+:data:`BEYOND_CHANCE`, because quantities that no test observes, as the level, depend on the hypothesis."""
+MAX_BANK_SQUARE: Final = 25.0
+"""Largest v²/S that one sample contributes: an outlier does not distinguish the estimators."""
+MAX_DEFICIT: Final = 10.0
+"""Largest deficit in log w against an alarm's, which is the best of dozens of onsets and causes."""
+PER_DEGREE: Final = 2.0
+"""Prior 1-sigma of the offset's change with temperature, nT/degC an axis."""
+DRIFT_SIGMA_NT_S: Final = 5.0 / 3600.0
+"""Prior 1-sigma of the offset's drift, nT/s an axis."""
+DRIFT_CORRELATION_TIME_S: Final = 2.0 * 3600.0
+"""Correlation time of the drift rate, s."""
+
+
+class EstimatorBank:
+    """Estimators of the coefficients, one for each hypothesis.
+
+    Attributes
+    ----------
+    all : list of Estimator
+        All estimators; the baseline is the first.
+    without_map : Estimator or None
+        Estimator that does not use the map, the last of `all`; only if the reference is a map.
+    map_doubted : bool
+        True if `without_map` predicts significantly better, and is selected.
+    map_since, map_lead : float
+        Time since when it leads, s, and its lead in log w.
+    """
+
+    def __init__(self, model: LearnedTerms, quiet: Estimator, mapless: Nuisance | None = None) -> None:
+        self._model, self.all, self._mapless = model, [quiet], mapless
+        self._weights, self._best, self._warm = [0.0], 0, 0
+        self.without_map: Estimator | None = None
+        self.map_doubted, self.map_since, self.map_lead = False, 0.0, 0.0
 
     @property
-    def residual(self) -> float:
-        """Innovation of the last prediction, nT."""
-        return self.filter.innovation
+    def quiet(self) -> Estimator:
+        """Baseline estimator, which assumes no change."""
+        return self.all[0]
 
     @property
-    def variance(self) -> float:
-        """Variance of the innovation, nT²."""
-        return self.filter.variance
+    def best(self) -> Estimator:
+        """Selected estimator: the one with the highest recent predictive likelihood."""
+        if self.map_doubted and self.without_map is not None:
+            return self.without_map
+        return self.all[self._best]
+
+    def suppose(self) -> None:
+        """Add the other hypotheses, each starting from the baseline's state."""
+        slots = self._model.slots(TEMPERATURE)
+        if TEMPERATURE in self._model.further and slots is not None:
+            warm = deepcopy(self.quiet)
+            warm.open(PER_DEGREE**2, slots)
+            self._warm = len(self.all)
+            self.all.append(warm)
+        # a drift of unknown rate, which is forgotten within hours
+        drifting = deepcopy(self.quiet)
+        drifting.drift(DRIFT_SIGMA_NT_S, DRIFT_CORRELATION_TIME_S)
+        self.all.append(drifting)
+        if self._mapless is not None:
+            self.without_map = deepcopy(self.quiet)
+            self.without_map.leave_map(self._mapless)
+            self.all.append(self.without_map)
+        self._weights = [0.0] * len(self.all)
+
+    def open(self, variance: float) -> None:
+        """Increase the variance of the offsets of all estimators by `variance` (nT²) an axis."""
+        for one in self.all:
+            one.open(variance)
+
+    def judge(self, time: float) -> None:
+        """Score each estimator's prediction at a time (s), and select the best."""
+        # log w of the module, with a bounded innovation
+        for k, one in enumerate(self.all):
+            v, S = one.filter.innovation, one.filter.variance
+            self._weights[k] *= 1.0 - 1.0 / BANK_MEMORY_SAMPLES
+            self._weights[k] -= 0.5 * (min(v * v / S, MAX_BANK_SQUARE) + log(S))
+        # the map has its own test below, since its estimator predicts another reference
+        with_map = [k for k, one in enumerate(self.all) if one is not self.without_map]
+        ahead = max(with_map, key=self._weights.__getitem__)
+        if self._weights[ahead] > self._weights[self._best] + (MIN_LEAD if self._best else BEYOND_CHANCE):
+            self._best = ahead
+        if self.without_map is None:
+            return
+        self.map_lead = self._weights[-1] - self._weights[ahead]
+        if self.map_lead <= 0.0:
+            self.map_doubted, self.map_since = False, time
+        self.map_doubted = self.map_doubted or self.map_lead > ALARM_LOG_RATIO
+
+    def take_over(self, strength: float) -> bool:
+        """Replace the baseline by the estimator that follows the temperature; return True if it is replaced.
+
+        The replacement needs significantly better predictions, and a log-likelihood not much lower than an
+        alarm's, `strength`. An estimator that followed the temperature from the start knows it more exactly.
+        """
+        warm = self._warm
+        if self._weights[warm] - self._weights[0] < max(BEYOND_CHANCE, strength - MAX_DEFICIT):
+            return False
+        # the warm estimator goes on as well, so that it is compared with its copy
+        self.all[0], self._weights[0], self._best = deepcopy(self.all[warm]), self._weights[warm], 0
+        return True
+
+    def explained(self, step: FloatArray, covariance: FloatArray, strength: float) -> None:
+        """Move the baseline's state by `step` (n,), of additional covariance `covariance` (n, n).
+
+        `step` and its log-likelihood ratio `strength` come from the alarm's cause; `strength` is added to the
+        baseline's score.
+        """
+        # the evidence for the cause is what the baseline would have gained with it
+        self.quiet.shift(step, covariance)
+        self._weights[0] += strength
+        if self._weights[0] > self._weights[self._best] + MIN_LEAD:
+            self._best = 0
+
+
+FIRST_FIT_SAMPLES: Final = 32
+LAST_FIT_SAMPLES: Final = 4096
+"""Samples at which they are fitted first and last: 2 minutes and 4.5 hours of 0.25 Hz."""
+MAX_GAUSS_NEWTON_STEPS: Final = 12
+"""Of Gauss-Newton, at most."""
+MIN_STEP_SIGMA: Final = 0.01
+"""Prior sigmas: a step this small is the last."""
+START_NOISE_NT: Final = 2.0
+"""1-sigma of a channel's noise, until the samples say more, nT."""
+MIN_SAMPLES_FOR_NOISE: Final = 256
+"""Samples from which on they do."""
+
+
+def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, order: int = 3) -> Calibration:
+    """Return the prior of any vehicle: an identity and its uncertainty.
+
+    Parameters
+    ----------
+    parameters : tuple of Parameter
+        Moving masses of the vehicle.
+    field : float
+        Reference field F_0, nT.
+    order : int
+        Highest total degree of the polynomials.
+
+    Notes
+    -----
+    The widths are those that the fit begins with (:mod:`magbridge.estimation.priors`), each with its
+    own uncertainty: the mean of a log-normal's square.
+    """
+    exponents = full_order(len(parameters), order)
+    family = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
+    # mean of the square of a log-normal width: exp(2 mu + 2 sigma^2)
+    square = np.exp(2.0 * (family.constant + family.design @ family.centre))
+    square *= np.exp(2.0 * ((family.design * family.spread) ** 2).sum(axis=1))
+    return Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=exponents),),
+        coefficients=np.zeros(len(square)),
+        covariance=(family.E * square) @ family.E.T,
+        noise=Noise(START_NOISE_NT),
+        reference=Reference(field),
+        method="none",
+    )
+
+
+class BatchResult(NamedTuple):
+    """Result of a fit: coefficients (K,), nuisance after the last sample (4,), and their covariance."""
+
+    coefficients: FloatArray
+    nuisances: FloatArray
+    covariance: FloatArray
+    noise: float
+    """Noise of a channel, nT, 1-sigma."""
+
+
+class BatchFit:
+    """Keep the samples since the start, and fit them from a prior (K,) of covariance (K, K)."""
+
+    def __init__(
+        self, model: LearnedTerms, coefficients: FloatArray, covariance: FloatArray, field: float
+    ) -> None:
+        self._model, self._prior, self._field = model, coefficients, field
+        values, vectors = np.linalg.eigh(covariance)
+        # square root L of a prior that may be singular
+        seen = values > values[-1] * 1e-14
+        self._root = vectors[:, seen] * np.sqrt(values[seen])
+        self._samples: list[tuple[Vector, FloatArray, float, Way]] = []
+        self._next = FIRST_FIT_SAMPLES
+
+    def add(self, field: Vector, phi: FloatArray, reference: float, way: Way) -> bool:
+        """Keep a sample, its regressors (m,), reference and way from the last; return whether to fit."""
+        self._samples.append((field, phi, reference, way))
+        if len(self._samples) < self._next:
+            return False
+        self._next *= 2
+        return True
 
     @property
-    def sigma(self) -> float:
-        """1-sigma of the innovation, nT."""
-        return self.filter.sigma
+    def fitted(self) -> bool:
+        """Return True if a fit was made; before it, the filter is linearised at the prior of the class."""
+        return self._next > FIRST_FIT_SAMPLES
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a filter can go on alone."""
+        return len(self._samples) >= LAST_FIT_SAMPLES
+
+    def fit(self, coefficients: FloatArray, nuisance: Nuisance) -> BatchResult:
+        """Fit all samples, beginning at `coefficients` (K,)."""
+        c, z = coefficients, np.full(self._root.shape[1], np.inf)
+        for _ in range(MAX_GAUSS_NEWTON_STEPS):
+            # Gauss-Newton step in the whitened prior's coordinates z, as in the module
+            r, J, nuisances, B, Pb = self._whitened(c, nuisance)
+            JL = J @ self._root
+            H = np.eye(JL.shape[1]) + JL.T @ JL
+            before, z = z, np.asarray(np.linalg.solve(H, -JL.T @ (r + J @ (self._prior - c))))
+            step = self._prior + self._root @ z - c
+            c, nuisances, r = c + step, nuisances + B @ step, r + J @ step
+            if float(np.abs(z - before).max()) < MIN_STEP_SIGMA:
+                break
+        rms = float(np.sqrt(np.mean(r * r)))
+        noise = float(np.sqrt(nuisance.white_variance)) * (rms if len(r) >= MIN_SAMPLES_FOR_NOISE else 1.0)
+        # joint covariance: the nuisance depends on the coefficients by B, and has Pb of its own
+        both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
+        covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
+        covariance[-TRACK_STATES:, -TRACK_STATES:] += Pb
+        return BatchResult(c, nuisances, covariance, noise)
+
+    def _whitened(
+        self, c: FloatArray, nuisance: Nuisance
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return residuals (n,) and derivatives (n, K), white; nuisance, its derivative and covariance."""
+        weights = self._model.weights(c)
+        n, K = len(self._samples), len(c)
+        out = np.empty((n, K + 1))
+        states, P = np.zeros((TRACK_STATES, K + 1)), nuisance.initial.copy()
+        for k, (field, phi, reference, way) in enumerate(self._samples):
+            F, Q = nuisance.transition(*way)
+            one = observe(field, phi @ weights, self._field, reference)
+            row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
+            h = nuisance.row(one.s)
+            # Kalman filter of the residual and of every column of J: innovations are white
+            P, states = F @ P @ F.T + Q, F @ states
+            Ph = P @ h
+            S = float(h @ Ph) + nuisance.white_variance
+            row += h @ states
+            states -= np.outer(Ph / S, row)
+            P -= np.outer(Ph / S, Ph)
+            out[k] = row / np.sqrt(S)
+        return out[:, 0], out[:, 1:], states[:, 0], states[:, 1:], P

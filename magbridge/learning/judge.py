@@ -29,13 +29,12 @@ from typing import Final
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.estimator import LENGTH, STATES, Nuisance
+from magbridge.estimation.track_process import CORRELATION_LENGTH_M, TRACK_STATES
+from magbridge.learning.estimator import Nuisance
 
-__all__ = ["BEYOND_CHANCE", "CANDIDATE", "FIRST", "JUDGE_MEMORY_SAMPLES", "PUBLISHED", "Coverage", "Judge"]
+__all__ = ["CANDIDATE", "FIRST", "JUDGE_MEMORY_SAMPLES", "PUBLISHED", "Coverage", "Judge"]
 
 FIRST, PUBLISHED, CANDIDATE = range(3)
-BEYOND_CHANCE: Final = 13.5
-"""Log-likelihood ratio that is exceeded by chance once in 30 days of 0.25 Hz (Ville's inequality)."""
 MAX_JUDGE_SQUARE: Final = 25.0
 """Normalised square of the smaller innovation above which a sample has a larger variance: an outlier of both
 calibrations does not distinguish them."""
@@ -127,11 +126,6 @@ class Blocks:
 class Judge:
     """Follow the predictions of the first and the published calibration and of the candidates.
 
-    Parameters
-    ----------
-    nuisance : Nuisance
-        Dynamics of the reference's error.
-
     Attributes
     ----------
     mean_square : (3,) array
@@ -152,11 +146,11 @@ class Judge:
         """Discard all blocks, for another first calibration, candidate or nuisance."""
         self._nuisance = nuisance or self._nuisance
         # one filter for each standard deviation of the crustal field: its value and slope are scaled
-        scale = np.ones((len(CRUST_FACTORS), STATES))
+        scale = np.ones((len(CRUST_FACTORS), TRACK_STATES))
         scale[:, :2] = CRUST_FACTORS[:, None]
         self._initial = scale[:, :, None] * self._nuisance.initial * scale[:, None, :]
         self._P = self._initial.copy()
-        self._states = np.zeros((len(CRUST_FACTORS), STATES, 3))
+        self._states = np.zeros((len(CRUST_FACTORS), TRACK_STATES, 3))
         self._likelihoods = np.zeros((len(CRUST_FACTORS), 3))
         self._fresh = True
         self.discard()
@@ -174,12 +168,7 @@ class Judge:
     def is_due(self, metres: float, seconds: float, direction: FloatArray) -> bool:
         """Return True if a sample begins a block, so that it needs a new candidate.
 
-        Parameters
-        ----------
-        metres, seconds : float
-            Distance and time since the previous sample.
-        direction : (3,) array
-            Direction of the field in sensor axes.
+        `metres` and `seconds` lead from the previous sample; `direction` (3,) is the field's in sensor axes.
         """
         if self._direction is None:
             self._direction = direction
@@ -192,7 +181,9 @@ class Judge:
         change = direction - self._direction
         if float(change @ change) > TURN * TURN:
             self._turned, self._direction, self._steady = True, direction, 0.0
-        long = self._seconds >= MAX_BLOCK_S or (self._seconds >= MIN_BLOCK_S and self._metres >= LENGTH)
+        long = self._seconds >= MAX_BLOCK_S or (
+            self._seconds >= MIN_BLOCK_S and self._metres >= CORRELATION_LENGTH_M
+        )
         over = self._steady >= STEADY_TIME_S or self._seconds >= 2.0 * MAX_BLOCK_S
         if not (long and over and self._turned):
             return False
@@ -207,16 +198,10 @@ class Judge:
         self._states[:, 3, index] += scale * change
 
     def judge(self, F: FloatArray, residuals: tuple[float, float, float], scale: float) -> None:
-        """Compare one sample, after the reference's error moved by F.
+        """Compare one sample, after the reference's error moved by `F` (4, 4).
 
-        Parameters
-        ----------
-        F : (4, 4) array
-            Transition of :meth:`.Nuisance.transition`.
-        residuals : tuple of 3 float
-            Residuals of the first and the published calibration and of the candidate, nT.
-        scale : float
-            Scale of the first calibration's residual.
+        `residuals` are those of the first and the published calibration and of the candidate, nT; `scale` is
+        that of the first calibration's residual.
         """
         # the three calibrations share the covariance, because only their residuals differ
         h = self._nuisance.row(scale)
@@ -281,13 +266,7 @@ class Judge:
 
 
 class Coverage:
-    """Attitudes, positions of masses and temperatures at which a change of the coefficients is evaluated.
-
-    Parameters
-    ----------
-    size : int
-        Number of coefficients K.
-    """
+    """Attitudes, masses and temperatures at which a change of the `size` coefficients is evaluated."""
 
     def __init__(self, size: int) -> None:
         self._rows = np.zeros((2 * MAX_ROWS, size))
@@ -311,14 +290,9 @@ class Coverage:
         self._stored += 1
 
     def is_significant(self, change: FloatArray, covariance: FloatArray) -> bool:
-        """Return True if a change of the coefficients is larger than its uncertainty at all attitudes.
+        """Return True if a change of the coefficients (K,) exceeds its uncertainty (K, K) at all attitudes.
 
-        Parameters
-        ----------
-        change : (K,) array
-            Change of the coefficients.
-        covariance : (K, K) array
-            Its covariance. The level, the mean over all rows, does not count.
+        The level, the mean over all rows, does not count.
         """
         if len(self._directions) < MIN_DIRECTIONS:
             return False

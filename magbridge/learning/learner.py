@@ -10,11 +10,9 @@ import numpy as np
 
 from magbridge.calibration.model import Calibration
 from magbridge.learning.alarms import AlarmState
-from magbridge.learning.decision import NO_METHOD, Decision, Publication
+from magbridge.learning.decision import NO_METHOD, Decision, Knowledge, Publication
 from magbridge.learning.estimator import Nuisance
-from magbridge.learning.knowledge import Knowledge
-from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import Intake, LearningSample
+from magbridge.learning.samples import Intake, LearnedTerms, LearningSample
 from magbridge.records import Quality, Vector
 
 if TYPE_CHECKING:
@@ -50,7 +48,7 @@ class LearnerState(NamedTuple):
 MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 """Samples that nothing is learned from."""
-MAPLESS: Final = 145.0
+MAIN_FIELD_SIGMA_NT: Final = 145.0
 """1-sigma of the field about the main field alone, nT."""
 
 
@@ -124,7 +122,7 @@ class Learner:
     @property
     def renewed(self) -> bool:
         """Return True if the last change of the published calibration was a routine update."""
-        return self._publication.renewed
+        return self._publication.is_update
 
     @property
     def flags(self) -> int:
@@ -177,7 +175,11 @@ class Learner:
         """Begin to learn from the published calibration; offsets may have changed at this power-on."""
         published = self.calibration
         # without the map, the reference is off by the crustal field and its level
-        mapless = Nuisance(published.noise, MAPLESS, MAPLESS) if self._grid is not None else None
+        mapless = (
+            Nuisance(published.noise, MAIN_FIELD_SIGMA_NT, MAIN_FIELD_SIGMA_NT)
+            if self._grid is not None
+            else None
+        )
         self._knowledge = Knowledge(self._model, published, nuisance, mapless, self._turn_on)
 
     def _notify(self, text: str, grave: bool = False) -> None:

@@ -9,10 +9,8 @@ from worlds import FIELD, World, calibration
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration
-from magbridge.learning.bank import EstimatorBank
-from magbridge.learning.estimator import MEAN_SAMPLES, Estimator, Nuisance
-from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import Way, observe
+from magbridge.learning.estimator import MEAN_SAMPLES, Estimator, EstimatorBank, Nuisance
+from magbridge.learning.samples import LearnedTerms, Way, observe
 
 PER_DEGREE = np.array([4.0, -3.0, 5.0])
 
@@ -46,7 +44,7 @@ def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[EstimatorBan
             one.follow(seen.s)
         bank.judge(0.0)
         for one in bank.all:
-            one.update(learn=one.telling)
+            one.update(learn=one.is_informative)
     return bank, model
 
 

@@ -12,7 +12,7 @@ from worlds import FIELD, MASS, World, calibration, error_of, learn
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import Calibration
 from magbridge.learning import Learner
-from magbridge.learning.start import FIRST, class_prior
+from magbridge.learning.estimator import FIRST_FIT_SAMPLES, class_prior
 
 HARD_IRON = np.array([2500.0, -1800.0, 3000.0])
 
@@ -56,7 +56,7 @@ def test_nothing_is_published_before_all_samples_were_fitted() -> None:
     world, learner = World(vehicle(), 60), Learner(class_prior((MASS,), FIELD))
     published = []
     learn(learner, world, seen=lambda _: published.append(learner.calibration.method))
-    assert "learned" not in published[:FIRST]
+    assert "learned" not in published[:FIRST_FIT_SAMPLES]
 
 
 def test_a_jump_that_a_young_calibration_made_is_over_with_the_next_fit() -> None:

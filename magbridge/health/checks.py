@@ -1,0 +1,210 @@
+r"""Check single readings: do channels repeat, and can the total field be the Earth's.
+
+A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. It is
+learned for each channel alone, and for all three together. For all three, p is at least what the noise gives:
+normal noise of standard deviation :math:`\sigma`, in steps of q, repeats a channel's reading with the
+probability :math:`q / (2 \sqrt\pi \sigma)`.
+
+The Earth's total field is the sum of the main field and the crustal field. The main field alone is off by 145
+nT (1-sigma over the Earth, crustal field and disturbances included: the error model of Chulliat et al. 2020,
+*The US/UK World Magnetic Model for 2020-2025*), or by ``align.reference_sigma``. A total field further off
+than :data:`MAX_LEVEL_SIGMA` is not the Earth's. Without a position, it is compared with the extremes on the
+Earth. The reference bounds every error: while the field is more than :data:`FAR_SIGMA` off, sigma includes
+the difference, until it is less than :data:`NEAR_SIGMA`.
+"""
+
+from __future__ import annotations
+
+from math import inf, isnan, log, nan, pi, sqrt
+from typing import Final
+
+from magbridge.records import Vector
+
+__all__ = ["LevelCheck", "Messages", "RepetitionCheck"]
+
+
+class Messages:
+    """Messages for the operator, each kind once.
+
+    Attributes
+    ----------
+    lines : list of str
+        Messages since the caller last emptied it.
+    """
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._kinds: set[str] = set()
+
+    def report(self, kind: str, text: str) -> None:
+        """Add a message, unless there was one of this kind."""
+        if kind not in self._kinds:
+            self._kinds.add(kind)
+            self.lines.append(text)
+
+
+LEARNING_SAMPLES: Final = 256
+"""Samples over which the fraction of repeated readings is learned."""
+MAX_PROBABILITY: Final = 1e-9
+"""Probability of a run of repeated readings that a healthy channel does not show."""
+MIN_STUCK_FRACTION: Final = 1e-3
+MIN_RUN: Final = 4
+MIN_COMMON_RUN: Final = 3
+AXIS_LETTERS: Final = "xyz"
+
+
+class Repetition:
+    """Repetitions of one reading: how many in a row, and how often they occur."""
+
+    __slots__ = ("fraction", "last", "limit", "run")
+
+    def __init__(self) -> None:
+        self.last = self.limit = nan
+        self.run = 0
+        self.fraction = 0.1  # of repeated readings
+
+    def change(self) -> None:
+        """Record that the reading has changed."""
+        self.run = 0
+        self.fraction += (MIN_STUCK_FRACTION - self.fraction) / LEARNING_SAMPLES
+
+    def repeat(self, probability: float, min_run: int) -> bool:
+        """Record a repetition; return True if a healthy channel does not repeat its reading so often."""
+        self.run += 1
+        if self.run >= min_run and self.run * log(max(self.fraction, probability)) < log(MAX_PROBABILITY):
+            return True
+        # exponential average of how often a healthy channel repeats
+        self.fraction += (1.0 - self.fraction) / LEARNING_SAMPLES
+        return False
+
+
+class RepetitionCheck:
+    """Check three channels."""
+
+    def __init__(self, messages: Messages) -> None:
+        self._messages = messages
+        self._axes = (Repetition(), Repetition(), Repetition())
+        self._common = Repetition()
+        self._has_limit = False
+        self._step = inf  # smallest change of a reading, nT
+
+    @property
+    def is_repeating(self) -> bool:
+        """Return True if the last reading repeats the previous one on all axes."""
+        return self._common.run > 0
+
+    def is_stuck(self, raw: Vector, white_sigma: float) -> bool:
+        """Return True if channels repeat their reading, or read a limit at which they were once stuck.
+
+        `raw` is the reading, `white_sigma` the 1-sigma of the white noise, nT.
+        """
+        same = [value == axis.last for value, axis in zip(raw, self._axes, strict=True)]
+        if all(same):
+            return self._repeat_all(white_sigma)
+        self._common.change()
+        stuck = False
+        for number, (axis, value) in enumerate(zip(self._axes, raw, strict=True)):
+            if same[number]:
+                stuck = self._repeat(number, axis, value) or stuck
+                continue
+            change = abs(value - axis.last)
+            self._step = min(self._step, change)
+            axis.last = value
+            axis.change()
+            stuck = stuck or (self._has_limit and abs(value) == axis.limit)
+        return stuck
+
+    def _repeat_all(self, white_sigma: float) -> bool:
+        # probability that one channel repeats: step of the readings over sigma, as in the module
+        axis_probability = min(self._step / (2.0 * sqrt(pi) * max(white_sigma, 1e-9)), 1.0)
+        if not self._common.repeat(axis_probability**3, MIN_COMMON_RUN):
+            return False
+        self._messages.report("repeat", "all axes repeat one reading: sensor or driver at fault")
+        return True
+
+    def _repeat(self, number: int, axis: Repetition, value: float) -> bool:
+        # a value at which the axis was stuck before is a limit: no probability is needed
+        if abs(value) == axis.limit:
+            axis.run += 1
+        elif not axis.repeat(0.0, MIN_RUN):
+            return False
+        axis.limit, self._has_limit = abs(value), True
+        self._messages.report(
+            "axis", f"axis {AXIS_LETTERS[number]} stuck at {value:.0f} nT, or clipped there"
+        )
+        return True
+
+
+MAX_LEVEL_SIGMA: Final = 5.0
+FAR_SIGMA: Final = 3.0
+NEAR_SIGMA: Final = 1.0
+"""Sigmas of the total field about the main field."""
+MIN_FIELD_NT: Final = 17_000.0
+MAX_FIELD_NT: Final = 72_000.0
+"""The main field's extremes on the Earth, 22,000 and 67,000 nT, with crustal fields."""
+MIN_WRONG_SAMPLES: Final = 3
+MIN_WRONG_US: Final = 8_000_000
+"""Samples and time after which a wrong field is not a burst of bad readings."""
+LEVEL_HOLD_US: Final = 3_600_000_000
+"""Time for which a wrong field that is over is remembered."""
+
+
+class LevelCheck:
+    """Compare the total field with the main field.
+
+    Attributes
+    ----------
+    is_wrong : bool
+        Whether the last sample's total field is not the Earth's.
+    until_us : int
+        Time until which samples are flagged because it was wrong, µs.
+    """
+
+    def __init__(self, messages: Messages) -> None:
+        self._messages = messages
+        self.is_wrong = False
+        self.until_us = 0
+        self._is_far = False
+        self._wrong_samples = self._since_us = self._far_samples = 0
+
+    def check(
+        self, time_us: int, total: float, sigma: float, reference: float, reference_sigma: float, steady: bool
+    ) -> float:
+        """Set :attr:`is_wrong`; return the variance (nT²) of a field that is far off.
+
+        Only a sample of `steady` masses can end that.
+        """
+        if isnan(reference):
+            self._record(time_us, total, reference, not MIN_FIELD_NT < total < MAX_FIELD_NT)
+            return 0.0
+        difference = total - reference
+        # normalised square of the difference from the main field
+        squared = difference * difference / (reference_sigma * reference_sigma + sigma * sigma)
+        self._record(time_us, total, reference, squared > MAX_LEVEL_SIGMA * MAX_LEVEL_SIGMA)
+        # two thresholds: begin at FAR_SIGMA, end at NEAR_SIGMA
+        if self._is_far and steady:
+            self._is_far = squared > NEAR_SIGMA * NEAR_SIGMA
+        self._is_far = self._is_far or squared > FAR_SIGMA * FAR_SIGMA
+        if not self._is_far:
+            self._far_samples = 0
+            return 0.0
+        self._far_samples += 1
+        if self._far_samples == MIN_WRONG_SAMPLES:
+            text = f"field of {total:.0f} nT, expected {reference:.0f}: sigma is widened"
+            self._messages.report("far", text)
+        return difference * difference
+
+    def _record(self, time_us: int, total: float, reference: float, wrong: bool) -> None:
+        self.is_wrong = wrong
+        if not wrong:
+            self._wrong_samples = 0
+            return
+        self._wrong_samples += 1
+        if self._wrong_samples == 1:
+            self._since_us = time_us
+        if self._wrong_samples >= MIN_WRONG_SAMPLES and time_us - self._since_us >= MIN_WRONG_US:
+            self.until_us = time_us + LEVEL_HOLD_US
+            expected = f"{MIN_FIELD_NT:.0f} to {MAX_FIELD_NT:.0f}" if isnan(reference) else f"{reference:.0f}"
+            self._messages.report(
+                "level", f"field of {total:.0f} nT, expected {expected}: sensor or calibration"
+            )
