@@ -223,9 +223,9 @@ class SequentialTest:
         return (float(self._squares[row]) - explained) / max(float(self._samples[row]), 1.0)
 
     def competing(self, distance: float) -> tuple[list[int], FloatArray]:
-        """Return the rows whose L is within `distance` of the largest, likeliest first, and their weights.
+        """Return the rows whose L is within `distance` of the largest, likeliest first, and weights (n,).
 
-        The weights (m,) are the posterior probabilities of these rows, if all were equally likely before.
+        The weights are the posterior probabilities of these rows, if all were equally likely before.
         """
         order = np.argsort(-self.log_ratio, kind="stable")
         rows = order[self.log_ratio[order] > self.log_ratio[order[0]] - distance]

@@ -136,6 +136,11 @@ class ConsistencyCheck:
         self._variance = 0.0
         self.is_wrong = False
 
+    def forget_crust(self) -> None:
+        """Discard evidence and roughness, of a vehicle that moves much faster than before."""
+        self.restart()
+        self._log_roughness, self._straight_samples = 0.0, 0
+
     def is_due(self, time_us: int, speed: float) -> bool:
         """Return True if it is time to test a sample of a vehicle that moves at a speed, m/s."""
         interval = MAX_INTERVAL_S

@@ -11,7 +11,7 @@ from magbridge.estimation.track_process import Course, ReferenceSteps
 from magbridge.field.geodesy import separation
 from magbridge.health.checks import LevelCheck, Messages, RepetitionCheck
 from magbridge.health.consistency import ConsistencyCheck, TestedSample
-from magbridge.health.scatter import Scatter
+from magbridge.health.scatter import ACCELERATION, MIN_FASTER_M_S, Scatter
 from magbridge.health.trend import TrendCheck
 from magbridge.records import Quality, Vector
 
@@ -73,8 +73,11 @@ class HealthMonitor:
         elif (latitude, longitude) != self._position:
             self._course.move(*separation(*self._position, latitude, longitude))
         self._position = latitude, longitude
+        speed = self._scatter.speed
         if self._scatter.set_position(time_us, latitude, longitude):
             self._trend.set_speed(self._scatter.speed)
+            if self._scatter.speed > max(ACCELERATION * speed, MIN_FASTER_M_S):
+                self._consistency.forget_crust()
 
     def begin_motion(self, since_us: int) -> None:
         """Record that telemetry reports a motion, which may have begun after `since_us`."""

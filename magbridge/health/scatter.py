@@ -25,7 +25,7 @@ from magbridge.calibration.model import Noise
 from magbridge.field.geodesy import separation
 from magbridge.health.checks import Messages
 
-__all__ = ["MIN_NOISE_NT", "Scatter"]
+__all__ = ["ACCELERATION", "MIN_FASTER_M_S", "MIN_NOISE_NT", "Scatter"]
 
 MIN_NOISE_NT: Final = 0.1
 """No fluxgate's noise is lower."""
@@ -66,6 +66,12 @@ MAX_LAG_US: Final = 32_000_000
 FIRST_INTERVAL_US: Final = 8_000_000
 SPEED_INTERVAL_US: Final = 60_000_000
 """Time over which the speed is measured, at least: for the first time, and later."""
+SPEED_CHECK_US: Final = 500_000
+ACCELERATION: Final = 2.0
+MIN_FASTER_M: Final = 20.0
+MIN_FASTER_M_S: Final = 2.0
+"""A vehicle that has become faster by this factor, over this distance and above this speed, is checked so
+often for that, and has another speed at once, as an aircraft at its take-off."""
 
 
 class MedianDifference:
@@ -125,7 +131,8 @@ class Scatter:
         self._is_noisy = False
         self._max_lag_us = 0  # none while the speed is not known
         self._latitude = self._longitude = nan
-        self._position_us = 0
+        self._position_us = self._checked_us = 0
+        self._faster = 0  # positions in a row that show a higher speed
 
     def begin(self, variance: float) -> None:
         """Set the variance (nT²) that an innovation may have at first."""
@@ -153,16 +160,33 @@ class Scatter:
         return float(max(variance, SECOND_DIFFERENCE * MIN_NOISE_NT**2))
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> bool:
-        """Record the position, deg; return True if it has told the speed, which limits the lags."""
-        step_us = time_us - self._position_us
-        interval_us = SPEED_INTERVAL_US if self.speed == self.speed else FIRST_INTERVAL_US
-        if 0 <= step_us < interval_us or (latitude == self._latitude and longitude == self._longitude):
+        """Record the position, deg; return True if it has changed the speed, which limits the lags."""
+        if 0 <= time_us - self._checked_us < SPEED_CHECK_US:
+            return False
+        self._checked_us = time_us
+        if latitude == self._latitude and longitude == self._longitude:
             return False
         north, east = separation(self._latitude, self._longitude, latitude, longitude)
-        speed = (north * north + east * east) ** 0.5 / (1e-6 * step_us)
+        step_us = time_us - self._position_us
+        distance = (north * north + east * east) ** 0.5
+        # a clock that goes back tells no speed
+        speed = distance / (1e-6 * step_us) if step_us > 0 else nan
+        faster = max(ACCELERATION * self.speed, MIN_FASTER_M_S)  # NaN while no speed is known
+        is_faster = speed > faster and distance > MIN_FASTER_M
+        interval_us = SPEED_INTERVAL_US if self.speed == self.speed else FIRST_INTERVAL_US
+        if 0 <= step_us < interval_us and not is_faster:
+            return False
         self._latitude, self._longitude, self._position_us = latitude, longitude, time_us
         if speed != speed:  # noqa: PLR0124 - faster than a call
             return False
+        # a faster vehicle shows twice; once is a jump of the position
+        self._faster = self._faster + 1 if is_faster else 0
+        if self._faster == 1:
+            return False
+        if is_faster:
+            # differences that were taken at the lower speed may be the crustal field's
+            self._lagged = tuple(MedianDifference() for _ in SCATTER_LAGS)
+            self.begin(self.variance)
         self.speed = speed
         self._max_lag_us = round(1e6 * min(TRAVEL_M / max(speed, 1e-3), 1e-6 * MAX_LAG_US))
         return True
@@ -192,8 +216,10 @@ class Scatter:
             middle, first = (place - lag) % STORED, (place - 2 * lag) % STORED
             late_us = time_us - self._times[middle]
             early_us = self._times[middle] - self._times[first]
-            # only differences of equal intervals, at lags that the speed allows
-            if late_us <= self._max_lag_us and abs(late_us - early_us) * 8 <= late_us:
+            # only lags that the speed allows, and differences of equal intervals
+            if late_us > self._max_lag_us:
+                continue
+            if abs(late_us - early_us) * 8 <= late_us:
                 difference = abs(total - 2.0 * self._fields[middle] + self._fields[first])
                 if difference == difference:  # noqa: PLR0124 - faster than a call
                     differences.update(difference)

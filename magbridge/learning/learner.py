@@ -205,34 +205,16 @@ class Learner:
         age: float = 0.0,
         settled: Vector | None = None,
     ) -> None:
-        """Add a corrected sample.
+        """Add a corrected sample of a time (µs since 1970 UTC).
 
         The sample waits until newer telemetry arrives. If a mass had begun to move, it is discarded.
 
-        Parameters
-        ----------
-        time_us : int
-            Time of the sample, µs since 1970 UTC.
-        field : tuple of 3 float
-            Raw field of one time, nT, sensor axes.
-        regressors : list of float
-            Regressors of the calibration at that time.
-        values : tuple of float
-            Values of the calibration's channels.
-        quality : int
-            Quality flags.
-        faulty : bool
-            True if the sensor is at fault, or the field cannot be the Earth's.
-        reference : float
-            Reference field H_e, nT; NaN if the position is not known.
-        position : tuple of 2 float or None
-            Latitude and longitude, deg.
-        watched : sequence of float
-            Values of the telemetry named by :attr:`watched`; NaN if unknown.
-        age : float
-            Age of the parameters' oldest telemetry, s.
-        settled : tuple of 3 float or None
-            Field of the previous sample, nT, if this sample makes it more exact.
+        `field` is the raw field, nT, sensor axes; `regressors` and `values` are the calibration's at that
+        time, the latter of its channels. `faulty` is True if the sensor is at fault, or the field cannot be
+        the Earth's. `reference` is H_e, nT, NaN without a position (latitude and longitude, deg). `watched`
+        are the values of the telemetry named by :attr:`watched`, NaN if unknown; `age` is that of the
+        parameters' oldest telemetry, s. `settled` is the field of the previous sample, if this sample makes
+        it more exact.
         """
         # axes sampled in turn: the next reading makes the waiting sample more exact
         self._intake.settle(settled)

@@ -95,6 +95,35 @@ def test_plane_over_a_steep_anomaly_is_not_flagged(seed: int) -> None:
     assert np.mean(sigma > 3.0) < 0.05
 
 
+@pytest.mark.parametrize("speed", [0.3, 3.0, 25.0, 60.0])
+@pytest.mark.parametrize("seed", range(2))
+def test_vehicle_that_takes_off_is_not_a_fault(speed: float, seed: int) -> None:
+    """It stands for 30 s, then flies and turns over plane waves of 120 nT RMS that are 1 km long."""
+    rng = np.random.default_rng(seed)
+    n, step = 4000, 0.1
+    time = step * np.arange(n)
+    heading = np.cumsum(step * 0.15 * ((time % 60.0 > 50.0) & (time > 40.0)))
+    metres = step * speed * np.clip((time - 30.0) / 5.0, 0.0, 1.0)
+    north, east = np.cumsum(metres * np.cos(heading)), np.cumsum(metres * np.sin(heading))
+    waves = rng.normal(0.0, 1e-3, (100, 2))
+    phases = waves @ np.stack([north, east]) + rng.uniform(0.0, 2.0 * np.pi, (100, 1))
+    total = FIELD + 120.0 * 0.02**0.5 * np.cos(phases).sum(axis=0) + rng.normal(0.0, 1.0, n)
+    pitch = 0.2 * np.clip((time - 30.0) / 3.0, 0.0, 1.0) * (time < 90.0)
+    u = np.stack([0.4 * np.cos(heading) - 0.9 * pitch, -0.4 * np.sin(heading), 0.9 + 0.4 * pitch], axis=1)
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    health, more, flags = HealthMonitor(Noise(1.0)), [], []
+    for k in range(n):
+        time_us = 1_000_000_000 + round(1e6 * time[k])
+        health.set_position(time_us, 49.5 + north[k] / 111_200.0, -57.9 + east[k] / 72_200.0)
+        field = tuple((total[k] * u[k]).tolist())
+        raw = tuple((total[k] * u[k] + rng.normal(0.0, 0.1, 3)).tolist())
+        one = float(total[k]), 1.0
+        more.append(health.check(time_us, raw, field, one, 0, (FIELD, 145.0), nan, 0.0, list))
+        flags.append(health.flags)
+    assert np.mean(np.array(flags) != 0) < 0.003
+    assert np.mean(np.array(more) > 8.0) < 0.05
+
+
 def test_reading_that_repeats_on_all_axes_is_flagged_after_a_few() -> None:
     u, crust = glide(1, 900)
     raw = np.round((FIELD + crust)[:, None] * u + np.random.default_rng(2).normal(0.0, 1.0, u.shape), 3)
