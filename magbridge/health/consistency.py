@@ -55,6 +55,8 @@ CONSISTENCY_ALARM_LOG_RATIO: Final = 15.0
 """L above which an alarm begins: by chance once in a million tested samples at most."""
 NOISE_DOF: Final = 8.0
 """Degrees of freedom with which the noise of the innovations is known."""
+MIN_ERROR_SIGMA: Final = 2.0
+"""Size of an error, in sigmas of the total field, from which it is an alarm: 1 has false alarms."""
 CLEAR_LOG_RATIO: Final = 4.0
 """L below which an alarm ends."""
 COMPETING_LOG_RATIO: Final = 5.0
@@ -232,7 +234,7 @@ class ConsistencyCheck:
         rows, weights = test.competing(COMPETING_LOG_RATIO)
         size = test.rms(rows[0])
         # an error that sigma covers is not an alarm, nor is one while the crust's roughness is not known
-        matters = size > sigma and self._straight_samples >= MIN_STRAIGHT_SAMPLES
+        matters = size > MIN_ERROR_SIGMA * sigma and self._straight_samples >= MIN_STRAIGHT_SAMPLES
         if self.is_wrong:
             self.is_wrong = largest > CLEAR_LOG_RATIO
         else:

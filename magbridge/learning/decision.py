@@ -35,7 +35,7 @@ MAX_LINEAR_SIGMA_NT: Final = 300.0
 OFFSET_WALK: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
 LEARNING_OUTLIER_SIGMA: Final = 5.0
-MIN_AGREEING_SAMPLES: Final = 3
+MIN_AGREEING_OUTLIERS: Final = 3
 """An innovation beyond so many sigmas says nothing, unless it is the third in a row."""
 
 
@@ -145,7 +145,7 @@ class Knowledge:
         best = self.bank.best
         far = abs(best.filter.innovation) > LEARNING_OUTLIER_SIGMA * best.filter.sigma
         self._outliers = self._outliers + 1 if far else 0
-        return far and self._outliers < MIN_AGREEING_SAMPLES and not learnable
+        return far and self._outliers < MIN_AGREEING_OUTLIERS and not learnable
 
     def learn(self, regressors: CauseRegressors, *, frozen: bool) -> tuple[LearningAlarm | None, bool]:
         """Test the prediction, then learn from it; return the alarm, and True if the sample was used."""
