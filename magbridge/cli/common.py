@@ -59,7 +59,7 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
         if path is None:
             return
         if path.is_dir():
-            raise ValueError("It is a folder.")
+            raise ValueError("Expected a file, got a folder.")
         if not path.parent.is_dir():
             raise ValueError(f"The folder {path.parent} does not exist.")
         if not os.access(path.parent, os.W_OK):
@@ -79,10 +79,10 @@ def folder_to_write(_: Any, path: Any) -> None:
     if path is None:
         return
     if path.exists() and not path.is_dir():
-        raise ValueError("It is a file.")
+        raise ValueError("Expected a folder, got a file.")
     there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not there.is_dir():
-        raise ValueError(f"{there} is a file.")
+        raise ValueError(f"Expected a folder, but {there} is a file.")
     if not os.access(there, os.W_OK):
         raise ValueError(f"The folder {there} cannot be written to.")
 
