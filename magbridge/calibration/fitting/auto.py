@@ -235,22 +235,18 @@ def _settled(
     """
     begun = [np.asarray(np.linalg.lstsq(prior.E, start, rcond=None)[0], float) for start in starts(samples)]
     wide = NoiseModel(1e-3 * samples.F_0)  # residuals are not noise yet
-    best: tuple[float, CoefficientPosterior] | None = None
+    best: CoefficientPosterior | None = None
     for start in begun if start_z is None else [start_z]:
         found = settle(
             samples, prior, start, partial(lasting_noise, samples), wide,
             rounds=WEIGHT_ITERATIONS, change=SAME_WEIGHT, tolerance=CONVERGED_LOG_LIKELIHOOD_GAIN,
         )  # fmt: skip
-        # negative log posterior, by which the starts are compared
-        e, z = found.residual, found.z
-        e = e if found.weighted.weight is None else e * found.weighted.weight
-        value = 0.5 * float(e @ e) / found.weighted.sigma**2 + 0.5 * float(z @ prior.precision @ z)
-        if found.settled and (best is None or value < 0.999 * best[0]):
-            best = value, found
-    check_scales(samples, found.coefficients if best is None else best[1].coefficients)
+        if found.settled and (best is None or found.objective < 0.999 * best.objective):
+            best = found
+    check_scales(samples, (found if best is None else best).coefficients)
     if best is None:
         raise NoSolutionError("nominal: no start converged; are the samples those of one sensor?")
-    return best[1]
+    return best
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:

@@ -113,7 +113,9 @@ def fit_in_place(
     noise = NoiseModel(found.widths.sigma, found.choice.rho, weight=survey.kept.astype(float))
     # the coefficients' part of prior and posterior, without that of the other unknowns
     own = Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset)
-    posterior = CoefficientPosterior(lifted, own, z[:q], covariance[:q, :q], noise, noise, settled=True)
+    posterior = CoefficientPosterior(
+        lifted, own, z[:q], covariance[:q, :q], noise, noise, settled=True, objective=0.0
+    )
     check_scales(samples, posterior.coefficients)
     # predict parts from the others, the field in place as found: a figure to compare parameters by
     details = {**_details(found, survey), "left_out_nT": leave_out(posterior, data.runs).rms}

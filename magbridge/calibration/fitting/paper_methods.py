@@ -152,7 +152,9 @@ def _assembled(
     check_scales(samples, coefficients)
     noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, free)
     none = Prior(np.zeros_like(covariance), np.eye(len(coefficients)))
-    found = CoefficientPosterior(samples, none, coefficients, covariance, noise, noise, settled=True)
+    found = CoefficientPosterior(
+        samples, none, coefficients, covariance, noise, noise, settled=True, objective=0.0
+    )
     return assemble(data, posed, found, method, details=details)
 
 

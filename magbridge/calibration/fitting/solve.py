@@ -59,6 +59,8 @@ class CoefficientPosterior:
     """Noise with which the samples are weighed: larger where many residuals in a row count as one."""
     settled: bool
     """True if the last step found a minimum."""
+    objective: float
+    """Negative log posterior at z, with the weights of the last step."""
 
     @property
     def coefficients(self) -> FloatArray:
@@ -120,7 +122,8 @@ def settle(
         if abs(weighted.sigma - last.sigma) < change * last.sigma:
             break
     spread = covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision)
-    return CoefficientPosterior(samples, prior, z, spread, noise, weighted, found.settled)
+    objective = 0.5 * found.normal.cost / weighted.sigma**2 + 0.5 * float(z @ prior.precision @ z)
+    return CoefficientPosterior(samples, prior, z, spread, noise, weighted, found.settled, objective)
 
 
 def approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> CoefficientPosterior:
@@ -218,8 +221,9 @@ def climb(
             noise = replace(found, sigma=widths.sigma)
     prior = family.prior(eta)
     spread = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
+    objective = 0.5 * solution.normal.cost / noise.sigma**2 + 0.5 * float(z @ prior.precision @ z)
     return Climbed(
-        samples, prior, z, spread, noise, noise, solution.settled, family, widths, quadratic, score
+        samples, prior, z, spread, noise, noise, solution.settled, objective, family, widths, quadratic, score
     )
 
 
