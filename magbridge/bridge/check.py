@@ -233,7 +233,7 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFaul
 
 
 def _map(config: Config, calibration: Calibration | None) -> Iterator[ConfigFault]:
-    from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
+    from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - where a map is used
 
     assert config.navigation is not None
     try:

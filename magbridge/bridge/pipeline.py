@@ -41,7 +41,7 @@ from magbridge.sensors.clock import Stamp
 from magbridge.version import __version__
 
 if TYPE_CHECKING:
-    from magbridge.bridge.navigation import NavigationService  # imports filterpy, which few vehicles have
+    from magbridge.bridge.navigation import NavigationService
 
 __all__ = ["Pipeline", "drive", "set_up"]
 
@@ -445,7 +445,7 @@ def set_up(config: Config, start: StartEvent) -> Pipeline:
     key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
     navigate = None
     if config.navigation is not None:
-        from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
+        from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - where a map is used
 
         navigate = open_navigation(config, config.navigation, calibration)
     return Pipeline(config, calibration, start, key, navigate, other_calibrations(config))

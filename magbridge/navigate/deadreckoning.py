@@ -58,18 +58,9 @@ class Step(NamedTuple):
 class DeadReckoning:
     """Dead-reckoned position from any kind of telemetry that the vehicle has.
 
-    Attributes
-    ----------
-    latitude, longitude : float
-        deg; NaN before :meth:`place`.
-    depth : float
-        m.
-    travelled : float
-        m through the water since the start.
-    noise : MotionNoise
-        Uncertainty of the motion since the start.
-    time : float
-        s, of the last motion; NaN before the first.
+    `latitude` and `longitude` (deg) are NaN before :meth:`place`; `depth` is in m, `time` (s) that of the
+    last motion, NaN before the first. `travelled` (m through the water) and `noise`, the uncertainty of the
+    motion, count from the start.
     """
 
     def __init__(self) -> None:
@@ -116,18 +107,12 @@ class DeadReckoning:
         return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)
 
     def telemetry(self, time: float, values: dict[str, float]) -> None:
-        """Use the telemetry of `time`.
+        """Use the telemetry of `time`, s on any clock; an earlier one than the last moves nothing.
 
-        Parameters
-        ----------
-        time : float
-            s, on any clock; an earlier one than the last moves nothing.
-        values : dict
-            Any of ``depth`` m, ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the water;
-            ``velocity_north velocity_east`` m/s; ``north east`` m, a local position of which only the
-            changes count; ``dr_latitude dr_longitude`` deg, a dead-reckoned position of which only the
-            changes count. NaN counts as missing. Without a speed, it is computed from the rate of depth and
-            the pitch, as for a glider.
+        `values` holds any of ``depth`` m, ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the
+        water; ``velocity_north velocity_east`` m/s; ``north east`` m, a local position, or ``dr_latitude
+        dr_longitude`` deg, a dead-reckoned one, of which only the changes count. NaN counts as missing.
+        Without a speed, it is computed from the rate of depth and the pitch, as for a glider.
         """
         self.advance(time)
         values = {name: value for name, value in values.items() if isfinite(value)}

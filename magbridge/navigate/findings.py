@@ -193,7 +193,7 @@ class _Shift(NamedTuple):
 def _best_shift(
     grid: AnomalyGrid, latitude: RealArray, longitude: RealArray, depth: RealArray, anomaly: RealArray
 ) -> _Shift:
-    """Return by how much the map must be moved to describe an anomaly (n,), nT, but for a constant."""
+    """Return by how much the map must be moved to describe an anomaly (n,), nT, except for a constant."""
     # Exhaustive search over a lattice of shifts: the scatter has many minima.
     shifts = np.linspace(-SEARCH, SEARCH, LATTICE)
     per_latitude, per_longitude = metres_per_degree(float(np.mean(latitude)))

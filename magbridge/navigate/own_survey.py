@@ -106,16 +106,12 @@ def localise(
     *,
     start: tuple[float, float] | None = None,
 ) -> xr.Dataset:
-    """Return the track that the field gives which the vehicle met itself.
+    """Return the track that the field along it gives, without a map.
 
     Parameters
     ----------
-    deployment : Dataset
+    deployment, options, start
         As for :func:`~.batch.navigate`.
-    options : NavigationOptions, optional
-        How well start, current and calibration are known.
-    start : (latitude, longitude), optional
-        deg; default the log's first position.
 
     Returns
     -------

@@ -33,7 +33,7 @@ from magbridge.calibration.fitting.field_search import (
     ladder,
     nodes_for,
 )
-from magbridge.calibration.fitting.scalar_fit import is_beyond_chance
+from magbridge.calibration.fitting.scalar_fit import is_significant
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
@@ -98,7 +98,7 @@ class ScalarTerms:
     merit: dict[str, Any] | None
     """Figure of merit of a box that was not fitted; None without one."""
     findings: tuple[Diagnostic, ...] = ()
-    """Lag or shift, heading error and channels that differ from zero beyond chance."""
+    """Statistically significant terms (:data:`.CHANCE`): shift along the track, heading error, channels."""
 
     def facts(self) -> dict[str, Any]:
         """Return the numbers to print as JSON."""
@@ -389,7 +389,7 @@ class _JointFit:
         )  # fmt: skip
 
     def _findings(self, parts: list[FloatArray], contribution: dict[str, float]) -> tuple[Diagnostic, ...]:
-        """Return the terms that differ from zero beyond chance: shift, heading error, channels."""
+        """Return the statistically significant terms: shift, heading error, channels."""
         names = ["heading error", *(term.name for term in self.rows.terms)]
         covariance, column = self.solution.covariance, self.rows.column
         tests, found = len(names) + 1, []
@@ -399,7 +399,7 @@ class _JointFit:
             metres = np.array([along @ self.shift[self.free]])
             many = len(self.free)
             variance = np.array([[along @ covariance[-many:, -many:] @ along]])
-            if is_beyond_chance(metres, variance, tests):
+            if is_significant(metres, variance, tests):
                 values = {
                     "column": column,
                     "shift_m": float(metres[0]),
@@ -408,7 +408,7 @@ class _JointFit:
                 found.append(Diagnostic("scalar.shift", values))
         edges = np.cumsum([0, *(len(part) for part in parts)])
         for name, part, first, last in zip(names, parts, edges[:-1], edges[1:], strict=True):
-            if name != COMPENSATION and is_beyond_chance(part, covariance[first:last, first:last], tests):
+            if name != COMPENSATION and is_significant(part, covariance[first:last, first:last], tests):
                 code = "scalar.heading_error" if name == "heading error" else "scalar.channel"
                 values = {"column": column, "channel": name, "effect_nT": contribution[name]}
                 found.append(Diagnostic(code, values))

@@ -52,7 +52,7 @@ from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.priors import PriorFamily
 
-__all__ = ["ScalarFit", "adapt_to_log", "fit_scalar", "is_beyond_chance"]
+__all__ = ["ScalarFit", "adapt_to_log", "fit_scalar", "is_significant"]
 
 WIDTH_CENTRES_NT = {"permanent": 1000.0, "induced": 100.0, "eddy": 10.0}
 """Centres of the priors of the widths, nT (eddy: nT s)."""
@@ -106,7 +106,7 @@ class ScalarFit:
     """Samples that were left out as outliers."""
     log_evidence: float
     findings: tuple[Diagnostic, ...] = ()
-    """A lag that was estimated, and channels that disturb the scalar, beyond chance."""
+    """Statistically significant lag, and channels that disturb the scalar (:data:`CHANCE`)."""
     merit: dict[str, Any] | None = None
     """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
 
@@ -182,8 +182,8 @@ def _agreeing(
     return np.asarray(valid & (residual <= WITNESS_SIGMA * usual))
 
 
-def is_beyond_chance(values: FloatArray, covariance: FloatArray, tests: int) -> bool:
-    """Return True if the coefficients (k,) of one of several `tests` differ from zero beyond chance.
+def is_significant(values: FloatArray, covariance: FloatArray, tests: int) -> bool:
+    """Return True if the coefficients (k,) of one of several `tests` are significant at :data:`CHANCE`.
 
     Notes
     -----
@@ -199,19 +199,19 @@ def _findings(
 ) -> tuple[Diagnostic, ...]:
     """Return the lag if it is not zero, then the channels that disturb the scalar, the strongest first."""
     names = [channel.name for channel in channels]
-    beyond = {
-        name: is_beyond_chance(state.mean[term], state.covariance[term, term], len(names) + 1)
+    significant = {
+        name: is_significant(state.mean[term], state.covariance[term, term], len(names) + 1)
         for name, term in term_columns(channels).items()
         if name == "lag" or name in names
     }
     found = []
-    if beyond["lag"]:
+    if significant["lag"]:
         # The coefficient of the rate of change is negative if the scalar is late.
         late, k = -float(state.mean[PLATFORM_TERMS - 1]), PLATFORM_TERMS - 1
         sigma = float(np.sqrt(state.covariance[k, k]))
         found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": late, "sigma_s": sigma}))
     for name in sorted(names, key=lambda name: -contribution[name]):
-        if beyond[name]:
+        if significant[name]:
             values = {"column": column, "channel": name, "effect_nT": contribution[name]}
             found.append(Diagnostic("scalar.channel", values))
     return tuple(found)
