@@ -75,7 +75,7 @@ def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(tmp_path: Pat
     assert len(tables["calibrations"]) == len(tables["corrected"]) == 1
     lines = " | ".join(sorted(row["line"] for row in tables["failures"]))
     assert "boot.nc: expected times of a known day, got 1970-01-01T00:01:40; give it one" in lines
-    assert "other.nc: sensor 'HMR 2', but comet may carries 'HMR 1'" in lines
+    assert "other.nc: expected a log of sensor 'HMR 1', which comet may carries, got 'HMR 2'" in lines
     assert "text.nc" in lines
     assert len(tables["failures"]) == 3
 
@@ -113,7 +113,7 @@ def test_which_sensor_flew_where_is_on_record(flown: Path, tmp_path: Path) -> No
         lines += [row["line"] for row in tables.pop("failures", [])]
         for table, rows in tables.items():
             catalogue.add(table, rows)
-    assert lines[0].endswith("2.nc: sensor 'HMR 2', but comet d2 carries 'HMR 1'")
+    assert lines[0].endswith("2.nc: expected a log of sensor 'HMR 1', which comet d2 carries, got 'HMR 2'")
     assert {row["sensor"] for row in catalogue.rows("sensors")} == {"HMR 1", "HMR 2"}
     # another sensor is as good as a refit
     assert [one.refit for one in lessons(catalogue, "comet")] == ["spring, HMR 1", "spring"]
@@ -216,7 +216,7 @@ def test_a_calibration_starts_from_its_fleet(
     write(few.isel(time=np.isin(few["run"], np.unique(few["run"])[:2])), log)
     arguments = ["calibrate", str(log), "--fleet", place, "-o", str(tmp_path / "cal.json"), "--json"]
     assert main(arguments) == 2
-    assert "name the vehicle (--vehicle)" in capsys.readouterr().err
+    assert "name the vehicle with --vehicle" in capsys.readouterr().err
     assert main([*arguments, "--vehicle", "one", "--refit", "spring"]) == 0
     found = json.loads(capsys.readouterr().out)["fleet"]
     assert (found["deployments"], found["deployments_of_others"]) == (2, 1)
