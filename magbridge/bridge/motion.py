@@ -111,6 +111,8 @@ VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
 """Flags of EKF_STATUS_REPORT, and of ESTIMATOR_STATUS: the velocity holds; the position is only held."""
 HEADING_STEP_RAD, HEADING_STEP_US = 0.15, 10_000_000
 """rad by which the heading of an autopilot whose filter contradicts its sensors may change in these µs."""
+FIX_3D = 3
+"""Lowest GPS_RAW_INT.fix_type whose position is used."""
 ARMED = 128
 """Flag of HEARTBEAT.base_mode: the vehicle is armed."""
 STATE_UNKNOWN, ON_GROUND = 0, 1
@@ -158,7 +160,7 @@ class Motion:
         self._unvouched_us = (
             -MAX_SOURCE_AGE_US
         )  # when the autopilot last reported that its velocity does not hold
-        self._contradicted_us = -HEADING_STEP_US
+        self._contradicted_us = self._gps_us = -HEADING_STEP_US
         self._is_aircraft = self._armed = self._grounded = False
         self._landed_state = STATE_UNKNOWN
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
@@ -240,8 +242,10 @@ class Motion:
                 speed = message["groundspeed"] if self._grounded else speed
                 self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
 
-    def _gps(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
+    def _gps(self, message: Message, time_us: int) -> None:
         self._ground_speed = message["vel"] * 1e-2
+        if message["fix_type"] >= FIX_3D:
+            self._gps_us = time_us
 
     def _vouch(self, message: Message, time_us: int) -> None:
         """Use the autopilot's report on whether its velocity holds."""
@@ -249,8 +253,11 @@ class Motion:
             flags = message["flags"]
             holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
             self._unvouched_us = -MAX_SOURCE_AGE_US if holds else time_us
-            # without a good heading, dead reckoning is wrong by a part of the speed
-            if is_contradicted(message) and time_us - self._contradicted_us >= HEADING_STEP_US:
+            # Without a good heading, dead reckoning is wrong by a part of the speed. While GPS is used, the
+            # autopilot rather contradicts GPS, and dead reckoning has to test that.
+            uses_gps = self.gps_trusted and time_us - self._gps_us < HEADING_STEP_US
+            is_due = time_us - self._contradicted_us >= HEADING_STEP_US
+            if is_due and not uses_gps and is_contradicted(message):
                 self._contradicted_us = time_us
                 self._navigator.widen_heading(time_us, HEADING_STEP_RAD)
 

@@ -8,7 +8,7 @@ from math import cos, hypot, inf, radians, sin
 
 import numpy as np
 
-from magbridge.bridge.motion import Frame, Motion, MotionSource
+from magbridge.bridge.motion import FIX_3D, Frame, Motion, MotionSource
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.config import Navigation as Wanted
@@ -31,8 +31,6 @@ from magbridge.wording import one_of
 
 __all__ = ["NavigationService", "open_navigation"]
 
-FIX_3D = 3
-"""Lowest GPS_RAW_INT.fix_type whose position is used."""
 SHORTEST_US, LONGEST_US = 5_000_000, 60_000_000
 """µs without a GPS position after which GPS is lost: three times its period, within these."""
 HELD_US = 60_000_000

@@ -40,6 +40,10 @@ MAX_DEVIATION_SIGMA = 4.5
 """Deviation from a prediction on which a position is rejected: by chance in 4e-5, two degrees of freedom."""
 MIN_SIGMA_M = 1.5
 """Smallest sigma of a receiver that is used, m: its error changes slowly."""
+MAX_RETURN_SIGMA, MAX_HOLD_US = 2.0, 60_000_000
+"""Largest change of positions against dead reckoning, in its errors, with which they are used again, and the
+µs for which that counts. A carry-off goes on while the positions are held back; so does a change of the wind.
+By chance 14 % of the changes are larger, two degrees of freedom."""
 WINDOW_US = 30_000_000
 """µs over which the motion by GNSS is compared with dead reckoning."""
 MEAN_TIME_S = 20.0
@@ -148,6 +152,7 @@ class GnssMonitor:
         self._count = 0  # positions since then
         self._chained = True  # no jump since the last position that was used
         self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
+        self._change = 0.0  # of the positions over the window against dead reckoning, in its errors
         self._mean = np.zeros(2)
         self._reported = GnssReason.NONE
         self._reported_us = -MAX_GNSS_AGE_US
@@ -254,7 +259,7 @@ class GnssMonitor:
         # slow carry-off in the last.
         while len(history) > 1 and time_us - history[0].time_us > WINDOW_US:
             history.popleft()
-        jumped = False
+        jumped, self._change = False, 0.0
         for then in (history[-1], history[2 * len(history) // 3], history[0]) if history else ():
             seconds = max((time_us - then.time_us) * 1e-6, 0.0)
             # the estimate of the current from before the positions were wrong
@@ -272,7 +277,8 @@ class GnssMonitor:
                 offset_m[0] - then.north - known.current_north * seconds,
                 offset_m[1] - then.east - known.current_east * seconds,
             )
-            jumped |= distance > MAX_DEVIATION_SIGMA * error
+            self._change = distance / error  # of the oldest position at last
+            jumped |= self._change > MAX_DEVIATION_SIGMA
         if jumped:
             self._trusted = self._trusted or history[0]
             history.clear()
@@ -340,6 +346,8 @@ class GnssMonitor:
             return False
         if prediction.lost:
             return agrees and self._chained and held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
+        if self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US:
+            return False
         undecided = not prediction.informed and field.log_odds_of_position > -0.5 * field.limit
         return agrees or (self._chained and undecided and held_us >= LONG_HOLD_US)
 

@@ -12,7 +12,8 @@ from referee.loop import Run, sail
 from referee.receiver import Receiver, carried_off, frozen, honest, jammed, jumped
 from vehicle import Bench
 
-from magbridge.navigate.gnss import GnssState
+from magbridge.field.geodesy import offset
+from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
 from magbridge.navigate.record import NavigationState
 
 BEGIN, END = 180.0, 420.0
@@ -139,3 +140,28 @@ def test_the_receiver_s_own_report_counts(jamming: int, spoofing: int, word: str
     reported = [text for text in bench.texts if text.startswith("GPS ")]
     assert reported[0].startswith(f"GPS {word}: the receiver reports")
     assert reported[-1] == "GPS good"
+
+
+def test_positions_that_go_on_drifting_are_not_used_again() -> None:
+    """A wide covariance of the navigator agrees with any position; a carry-off of 3 m/s goes on all the same.
+
+    A real ArduPlane that followed the wrong GPS had a wrong heading, so that its covariance grew.
+    """
+    returned = {}
+    for drift in (0.0, 3.0):
+        monitor = GnssMonitor(steep_map(), AIRCRAFT)
+        states = []
+        for k in range(241):  # twice a second: right for 30 s, then a step of 60 m
+            seconds = 0.5 * k
+            late = max(seconds - 30.0, 0.0)
+            north = 60.0 * (late > 0.0) + drift * late
+            P = np.eye(2) * (3.0 if late == 0.0 else 200.0) ** 2
+            prediction = Prediction(
+                np.zeros(2), P, P, np.zeros(2), 0.3, 22.0 * seconds, 22.0, 0.0, lost=False, informed=True
+            )
+            place = offset(*PLACE, north + 22.0 * seconds, 0.0)
+            states.append(monitor.check(round(5e5 * k) + 1, place, (north, 0.0), 1.0, prediction))
+        assert states[50] is GnssState.GOOD
+        assert states[62] is GnssState.REJECTED
+        returned[drift] = GnssState.GOOD in states[62:150]
+    assert returned == {0.0: True, 3.0: False}

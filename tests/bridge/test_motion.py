@@ -233,7 +233,7 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
         place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
         bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
         sample(bench, latitude, longitude)
-        if reports or k > 140:
+        if reports or k > 160:
             assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
     assert bench.navigation.navigator.gnss.deviation < 10.0
