@@ -72,7 +72,7 @@ RUN_COMMAND = (
         ("from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)", ASHORE),
         ("from magbridge.cli import main; main(['--help'])", {"numpy", *ASHORE}),
         ("from magbridge.cli import main; main(['calibrate', 'none', '-o', 'x'])", {"numpy", *ASHORE}),
-        ("from magbridge.field import grid, nearby, prepare, read, reference", ASHORE),
+        ("from magbridge.field import grid, read, reference", ASHORE),
     ],
     ids=["the package", "the live path", "run", "the main field", "help", "a log that is not there", "maps"],
 )

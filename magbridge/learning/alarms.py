@@ -102,8 +102,8 @@ class LearningAlarm(NamedTuple):
     """The model no longer explains the data.
 
     `causes` are those that fit, the likeliest first, and `channels` the telemetry that each follows, or "".
-    Of the likeliest one, `since` is the onset (s since 1970 UTC), `size` the RMS of its effect on the total
-    field (nT), and `strength` the log-likelihood ratio L.
+    `since` is the onset of the likeliest cause (s since 1970 UTC), `size` the RMS of its effect on the total
+    field (nT), and `strength` its log-likelihood ratio L.
     """
 
     causes: tuple[str, ...]
@@ -228,7 +228,7 @@ class ChangeDetector:
             G[cause.states, range(3)] += unit / 3600.0
             G[self._offsets, range(3)] += unit * (self._now / 3600.0 - start)
             return np.asarray(G)
-        # step or coefficient: what was absorbed (Xi), and the cause itself
+        # step or coefficient: the absorbed part (Xi), and the cause itself
         G[cause.states, range(3)] += unit
         if cause.name not in FROM_ZERO:
             # the regressor counts from the onset, the coefficient from its origin
@@ -446,7 +446,7 @@ class AlarmState:
         self._silent += informative
         self._informative += informative
         self._explained += informative
-        # largest error that is beyond chance, forgotten over SILENT_SAMPLES informative samples
+        # largest statistically significant error, forgotten over SILENT_SAMPLES informative samples
         seen = error * error - SIGNIFICANT_SQUARE * variance
         self._peak = max(self._peak * (1.0 - informative / SILENT_SAMPLES), seen)
         if self.relapses and seen > 0.0:

@@ -452,7 +452,7 @@ class Decision:
             self._unconfirmed = self._refuted = False
             return True
         worse, relapsed = publication.judge.roll_back, self._standing.relapses > 0
-        # first undo what is worse, then publish what is better
+        # discard the worse calibration first, then publish the better one
         if worse and not publication.learned and self._standing.alarm is None:
             publication.judge.discard()  # the learned calibration may improve yet
         elif worse or (relapsed and publication.judge.improves < -BEYOND_CHANCE):

@@ -221,7 +221,7 @@ class Judge:
         self._judged += 1
         share = 1.0 / min(self._judged, JUDGE_MEMORY_SAMPLES)
         self.mean_square += share * (v[0] * v[0] - self.mean_square)
-        # likelihood of each standard deviation, of innovations that are no outliers
+        # likelihood of each standard deviation, without outliers
         squares = v * v / S[:, None]
         self._likelihoods *= 1.0 - 1.0 / CRUST_MEMORY_SAMPLES
         self._likelihoods -= 0.5 * (np.minimum(squares, MAX_JUDGE_SQUARE) + np.log(S)[:, None])
