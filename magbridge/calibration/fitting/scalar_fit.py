@@ -87,7 +87,7 @@ OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 """Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
 
 
-MAX_FALSE_NAME_PROBABILITY = 1e-3
+FALSE_NAME_LEVEL = 1e-3
 """Probability of a finding by chance, over all terms that are tested."""
 
 
@@ -106,7 +106,7 @@ class ScalarFit:
     """Samples that were left out as outliers."""
     log_evidence: float
     findings: tuple[Diagnostic, ...] = ()
-    """Statistically significant lag, and channels that disturb the scalar (:data:`MAX_FALSE_NAME_PROBABILITY`)."""
+    """Statistically significant lag, and channels that disturb the scalar (:data:`FALSE_NAME_LEVEL`)."""
     merit: dict[str, Any] | None = None
     """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
 
@@ -183,7 +183,7 @@ def _agreeing(
 
 
 def is_significant(values: FloatArray, covariance: FloatArray, tests: int) -> bool:
-    """Return True if the coefficients (k,) of one of several `tests` are significant at :data:`MAX_FALSE_NAME_PROBABILITY`.
+    """Return True if coefficients (k,), one of several `tests`, are significant at :data:`FALSE_NAME_LEVEL`.
 
     Notes
     -----
@@ -191,7 +191,7 @@ def is_significant(values: FloatArray, covariance: FloatArray, tests: int) -> bo
     degrees.
     """
     squared = float(values @ np.linalg.solve(covariance, values))
-    return bool(chdtrc(len(values), squared) < MAX_FALSE_NAME_PROBABILITY / max(tests, 1))
+    return bool(chdtrc(len(values), squared) < FALSE_NAME_LEVEL / max(tests, 1))
 
 
 def _findings(
