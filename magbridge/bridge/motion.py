@@ -22,7 +22,7 @@ from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
 from magbridge.navigate.deadreckoning import GLIDE
 
-__all__ = ["Frame", "Motion", "MotionSource"]
+__all__ = ["FIX_3D", "Frame", "Motion", "MotionSource"]
 
 MAX_STATE_AGE_US = 10_000_000
 """Time for which a height or an attitude is the present one, µs."""

@@ -354,6 +354,9 @@ class StreamRequests:
     def _ask_next(self) -> None:
         """Send the next request; only one is pending, because an answer does not name its message."""
         self._asked = None
+        # a message of aircraft is not needed any more if the vehicle turns out to be another
+        while self._queue and not self.rate_of(self._queue[0]) > 0.0:
+            self._queue.popleft()
         if not self._queue:
             return
         stream = self._asked = self._queue.popleft()

@@ -176,7 +176,10 @@ GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the dive that a glider sent in pieces; it is held whole."""
+    """Yield the dive that a glider sent in pieces; it is held whole.
+
+    FormatError: the file with the samples is missing.
+    """
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():
         raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")
