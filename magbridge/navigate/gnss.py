@@ -40,7 +40,7 @@ MAX_DEVIATION_SIGMA = 4.5
 """Deviation from a prediction on which a position is rejected: by chance in 4e-5, two degrees of freedom."""
 MIN_SIGMA_M = 1.5
 """Smallest sigma of a receiver that is used, m: its error changes slowly."""
-MAX_RETURN_SIGMA, MAX_HOLD_US = 2.0, 60_000_000
+MAX_RETURN_SIGMA, MAX_HOLD_US = 2.0, 180_000_000
 """Largest change of positions against dead reckoning, in its errors, with which they are used again, and the
 µs for which that counts. A carry-off goes on while the positions are held back; so does a change of the wind.
 By chance 14 % of the changes are larger, two degrees of freedom."""
@@ -344,10 +344,11 @@ class GnssMonitor:
             return True
         if field.contradicts or self.reason is GnssReason.FIELD:
             return False
-        if prediction.lost:
-            return agrees and self._chained and held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
         if self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US:
             return False
+        # a lost navigator has no position to compare with
+        if prediction.lost:
+            return held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
         undecided = not prediction.informed and field.log_odds_of_position > -0.5 * field.limit
         return agrees or (self._chained and undecided and held_us >= LONG_HOLD_US)
 

@@ -220,7 +220,7 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
     """
     bench = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT)
     north, east = -1500.0, -1500.0
-    for k in range(1, 181):
+    for k in range(1, 181 if reports else 301):
         flying, speed = k > 70, 22.0 * min(max(k - 60, 0) / 10.0, 1.0)
         bench.to(k)
         bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128 * (k > 50))
@@ -233,7 +233,7 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
         place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
         bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
         sample(bench, latitude, longitude)
-        if reports or k > 160:
+        if reports or k > 270:
             assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
     assert bench.navigation.navigator.gnss.deviation < 10.0
