@@ -143,7 +143,7 @@ class OneTime:
         )
 
     def _judge(self, field: Vector, slope: Vector, lever: Vector, share: float) -> None:
-        """Set the lag that is to be expected, and the reading before without its own."""
+        """Set the variance by the expected lag, and the previous reading without its lag."""
         (x, y, z), (x_lever, y_lever, z_lever), (x_was, y_was, z_was) = field, lever, self._lever
         before = self._slope
         dx, dy, dz = slope[0] - before[0], slope[1] - before[1], slope[2] - before[2]

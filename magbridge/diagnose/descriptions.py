@@ -247,7 +247,7 @@ class Description(NamedTuple):
 
 
 def _heat(candidate: Candidate) -> Literal["offset", "scale"] | None:
-    """Return whether slow heat changes offset or scale in a candidate; None without slow heat."""
+    """Return the target of a lagged temperature effect, offset or scale; None if there is none."""
     soaked = (e for e in candidate.effects if isinstance(e, ChannelEffect) and e.stages > 1)
     return next((effect.on for effect in soaked), None)
 

@@ -167,7 +167,7 @@ class GaussianField:
         return csr_array(rows)
 
     def slopes(self, place: FloatArray) -> tuple[csr_array, csr_array]:
-        """Return the derivatives of that north and east, 1/m, at places (n, 2), m, at the nodes' depth."""
+        """Return the basis' derivatives to north and east, 1/m, at places (n, 2), m, at the nodes' depth."""
         north, east = self.nodes.slopes(place)
         if not self.harmonic:
             return north, east

@@ -316,7 +316,7 @@ class LearnedTerms:
         return coefficients, covariance
 
     def calibration(self, coefficients: FloatArray, covariance: FloatArray) -> Calibration:
-        """Return a calibration of these (K,) and (K, K), with the further terms that are not zero."""
+        """Return the calibration with coefficients (K,) and covariance (K, K), without terms of zero."""
         by_further = coefficients[self._own :].reshape(-1, 3)
         used = [k for k, three in zip(self._further, by_further, strict=True) if three.any()]
         index = self._index(used)

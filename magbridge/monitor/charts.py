@@ -260,7 +260,7 @@ class TotalField:
 
 
 class TelemetryChart:
-    """A chart each for the positions of the masses, whatever else the vehicle names, and the temperature."""
+    """Three charts: positions of the masses, other named values of the vehicle, and the temperature."""
 
     def __init__(self) -> None:
         self._changes, self._curves, self._drawn = Changes(), dict[str, Curve](), -MAX_CHART_INTERVAL_S

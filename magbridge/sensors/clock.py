@@ -298,7 +298,7 @@ class DeviceClock:
     def _by_time(
         self, device_time: float, arrival_us: int, origin_us: int, informative: bool
     ) -> tuple[float, bool, bool]:
-        """Return the host time (µs), and whether the instrument was restarted, or a clock set."""
+        """Return the host time (µs), and True if the instrument restarted or a clock was set."""
         step = device_time - self._device_time
         if self._time_modulo:
             turns = round(((arrival_us - self._arrival_us) * 1e-6 - step) / self._time_modulo)

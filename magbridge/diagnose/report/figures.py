@@ -250,7 +250,7 @@ def channels(diagnosis: Diagnosis) -> str:
 
 
 def _binned(values: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return count, mean and scatter of `residual` in bins of a channel; NaN where it hardly was."""
+    """Return count, mean and scatter of `residual` in bins of a channel; NaN in bins with few samples."""
     edges = np.linspace(values.min(), values.max(), BINS + 1)
     bins = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
     number = np.bincount(bins, minlength=BINS)
