@@ -121,7 +121,7 @@ SCALAR_TEXTS = {
     "scalar.heading_error": "{column} has a heading error of {effect_nT:.1f} nT (standard deviation)",
     "scalar.channel": "{channel} disturbs {column} by {effect_nT:.2f} nT (standard deviation)",
 }
-"""Of a scalar magnetometer."""
+"""Texts of a scalar magnetometer."""
 
 DIAGNOSIS_TEXTS = {
     # Notes on one finding

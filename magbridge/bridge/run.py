@@ -287,7 +287,7 @@ class Upkeep:
         self._look_us = 0
 
     def finish_event(self, time_us: int) -> None:
-        """Do what is due after an event at `time_us`."""
+        """Run the tasks that are due after an event at `time_us`."""
         while self._requests:
             self.files.ask(self._requests.popleft())
         if not self._link.waiting:

@@ -234,7 +234,7 @@ def is_contradicted(status: Message) -> bool:
     """Return True if an EKF_STATUS_REPORT or ESTIMATOR_STATUS shows that the angles are uncertain.
 
     An innovation of velocity, position or compass is beyond its limit: the filter contradicts a sensor. In a
-    real ArduPlane with a jammed receiver the heading was then wrong by 20 to 40 deg, and so was the tilt.
+    real ArduPlane with a jammed receiver, heading and tilt were then wrong by 20 to 40 deg.
     """
     return bool(max(status[name] for name in INNOVATION_RATIOS[status.id]) > 1.0)
 

@@ -55,7 +55,7 @@ ID_PARAMETERS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the log in pieces; the values that are read are held whole.
 
-    FormatError: there is no record of a magnetometer with a time.
+    FormatError: the log lacks a record of a magnetometer with a time.
     """
     with path.open("rb") as file:
         text = b"FMT," in file.read(4096)
