@@ -8,12 +8,12 @@ from math import hypot, nan
 import numpy as np
 import pytest
 import xarray as xr
+from small import polynomial
 
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import CalibratedRange, Calibration, Noise, Parameter, Reference, identity
-from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.calibration.model import CalibratedRange, Calibration, Parameter, Reference, identity
 from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.records import Quality, Reading
@@ -31,15 +31,8 @@ def calibration() -> Calibration:
 
 
 def follows(channel: str, unit: str) -> Calibration:
-    return Calibration(
-        parameters=(Parameter(channel, unit, -1.0, 1.0, 0.0, 1.0),),
-        terms=(Polynomial(exponents=full_order(1, 1)),),
-        coefficients=np.where(np.arange(18) == T_X, LINE, 0.0),
-        covariance=np.eye(18) * 1e-6,
-        noise=Noise(1.0),
-        reference=Reference(50_000.0),
-        method="auto",
-    )
+    coefficients = np.where(np.arange(18) == T_X, LINE, 0.0)
+    return polynomial(coefficients, Parameter(channel, unit, -1.0, 1.0, 0.0, 1.0), variance=1e-6)
 
 
 def total(position: float) -> float:

@@ -22,6 +22,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from small import bridge_text, polynomial
+
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
 
 import grids
@@ -35,8 +37,7 @@ from ulogs import ulog_of
 
 from magbridge import config, logs
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference, Run
-from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.calibration.model import CalibratedSensor, Parameter, Run
 from magbridge.errors import MagbridgeError
 from magbridge.field import read
 from magbridge.field.grid import AnomalyGrid
@@ -52,24 +53,6 @@ NUMBERS = [0, 1, 2, 3, 4, 7, 8, 127, 128, 254, 255]
 WORDS = [
     b"nan", b"inf", b"-1", b"1e400", b"-9999", b"0", b",", b"\n", b"\0", b'"', b"\xff\xfe", b"\xef\xbb\xbf",
 ]  # fmt: skip
-CONFIG = """
-[sensor]
-driver = "ascii"
-port = "loop://"
-[sensor.options]
-columns = ["x", "y", "z"]
-[link]
-url = "udpout:192.0.2.1:14550"
-system = 1
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
-[publish]
-MAG_FIELD = 0
-[log]
-directory = "logs"
-"""
 
 Read = Callable[[bytes], object]
 
@@ -136,18 +119,12 @@ def _frame_log(folder: Path) -> list[bytes]:
 def _calibration(_: Path) -> list[bytes]:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(27, 27))
-    made = Calibration(
-        parameters=(Parameter("battpos", "in", -0.4, 0.5, 0.05, 0.45),),
-        terms=(Polynomial(exponents=full_order(1, 2)),),
-        effects=(),
-        coefficients=rng.normal(size=27) * 100.0,
+    made = polynomial(
+        rng.normal(size=27) * 100.0,
+        Parameter("battpos", "in", -0.4, 0.5, 0.05, 0.45),
         covariance=root @ root.T,
-        noise=Noise(1.0, 0.0, 0.3, 4.0),
-        reference=Reference(51_000.0, "IGRF"),
         sensor=CalibratedSensor("digitizer", 3),
-        boresight=None,
         runs=(Run("1", 225, 1.1, (0.3,)),),
-        method="auto",
         inputs={"a.csv": "00"},
         software="magbridge 0.1.0",
     )
@@ -232,7 +209,9 @@ TARGETS: dict[str, Target] = {
         "bytes", lambda _: lambda data: [(one, one.message) for one in LogReader(BytesIO(data))], _frame_log
     ),
     "calibration": Target("bytes", lambda _: decode_calibration, _calibration),
-    "config": _file("bridge.toml", config.load, lambda path: path.write_text(CONFIG)),
+    "config": _file(
+        "bridge.toml", config.load, lambda path: path.write_text(bridge_text(publish={"MAG_FIELD": 0}))
+    ),
     "polygon": _file(
         "mask.csv",
         read.read_polygon,

@@ -1,13 +1,16 @@
-"""A bridge without ports, for tests and studies: line protocol, one mass, random coefficients."""
+"""Small calibrations, and bridges without ports, for tests and studies."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
 from magbridge.bridge.events import StartEvent
 from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import save
@@ -48,6 +51,44 @@ def bridge_text(
     return "\n".join([*lines, more])
 
 
+def polynomial(
+    coefficients: FloatArray,
+    *parameters: Parameter,
+    variance: float = 1.0,
+    noise_nt: float = 1.0,
+    field_nt: float = 50_000.0,
+    **more: Any,
+) -> Calibration:
+    """Return a calibration with a polynomial in its parameters, of the order that its coefficients have.
+
+    The coefficients are uncertain by the same `variance`; `more` are further fields of the calibration.
+    """
+    size = len(coefficients)
+    orders = (full_order(len(parameters), order) for order in count())
+    exponents = next(one for one in orders if 9 * len(one) >= size)
+    return Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=exponents),),
+        coefficients=coefficients,
+        noise=Noise(noise_nt),
+        reference=Reference(field_nt),
+        **{"covariance": variance * np.eye(size), "method": "auto", **more},
+    )
+
+
+def aligned(variance: float = 1e-6) -> Boresight:
+    """Return the boresight of a sensor along the axes of the body; each angle has a `variance`, rad²."""
+    return Boresight((0.0, 0.0, 0.0), ((variance, 0.0, 0.0), (0.0, variance, 0.0), (0.0, 0.0, variance)))
+
+
+def write_bridge(folder: Path, known: Calibration, /, **settings: Any) -> Path:
+    """Write a calibration and a ``bridge.toml`` with `settings` of :func:`bridge_text`; return the latter."""
+    save(known, folder / "cal.json")
+    path = folder / "bridge.toml"
+    path.write_text(bridge_text(**settings), encoding="utf-8")
+    return path
+
+
 def small_bridge(
     folder: Path,
     start: StartEvent,
@@ -62,18 +103,6 @@ def small_bridge(
     `more` is that of :func:`bridge_text`. With the `boresight` of its calibration the bridge computes a
     heading.
     """
-    size = 4 * 9
-    cal = Calibration(
-        parameters=(battery,),
-        terms=(Polynomial(exponents=full_order(1, 3)),),
-        coefficients=np.random.default_rng(1).normal(size=size) * 300.0,
-        covariance=np.eye(size),
-        noise=Noise(1.0),
-        reference=Reference(50_000.0),
-        boresight=boresight,
-        method="auto",
-    )
-    save(cal, folder / "cal.json")
-    config = folder / "bridge.toml"
-    config.write_text(bridge_text(publish=dict.fromkeys(publish, 0), more=more), encoding="utf-8")
-    return set_up(load(config), start)
+    coefficients = np.random.default_rng(1).normal(size=4 * 9) * 300.0
+    known = polynomial(coefficients, battery, boresight=boresight)
+    return set_up(load(write_bridge(folder, known, publish=dict.fromkeys(publish, 0), more=more)), start)

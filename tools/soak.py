@@ -18,15 +18,13 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from small import bridge_text
+from small import polynomial, write_bridge
 from studies import command_line
 
 from magbridge.bridge import events
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import set_up
-from magbridge.calibration.file import save
-from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial
+from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality, Reading
@@ -51,15 +49,11 @@ HOUR = 3_600_000
 
 def calibration() -> Calibration:
     """Return the right value for a mass whose field is `SLOPE` times its position."""
-    return Calibration(
-        parameters=(Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),),
-        terms=(Polynomial(exponents=((0,), (1,))),),
-        coefficients=np.array([0.0] * 15 + [*SLOPE]),
-        covariance=np.eye(18),
-        noise=Noise(1.0),
-        reference=Reference(float(np.linalg.norm(TRUTH))),
+    return polynomial(
+        np.array([0.0] * 15 + [*SLOPE]),
+        Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),
+        field_nt=float(np.linalg.norm(TRUTH)),
         sensor=CalibratedSensor("digitizer"),
-        method="made for a soak",
     )
 
 
@@ -67,10 +61,8 @@ class Soak:
     """A bridge, its instrument and autopilot, and the account of all readings."""
 
     def __init__(self, folder: Path, seed: int) -> None:
-        save(calibration(), folder / "cal.json")
-        text = bridge_text("digitizer", "sensitivity = 5e-5, reference_voltage = 5.0", log=False)
-        (folder / "bridge.toml").write_text(text, encoding="utf-8")
-        config = load(folder / "bridge.toml")
+        options = "sensitivity = 5e-5, reference_voltage = 5.0"
+        config = load(write_bridge(folder, calibration(), driver="digitizer", options=options, log=False))
         self.pipeline = set_up(config, StartEvent(BEGIN_US))
         self.encoder = open_encoder("digitizer", config.sensor.options)
         self.rng = np.random.default_rng(seed)

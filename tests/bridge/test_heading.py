@@ -15,14 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small import bridge_text
+from small import aligned, polynomial, write_bridge
 
 from magbridge.bridge.check import findings
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline, set_up
-from magbridge.calibration.file import save
-from magbridge.calibration.model import Boresight, Calibration, Noise, Reference
-from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.errors import ConfigError
 from magbridge.field.igrf import igrf
@@ -45,31 +42,17 @@ def body_field(roll: float = ROLL, pitch: float = PITCH, yaw: float = YAW) -> np
     return np.asarray((turn @ to_level).T @ MAIN)
 
 
-def write_bridge(
+def bridge_with(
     folder: Path, heading: str = "", *, boresight: bool = True, port: str = "/dev/null",
     link: str = "udpout:127.0.0.1:14550",
 ) -> Path:  # fmt: skip
     """Write a configuration with a calibration that changes nothing."""
-    v = radians(0.2) ** 2
-    turn = ((v, 0.0, 0.0), (0.0, v, 0.0), (0.0, 0.0, v))
-    cal = Calibration(
-        parameters=(),
-        terms=(Polynomial(exponents=((),)),),
-        coefficients=np.zeros(9),
-        covariance=1e-4 * np.eye(9),
-        noise=Noise(5.0),
-        reference=Reference(50_000.0),
-        method="nominal",
-        boresight=Boresight((0.0, 0.0, 0.0), turn) if boresight else None,
-    )
-    save(cal, folder / "cal.json")
-    path = folder / "bridge.toml"
-    text = bridge_text(
-        options='columns = ["x", "y", "z", "time"]', port=port, url=link, masses={}, log=False,
-        publish={"MAG_FIELD": 0, "ATTITUDE_QUATERNION_COV": 0}, more=f"[heading]\n{heading}\n",
+    turn = aligned(radians(0.2) ** 2) if boresight else None
+    known = polynomial(np.zeros(9), variance=1e-4, noise_nt=5.0, method="nominal", boresight=turn)
+    return write_bridge(
+        folder, known, options='columns = ["x", "y", "z", "time"]', port=port, url=link, masses={},
+        log=False, publish={"MAG_FIELD": 0, "ATTITUDE_QUATERNION_COV": 0}, more=f"[heading]\n{heading}\n",
     )  # fmt: skip
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def attitude(time_us: int, **fields: float) -> Event:
@@ -108,7 +91,7 @@ def level_flight(stack: int = ARDUPILOT, seconds: int = 3) -> list[Event]:
 
 
 def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
+    bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
     messages = fly(bridge, level_flight())
     field = last(messages, "MAG_FIELD")
     declination = degrees(atan2(MAIN[1], MAIN[0]))
@@ -121,7 +104,7 @@ def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Pa
 
 
 def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path, "tilt_sigma = 0.5")), StartEvent(START))
+    bridge = set_up(load(bridge_with(tmp_path, "tilt_sigma = 0.5")), StartEvent(START))
     rng, ratios = np.random.default_rng(4), []
     fly(bridge, begin())
     for tenth in range(400):
@@ -136,7 +119,7 @@ def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
 
 
 def test_no_heading_without_attitude_or_with_an_old_one(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
+    bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
     field = last(fly(bridge, [*begin(), sample(START + 100_000, body_field())]), "MAG_FIELD")
     assert field["heading_sigma"] == 0.0
     known = last(fly(bridge, [attitude(START + 150_000), sample(START + 200_000, body_field())]), "MAG_FIELD")
@@ -146,7 +129,7 @@ def test_no_heading_without_attitude_or_with_an_old_one(tmp_path: Path) -> None:
 
 
 def test_a_turning_vehicle_is_levelled_at_the_time_of_the_sample(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
+    bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
     fly(bridge, level_flight())
     rate, late = radians(30.0), 0.2
     events = [attitude(START + 4_000_000, rollspeed=rate)]
@@ -157,7 +140,7 @@ def test_a_turning_vehicle_is_levelled_at_the_time_of_the_sample(tmp_path: Path)
 
 
 def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
+    bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
     field = last(fly(bridge, level_flight()[1:]), "MAG_FIELD")
     assert field["heading"] != field["heading"]
     assert field["magnetic_heading"] == pytest.approx(130.0 - degrees(atan2(MAIN[1], MAIN[0])), abs=0.05)
@@ -167,7 +150,7 @@ def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) ->
 @pytest.mark.parametrize("send", ["odometry", "vision_position_estimate"])
 def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stack: int) -> None:
     """ArduPilot: GCS_Common.cpp, cbrt of the sum of squares; PX4: mavlink_receiver.cpp, entry 20."""
-    bridge = set_up(load(write_bridge(tmp_path, f'send = "{send}"')), StartEvent(START))
+    bridge = set_up(load(bridge_with(tmp_path, f'send = "{send}"')), StartEvent(START))
     messages = fly(bridge, level_flight(stack))
     message, sigma = last(messages, send.upper()), radians(last(messages, "MAG_FIELD")["heading_sigma"])
     is_odometry = send == "odometry"
@@ -190,7 +173,7 @@ def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stac
 
 
 def test_nothing_goes_to_the_autopilot_without_boresight(tmp_path: Path) -> None:
-    path = write_bridge(tmp_path, 'send = "odometry"', boresight=False)
+    path = bridge_with(tmp_path, 'send = "odometry"', boresight=False)
     messages = fly(set_up(load(path), StartEvent(START)), level_flight())
     assert not any(one.name == "ODOMETRY" for one in messages)
     assert any("no boresight: no heading is sent" in one.text for one in findings(path))
@@ -217,11 +200,11 @@ def test_nmea_sentences() -> None:
 @pytest.mark.parametrize(("line", "key"), [('send = "gps"', "heading.send"), ("rat = 1", "heading.rat")])
 def test_wrong_keys_are_named(tmp_path: Path, line: str, key: str) -> None:
     with pytest.raises(ConfigError, match=key):
-        load(write_bridge(tmp_path, line))
+        load(bridge_with(tmp_path, line))
 
 
 def test_a_wrong_nmea_port_is_found_before_anything_is_opened(tmp_path: Path) -> None:
-    path = write_bridge(tmp_path, 'nmea = "udp:nowhere"')
+    path = bridge_with(tmp_path, 'nmea = "udp:nowhere"')
     assert any(one.fatal and "heading.nmea" in one.text for one in findings(path))
 
 
@@ -232,7 +215,7 @@ def test_sentences_and_messages_through_real_sockets(tmp_path: Path) -> None:
     for one in (link, ear):
         one.bind(("127.0.0.1", 0))
         one.settimeout(20.0)
-    path = write_bridge(
+    path = bridge_with(
         tmp_path, f'send = "odometry"\nnmea = "udp:127.0.0.1:{ear.getsockname()[1]}"',
         port=os.ttyname(outside), link=f"udpout:127.0.0.1:{link.getsockname()[1]}",
     )  # fmt: skip
@@ -279,7 +262,7 @@ def test_an_autopilot_that_contradicts_its_sensors_gives_no_good_heading(
     """Roll and pitch of a real ArduPlane under a jammed receiver were wrong by tens of degrees."""
     sigmas = []
     for ratio in (0.1, 5.0):
-        bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
+        bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
         report = Event(START, Channel.LINK, Codec(1, 1).pack(status, **{field: ratio}))
         sent = fly(bridge, [*begin(), report, *level_flight()])
         sigmas.append(last(sent, "MAG_FIELD")["heading_sigma"])

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from devices import open_line
+from small import aligned, polynomial
 
 from magbridge.bridge import events
 from magbridge.bridge.check import findings
 from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.bridge.pipeline import set_up
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Boresight, CalibratedSensor, Calibration, Noise, Reference
+from magbridge.calibration.model import CalibratedSensor, Calibration
 from magbridge.calibration.scalar import (
     PLATFORM_TERMS,
     ScalarNoise,
@@ -27,7 +28,6 @@ from magbridge.calibration.scalar import (
     ScalarSeries,
     correct_scalar,
 )
-from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.logs import read
 from magbridge.mavlink import Codec, Message
@@ -87,17 +87,8 @@ def scalar() -> ScalarSensor:
 
 def calibration(*sensors: ScalarSensor) -> Calibration:
     """Return a calibration that changes nothing."""
-    return Calibration(
-        parameters=(),
-        terms=(Polynomial(exponents=((),)),),
-        coefficients=np.zeros(9),
-        covariance=np.eye(9),
-        noise=Noise(1.0),
-        reference=Reference(FIELD_NT),
-        sensor=CalibratedSensor("ascii"),
-        boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
-        method="made for a test",
-        sensors=sensors,
+    return polynomial(
+        np.zeros(9), sensor=CalibratedSensor("ascii"), boresight=aligned(), sensors=sensors, field_nt=FIELD_NT
     )
 
 

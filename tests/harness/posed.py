@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from small import polynomial
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Effect, LogSeries, Polynomial
+from magbridge.calibration.model import Calibration, Parameter
+from magbridge.calibration.terms import Effect, LogSeries
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.survey import MAX_LAG, Survey, TelemetryChannel
@@ -57,14 +58,8 @@ def walk(n: int, rng: np.random.Generator) -> FloatArray:
 
 def calibrated(coefficients: FloatArray, variance: float = 4.0, **parameter: float) -> Calibration:
     """A calibration with a polynomial in p: nine coefficients for each power, of one `variance`, nT²."""
-    powers = len(coefficients) // 9
     limits = {"low": -1.0, "high": 1.0, "centre": 0.0, "scale": 1.0} | parameter
-    return Calibration(
-        parameters=(Parameter("p", "in", **limits),),
-        terms=(Polynomial(exponents=tuple((power,) for power in range(powers))),),
-        coefficients=coefficients, covariance=np.diag(np.full(9 * powers, variance)), noise=Noise(1.0),
-        reference=Reference(FIELD), method="made",
-    )  # fmt: skip
+    return polynomial(coefficients, Parameter("p", "in", **limits), variance=variance, method="made")
 
 
 def regressors_of(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:

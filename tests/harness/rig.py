@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from devices import SENSOR_HZ, TRUTH, TURN, Autopilot, Fluxgate
+from small import aligned, polynomial
 from standstill import standstill
 
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Boresight, CalibratedSensor, Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial
+from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message, Signing
 from magbridge.records import Quality
@@ -305,14 +305,10 @@ def calibration(slope: tuple[float, float, float] = (30.0, -20.0, 10.0)) -> Cali
 
     `slope` is the nT by which the offset changes as the mass goes from there to the end of its range.
     """
-    return Calibration(
-        parameters=(Parameter("battpos", "in", -1.0, 2.0, 0.5, 1.5),),
-        terms=(Polynomial(exponents=((0,), (1,))),),
-        coefficients=np.array([0.0] * 15 + [*slope]),
-        covariance=np.eye(18),
-        noise=Noise(1.0),
-        reference=Reference(float(np.linalg.norm(TRUTH))),
+    return polynomial(
+        np.array([0.0] * 15 + [*slope]),
+        Parameter("battpos", "in", -1.0, 2.0, 0.5, 1.5),
+        field_nt=float(np.linalg.norm(TRUTH)),
         sensor=CalibratedSensor("digitizer"),
-        boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
-        method="made for a test",
+        boresight=aligned(),
     )

@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from small import ASCII_OPTIONS, START, bridge_text
+from small import ASCII_OPTIONS, START, polynomial, write_bridge
 
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline, set_up
-from magbridge.calibration.file import load, save
-from magbridge.calibration.model import Calibration, Noise, Reference
-from magbridge.calibration.terms import Polynomial
+from magbridge.calibration.file import load
 from magbridge.config import load as load_config
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel
@@ -28,20 +26,16 @@ LEARNING = "[learning]\nenabled = true\n"
 
 def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pipeline:
     """Set up a bridge with a nominal calibration that is known to a nanotesla, or with none."""
-    cal = Calibration(
-        parameters=(),
-        terms=(Polynomial(exponents=((),)),),
-        coefficients=np.random.default_rng(1).normal(size=9) * 100.0,
-        covariance=np.eye(9),
-        noise=Noise(1.0),
-        reference=Reference(51_900.0),
-        method="nominal",
+    coefficients = np.random.default_rng(1).normal(size=9) * 100.0
+    config = write_bridge(
+        folder,
+        polynomial(coefficients, field_nt=51_900.0, method="nominal"),
+        options=f'unit = "counts", scale = {COUNT}, {ASCII_OPTIONS}',
+        masses={},
+        calibration=known,
+        publish={"MAG_FIELD": 0},
+        more=learning,
     )
-    save(cal, folder / "cal.json")
-    config = folder / "bridge.toml"
-    options = f'unit = "counts", scale = {COUNT}, {ASCII_OPTIONS}'
-    text = bridge_text(options=options, masses={}, calibration=known, publish={"MAG_FIELD": 0}, more=learning)
-    config.write_text(text, encoding="utf-8")
     return set_up(load_config(config), StartEvent(START))
 
 

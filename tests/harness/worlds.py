@@ -6,10 +6,11 @@ from collections.abc import Callable
 from math import nan
 
 import numpy as np
+from small import polynomial
 
 from magbridge.calibration.corrector import Corrector
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.calibration.model import Calibration, Parameter
+from magbridge.calibration.terms import full_order
 from magbridge.field.grid import AnomalyGrid
 from magbridge.learning import Learner
 
@@ -23,16 +24,7 @@ FIELD = 50_000.0
 def calibration(sigma: float = 1.0) -> Calibration:
     """Return one whose coefficients are uncertain by `sigma` nT each."""
     K = 9 * len(ORDER)
-    coefficients = np.random.default_rng(3).normal(size=K) * 200.0
-    return Calibration(
-        parameters=(MASS,),
-        terms=(Polynomial(exponents=ORDER),),
-        coefficients=coefficients,
-        covariance=np.eye(K) * sigma**2,
-        noise=Noise(1.0),
-        reference=Reference(FIELD),
-        method="auto",
-    )
+    return polynomial(np.random.default_rng(3).normal(size=K) * 200.0, MASS, variance=sigma**2)
 
 
 class World:

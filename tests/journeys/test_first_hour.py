@@ -18,11 +18,11 @@ import pytest
 import theirs
 import xarray as xr
 from pages import blocks
+from small import polynomial
 
 from magbridge import logs
 from magbridge.calibration.file import load, save
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.calibration.model import Calibration, Parameter
 
 from .conftest import Walk
 
@@ -38,15 +38,8 @@ def right(file: str, within: float) -> None:
 @pytest.fixture
 def calibration(here: Path) -> Calibration:
     """cal.json: a mass that moves, and no boresight."""
-    made = Calibration(
-        parameters=(Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0),),
-        terms=(Polynomial(exponents=full_order(1, 1)),),
-        coefficients=np.random.default_rng(1).normal(size=18) * 300.0,
-        covariance=np.eye(18),
-        noise=Noise(1.0),
-        reference=Reference(50_000.0),
-        method="auto",
-    )
+    coefficients = np.random.default_rng(1).normal(size=18) * 300.0
+    made = polynomial(coefficients, Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0))
     save(made, here / "cal.json")
     return made
 

@@ -13,12 +13,10 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
-from small import bridge_text
+from small import aligned, polynomial, write_bridge
 
 from magbridge.bridge.events import Event
-from magbridge.calibration.file import save
-from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.calibration.model import Boresight, Calibration, Parameter
 from magbridge.mavlink import Codec
 from magbridge.records import Channel, Reading
 from sitl.fluxgate import Encoder, open_encoder
@@ -39,22 +37,15 @@ OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
 def calibration() -> Calibration:
     """Return a full cubic in two masses: 90 coefficients with a full covariance."""
     random = np.random.default_rng(1)
-    terms = (Polynomial(exponents=full_order(2, 3)),)
-    size = terms[0].size
+    size = 90
     root = random.normal(size=(size, size))
-    small = (np.eye(3) * 1e-6).tolist()
-    return Calibration(
-        parameters=(
-            Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0),
-            Parameter("ballast", "cm3", 0.0, 400.0, 200.0, 200.0),
-        ),
-        terms=terms,
-        coefficients=random.normal(size=size) * IRON_NT,
+    return polynomial(
+        random.normal(size=size) * IRON_NT,
+        Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0),
+        Parameter("ballast", "cm3", 0.0, 400.0, 200.0, 200.0),
+        field_nt=52_217.0,
         covariance=root @ root.T / size,
-        noise=Noise(1.0),
-        reference=Reference(52_217.0),
-        boresight=Boresight((0.01, -0.02, 0.03), (tuple(small[0]), tuple(small[1]), tuple(small[2]))),
-        method="auto",
+        boresight=Boresight((0.01, -0.02, 0.03), aligned().covariance),
     )
 
 
@@ -62,19 +53,17 @@ def write_config(
     folder: Path, port: str = "/dev/null", url: str = "udpout:127.0.0.1:14550", more: str = ""
 ) -> Path:
     """Write ``bridge.toml``, with `more` tables, and ``cal.json`` to `folder`; return the first."""
-    save(calibration(), folder / "cal.json")
-    path = folder / "bridge.toml"
-    text = bridge_text(
-        "digitizer",
-        ", ".join(f"{name} = {value}" for name, value in OPTIONS.items()),
+    return write_bridge(
+        folder,
+        calibration(),
+        driver="digitizer",
+        options=", ".join(f"{name} = {value}" for name, value in OPTIONS.items()),
         port=port,
         url=url,
         masses={"battpos": "in", "ballast": "cm3"},
         publish={"MAG_RAW": 0, "MAG_FIELD": 0, "HIGHRES_IMU": 0, "NAMED_VALUE_FLOAT": 1},
         more=more,
     )
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 class Feed:
