@@ -84,11 +84,11 @@ def by_dbdreader(paths: list[Path], wanted: Any) -> None:
 
 def wanted_by(name: str) -> Any:
     """Return what magbridge reads of a format, in the terms of the peer."""
-    from magbridge.logs import ardupilot, px4, rosbag, slocum, telemetry_survey  # noqa: PLC0415
+    from magbridge.logs import ardupilot, px4, rosbag, slocum, telemetry  # noqa: PLC0415
 
     return {
         "ardupilot": [*ardupilot.WANTED],
-        "telemetry": [*telemetry_survey.MAVLINK_FIELDS, "NAMED_VALUE_FLOAT"],
+        "telemetry": [*telemetry.MAVLINK_FIELDS, "NAMED_VALUE_FLOAT"],
         "px4": [*px4.PX4_FIELDS, *px4.NEEDED_FIELDS],
         "ros": [*rosbag.MESSAGE_KINDS],
         "slocum": [slocum.SCIENCE, [*slocum.SENSORS]],

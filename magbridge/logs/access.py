@@ -101,7 +101,7 @@ def read_chunks(
 ) -> Iterator[xr.Dataset]:
     """Yield the result of :func:`read` in pieces of about `rows` rows, in bounded memory.
 
-    Every piece has the same columns. CSV, netCDF, Parquet and ``.tlog`` are streamed; files of the other
+    Every piece has the same columns. CSV, netCDF and Parquet are streamed; files of the other
     formats are held in memory one at a time. Of files that overlap in time, one piece each is held. A file
     that cannot be read to its end is read up to there.
 

@@ -1,8 +1,7 @@
 """MAVLink telemetry logs (``.tlog``) as deployments.
 
-A row is a magnetometer message of the best kind that the log holds
-(:data:`~magbridge.logs.telemetry_survey.SOURCES`), from the component that sent most of them; every other
-column is the last value from this vehicle before it (NaN once older than
+A row is a magnetometer message of the best kind that the log holds (:data:`SOURCES`), from the component
+that sent most of them; every other column is the last value from this vehicle before it (NaN once older than
 :data:`~magbridge.logs.fields.MAX_AGE`).
 
 - ``MAG_RAW`` (ours): nT computed from the counts as by the driver, where the log declares the nT per count,
@@ -13,119 +12,528 @@ column is the last value from this vehicle before it (NaN once older than
   ... ``mag3_z``.
 - Without any of these, each ``ATTITUDE`` or position makes a row, and there is no ``mag_x``.
 
-Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own, with the age of each value; one
-from :mod:`magbridge.logs`), what :data:`~magbridge.logs.telemetry_survey.TELEMETRY` lists, and every
-``NAMED_VALUE_FLOAT`` by its name.
-Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
+Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own log, with the age of each value,
+or one written by :mod:`.telemetry_writer`), what :data:`TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by
+its name. Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
 Attitude and position are the autopilot's, not a gimbal's, and a named value never takes the place of a column
 that the log has a source for. Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and
-``damages``.
+``damages``. The messages that are read are held whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
-from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
+from magbridge.columns import AGE, CHANNEL_TIMES, CHANNELS, CORRECTED
+from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass, by_columns, choose, compass_notes, listed
-from magbridge.logs.deployment import NOTES, deployment, noted
-from magbridge.logs.fields import MAX_AGE
-from magbridge.logs.telemetry_survey import (
-    AUTOPILOT,
-    TELEMETRY,
-    DeclaredField,
-    LogContents,
-    are_of_main_sensor,
-    source_columns,
-    survey,
-)
-from magbridge.logs.telemetry_writer import FileWriter
+from magbridge.logs.deployment import CHANGES_SETTING, NOTES, deployment, sliced
+from magbridge.logs.fields import MAX_AGE, FieldMap, field_maps
+from magbridge.logs.telemetry_writer import POWER_CYCLE, FileWriter
 from magbridge.mavlink import Source, spec
-from magbridge.mavlink.tlog import RecordBlock, blocks
+from magbridge.mavlink.messages import split_index
+from magbridge.mavlink.tlog import blocks
 from magbridge.records import Channel
 
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
 
-__all__ = ["FileWriter", "chunks"]
+__all__ = ["MAVLINK_FIELDS", "FileWriter", "chunks"]
 
-NAMED = spec("NAMED_VALUE_FLOAT")
-FIELD, STEP = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id
+Payloads = NDArray[np.uint8]
+"""(n, size): the payloads of messages of one kind, without zeros cut off."""
+MAVLINK_FIELDS = field_maps("mavlink")
+"""Message to its fields; the values that the dialect declares to be invalid are missing, too."""
+SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": []}
+"""The messages that make a row, the best first, and the fields whose values the row has from them."""
+RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
+START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
+SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
+NAMED = spec("NAMED_VALUE_FLOAT").id
+RAW_COLUMNS = {one.column: one.unit for one in SOURCES["MAG_RAW"]}
+COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
+"""Message to the number of the compass whose field it holds; of several for one, the first is read."""
+AUTOPILOT = 1
+GIMBALS = {154, 171, 172, 173, 174, 175}
+"""Components whose attitude is their own, and not the vehicle's."""
+RESERVED_COLUMNS = {"time", *CHANNELS}
+"""Columns that a named value never is."""
 MAX_TELEMETRY_AGE_US = round(MAX_AGE * 1e6)
 SINGLE = 1e-7
 """Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
 SENSOR_ID, OTHER_TIME = "sensor_id", "_time"
 """Field by which a column belongs to a sensor after the first; ending of the column with the times."""
-Updates = tuple[IndexArray, FloatArray]
-"""Places in a block (m,), increasing, and the values (m,) of a column there."""
+
+
+class MessageField:
+    """How a column is read from the payloads of a message: ``factor * field + offset``, in `unit`."""
+
+    def __init__(self, source: FieldMap, offset: float = 0.0) -> None:
+        name, index = split_index(source.field)
+        field = spec(source.record).fields[name]
+        if field.code == "s":
+            raise ValueError(f"{source.record}.{name}: expected a field of numbers")
+        self.message = spec(source.record).id
+        self.column, self.unit, self.factor, self.offset = source.column, source.unit, source.factor, offset
+        self._layout = np.dtype(f"<{field.code}")
+        self._start = field.offset + (index or 0) * self._layout.itemsize
+        unknown = source.missing if field.invalid is None else (*source.missing, field.invalid)
+        self._source = source._replace(missing=unknown)
+
+    def values(self, payloads: Payloads) -> FloatArray:
+        """Return the values (n,) of the column in payloads (n, size); NaN where the sender knows none."""
+        raw = payloads[:, self._start : self._start + self._layout.itemsize].copy().view(self._layout)[:, 0]
+        return self._source.values(raw) + self.offset
+
+
+class DeclaredField(MessageField):
+    """A column that the log itself declares, by a ``MAG_COLUMN``.
+
+    `match` has the values that other fields of the message must have, as text; `component` is the only sender
+    that counts.
+    """
+
+    def __init__(self, declaration: Mapping[str, Any]) -> None:
+        layout = spec(declaration["message"])
+        unit, scale = declaration["unit"] or "1", declaration["scale"]
+        source = FieldMap(layout.name, declaration["field"], declaration["column"], unit, scale)
+        super().__init__(source, declaration["offset"])
+        self.component: int | None = declaration["component"] or None
+        self.match = dict(part.split("=", 1) for part in declaration["match"].split(",") if part)
+        self._others = [(layout.fields[name], text) for name, text in self.match.items()]
+
+    @property
+    def is_named_value(self) -> bool:
+        """Return True if the column is a ``NAMED_VALUE_FLOAT`` of one name."""
+        return self.message == NAMED and self.match.keys() == {"name"}
+
+    def matches(self, payloads: Payloads) -> BoolArray:
+        """Return which of the payloads (n, size) hold the column, (n,)."""
+        found = np.ones(len(payloads), bool)
+        for field, text in self._others:
+            part = payloads[:, field.offset : field.offset + field.struct.size]
+            kinds, first, kind = np.unique(part, axis=0, return_index=True, return_inverse=True)
+            equal = [str(field.get(payloads[k].tobytes())) == text for k in first.tolist()]
+            found &= np.array(equal, bool)[kind.ravel()] if len(kinds) else found
+        return found
+
+
+TELEMETRY = {
+    spec(message).id: [MessageField(one) for one in fields] for message, fields in MAVLINK_FIELDS.items()
+}
+"""Message id to the columns in the message."""
+SOURCE_FIELDS = {
+    spec(message).id: [MessageField(one) for one in fields] for message, fields in SOURCES.items()
+}
+SENSOR_IDS = {number: spec(number).fields["sensor_id"].offset for number in (RAW, FIELD)}
+STAMP_FIELDS = {
+    number: MessageField(FieldMap(spec(number).name, "time_usec", "time", "us")) for number in (RAW, FIELD)
+}
+DELAY_FIELDS = [
+    MessageField(FieldMap("MAG_RAW", f"delay_{axis}", name, "us"))
+    for axis, name in zip("xyz", CHANNEL_TIMES, strict=True)
+]
+NAMED_FIELD = MessageField(FieldMap("NAMED_VALUE_FLOAT", "value", "value", "1"))
+NAME_LETTERS = spec(NAMED).fields["name"]
+RAW_FLAGS = MessageField(FieldMap("MAG_RAW", "flags", "flags", ""))
+WANTED = [*TELEMETRY, *SOURCE_FIELDS, NAMED, COLUMN, STEP, START, BYTES, SET, VALUE]
+"""Ids of the messages that are read, with those in which a log declares a column: at its start."""
+
+
+def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
+    """Return the columns (n,) of the rows that messages of one id make; those of a bridge have ``time``."""
+    columns = {one.column: one.values(payloads) for one in SOURCE_FIELDS[number]}
+    if number not in SENSOR_IDS:
+        return columns
+    time_us = STAMP_FIELDS[number].values(payloads)
+    columns["time"] = time_us / 1e6
+    if number == RAW:
+        delays_us = [field.values(payloads) for field in DELAY_FIELDS]
+        in_turn = np.any(delays_us, axis=0)
+        for one, delay_us in zip(DELAY_FIELDS, delays_us, strict=True):
+            columns[one.column] = np.where(in_turn, (time_us + delay_us) / 1e6, np.nan)
+        counted = RAW_FLAGS.values(payloads).astype(np.int64) & POWER_CYCLE
+        columns["power_cycle"] = np.where(counted > 0, columns["power_cycle"], np.nan)
+    return columns
+
+
+class Messages(NamedTuple):
+    """Messages of one kind in the order of the log; the arrays are (n,)."""
+
+    number: int
+    at: IndexArray
+    """Place among the records of the log."""
+    time_us: IndexArray
+    """Time stamp of the record."""
+    channel: IndexArray
+    """:class:`~magbridge.records.Channel`, in a bridge's own log."""
+    system: IndexArray
+    component: IndexArray
+    payloads: Payloads
+
+    def where(self, keep: BoolArray) -> Messages:
+        """Return the messages of a mask (n,)."""
+        arrays: list[Any] = [array[keep] for array in self[1:]]
+        return Messages(self.number, *arrays)
+
+    @property
+    def is_of_main_sensor(self) -> BoolArray:
+        """Return which messages (n,) are not samples of a sensor after the first."""
+        if self.number not in SENSOR_IDS:
+            return np.ones(len(self.at), bool)
+        return np.asarray(self.payloads[:, SENSOR_IDS[self.number]] == 0)
+
+    def senders(self) -> dict[tuple[int, int], int]:
+        """Return the number of messages of each system and component."""
+        codes, counts = np.unique(self.system << 8 | self.component, return_counts=True)
+        return {divmod(code, 256): n for code, n in zip(codes.tolist(), counts.tolist(), strict=True)}
+
+    def decoded(self) -> list[dict[str, Any]]:
+        """Return the fields of each message by name."""
+        fields = spec(self.number).fields
+        return [{name: one.get(row.tobytes()) for name, one in fields.items()} for row in self.payloads]
+
+
+Kinds = dict[int, Messages]
+"""Messages by their id."""
+Update = tuple[Messages, FloatArray]
+"""Messages (n), and the values (n,) of a column in them."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces; it is read twice."""
-    status = path.stat()
-    found = survey(path, status.st_mtime_ns, status.st_size)
+    """Yield the log in pieces of at most `rows` rows."""
+    log = TelemetryLog(path)
     wanted = options.compass if options else None
-    compasses: list[LogCompass] = []
-    if found.plain and found.compasses:
-        compasses = choose(path, found.compasses, wanted)
-        found = found.of_compass(next(one for one in compasses if one.chosen).id)
-    attrs, first_attrs = dict(found.attrs), {}
+    compasses = log.compasses() if log.is_plain else []
+    attrs: dict[str, Any] = {**log.attrs, **log.lost}
+    notes = log.notes
     if compasses:
-        span_s = found.span_s
-        timed = [replace(one, rate=(one.samples - 1) / span_s if span_s > 0 else 0.0) for one in compasses]
-        attrs |= listed(timed)
-        first_attrs = {NOTES: "\n".join([*noted(found.attrs), *compass_notes(timed, wanted)])}
-    elif NOTES in attrs:
-        first_attrs = {NOTES: attrs[NOTES]}
-    attrs.pop(NOTES, None)
-    for piece in _pieces(path, found, rows, attrs):
-        part = piece.assign_attrs(first_attrs)
-        yield part if found.plain else by_columns(part, wanted)
-        first_attrs = {}
+        found = choose(path, compasses, wanted)
+        log.source = next(one for one in found if one.chosen).id
+        found = log.with_rates(found)
+        attrs |= listed(found)
+        notes = [*notes, *compass_notes(found, wanted)]
+    if notes:
+        attrs[NOTES] = "\n".join(notes)
+    whole = deployment(path, *log.table(), attrs=attrs)
+    yield from sliced(whole if log.is_plain else by_columns(whole, wanted), rows)
 
 
-def _pieces(path: Path, found: LogContents, rows: int, attrs: dict[str, Any]) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows, each with the losses since the piece before."""
-    table = TelemetryTable(found)
+def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
+    """Return the messages of a log that are read, and what was skipped."""
+    parts: dict[int, list[Messages]] = {}
     lost = {"bytes_skipped": 0, "damages": 0}
+    wanted, before = {*WANTED}, 0
     with path.open("rb") as file:
         for block in blocks(file):
-            table.add(block)
             lost["bytes_skipped"] += block.bytes_skipped
             lost["damages"] += block.damages
-            while table.rows > rows:  # the last row still waits for its correction
-                yield _deployment(path, found, table.pop(rows), attrs | lost)
-                lost = dict.fromkeys(lost, 0)
-    if table.rows:
-        yield _deployment(path, found, table.pop(table.rows), attrs | lost)
+            for k in np.flatnonzero(block.number == COLUMN).tolist():
+                with suppress(KeyError):
+                    wanted.add(spec(block.message(k)["message"]).id)
+            for number in np.intersect1d(block.number, [*wanted]).tolist():
+                at = np.flatnonzero(block.number == number)
+                sender = block.system[at], block.component[at]
+                part = Messages(
+                    number, before + at, block.time_us[at], block.channel[at], *sender, block.payloads(at)
+                )
+                parts.setdefault(number, []).append(part)
+            before += len(block.number)
+    return {number: _joined(found) for number, found in parts.items()}, lost
 
 
-def _deployment(
-    path: Path, found: LogContents, columns: dict[str, FloatArray], attrs: dict[str, Any]
-) -> xr.Dataset:
-    time = columns.pop("time")
-    _bring_to_rows(time, columns, [one.column for one in _of_other_sensors(found)])
-    if "heading" in columns:
-        columns["heading"] %= 360.0
-    units = {name: found.columns.get(name, "") for name in columns}
-    return deployment(path, time, columns, units, attrs)
+def _joined(parts: Sequence[Messages]) -> Messages:
+    arrays = zip(*(part[1:] for part in parts), strict=True)
+    return Messages(parts[0].number, *map(np.concatenate, arrays))
 
 
-def _of_other_sensors(found: LogContents) -> list[DeclaredField]:
-    """Return the columns of the sensors after the first, which are in the source's messages."""
-    source = spec(found.source).id
-    return [one for one in found.declared if one.message == source and SENSOR_ID in one.match]
+class TelemetryLog:
+    """The messages of a log, and the source of each column.
+
+    `source` is the message that makes the rows, `ours` a bridge's own log, `attrs` what the log declares,
+    `lost` what was skipped.
+    """
+
+    def __init__(self, path: Path) -> None:
+        kinds, self.lost = _messages(path)
+        self.attrs: dict[str, Any] = {}
+        self.notes: list[str] = []
+        self.ours = bool(kinds.keys() & {START, BYTES})
+        if self.ours:  # the bridge's own messages are not telemetry
+            self._count_settings(kinds)
+            kinds = {
+                number: one if number in (RAW, FIELD) else one.where(one.channel != Channel.SENT)
+                for number, one in kinds.items()
+            }
+        declared = self._declarations(kinds.get(COLUMN))
+        steps = kinds.get(STEP)
+        self._steps_at = steps.at if steps else np.empty(0, np.intp)
+        self._steps_us = np.cumsum([0, *(one["step"] for one in steps.decoded())] if steps else [0])
+        self.source, (system, self._component) = self._source_of(path, kinds)
+        mine = {number: one.where(one.system == system) for number, one in kinds.items()}
+        self._kinds = {number: one for number, one in mine.items() if len(one.at)}
+        is_of_bridge = self.source in ("MAG_RAW", "MAG_FIELD")
+        self.is_plain = not (is_of_bridge or self.ours or declared or self._steps_us[-1])
+        self._updates: dict[str, list[Update]] = {}
+        self._units = self._telemetry({one.column for one in declared})
+        self._units |= self._columns_of_bridge()
+        self._declared = [one for one in declared if not one.is_named_value]
+        self._add_declared(declared)
+        self._add_named([one for one in declared if one.is_named_value])
+
+    def _source_of(self, path: Path, kinds: Kinds) -> tuple[str, tuple[int, int]]:
+        """Return the message that makes the rows, and its most frequent sender."""
+        for source in SOURCES:
+            messages = kinds.get(spec(source).id)
+            # the autopilot's compass does not replace the instrument
+            if messages and len(messages.at) and not (self.ours and "IMU" in source):
+                senders = messages.senders()
+                return source, max(senders, key=senders.__getitem__)
+        raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
+
+    def _count_settings(self, kinds: Kinds) -> None:
+        """Count how often a station has set what the alignment computes with; the bridge confirms it."""
+        asked: dict[str, float] = {}
+        both = [kinds[number] for number in (SET, VALUE) if number in kinds]
+        stated = [
+            (at, one.number, channel, fields["param_id"], fields["param_value"])
+            for one in both
+            for at, channel, fields in zip(one.at.tolist(), one.channel.tolist(), one.decoded(), strict=True)
+        ]
+        for _, number, channel, name, value in sorted(stated):
+            if number == SET:
+                asked[name] = value
+            elif channel == Channel.SENT and asked.pop(name, None) == value:
+                # MB_R_ are rates of messages
+                aligns = name.startswith("MB_") and not name.startswith("MB_R_")
+                self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
+
+    def _declarations(self, messages: Messages | None) -> list[DeclaredField]:
+        """Return the columns that the log declares; its attributes are kept."""
+        found: dict[str, DeclaredField] = {}
+        for one in messages.decoded() if messages else ():
+            if not one["message"]:
+                self.attrs[one["column"]] = one["unit"] or one["scale"]
+                continue
+            with suppress(KeyError, ValueError):  # of a dialect that we do not know
+                found[one["column"]] = DeclaredField(one)
+        return [*found.values()]
+
+    def compasses(self) -> list[LogCompass]:
+        """Return the compasses whose field messages of the sender hold: ``RAW_IMU`` has the first."""
+        found = {}
+        for message, number in COMPASS_NUMBERS.items():
+            if number not in found and (n := len(self._samples(message).at)):
+                found[number] = LogCompass(number, n, 0.0, message)
+        return [found[number] for number in sorted(found)]
+
+    def with_rates(self, compasses: Sequence[LogCompass]) -> list[LogCompass]:
+        """Return the compasses with their mean rates over the time of the rows."""
+        time_us = self._samples(self.source).time_us
+        span_s = float(time_us[-1] - time_us[0]) / 1e6
+        return [replace(one, rate=(one.samples - 1) / span_s if span_s > 0 else 0.0) for one in compasses]
+
+    def _samples(self, message: str) -> Messages:
+        """Return the messages of one kind from the component that sends the rows."""
+        found = self._kinds.get(spec(message).id)
+        if found is None:
+            nothing = np.empty(0, np.int64)
+            arrays: list[Any] = [*[nothing] * 5, np.empty((0, spec(message).size), np.uint8)]
+            return Messages(spec(message).id, *arrays)
+        return found.where(found.component == self._component)
+
+    def _telemetry(self, declared: set[str]) -> dict[str, str]:
+        """Add the values of :data:`TELEMETRY`; return the units of the columns that have one.
+
+        Each message is taken from one component: the sender of the rows or the autopilot where they send it,
+        and hardly a gimbal.
+        """
+        units: dict[str, str] = {}
+        read = []
+        for number, fields in TELEMETRY.items():
+            if (messages := self._kinds.get(number)) is None:
+                continue
+            counts = {component: n for (_, component), n in messages.senders().items()}
+            ranks = {
+                one: (one == self._component, one == AUTOPILOT, one not in GIMBALS, n)
+                for one, n in counts.items()
+            }
+            messages = messages.where(messages.component == max(ranks, key=ranks.__getitem__))
+            for field in fields:
+                values = field.values(messages.payloads)
+                read.append((field.column, messages, values))
+                if not np.isnan(values).all():
+                    units.setdefault(field.column, field.unit)
+        for column, messages, values in read:
+            if column in units and column not in declared:
+                self._updates.setdefault(column, []).append((messages, values))
+        return units
+
+    def _columns_of_bridge(self) -> dict[str, str]:
+        """Return the units of the columns of a bridge's messages that have a value."""
+        units: dict[str, str] = {}
+        if (raw := self._kinds.get(RAW)) is not None:
+            columns = source_columns(RAW, raw.payloads[raw.is_of_main_sensor])
+            possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
+            there = [name for name in possible if not np.isnan(columns[name]).all()]
+            there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
+            units |= {name: RAW_COLUMNS.get(name, "") for name in there}
+        if (field := self._kinds.get(FIELD)) is not None and field.is_of_main_sensor.any():
+            units |= dict.fromkeys(CORRECTED, "")
+        return units
+
+    def _add_declared(self, declared: Sequence[DeclaredField]) -> None:
+        """Add the columns that the log declares, with the ages of their values in a bridge's own log."""
+        source = spec(self.source).id
+        for one in declared:
+            self._units[one.column] = one.unit
+            if self.ours and one.message not in (RAW, FIELD):
+                self._units[AGE + one.column] = "s"
+            messages = self._kinds.get(one.message)
+            if one.is_named_value or one.message == source or messages is None:
+                continue
+            messages = messages.where(one.matches(messages.payloads))
+            self._add_admitted(one.column, one.component, messages, one.values(messages.payloads))
+
+    def _add_admitted(
+        self, column: str, component: int | None, messages: Messages, values: FloatArray
+    ) -> None:
+        """Add the values (n,) of a column: of several components that send it one counts, as live."""
+        max_age_s = self.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)
+        source = Source(AUTOPILOT, round(1e6 * max_age_s), component)
+        senders = zip(messages.component.tolist(), messages.time_us.tolist(), strict=True)
+        admitted = np.array([source.admit(one, time_us) for one, time_us in senders], bool)
+        self._updates.setdefault(column, []).append((messages.where(admitted), values[admitted]))
+
+    def _add_named(self, declared: Sequence[DeclaredField]) -> None:
+        """Add each ``NAMED_VALUE_FLOAT`` as the columns that the log declares, else by its name."""
+        if (named := self._kinds.get(NAMED)) is None:
+            return
+        start = NAME_LETTERS.offset
+        letters = named.payloads[:, start : start + NAME_LETTERS.struct.size]
+        for row in np.unique(letters, axis=0):
+            name = NAME_LETTERS.get(bytes(start) + row.tobytes())
+            messages = named.where((letters == row).all(axis=1))
+            values = NAMED_FIELD.values(messages.payloads)
+            fields = [one for one in declared if one.match["name"] == name]
+            for one in fields:
+                self._add_admitted(one.column, one.component, messages, values * one.factor + one.offset)
+            if fields:
+                continue
+            own = f"named_{name}" if name in self._units or name in RESERVED_COLUMNS else name
+            if own != name:
+                why = f"the log has a {name} of its own"
+                self.notes.append(f"NAMED_VALUE_FLOAT {name!r} is read as {own}: {why}")
+            self._units.setdefault(own, "1")
+            if not self.is_plain:
+                self._add_admitted(own, None, messages, values)
+                continue
+            counts = {component: n for (_, component), n in messages.senders().items()}
+            speaker = AUTOPILOT if AUTOPILOT in counts else max(counts, key=counts.__getitem__)
+            here = messages.component == speaker
+            self._updates.setdefault(own, []).append((messages.where(here), values[here]))
+
+    def table(self) -> tuple[FloatArray, dict[str, FloatArray], dict[str, str]]:
+        """Return the times (n,), s, the columns (n,), and their units."""
+        samples = self._samples(self.source)
+        main = samples.is_of_main_sensor
+        rows = samples.where(main)
+        others = self._add_readings(samples.where(~main))
+        raw = {one.column for one in TELEMETRY.get(rows.number, []) if one.column.startswith("mag")}
+        own = [f"mag_{axis}" for axis in "xyz" if "IMU" in self.source]
+        columns = {name: np.full(len(rows.at), np.nan) for name in (*own, *self._units) if name not in raw}
+        for name, updates in self._updates.items():
+            if name in columns:
+                columns[name], age_s = _carried(rows, updates)
+                if self.ours and AGE + name in columns:
+                    columns[AGE + name] = age_s
+        time = self._fill(rows, columns)
+        self._correct(rows, columns)
+        _bring_to_rows(time, columns, others)
+        if "heading" in columns:
+            columns["heading"] %= 360.0
+        return time, columns, {name: self._units.get(name, "") for name in columns}
+
+    def _to_step_us(self, at: IndexArray) -> IndexArray:
+        """Return by how much the clock was set after each place (n,), µs."""
+        passed = self._steps_us[np.searchsorted(self._steps_at, at, side="right")]
+        return np.asarray(self._steps_us[-1] - passed)
+
+    def _add_readings(self, samples: Messages) -> list[str]:
+        """Add the readings of the sensors after the first; return the names of their columns."""
+        of_others = [
+            one for one in self._declared if one.message == samples.number and SENSOR_ID in one.match
+        ]
+        for one in of_others:
+            messages = samples.where(one.matches(samples.payloads))
+            values = one.values(messages.payloads)
+            if one.column.endswith(OTHER_TIME):
+                values = values + self._to_step_us(messages.at) / 1e6
+            self._updates.setdefault(one.column, []).append((messages, values))
+        return [one.column for one in of_others]
+
+    def _fill(self, rows: Messages, columns: dict[str, FloatArray]) -> FloatArray:
+        """Set the columns (n,) that the rows' own messages hold, in place; return the times (n,), s."""
+        found = source_columns(rows.number, rows.payloads)
+        for one in self._declared:
+            if one.message == rows.number and SENSOR_ID not in one.match and one.column in found:
+                exact, single = one.values(rows.payloads), found[one.column]
+                same = np.isclose(exact, single, rtol=SINGLE, atol=0.0) & one.matches(rows.payloads)
+                found[one.column] = np.where(same, exact, single)
+        to_step_us = self._to_step_us(rows.at)
+        if "time" not in found:
+            found["time"] = (rows.time_us + self._steps_us[-1] - to_step_us) / 1e6
+        for name in ("time", *CHANNEL_TIMES):
+            if name in found:
+                moved = (np.rint(1e6 * found[name]) + to_step_us) / 1e6
+                found[name] = np.where(to_step_us != 0, moved, found[name])
+        for name, values in found.items():
+            if name in columns:
+                columns[name] = np.where(np.isnan(values), columns[name], values)
+        return found["time"]
+
+    def _correct(self, rows: Messages, columns: dict[str, FloatArray]) -> None:
+        """Add each ``MAG_FIELD`` to the row before it, that of its reading, unless that has one already."""
+        if (found := self._kinds.get(FIELD)) is None:
+            return
+        found = found.where(found.is_of_main_sensor & ~np.isin(found.at, rows.at))
+        row = np.searchsorted(rows.at, found.at, side="right") - 1
+        values = source_columns(FIELD, found.payloads)
+        is_free = (row >= 0) & np.isnan(columns["total_field"][row]) if len(rows.at) else np.zeros(0, bool)
+        # of several, the first with a total field counts: it is written last
+        has_total = ~np.isnan(values["total_field"])
+        order = np.concatenate(
+            [np.flatnonzero(is_free & ~has_total), np.flatnonzero(is_free & has_total)[::-1]]
+        )
+        for name in CORRECTED:
+            columns[name][row[order]] = values[name][order]
 
 
-def _bring_to_rows(time: FloatArray, columns: dict[str, FloatArray], names: list[str]) -> None:
-    """Interpolate the readings of the sensors after the first to the rows' times (s)."""
+def _carried(rows: Messages, updates: Sequence[Update]) -> tuple[FloatArray, FloatArray]:
+    """Return the last value of a column at or before each row (n,), and its age, s (n,); NaN once too old."""
+    at = np.concatenate([messages.at for messages, _ in updates])
+    if not len(at):
+        return np.full(len(rows.at), np.nan), np.full(len(rows.at), np.nan)
+    order = np.argsort(at, kind="stable")  # two messages may hold one column
+    values = np.concatenate([values for _, values in updates])[order]
+    time_us = np.concatenate([messages.time_us for messages, _ in updates])[order]
+    k = np.searchsorted(at[order], rows.at, side="right") - 1
+    age_us = rows.time_us - time_us[k]
+    fresh = (k >= 0) & (age_us <= MAX_TELEMETRY_AGE_US)
+    return np.where(fresh, values[k], np.nan), np.where(fresh, age_us * 1e-6, np.nan)
+
+
+def _bring_to_rows(time: FloatArray, columns: dict[str, FloatArray], names: Sequence[str]) -> None:
+    """Interpolate the readings of the sensors after the first to the rows' times (n,), s, in place."""
     for time_name in [name for name in names if name.endswith(OTHER_TIME)]:
         sampled, sensor = columns.pop(time_name), time_name.removesuffix(OTHER_TIME)
         times, first = np.unique(sampled[np.isfinite(sampled)], return_index=True)
@@ -134,200 +542,3 @@ def _bring_to_rows(time: FloatArray, columns: dict[str, FloatArray], names: list
                 values = columns[name][np.isfinite(sampled)][first]
                 rows = np.interp(time, times, values, left=np.nan)
                 columns[name] = np.where(np.isfinite(columns[name]), rows, np.nan)
-
-
-class TelemetryTable:
-    """The rows of a log, block by block; the last value of each column is carried to the next block.
-
-    `rows` counts those that are complete, or wait for their correction.
-    """
-
-    def __init__(self, found: LogContents) -> None:
-        self.rows = 0
-        self._found = found
-        self._source = spec(found.source).id
-        raw = {one.column for one in TELEMETRY.get(self._source, []) if one.column.startswith("mag")}
-        own = [f"mag_{axis}" for axis in "xyz" if "IMU" in found.source]
-        names = ["time", *own, *(name for name in found.columns if name not in raw)]
-        self._place = {name: k for k, name in enumerate(names)}
-        declared = {column for columns in found.named.values() for column, _, _ in columns}
-        declared |= {one.column for one in found.declared}
-        self._tables = {
-            number: [one for one in fields if one.column in self._place and one.column not in declared]
-            for number, fields in TELEMETRY.items()
-        }
-        self._further = _of_other_sensors(found)
-        in_source = [one for one in found.declared if one.message == self._source]
-        self._exact = [one for one in in_source if SENSOR_ID not in one.match]
-        self._elsewhere = [one for one in found.declared if one.message != self._source]
-        self._sources: dict[str, Source] = {}
-        for column, component in found.wanted.items():
-            max_age_s = found.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)
-            # as live: of several components that send a value, one counts
-            self._sources[column] = Source(AUTOPILOT, round(1e6 * max_age_s), component)
-        self._to_step_us = found.stepped_us
-        self._last: dict[str, tuple[int, float]] = {}
-        self._parts: list[FloatArray] = []
-
-    def add(self, block: RecordBlock) -> None:
-        """Add the rows of the next block."""
-        found = self._found
-        is_step = block.number == STEP
-        steps_us = [block.message(k)["step"] for k in np.flatnonzero(is_step).tolist()]
-        passed_us = np.concatenate([[0], np.cumsum(steps_us, dtype=np.int64)])[np.cumsum(is_step)]
-        to_step_us = self._to_step_us - passed_us
-        sent = block.system == found.system
-        received = sent if not found.ours else sent & (block.channel != Channel.SENT)
-        samples = np.flatnonzero(sent & (block.number == self._source) & (block.component == found.component))
-        main = _of_main_sensor(block, samples)
-        rows = samples[main]
-        updates = self._updates(block, received)
-        for name, update in self._readings(block, samples[~main], to_step_us):
-            updates.setdefault(name, []).append(update)
-        table = self._carried(block.time_us, rows, updates)
-        if len(rows):
-            self._fill(block, rows, to_step_us[rows], table)
-            self._parts.append(table)
-            self.rows += len(rows)
-        corrections = np.flatnonzero(sent & (block.number == FIELD))
-        corrections = np.setdiff1d(corrections[_of_main_sensor(block, corrections)], rows)
-        if len(corrections) and self._parts:
-            self._correct(rows, corrections, source_columns(FIELD, block.payloads(corrections)))
-        self._to_step_us = int(to_step_us[-1]) if len(to_step_us) else self._to_step_us
-
-    def pop(self, count: int) -> dict[str, FloatArray]:
-        """Return the columns of the first rows, and forget these."""
-        table = np.concatenate(self._parts)
-        self._parts = [table[count:].copy()] if count < len(table) else []
-        self.rows = len(table) - count
-        return {name: table[:count, k].copy() for name, k in self._place.items()}
-
-    def _updates(self, block: RecordBlock, received: BoolArray) -> dict[str, list[Updates]]:
-        """Return the telemetry in a block by column, from the component that each column is taken from."""
-        found: dict[str, list[Updates]] = {}
-        for number, component in self._found.senders.items():
-            which = np.flatnonzero(received & (block.number == number) & (block.component == component))
-            if len(which) and self._tables[number]:
-                payloads = block.payloads(which)
-                for one in self._tables[number]:
-                    found.setdefault(one.column, []).append((which, one.values(payloads)))
-        for declared in self._elsewhere:
-            which = np.flatnonzero(received & (block.number == declared.message))
-            if len(which):
-                payloads = block.payloads(which)
-                here = declared.matches(payloads)
-                which, values = which[here], declared.values(payloads[here])
-                admitted = self._admitted(declared.column, block, which)
-                found.setdefault(declared.column, []).append((which[admitted], values[admitted]))
-        which = np.flatnonzero(received & (block.number == NAMED.id))
-        if len(which):
-            self._add_named(found, block, which)
-        return found
-
-    def _add_named(self, found: dict[str, list[Updates]], block: RecordBlock, records: IndexArray) -> None:
-        """Add the values of ``NAMED_VALUE_FLOAT`` by their names."""
-        payloads = block.payloads(records)
-        start = NAMED.fields["value"].offset
-        values = payloads[:, start : start + 4].copy().view("<f4")[:, 0].astype(np.float64)
-        letters = payloads[:, NAMED.fields["name"].offset :]
-        for name, columns in self._found.named.items():
-            here = np.flatnonzero((letters == np.frombuffer(name, np.uint8)).all(axis=1))
-            if self._found.plain:
-                here = here[block.component[records[here]] == self._found.speakers.get(name, -1)]
-            for column, factor, offset in columns:
-                places = here
-                if not self._found.plain:
-                    places = here[self._admitted(column, block, records[here])]
-                update = records[places], values[places] * factor + offset
-                found.setdefault(column, []).append(update)
-
-    def _admitted(self, column: str, block: RecordBlock, records: IndexArray) -> BoolArray:
-        """Return which messages are from the component that a column is taken from at their time."""
-        source = self._sources[column]
-        senders = zip(block.component[records].tolist(), block.time_us[records].tolist(), strict=True)
-        return np.array([source.admit(component, time_us) for component, time_us in senders], bool)
-
-    def _readings(
-        self, block: RecordBlock, samples: IndexArray, to_step_us: IndexArray
-    ) -> Iterator[tuple[str, Updates]]:
-        """Yield the readings of the sensors after the first by column, with the times at which they are."""
-        if not len(samples):
-            return
-        payloads = block.payloads(samples)
-        for one in self._further:
-            here = one.matches(payloads)
-            values = one.values(payloads[here])
-            if one.column.endswith(OTHER_TIME):
-                values = values + to_step_us[samples[here]] / 1e6
-            yield one.column, (samples[here], values)
-
-    def _carried(
-        self, time_us: IndexArray, rows: IndexArray, updates: dict[str, list[Updates]]
-    ) -> FloatArray:
-        """Return the rows with the last value of each column before them; NaN for older ones."""
-        table = np.full((len(rows), len(self._place)), np.nan)
-        for name in {**self._last, **updates}:
-            parts = updates.get(name, [])
-            before = [self._last[name]] if name in self._last else []
-            at = np.concatenate([np.full(len(before), -1), *(places for places, _ in parts)])
-            values = np.concatenate([[value for _, value in before], *(values for _, values in parts)])
-            order = np.argsort(at, kind="stable")  # two messages may hold one column
-            at, values = at[order], values[order]
-            if not len(at):
-                continue
-            when = np.where(at >= 0, time_us[np.maximum(at, 0)] if len(time_us) else 0, 0)
-            when[at < 0] = [stamp_us for stamp_us, _ in before]
-            self._last[name] = int(when[-1]), float(values[-1])
-            k = np.searchsorted(at, rows, side="right") - 1
-            age_us = time_us[rows] - when[k]
-            fresh = (k >= 0) & (age_us <= MAX_TELEMETRY_AGE_US)
-            table[:, self._place[name]] = np.where(fresh, values[k], np.nan)
-            if self._found.ours and AGE + name in self._place:
-                table[:, self._place[AGE + name]] = np.where(fresh, age_us * 1e-6, np.nan)
-        return table
-
-    def _fill(self, block: RecordBlock, rows: IndexArray, to_step_us: IndexArray, table: FloatArray) -> None:
-        """Set the columns of rows that their own messages hold."""
-        payloads = block.payloads(rows)
-        columns = source_columns(self._source, payloads)
-        for one in self._exact:
-            if one.column in columns:
-                exact, single = one.values(payloads), columns[one.column]
-                same = np.isclose(exact, single, rtol=SINGLE, atol=0.0) & one.matches(payloads)
-                columns[one.column] = np.where(same, exact, single)
-        if "time" not in columns:
-            columns["time"] = (block.time_us[rows] + self._found.stepped_us - to_step_us) / 1e6
-        for name in ("time", *CHANNEL_TIMES):
-            if name in columns:
-                moved = (np.rint(1e6 * columns[name]) + to_step_us) / 1e6
-                columns[name] = np.where(to_step_us != 0, moved, columns[name])
-        for name, values in columns.items():
-            if name in self._place:
-                k = self._place[name]
-                table[:, k] = np.where(np.isnan(values), table[:, k], values)
-
-    def _correct(self, rows: IndexArray, corrections: IndexArray, columns: dict[str, FloatArray]) -> None:
-        """Add each ``MAG_FIELD`` to the row before it, that of its reading, unless that has one already."""
-        places = [self._place[name] for name in CORRECTED]
-        values = np.column_stack([columns[name] for name in CORRECTED])
-        # a correction before the first row of the block is that of the last row before the block
-        table = self._parts[-1]
-        row = np.searchsorted(rows, corrections, side="right") - 1
-        if len(rows):
-            earlier = self._parts[-2][-1:] if len(self._parts) > 1 else table[:0]
-        else:
-            earlier, row = table[-1:], np.full(len(corrections), -1)
-        # of several, the first with a total field counts: it is written last
-        has_total = ~np.isnan(values[:, 0])
-        order = np.concatenate([np.flatnonzero(~has_total), np.flatnonzero(has_total)[::-1]])
-        for part, of_part in ((earlier, row < 0), (table, row >= 0)):
-            which = order[of_part[order]] if len(part) else order[:0]
-            which = which[np.isnan(part[np.maximum(row[which], 0), places[0]])]
-            part[np.maximum(row[which], 0)[:, None], places] = values[which]
-
-
-def _of_main_sensor(block: RecordBlock, samples: IndexArray) -> BoolArray:
-    """Return which messages of one kind are not samples of a sensor after the first."""
-    if not len(samples):
-        return np.ones(0, bool)
-    return are_of_main_sensor(int(block.number[samples[0]]), block.payloads(samples))

@@ -22,12 +22,12 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.logs.deployment import lasting
-from magbridge.logs.telemetry_survey import POWER_CYCLE, UNKNOWN_INT
 from magbridge.mavlink import Codec, Spec, pack_record, spec
+from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import east_e7
 from magbridge.records import Channel, Quality
 
-__all__ = ["FileWriter", "short_name"]
+__all__ = ["POWER_CYCLE", "FileWriter", "short_name"]
 
 VEHICLE, AUTOPILOT, BRIDGE = 1, 1, 191
 ATTITUDE = ("roll", "pitch", "heading")
@@ -39,6 +39,9 @@ ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
 )
 UNKNOWN_HEADING = 0xFFFF
+UNKNOWN_INT = 0x7FFFFFFF
+POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
+"""Flag of MAG_RAW: its power cycle is counted."""
 NAMED_VALUE = {"message": "NAMED_VALUE_FLOAT", "field": "value", "scale": 1.0, "offset": 0.0}
 
 Row = dict[str, float]
