@@ -63,9 +63,8 @@ OUTAGE_SPEED_FRACTION = 0.1
 """1-sigma of the velocity error after an outage, as a fraction of the speed."""
 MIN_FROZEN_M = 10.0
 """Distance that the vehicle must have moved until a constant position is frozen, m."""
-FIELD_STEP = 0.1
-"""Correlation lengths of the map between two measurements of the field that are compared: between closer ones
-an unrelated smooth field predicts as well as the map."""
+UNSEEN_FRACTION = 0.1
+"""Error of positions, in correlation lengths of the map, that the field shows only after it has lasted."""
 MAX_GNSS_AGE_US = 10_000_000
 """µs for which a position, or a report of the receiver's, holds."""
 CORRELATION_TIME_S = 30.0
@@ -138,7 +137,8 @@ class _Position(NamedTuple):
 class GnssMonitor:
     """Tests GNSS positions, in order of time; `state` and, where they are not used, the `reason`.
 
-    `deviation` and `drift` are the last position's distance from the navigator's, m, and its mean over 20 s.
+    `deviation` and `drift` are the last position's distance from the navigator's, m, and its mean over 20 s;
+    `evidence` compares the field with the map at its position.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -156,12 +156,12 @@ class GnssMonitor:
         self._mean = np.zeros(2)
         self._reported = GnssReason.NONE
         self._reported_us = -MAX_GNSS_AGE_US
-        self._field = _FieldTest(grid, options)
+        self.evidence = _FieldTest(grid, options)
 
     @property
     def possible_error(self) -> float:
         """Error that positions may have had while they were still used, m."""
-        unseen = FIELD_STEP * self._grid.correlation_length if self.reason is GnssReason.FIELD else 0.0
+        unseen = UNSEEN_FRACTION * self._grid.correlation_length if self.reason is GnssReason.FIELD else 0.0
         return hypot(self.drift, unseen)
 
     def receive_integrity(self, time_us: int, jamming: int, spoofing: int) -> None:
@@ -211,7 +211,7 @@ class GnssMonitor:
         # that fails: the receiver's report, a frozen position, a jump, the deviation, the field.
         jumped = self._jumps(time_us, offset_m, sigma, prediction)
         frozen = self._frozen(place, sigma, prediction.travelled)
-        self._field.move(time_us, offset_m, sigma, restart=jumped)
+        self.evidence.move(time_us, offset_m, sigma, restart=jumped)
         away = np.array(offset_m) - prediction.position
         self.deviation = hypot(*away.tolist())
         agrees = self._agrees(away, sigma, prediction)
@@ -240,7 +240,7 @@ class GnssMonitor:
 
         It is one `step` after the previous one, with a log-likelihood by the navigator's filter.
         """
-        self._field.update(block, step, filter_likelihood)
+        self.evidence.update(block, step, filter_likelihood)
 
     # ---- single tests --------------------------------------------------------------------------------
 
@@ -323,12 +323,13 @@ class GnssMonitor:
             self._set(GnssState.REJECTED, GnssReason.POSITION, time_us)
         elif drifts:
             self._set(GnssState.REJECTED, GnssReason.DRIFT, time_us)
-        elif self._field.contradicts or (lost and self._field.log_odds_of_map < 0.0):
+        elif self.evidence.contradicts or (lost and self.evidence.log_odds_of_map < 0.0):
             self._set(GnssState.SUSPECT, GnssReason.FIELD, time_us)
 
     def _set(self, state: GnssState, reason: GnssReason, time_us: int) -> None:
         if self.state is GnssState.GOOD:
             self._since_us, self._count = time_us, 0
+            self.evidence.begin_comparison()
             self._trusted = self._trusted or self._history[0]
         self.state, self.reason = state, reason
 
@@ -338,87 +339,119 @@ class GnssMonitor:
         # Positions return only after they have agreed with each other for a while.
         if held_us < HOLD_US or self._count < MIN_POSITIONS:
             return False
-        field = self._field
-        # The field decides first; where it cannot, agreement with the navigator; else time alone.
-        if field.confirms or (field.favours and not prediction.lost):
+        # The field decides first: it has to describe the position better than the navigator's.
+        field = self.evidence
+        if field.favours and field.log_odds_of_map > 0.0:
             return True
-        if field.contradicts or self.reason is GnssReason.FIELD:
-            return False
+        if field.contradicts or field.disfavours or self.reason is GnssReason.FIELD:
+            return field.confirms and self.reason is GnssReason.FIELD
+        # Then the motion since, against dead reckoning; a carry-off goes on while it is held back.
         if self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US:
             return False
+        if field.confirms:
+            return True
         # a lost navigator has no position to compare with
         if prediction.lost:
             return held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
-        undecided = not prediction.informed and field.log_odds_of_position > -0.5 * field.limit
-        return agrees or (self._chained and undecided and held_us >= LONG_HOLD_US)
+        return agrees or (self._chained and not prediction.informed and held_us >= LONG_HOLD_US)
 
 
 class _FieldTest:
-    """Compares the field with the map at the GNSS position, with an unrelated field, and with the navigator.
+    """Log odds of the receiver's position by the field, each within ± `limit` (``options.alarm_odds``).
 
-    Each difference of log-likelihoods is summed, within ± `limit`, the logarithm of ``options.alarm_odds``:
-    `log_odds_of_map` is for the map at the position against a field unrelated to it, `log_odds_of_position`
-    for the map at the position against the map at the navigator's.
+    `log_odds_of_map` is against a field unrelated to the map, `log_odds_of_position` against the navigator.
+
+    Notes
+    -----
+    Both are sums of log-likelihood ratios ``log p(y_k | y_1 .. y_k-1, H1) - log p(y_k | y_1 .. y_k-1, H0)``.
+    Under H1 the vehicle is at the receiver's position; the position error is Gauss-Markov with the receiver's
+    sigma and :data:`CORRELATION_TIME_S`, so that the field's information on it lasts that long. Calibration
+    bias and map error are free states, as in the navigator. Under H0 the vehicle is where the navigator is,
+    which has not used the positions. Both predict each measurement from all earlier ones. The first is not
+    counted: it determines the level under H1.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.limit = log(options.alarm_odds)
+        self._grid, self._options = grid, any_level(options, grid)
+        self._time_us = -MAX_GNSS_AGE_US
+        self._restart()
+
+    def _restart(self) -> None:
         self.log_odds_of_map = self.log_odds_of_position = 0.0
         self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)
-        self._grid, self._options = grid, any_level(options, grid)
-        self._unmapped = Unmapped(grid, self._options)
-        self._tracker: Bank | None = None
-        self._offset, self._sigma, self._time_us = (0.0, 0.0), inf, -MAX_GNSS_AGE_US
+        self._unmapped = Unmapped(self._grid, self._options)
+        self._filter: Bank | None = None
+        self._filtered = self._offset = np.zeros(2)  # position at the last measurement, and the latest
+        self._sigma = inf
         self._step = Step()  # since the last measurement that was used
 
     @property
     def contradicts(self) -> bool:
-        """The map does not describe the field at the position."""
+        """Return True if the map does not describe the field at the position."""
         return self._against >= self.limit
 
     @property
     def confirms(self) -> bool:
-        """The map describes the field at the position, and not worse than at the navigator's."""
+        """Return True if the map describes the field at the position, and not worse than at the navigator's."""
         return self.log_odds_of_map >= self.limit and self.log_odds_of_position >= 0.0
 
     @property
+    def disfavours(self) -> bool:
+        """Return True if the map describes the field better at the navigator's position, with odds of 45."""
+        return self.log_odds_of_position <= -0.5 * self.limit
+
+    @property
     def favours(self) -> bool:
-        """The map describes the field at the position better than at the navigator's."""
+        """Return True if the map describes the field at the position better than at the navigator's."""
         return self.log_odds_of_position >= self.limit
 
     def move(self, time_us: int, offset_m: tuple[float, float], sigma: float, *, restart: bool) -> None:
         """Continue at a position (m, north and east of dead reckoning) with its 1-sigma (m)."""
         if restart or time_us - self._time_us > MAX_GNSS_AGE_US:
-            self._tracker, self.log_odds_of_map, self.log_odds_of_position = None, 0.0, 0.0
-            self._against = 0.0
-            self._unmapped = Unmapped(self._grid, self._options)
-        self._offset, self._sigma, self._time_us = offset_m, sigma, time_us
+            self._restart()
+        self._offset, self._sigma, self._time_us = np.array(offset_m), sigma, time_us
+
+    def begin_comparison(self) -> None:
+        """Discard the evidence so far: from now on the navigator does not use the positions."""
+        self.log_odds_of_map = min(self.log_odds_of_map, 0.0)
+        self.log_odds_of_position = 0.0
 
     def update(self, block: Block, step: Step, filter_likelihood: float) -> None:
         """Add a measurement, one `step` after the previous one."""
         self._step = self._step.joined(step)
-        far = self._step.metres >= FIELD_STEP * self._grid.correlation_length
-        if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US or not far:
+        if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US:
             return
-        # One filter runs at the receiver's position; only its bias and map error are free.
         whole, self._step = self._step, Step()
-        if self._tracker is None:
-            self._tracker = Bank(self._grid, *prior(self._options, self._sigma), inf, self._options.gate)
-        tracker = self._tracker
-        tracker.predict(*transition(self._options, *whole))
-        # the position is the receiver's, whatever the field says; bias and map error are estimated
-        x, P = tracker.x, tracker.P
-        x[:2, 0] = self._offset
-        P[:2], P[:, :2] = 0.0, 0.0
-        P[0, 0] = P[1, 1] = self._sigma**2
-        seen = tracker.update(block)
-        unmapped = self._unmapped.update(block, whole, tracker.curvature_variance)
-        if not seen.variance > 0.0:  # off the map
+        is_first = self._filter is None
+        if self._filter is None:
+            x, P = prior(self._options, self._sigma)
+            P[2:4, 2:4] = 0.0  # the receiver's positions move the filter, not dead reckoning
+            self._filter = Bank(self._grid, x, P, inf, self._options.gate)
+        self._predict(self._filter, whole)
+        seen = self._filter.update(block)
+        unmapped = self._unmapped.update(block, whole, self._filter.curvature_variance)
+        if is_first or not seen.variance > 0.0:  # off the map
             return
         if not seen.accepted:  # as the filter does: a rejected measurement is never evidence for the map
             unmapped = max(unmapped, seen.log_likelihood)
         # Cumulative sums of log-likelihood ratios, limited so that a change of truth shows soon.
         self._against = min(max(self._against - seen.log_likelihood + unmapped, 0.0), self.limit)
-        for name, other in (("log_odds_of_map", unmapped), ("log_odds_of_position", filter_likelihood)):
-            total = getattr(self, name) + seen.log_likelihood - other
-            setattr(self, name, min(max(total, -self.limit), self.limit))
+        self.log_odds_of_map = self._limited(self.log_odds_of_map + seen.log_likelihood - unmapped)
+        gained = seen.log_likelihood - filter_likelihood
+        self.log_odds_of_position = self._limited(self.log_odds_of_position + gained)
+
+    def _predict(self, one: Bank, step: Step) -> None:
+        """Propagate the filter of H1: the receiver's error decays, and its position moves."""
+        F, Q = transition(self._options, *step)
+        F[:4], Q[:4] = 0.0, 0.0
+        kept = exp(-step.seconds / CORRELATION_TIME_S)
+        F[0, 0] = F[1, 1] = kept
+        Q[0, 0] = Q[1, 1] = self._sigma**2 * (1.0 - kept * kept)
+        one.x[:2] -= self._filtered[:, None]
+        one.predict(F, Q)
+        one.x[:2] += self._offset[:, None]
+        self._filtered = self._offset
+
+    def _limited(self, log_odds: float) -> float:
+        return min(max(log_odds, -self.limit), self.limit)
