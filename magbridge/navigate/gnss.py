@@ -339,21 +339,20 @@ class GnssMonitor:
         # Positions return only after they have agreed with each other for a while.
         if held_us < HOLD_US or self._count < MIN_POSITIONS:
             return False
-        # The field decides first: it has to describe the position better than the navigator's.
-        field = self.evidence
+        # The field decides first: it describes the position better than the navigator's, or worse.
+        field, by_field = self.evidence, self.reason is GnssReason.FIELD
         if field.favours and field.log_odds_of_map > 0.0:
             return True
-        if field.contradicts or field.disfavours or self.reason is GnssReason.FIELD:
-            return field.confirms and self.reason is GnssReason.FIELD
         # Then the motion since, against dead reckoning; a carry-off goes on while it is held back.
-        if self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US:
+        moves = self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US
+        if field.contradicts or field.disfavours or (moves and not by_field):
             return False
-        if field.confirms:
-            return True
-        # a lost navigator has no position to compare with
-        if prediction.lost:
-            return held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
-        return agrees or (self._chained and not prediction.informed and held_us >= LONG_HOLD_US)
+        if field.confirms or by_field:
+            return field.confirms
+        # Neither decides: time does. A lost navigator has no position to compare with.
+        undecided = field.log_odds_of_map > 0.0 if prediction.lost else self._chained
+        waited = undecided and held_us >= LONG_HOLD_US
+        return waited and (prediction.lost or not prediction.informed) or (agrees and not prediction.lost)
 
 
 class _FieldTest:
@@ -393,7 +392,7 @@ class _FieldTest:
 
     @property
     def confirms(self) -> bool:
-        """Return True if the map describes the field at the position, and not worse than at the navigator's."""
+        """Return True if the map describes the field at the position, not worse than at the navigator's."""
         return self.log_odds_of_map >= self.limit and self.log_odds_of_position >= 0.0
 
     @property
