@@ -350,9 +350,10 @@ class GnssMonitor:
         if field.confirms or by_field:
             return field.confirms
         # Neither decides: time does. A lost navigator has no position to compare with.
-        undecided = field.log_odds_of_map > 0.0 if prediction.lost else self._chained
-        waited = undecided and held_us >= LONG_HOLD_US
-        return waited and (prediction.lost or not prediction.informed) or (agrees and not prediction.lost)
+        waited = held_us >= LONG_HOLD_US
+        if prediction.lost:
+            return waited and field.log_odds_of_map > 0.0
+        return agrees or (waited and self._chained and not prediction.informed)
 
 
 class _FieldTest:
