@@ -57,8 +57,6 @@ class Correction:
         Applies the calibration.
     is_contradicted : bool
         Whether another sensor contradicts the last sample: the learner then does not use the next one.
-    stated_sigma : float
-        1-sigma of the last sample's total field without what the plausibility checks added, nT.
     """
 
     def __init__(
@@ -91,7 +89,6 @@ class Correction:
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
         self._conditions = _unmodelled_conditions(calibration)
-        self.stated_sigma = nan
         self.is_contradicted = False
         cutoff_hz = calibration.sensor.filter_cutoff
         self._filter_lag = LagCorrection(cutoff_hz) if cutoff_hz else None
@@ -172,15 +169,16 @@ class Correction:
             self._hold(TEMPERATURE, reading.temperature)
             beyond, flags = self._extrapolation(sigma)
             quality |= flags
-        self.stated_sigma = sigma
+        stated_sigma = sigma
         if sample.sigma or sample.spans or judged or turned or beyond:
             more = beyond + (self._more(sample) if sample.sigma or sample.spans else 0.0)
-            self.stated_sigma = sqrt(sigma * sigma + more)
+            stated_sigma = sqrt(sigma * sigma + more)
             more += judged
             sigma = sqrt(sigma * sigma + more)
             more += turned
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
-        return sample, Corrected(F, sigma, vector, (sx, sy, sz), quality)
+        corrected = Corrected(F, sigma, vector, (sx, sy, sz), quality, main_field, stated_sigma)
+        return sample, corrected
 
     def _check_field(
         self,

@@ -107,3 +107,7 @@ class Corrected(msgspec.Struct, frozen=True, gc=False):
     """1-sigma of each component, nT."""
     quality: int
     """:class:`Quality` bits."""
+    main_field: float = nan
+    """Main field's total at the sample, nT; NaN where unknown."""
+    stated_sigma: float = nan
+    """1-sigma of the total field without what the plausibility checks added, nT."""

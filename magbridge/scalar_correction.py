@@ -24,7 +24,7 @@ from magbridge.health import HealthMonitor, Messages
 from magbridge.parts import OptionalParts
 from magbridge.records import Corrected, Quality, Reading, Vector
 
-__all__ = ["CorrectedReading", "ScalarCorrection"]
+__all__ = ["ScalarCorrection"]
 
 MAX_TELEMETRY_AGE_S = 30.0
 """s after which telemetry is stale, unless the configuration sets another age."""
@@ -43,17 +43,6 @@ class PendingReading(NamedTuple):
     """Main field's total, nT; NaN where unknown."""
     where: tuple[float, float] | None
     """Position of the vehicle: latitude and longitude, deg; None where unknown."""
-
-
-class CorrectedReading(NamedTuple):
-    """A corrected reading of any sensor."""
-
-    sample: Sample
-    corrected: Corrected
-    main_field: float
-    """Main field's total, nT; NaN where unknown."""
-    stated_sigma: float
-    """1-sigma of the total field without what the plausibility checks added, nT."""
 
 
 class ScalarCorrection:
@@ -124,7 +113,7 @@ class ScalarCorrection:
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
         self._pending.append(PendingReading(sample, main_field, position))
 
-    def samples(self, now_us: int) -> list[CorrectedReading]:
+    def samples(self, now_us: int) -> list[tuple[Sample, Corrected]]:
         """Return the samples that are complete at `now_us` (µs)."""
         pending = self._pending
         if self._sensor is None:
@@ -193,7 +182,9 @@ class ScalarCorrection:
         far = np.abs(times[np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)] - wanted) > MAX_WAIT_US
         return np.where(far[:, None], nan, np.stack(columns, axis=1))
 
-    def _checked(self, pending: PendingReading, total: float, sigma: float, flags: int) -> CorrectedReading:
+    def _checked(
+        self, pending: PendingReading, total: float, sigma: float, flags: int
+    ) -> tuple[Sample, Corrected]:
         """Return a sample with the flags and the variance that alignment and plausibility checks add."""
         sample = pending.sample
         quality = sample.quality | flags | self._flags
@@ -203,8 +194,8 @@ class ScalarCorrection:
             arguments = (self._health, pending, (total, sigma), quality)
             added, more = self.parts.call("plausibility check", (0.0, 0), self._check, *arguments)
             variance, quality = variance + added, quality | more
-        corrected = Corrected(total, sqrt(variance), NO_VECTOR, NO_VECTOR, quality)
-        return CorrectedReading(sample, corrected, pending.main_field, stated_sigma)
+        main_field, sigma = pending.main_field, sqrt(variance)
+        return sample, Corrected(total, sigma, NO_VECTOR, NO_VECTOR, quality, main_field, stated_sigma)
 
     def _check(
         self, health: HealthMonitor, pending: PendingReading, total: tuple[float, float], quality: int

@@ -122,8 +122,19 @@ def definitions() -> dict[Path, Any]:
     return collect(DEFINITIONS / INCLUDED, collect(XML, {}))
 
 
+HEADER = '''"""Our messages, and those that pymavlink's wheel lacks: written by tools/dialect.py."""
+
+from __future__ import annotations
+
+import struct
+from typing import Dict
+
+from pymavlink.dialects.v20.all import MAVLink_message, mavlink_msg_deprecated_name_property
+'''
+
+
 def render_dialect() -> str:
-    """Return the module that mavgen makes of our XML and of what the wheel lacks."""
+    """Return the part of mavgen's module that holds our messages and those that the wheel lacks."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         ours = XML.read_text(encoding="utf-8").replace("  <include>common.xml</include>\n", "")
@@ -136,7 +147,10 @@ def render_dialect() -> str:
         )
         with redirect_stdout(StringIO()):
             mavgen.mavgen(options, [str(folder / "magbridge.xml")])
-        return (folder / "dialect.py").read_text(encoding="utf-8")
+        text = (folder / "dialect.py").read_text(encoding="utf-8")
+    # the rest of the module is the same in each dialect of the wheel
+    begin, end = text.index("MAVLINK_MSG_ID_MAG_RAW ="), text.index("class MAVError(")
+    return f"{HEADER}\n{text[begin:end].rstrip()}\n"
 
 
 def render_enums() -> str:

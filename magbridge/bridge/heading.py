@@ -54,6 +54,7 @@ class LiveHeading:
     `component`: the MAVLink side.
     `nmea`: sentences that are due; the bridge takes them out. A replay does not: the oldest are dropped.
     `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    `is_sending`: the configuration names a receiver of headings.
     """
 
     def __init__(self, wanted: HeadingOutput, component: Component) -> None:
@@ -63,6 +64,7 @@ class LiveHeading:
         self._send = HEADING_SENDERS[wanted.send] if wanted.send is not None else None
         self._rate = Rate(wanted.rate)
         self._nmea_rate = Rate(wanted.nmea_rate if wanted.nmea is not None else -1.0)
+        self.is_sending = wanted.send is not None or wanted.nmea is not None
         self._tilt_sigma = radians(wanted.tilt_sigma)
         self._is_contradicted = False
         self._read_time = own_time(ATTITUDE)
@@ -73,7 +75,8 @@ class LiveHeading:
         self._turn: tuple[float, ...] = ()
         self._covariance_us = 0
         self._calibration: Calibration | None = None
-        self._main: tuple[Vector, float] | None = None
+        self._main: Vector | None = None
+        self._crustal = nan
         self._declination = self._declination_sigma = nan
 
     def receive(self, message: Message, time_us: int) -> None:
@@ -139,10 +142,10 @@ class LiveHeading:
 
     def _decline(self, main: Vector, crustal: float) -> None:
         """Compute the declination (deg) and its standard deviation when the main field has changed."""
-        if self._main == (main, crustal):
+        if self._main is main and self._crustal == crustal:
             return
         north, east, _ = main
-        self._main = main, crustal
+        self._main, self._crustal = main, crustal
         self._declination = degrees(atan2(east, north))
         sigma = model_declination_sigma(np.array([hypot(north, east)]), crustal)
         self._declination_sigma = sigma.item()

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import nan, sqrt
 from typing import TYPE_CHECKING, Final, Protocol
 
+from msgspec.structs import replace
+
 from magbridge.align import Sample
 from magbridge.bridge import events
 from magbridge.bridge.events import (
@@ -35,7 +37,7 @@ from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Message, Signing, Spec, load_key, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
-from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
+from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver
 from magbridge.sensors.clock import Stamp
 from magbridge.version import __version__
@@ -186,7 +188,7 @@ class Pipeline:
             for name in ("autopilot", *(stream.line.timer for stream in self.streams)):
                 component.timers.delay(name, held_us)  # who was not listened to was not silent
         component.advance(time_us)
-        due = outbox.drain()
+        due = outbox.drain() if outbox.frames else []
         recorder.sent(due)
         if self._late and time_us > self._changes.until_us:
             self._late = False
@@ -223,51 +225,52 @@ class Pipeline:
         position, main = self._position, self.streams[0]
         utc_us = stamp.time_us + self.component.codec.utc_offset_us
         main_field = self._parts.call("position", nan, position.main_field, stamp.time_us, utc_us)
-        for result in stream.correct(reading, stamp, main_field, position.last_position, position.depth):
-            self._process(stream, result)
-        if stream is main:
+        place, depth = position.last_position, position.depth
+        for sample, corrected in stream.correct(reading, stamp, main_field, place, depth):
+            self._process(stream, sample, corrected)
+        if self._comparisons and stream is main:
             for other in self.streams[1:]:
-                for result in other.complete():
-                    self._process(other, result)
+                for sample, corrected in other.complete():
+                    self._process(other, sample, corrected)
 
-    def _process(self, stream: SensorStream, result: CorrectedReading) -> None:
+    def _process(self, stream: SensorStream, sample: Sample, corrected: Corrected) -> None:
         """Check, use and publish a corrected sample."""
-        sample, corrected, main_field, _ = result
         if self._comparisons:
-            compare = self._compare
-            corrected = self._parts.call("comparison of sensors", corrected, compare, stream, result)
+            call, compare = self._parts.call, self._compare
+            corrected = call("comparison of sensors", corrected, compare, stream, sample.time_us, corrected)
         if stream.correction.notices:
             self._report_implausible(stream)
         doubtful = corrected.quality & ANNOUNCED_FLAGS
         if doubtful != stream.quality:
             self._report_doubtful(stream, doubtful)
-        anomaly, attitude = corrected.total_field - main_field, NO_ATTITUDE
+        anomaly, attitude = corrected.total_field - corrected.main_field, NO_ATTITUDE
         is_main = stream is self.streams[0]
         if is_main:
             for other in self.streams[1:]:
                 other.use_vector(sample.time_us, corrected.field)
             if self.navigation is not None:
                 self._parts.call("navigation", None, self.navigation.sample, sample.time_us, corrected)
-            attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
+            if self.heading is not None:
+                attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
         stream.publisher.publish(sample, corrected, anomaly, attitude)
-        if is_main and self.heading is not None:
+        if is_main and self.heading is not None and self.heading.is_sending:
             self.heading.send(attitude, sample.time_us, corrected.quality)
         if self.recorder.active and self._raw_rate.hertz != 0:
             self.recorder.raw(self.component.codec.now_us, stream.publisher.raw_payload(sample))
         if is_main and self.learning is not None:
             self._parts.call("learning", None, self.learning.sample, sample.time_us)
 
-    def _compare(self, stream: SensorStream, result: CorrectedReading) -> Corrected:
+    def _compare(self, stream: SensorStream, time_us: int, corrected: Corrected) -> Corrected:
         """Return a sample with the flags and the sigma that the comparison of the sensors adds."""
-        sample, corrected, main_field, stated = result
+        stated = corrected.stated_sigma
         total = corrected.total_field, stated
-        main = main_field, stream.correction.aligner.settings.reference_sigma
+        main = corrected.main_field, stream.correction.aligner.settings.reference_sigma
         variance, flags = 0.0, 0
         for other, comparison in zip(self.streams[1:], self._comparisons, strict=True):
             if stream is not other and stream is not self.streams[0]:
                 continue
             side = 1 if stream is other else 0
-            more, flag = comparison.update(side, sample.time_us, total, main, corrected.quality)
+            more, flag = comparison.update(side, time_us, total, main, corrected.quality)
             variance, flags = max(variance, more), flags | flag
             if comparison.message:
                 severity = MAV_SEVERITY.ERROR if comparison.is_wrong else MAV_SEVERITY.INFO
@@ -283,15 +286,15 @@ class Pipeline:
         sigma = sqrt(corrected.total_field_sigma**2 + missing)
         x, y, z = (sqrt(component * component + missing) for component in corrected.field_sigma)
         quality = corrected.quality | flags
-        return Corrected(corrected.total_field, sigma, corrected.field, (x, y, z), quality)
+        return replace(corrected, total_field_sigma=sigma, field_sigma=(x, y, z), quality=quality)
 
     def _attitude(self, sample: Sample, corrected: Corrected) -> Attitude:
         """Return the attitude at a sample with the heading that follows from the corrected field."""
-        if self.heading is None:
-            return NO_ATTITUDE
         time_us, correction = sample.time_us, self._correction
+        assert self.heading is not None
         assert isinstance(correction, Correction)
-        main = self._position.direction(time_us, time_us + self.component.codec.utc_offset_us)
+        utc_us = time_us + self.component.codec.utc_offset_us
+        main = self._position.direction(corrected.main_field, utc_us)
         crustal = correction.aligner.settings.reference_sigma
         return self.heading.compute(sample, corrected, correction.corrector, main, crustal)
 
@@ -339,7 +342,8 @@ class Pipeline:
         """Set the vehicle's attitude, with which the vector's direction is compared."""
         if self._direction is not None:
             utc_us = time_us + self.component.codec.utc_offset_us
-            self._direction.expect(*self._position.direction(time_us, utc_us))
+            main_field = self._position.main_field(time_us, utc_us)
+            self._direction.expect(*self._position.direction(main_field, utc_us))
             self._direction.attitude(time_us, message["roll"], message["pitch"], message["yaw"])
 
     def _tune(self, _: str = "") -> None:

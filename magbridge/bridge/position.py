@@ -39,6 +39,8 @@ LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 ALTITUDE_M: Final = -15_000.0, 100_000.0
 """Heights at which the main-field model is defined for vehicles, m."""
 
+UNKNOWN_VECTOR: Final = (nan, nan, nan)
+
 
 class Position:
     """Last position of the vehicle; the first one loads the field model.
@@ -54,8 +56,9 @@ class Position:
         self._depth = 0.0
         self._when_us = self._evaluated_us = 0
         self._field = nan
-        self._vector = nan, nan, nan
-        self._vector_us, self._vector_where = 0, (nan, nan)
+        self._vector = UNKNOWN_VECTOR
+        self._vector_us, self._vector_at = 0, (nan, nan)
+        self._vector_where: tuple[float, float] | None = None  # for which the vector was checked
         self._model: NearbyField | None = None
         self._trusted: tuple[float, float] | None = None
         self._trusted_us = self._jumped_us = 0
@@ -113,7 +116,8 @@ class Position:
         `time_us`, `utc_us`: µs of event time, and of UNIX time by the host's clock as it is set now.
         """
         if (
-            self.last_position is None
+            self._where is None
+            or self._jumped_us
             or utc_us < CLOCK_SET_US
             or abs(time_us - self._when_us) > MAX_POSITION_AGE_US
         ):
@@ -123,19 +127,29 @@ class Position:
             self._field = self._evaluate(utc_us)
         return self._field
 
-    def direction(self, time_us: int, utc_us: int) -> tuple[float, float, float]:
-        """Return the IGRF's vector near the position, nT, north-east-down; NaN as :meth:`main_field`."""
-        if isnan(self.main_field(time_us, utc_us)):
-            return nan, nan, nan
-        assert self._where is not None
-        (latitude, longitude), (last_latitude, last_longitude) = self._where, self._vector_where
-        distance_deg = max(abs(latitude - last_latitude), abs(longitude - last_longitude))
-        if not distance_deg < MAX_VECTOR_DISTANCE_DEG or abs(utc_us - self._vector_us) > MAX_VECTOR_AGE_US:
-            from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
+    def direction(self, main_field: float, utc_us: int) -> tuple[float, float, float]:
+        """Return the IGRF's vector near the position, nT, north-east-down.
 
-            north, east, down = igrf(longitude, latitude, self._depth, utc_us * 1e-6)[0].tolist()
-            self._vector, self._vector_us, self._vector_where = (north, east, down), utc_us, self._where
+        `main_field`: what :meth:`main_field` has returned; the vector is NaN where that is.
+        """
+        if isnan(main_field):
+            return UNKNOWN_VECTOR
+        if self._where is not self._vector_where or abs(utc_us - self._vector_us) > MAX_VECTOR_AGE_US:
+            self._evaluate_vector(utc_us)
         return self._vector
+
+    def _evaluate_vector(self, utc_us: int) -> None:
+        """Compute the vector at the position, unless the vehicle is still near the last place of that."""
+        assert self._where is not None
+        self._vector_where = self._where
+        (latitude, longitude), (last_latitude, last_longitude) = self._where, self._vector_at
+        distance_deg = max(abs(latitude - last_latitude), abs(longitude - last_longitude))
+        if distance_deg < MAX_VECTOR_DISTANCE_DEG and abs(utc_us - self._vector_us) <= MAX_VECTOR_AGE_US:
+            return
+        from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
+
+        north, east, down = igrf(longitude, latitude, self._depth, utc_us * 1e-6)[0].tolist()
+        self._vector, self._vector_us, self._vector_at = (north, east, down), utc_us, self._where
 
     def _evaluate(self, utc_us: int) -> float:
         assert self._where is not None

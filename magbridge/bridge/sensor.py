@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from magbridge.align import Sample
 from magbridge.calibration.file import load
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.scalar import ScalarSensor
@@ -22,8 +23,8 @@ from magbridge.link.component import Component
 from magbridge.link.output import Announcer, Timers
 from magbridge.link.publish import Publisher
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
-from magbridge.records import Reading, Vector
-from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
+from magbridge.records import Corrected, Reading, Vector
+from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver, is_scalar, open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
 
@@ -309,7 +310,7 @@ class SensorStream:
         main_field: float,
         position: tuple[float, float] | None,
         depth: float,
-    ) -> list[CorrectedReading]:
+    ) -> list[tuple[Sample, Corrected]]:
         """Correct a reading; return the samples that are complete now.
 
         `reading`, `stamp`: as :meth:`receive` returns them.
@@ -324,17 +325,18 @@ class SensorStream:
         correction, time_us = self.correction, stamp.time_us
         restarted, missing = stamp.restarted, stamp.missing
         if isinstance(correction, Correction):
-            sample, corrected = correction.reading(
-                reading, time_us, restarted=restarted, missing=missing, main_field=main_field,
-                position=position, depth=depth,
-            )  # fmt: skip
-            return [CorrectedReading(sample, corrected, main_field, correction.stated_sigma)]
+            return [
+                correction.reading(
+                    reading, time_us, restarted=restarted, missing=missing, main_field=main_field,
+                    position=position, depth=depth,
+                )
+            ]  # fmt: skip
         correction.reading(
             reading, time_us, restarted=restarted, missing=missing, main_field=main_field, position=position
         )
         return self.complete()
 
-    def complete(self) -> list[CorrectedReading]:
+    def complete(self) -> list[tuple[Sample, Corrected]]:
         """Return the waiting samples of a scalar that the vector of the same time completes."""
         if not isinstance(self.correction, ScalarCorrection):
             return []

@@ -98,20 +98,23 @@ class RepetitionCheck:
 
         `raw` is the reading, `white_sigma` the 1-sigma of the white noise, nT.
         """
-        same = [value == axis.last for value, axis in zip(raw, self._axes, strict=True)]
-        if all(same):
+        x_axis, y_axis, z_axis = self._axes
+        x, y, z = raw
+        if x == x_axis.last and y == y_axis.last and z == z_axis.last:
             return self._repeat_all(white_sigma)
         self._common.change()
         stuck = False
-        for number, (axis, value) in enumerate(zip(self._axes, raw, strict=True)):
-            if same[number]:
+        for number, axis in enumerate(self._axes):
+            value = raw[number]
+            if value == axis.last:
                 stuck = self._repeat(number, axis, value) or stuck
                 continue
             change = abs(value - axis.last)
             self._step = min(self._step, change)
             axis.last = value
             axis.change()
-            stuck = stuck or (self._has_limit and abs(value) == axis.limit)
+            if self._has_limit and abs(value) == axis.limit:
+                stuck = True
         return stuck
 
     def _repeat_all(self, white_sigma: float) -> bool:

@@ -96,7 +96,8 @@ class Publisher:
         self.samples += 1
         time_us = sample.time_us
         for rate, send in self._messages:
-            if rate.hertz == 0.0 or rate.due(time_us):
+            hertz = rate.hertz
+            if hertz == 0.0 or (hertz > 0.0 and rate.due(time_us)):
                 send(sample, corrected, anomaly, attitude)
 
     def repeat(self, name: str) -> bool:

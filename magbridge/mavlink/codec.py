@@ -23,10 +23,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
+from pymavlink.dialects.v20.all import MAVLink, MAVLink_message, MAVLinkSigning
+
 from magbridge.errors import FormatError
 from magbridge.files import contents
-from magbridge.mavlink import dialect
-from magbridge.mavlink.dialect import MAVLinkSigning
 from magbridge.mavlink.messages import (
     BAD_DATA,
     NEEDS_MORE,
@@ -92,7 +92,7 @@ def readable_by_all(path: str | Path) -> bool:
     return bool(Path(path).stat().st_mode & 0o004)
 
 
-class Signing(MAVLinkSigning):
+class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
     """State of signing: pymavlink signs with it; it verifies, in event time.
 
     The verification replaces pymavlink's ``check_signature``, which stores a stamp before it has verified the
@@ -214,7 +214,7 @@ class Codec:
         self.system, self.component = system, component
         self.signing = signing
         self.now_us = self.utc_offset_us = 0
-        self._mav = dialect.MAVLink(None, system, component)
+        self._mav = MAVLink(None, system, component)
         if signing is not None:
             self._mav.signing = signing
         self._packers: dict[int, Any] = {}
@@ -292,7 +292,7 @@ class Codec:
             self.signing.set_clock(self.utc_us)
         packer = self._packers.get(layout.id)
         if packer is None:
-            packer = self._packers[layout.id] = dialect.MAVLink_message(layout.id, layout.name)
+            packer = self._packers[layout.id] = MAVLink_message(layout.id, layout.name)
         frame: bytes = packer._pack(self._mav, layout.extra, payload)  # noqa: SLF001 - pymavlink's own packer
         self._mav.seq = self._mav.seq + 1 & 0xFF
         return frame

@@ -13,15 +13,15 @@ from struct import Struct
 from typing import Any, Final, TypeVar
 
 from pymavlink.dialects.v20 import all as upstream
-
-from magbridge.mavlink import dialect
-from magbridge.mavlink.dialect import (
+from pymavlink.dialects.v20.all import (
     MAVLINK_IFLAG_SIGNED,
     MAVLINK_SIGNATURE_BLOCK_LEN,
     PROTOCOL_MARKER_V1,
     PROTOCOL_MARKER_V2,
     x25crc,
 )
+
+from magbridge.mavlink import dialect
 from magbridge.mavlink.enums import INVALID
 
 __all__ = [
@@ -42,10 +42,10 @@ TURN_E7 = 3_600_000_000
 
 MESSAGES: Final[dict[int, Any]] = {**upstream.mavlink_map, **dialect.mavlink_map}
 """Message id -> pymavlink's class of the message; ours and the few that the wheel lacks take precedence."""
-dialect.mavlink_map.update(MESSAGES)  # the generated parser decodes all of them
+upstream.mavlink_map.update(dialect.mavlink_map)  # pymavlink's decoder takes the classes from there
 MESSAGE_IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
 """Message name -> id."""
-DECODER: Final = dialect.MAVLink(None)
+DECODER: Final = upstream.MAVLink(None)
 """Decodes frames that were accepted; it holds no key and no buffer."""
 
 

@@ -51,7 +51,7 @@ import msgspec
 from msgspec import Meta
 
 from magbridge.records import Reading
-from magbridge.sensors.framing import CRC32_RESIDUE, FramedDriver, cobs_decode, saturated
+from magbridge.sensors.framing import CRC32_RESIDUE, FramedDriver, cobs_decode
 
 __all__ = ["EXAMPLE", "FULL_SCALE", "Digitizer", "DigitizerOptions"]
 
@@ -88,10 +88,11 @@ EXAMPLE: Final = bytes.fromhex(
 READING: Final = 1
 LENGTH: Final = 36
 WRAP_US: Final = 1 << 32
+HALF_WRAP_US: Final = 1 << 31
 NO_TEMPERATURE: Final = -32768
 NO_SUPPLY: Final = 65535
 BODY: Final = Struct("<BBHHIIIhHBHbHbHb")
-"""A reading's body; a channel's 24 bits are in two parts (:func:`_count`)."""
+"""A reading's body; a channel's 24 bits are in two parts: the lower 16, and the upper 8 with the sign."""
 
 
 class Digitizer(FramedDriver):
@@ -125,26 +126,23 @@ class Digitizer(FramedDriver):
             _, _, sequence, cycle, time_x, time_y, time_z, temperature, supply, flags,
             x_low, x_high, y_low, y_high, z_low, z_high,
         ) = BODY.unpack_from(message)  # fmt: skip
-        x, y, z = _count(x_low, x_high), _count(y_low, y_high), _count(z_low, z_high)
-        scale = self.nt_per_count
+        # a channel's upper 8 bits carry the sign
+        x, y, z = x_low | x_high << 16, y_low | y_high << 16, z_low | z_high << 16
+        scale, limit = self.nt_per_count, self._limit
+        saturated = not (-limit < x < limit and -limit < y < limit and -limit < z < limit)
         return Reading(
             (x * scale, y * scale, z * scale),
             (x, y, z),
             sequence,
             time_x * 1e-6,
-            (0.0, _elapsed(time_y, time_x), _elapsed(time_z, time_x)),
+            # on the wrapping clock, with a difference below half a turn
+            (
+                0.0,
+                ((time_y - time_x + HALF_WRAP_US) % WRAP_US - HALF_WRAP_US) * 1e-6,
+                ((time_z - time_x + HALF_WRAP_US) % WRAP_US - HALF_WRAP_US) * 1e-6,
+            ),
             nan if temperature == NO_TEMPERATURE else temperature * 0.01,
             nan if supply == NO_SUPPLY else supply * 1e-3,
             cycle,
-            flags & 7 != 0 or saturated(x, y, z, self._limit),
+            flags & 7 != 0 or saturated,
         )
-
-
-def _count(low: int, high: int) -> int:
-    """Return a channel's count from its lower 16 bits, and the upper 8 with the sign."""
-    return low | high << 16
-
-
-def _elapsed(time: int, start: int) -> float:
-    """Return `time` - `start` in s, both in µs on the wrapping clock, with a difference below half a turn."""
-    return ((time - start + WRAP_US // 2) % WRAP_US - WRAP_US // 2) * 1e-6
