@@ -202,8 +202,8 @@ class HeadingOutput(Table, frozen=True):
     ``vision_position_estimate``; not sent by default."""
     rate: NotNegative = 10.0
     """Hz of that message; 0 is with every sample. ArduPilot needs 4 Hz at least, PX4 10 Hz."""
-    tilt_sigma: Positive = 0.3
-    """1-sigma of the autopilot's roll and pitch, deg."""
+    tilt_sigma: Positive | None = None
+    """1-sigma of the autopilot's roll and pitch, deg; by default that of the calibration's runs."""
     nmea: Name | None = None
     """Port for the NMEA 0183 sentences HDG, HDT and PASHR: ``udp:HOST:PORT`` or a serial device."""
     nmea_baudrate: Baudrate = 4800

@@ -139,7 +139,7 @@ def _headings(
     uncertain = model_declination_sigma(np.hypot(main[:, 0], main[:, 1]), crustal_sigma)
     found = heading(
         vector, tilt[:, 0], tilt[:, 1], declination, covariance=covariance, boresight_covariance=turn,
-        declination_sigma_deg=uncertain,
+        tilt_sigma_deg=calibration.boresight.tilt_sigma, declination_sigma_deg=uncertain,
     )  # fmt: skip
     columns = found.magnetic, found.true, found.sigma, declination, uncertain
     return dict(zip(HEADINGS, columns, strict=True))

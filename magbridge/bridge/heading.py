@@ -65,7 +65,7 @@ class LiveHeading:
         self._rate = Rate(wanted.rate)
         self._nmea_rate = Rate(wanted.nmea_rate if wanted.nmea is not None else -1.0)
         self.is_sending = wanted.send is not None or wanted.nmea is not None
-        self._tilt_sigma = radians(wanted.tilt_sigma)
+        self._wanted_tilt_sigma = wanted.tilt_sigma
         self._is_contradicted = False
         self._read_time = own_time(ATTITUDE)
         self._attitude_us = -(1 << 62)
@@ -106,7 +106,8 @@ class LiveHeading:
         since_us = sample.time_us - self._attitude_us
         if boresight is None or abs(since_us) > MAX_ATTITUDE_AGE_US or not isfinite(corrected.total_field):
             return NO_ATTITUDE
-        roll, pitch, tilt_sigma = self._tilt(since_us * 1e-6)
+        stated = self._wanted_tilt_sigma or boresight.tilt_sigma
+        roll, pitch, tilt_sigma = self._tilt(since_us * 1e-6, radians(stated))
         if not abs(pitch) < MAX_PITCH_RAD:
             return NO_ATTITUDE
         self._decline(main, crustal)
@@ -124,14 +125,16 @@ class LiveHeading:
         )  # fmt: skip
         return Attitude(magnetic, true, sigma, self._declination, roll, pitch, self._rates, tilt_sigma)
 
-    def _tilt(self, elapsed: float) -> tuple[float, float, float]:
+    def _tilt(self, elapsed: float, stated: float) -> tuple[float, float, float]:
         """Return roll, pitch and their standard deviation (rad), `elapsed` s after the last ATTITUDE.
+
+        `stated`: rad, that of the ATTITUDE itself.
 
         The body rates p, q, r give ``droll/dt = p + tan(pitch) (q sin(roll) + r cos(roll))`` and
         ``dpitch/dt = q cos(roll) - r sin(roll)``.
         """
         roll, pitch, (p, q, r) = self._roll, self._pitch, self._rates
-        known = CONTRADICTED_TILT_RAD if self._is_contradicted else self._tilt_sigma
+        known = CONTRADICTED_TILT_RAD if self._is_contradicted else stated
         if not (isfinite(p + q + r) and abs(pitch) < MAX_PITCH_RAD):
             return roll, pitch, known
         roll_change = elapsed * (p + tan(pitch) * (q * sin(roll) + r * cos(roll)))

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
 from magbridge.calibration.model import (
     MIN_HALF_RANGE,
     Boresight,
@@ -32,7 +33,7 @@ from magbridge.files import atomic_path, contents
 
 __all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
-CALIBRATION_FORMAT = 7
+CALIBRATION_FORMAT = 8
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
 ``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``, 6 ``conditions``, 7 the
@@ -106,6 +107,8 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 def _format(calibration: Calibration) -> int:
     """Return the oldest format that can represent a calibration."""
+    if calibration.boresight and calibration.boresight.tilt_sigma != DEFAULT_TILT_SIGMA_DEG:
+        return 8
     if calibration.sensor.filter_cutoff:
         return 7
     if calibration.conditions:
@@ -210,6 +213,8 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         _check_covariance(np.array(content.boresight.covariance), "boresight: ")
         if np.abs(content.boresight.rotation).max() > 2.0 * np.pi:
             raise CalibrationError("boresight: rotation: expected a rotation vector, rad, up to a full turn")
+        if not 0.0 < content.boresight.tilt_sigma <= 90.0:
+            raise CalibrationError("boresight: tilt_sigma: expected deg above 0, up to 90")
     _check_settings(content)
     # plugins may define either kind; each must stand in its own list
     positions = tuple(term for term in terms if isinstance(term, PositionTerm))

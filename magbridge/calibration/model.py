@@ -31,6 +31,7 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
 from magbridge.calibration.kernel import TABLE_SUMS, Kernel
 from magbridge.calibration.scalar import ScalarSensor
 from magbridge.calibration.terms import Effect, Exponents, Parameter, Polynomial, PositionTerm
@@ -207,15 +208,16 @@ class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     level_sigma: float = 0.0
 
 
-class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The rotation from corrected sensor axes to body axes that a scalar fit leaves free.
 
     `rotation` is a rotation vector (rad), `covariance` that of a small further rotation in body
-    axes (rad²).
+    axes (rad²). `tilt_sigma` is the 1-sigma of roll and of pitch in the runs of which it was found (deg).
     """
 
     rotation: tuple[float, float, float]
     covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    tilt_sigma: float = DEFAULT_TILT_SIGMA_DEG
 
     def matrix(self) -> FloatArray:
         """Return (3, 3) rotation matrix: Rodrigues' formula."""

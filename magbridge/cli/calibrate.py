@@ -441,10 +441,11 @@ def _facts(found: Fit, data: Observations) -> dict[str, Any]:
     from magbridge.calibration.fitting.uncertainty import expected_heading_sigma
     from magbridge.calibration.model import facts
 
-    sigma = expected_heading_sigma(found.calibration, data)
+    sigma, boresight = expected_heading_sigma(found.calibration, data), found.calibration.boresight
     return {
         "samples": len(data),
         "heading_sigma_deg": sigma if isfinite(sigma) else None,
+        "tilt_sigma_deg": boresight.tilt_sigma if boresight is not None else None,
         "rms_nT": found.rms,
         "supported": found.supported,
         "scales": found.scales,
@@ -456,8 +457,6 @@ def _facts(found: Fit, data: Observations) -> dict[str, Any]:
 
 
 def _summary(facts: dict[str, Any]) -> str:
-    from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
-
     low, high = facts["scales"]
     text = (
         f"{facts['samples']} samples, {facts['rms_nT']:.2f} nT RMS in the sensor's own units, "
@@ -465,7 +464,7 @@ def _summary(facts: dict[str, Any]) -> str:
     )
     if (sigma := facts["heading_sigma_deg"]) is None:
         return f"{text}; no heading, which needs roll and pitch in the log at several pitch angles"
-    tilt = f"with roll and pitch good to {DEFAULT_TILT_SIGMA_DEG:g} deg"
+    tilt = f"with roll and pitch good to {facts['tilt_sigma_deg']:.2f} deg"
     return f"{text}; magnetic heading {sigma:.2f} deg (1-sigma, {tilt})"
 
 

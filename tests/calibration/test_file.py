@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -112,6 +113,16 @@ def test_warnings_are_read_back_and_older_readers_refuse_them(cal: Calibration) 
     assert json.loads(data)["format"] == 3
     assert decode_calibration(data).warnings == doubtful.warnings
     assert "doubts" not in json.loads(encode_calibration(cal))  # with the id that it always had
+
+
+def test_the_tilt_s_sigma_is_read_back(cal: Calibration) -> None:
+    assert cal.boresight is not None
+    measured = replace(cal, boresight=msgspec.structs.replace(cal.boresight, tilt_sigma=0.12))
+    data = encode_calibration(measured)
+    assert json.loads(data)["format"] == 8
+    assert decode_calibration(data).boresight == measured.boresight
+    with pytest.raises(CalibrationError, match="tilt_sigma: expected deg above 0"):
+        decode_calibration(data.replace(b'"tilt_sigma":0.12', b'"tilt_sigma":-0.12'), "cal.json")
 
 
 def test_another_calibration_has_another_id(cal: Calibration) -> None:

@@ -25,8 +25,11 @@ e_i by roll and pitch, the covariance is the sandwich
 
     C = N^-1 (s^2 N + sum_r (sum_(i in r) J_i^T t_i) diag(sigma_t^2) (...)^T) N^-1
 
-N the information of the rows, s^2 their measured variance, and sigma_t = :data:`RUN_TILT_SIGMA_DEG`. An
-estimate from the scatter between a few runs would be far too small: it is not used.
+N the information of the rows, s^2 their measured variance. A few runs show little of sigma_t, so sigma_t^2 is
+its posterior mean, with a prior: the inverse gamma distribution about :data:`RUN_TILT_SIGMA_DEG` with the
+weight of :data:`RUN_TILT_PRIOR_COUNT` observations. Within a run, e has the covariance
+``s^2 I + sigma_t^2 T T^T``, T the rows t_i. Its eigenvectors give independent z_k of the variance
+``s^2 + sigma_t^2 l_k``, l_k an eigenvalue of ``T^T T``.
 """
 
 from __future__ import annotations
@@ -55,7 +58,13 @@ __all__ = [
 INCLINATION_SIGMA_DEG = 0.2
 """1-sigma of a main-field model's inclination (Chulliat et al, deg. 2020, table 14)."""
 RUN_TILT_SIGMA_DEG = 0.2
-"""1-sigma of the offset of roll and of pitch in one run, deg."""
+"""Expected 1-sigma of the offset of roll and of pitch in one run, deg."""
+RUN_TILT_PRIOR_COUNT = 2.0
+"""Observations that this expectation counts as."""
+MAX_RUN_TILT_SIGMA_DEG = 10.0
+"""Largest 1-sigma of that offset that is considered, deg."""
+MIN_SQUARED_LEVER = 1e-12
+"""Smallest sum of squared derivatives of a run, so that none divides by zero."""
 MIN_TILT_SIGMA_DEG = 0.02
 """Smallest 1-sigma of the tilt's noise that is believed, deg."""
 MAX_ITERATIONS = 50
@@ -83,7 +92,7 @@ class TiltBoresight:
     inclination_shift: float
     """Difference of the field's inclination from the reference's, deg; positive: steeper."""
     tilt_sigma: float
-    """Standard deviation of the tilt that explains the residual, deg."""
+    """Standard deviation of roll and of pitch, white noise and the run's offset together, deg."""
 
     @property
     def open_angle(self) -> tuple[str, float]:
@@ -158,16 +167,43 @@ def boresight_from_tilt(
     values, axes = np.linalg.eigh(N)
     N = (axes * np.maximum(values, LEAST_INFORMATION)) @ axes.T
     _, run = np.unique(runs, return_inverse=True)
+    parts = [run == index for index in range(int(run.max()) + 1)]
+    white, offset = _tilt_variances([e[part] for part in parts], [offsets[part] for part in parts])
     meat = N.copy()
-    for index in range(int(run.max()) + 1):
-        lever = J[run == index].T @ offsets[run == index] / tilt_sigma**2  # (4, 2)
-        meat += np.radians(RUN_TILT_SIGMA_DEG) ** 2 * lever @ lever.T
+    for part in parts:
+        lever = J[part].T @ offsets[part] / tilt_sigma**2  # (4, 2)
+        meat += offset * lever @ lever.T
     inverse = np.linalg.inv(N)
     covariance = (inverse @ meat @ inverse)[:3, :3]
     return TiltBoresight(
         rotation.as_rotvec(), 0.5 * (covariance + covariance.T), float(np.degrees(shift)),
-        float(np.degrees(tilt_sigma)),
+        float(np.degrees(np.sqrt(white + offset))),
     )  # fmt: skip
+
+
+def _tilt_variances(residuals: list[FloatArray], levers: list[FloatArray]) -> tuple[float, float]:
+    """Return s^2 and sigma_t^2 of the module's notes, rad^2.
+
+    `residuals`: (m,) of each run, rad. `levers`: (m, 2) of each run, the derivatives by roll and by pitch.
+    """
+    squares, eigenvalues, white = np.empty((0,)), np.empty((0,)), 0.0
+    for e, T in zip(residuals, levers, strict=True):
+        of_run, axes = np.linalg.eigh(T.T @ T)
+        of_run = np.maximum(of_run, MIN_SQUARED_LEVER)
+        z_squared = (axes.T @ (T.T @ e)) ** 2 / of_run
+        squares, eigenvalues = np.append(squares, z_squared), np.append(eigenvalues, of_run)
+        white += float(e @ e - z_squared.sum())
+    count = sum(map(len, residuals)) - len(squares)
+    white = max(white / max(count, 1), np.radians(MIN_TILT_SIGMA_DEG) ** 2)
+    # the rotation took three of the values
+    squares *= len(squares) / max(len(squares) - 3, 1)
+    # posterior mean of sigma_t^2 over a grid: -2 log p = sum (log v_k + z_k^2 / v_k) - 2 log prior
+    grid = np.radians(np.geomspace(MIN_TILT_SIGMA_DEG, MAX_RUN_TILT_SIGMA_DEG, 200)) ** 2
+    variance = white + grid[:, None] * eigenvalues
+    cost = (np.log(variance) + squares / variance).sum(axis=1)
+    cost += RUN_TILT_PRIOR_COUNT * (np.log(grid) + np.radians(RUN_TILT_SIGMA_DEG) ** 2 / grid)
+    weight = np.exp(-0.5 * (cost - cost.min()))
+    return white, float(weight @ grid / weight.sum())
 
 
 def _gauss_newton(
@@ -288,7 +324,7 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
         return with_headings
     x, y, z = found.rotation.tolist()
     first, second, third = ((x, y, z) for x, y, z in found.covariance.tolist())
-    return Boresight((x, y, z), (first, second, third))
+    return Boresight((x, y, z), (first, second, third), found.tilt_sigma)
 
 
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:

@@ -19,7 +19,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct, forward, vector_covariance
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG, heading, published_covariance
+from magbridge.calibration.heading import heading, published_covariance
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Noise, Reference
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
@@ -194,8 +194,8 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
 def expected_heading_sigma(calibration: Calibration, data: Observations) -> float:
     """Return the RMS over the samples of the magnetic heading's standard deviation, deg.
 
-    Roll and pitch count as known to :data:`~magbridge.calibration.heading.DEFAULT_TILT_SIGMA_DEG`. The
-    declination is not part of it. NaN without a boresight, or without roll and pitch.
+    Roll and pitch are as uncertain as in the calibration's own runs. The declination is not part of it. NaN
+    without a boresight, or without roll and pitch.
     """
     if calibration.boresight is None or data.attitude is None:
         return float("nan")
@@ -206,7 +206,7 @@ def expected_heading_sigma(calibration: Calibration, data: Observations) -> floa
     roll, pitch = data.attitude[:, 0], data.attitude[:, 1]
     found = heading(
         corrected.vector, roll, pitch, covariance=covariance, boresight_covariance=turn,
-        tilt_sigma_deg=DEFAULT_TILT_SIGMA_DEG,
+        tilt_sigma_deg=calibration.boresight.tilt_sigma,
     )  # fmt: skip
     known = found.sigma[np.isfinite(found.sigma)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

@@ -1,0 +1,211 @@
+"""Measure the error of the heading out of sample, and whether its standard deviation covers it.
+
+Each row of the table is a calibration, and another log that is corrected with it. No calibration uses the
+log's headings, except in the row that says so. The peers have no boresight of their own: each gets
+magbridge's. The aircraft is flown by others (``$MAGBRIDGE_REAL_DATA``, or ``../shared/data``); its inertial
+heading is the truth.
+
+    python tools/heading.py --seeds 6 --out heading.parquet
+    python tools/heading.py --peers .venv-peers/bin/python        # adds magyc, see tools/peers.py
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from accuracy import other_methods
+from scipy.spatial.transform import Rotation
+from studies import Column, Row, Study, study_options
+from study_worlds import MASSES, glider, measure_trials
+
+import magbridge as mb
+from magbridge.calibration.correct import correct, vector_covariance
+from magbridge.calibration.fitting.boresight import choose_boresight, find_boresight
+from magbridge.calibration.fitting.observations import Observations, unfiltered
+from magbridge.calibration.model import Calibration
+from magbridge.columns import HEADINGS
+from magbridge.estimation.residual import rms
+from magbridge.field.reference import earth_field
+from sitl import load
+from sitl.dataset import channels, side_by_side
+from sitl.twin import Twin
+
+TILT_SIGMA_DEG = 0.1
+"""1-sigma of the simulated roll and pitch, white, deg."""
+RUN_OFFSET_DEG = 0.2
+"""1-sigma of their offset in one run, deg."""
+PAIRS = (1, 5)
+"""Pairs of spirals of which the boresight is estimated."""
+CUTOFF_HZ = 0.33
+"""Cut-off of the anti-alias filter of the row that has one, Hz; a spiral turns at 1.6 deg/s."""
+ANGLES = ("roll", "pitch")
+AIRCRAFT = "magnav_flt1002/Flt1002_1002.02.txt"
+FLOWN = 1_592_611_200.0
+"""s since 1970, the day of the aircraft's flight."""
+AIRCRAFT_STEP = 10
+"""Samples of the line, of 10 Hz, of which one is used."""
+SIMULATED = ("gliders", "gliders, tilt offsets", "gliders, filter", "Bonne Bay twin")
+
+
+def run(name: str, seed: int, peers: str) -> list[Row]:
+    """Return the rows of one vehicle: a heading's RMS error and its normalised error, by method."""
+    rows = list(aircraft() if name == "aircraft" else simulated(name, seed, peers))
+    return [{"data": name, "seed": seed, "failed": ""} | row for row in rows]
+
+
+def difference_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a - b on the circle, deg."""
+    return np.asarray((a - b + 180.0) % 360.0 - 180.0)
+
+
+def score(method: str, heading: np.ndarray, sigma: np.ndarray | float, truth: np.ndarray) -> Row:
+    """Return the row of a method: `heading`, `sigma` and `truth` (n,), deg."""
+    error = difference_deg(heading, truth)
+    good = np.isfinite(error)
+    error, stated = error[good], np.broadcast_to(sigma, truth.shape)[good]
+    return {"method": method, "rms": rms(error), "stated": rms(stated), "normalised": rms(error / stated)}
+
+
+def published(method: str, calibration: Calibration, log: xr.Dataset) -> Row:
+    """Score the columns that ``correct`` writes for a log whose own headings are true, on unflagged rows."""
+    rows = mb.correct_rows(mb.Correction(calibration), log.drop_vars("heading"))
+    good = rows["quality"].to_numpy() == 0
+    magnetic, _, sigma, declination, its_sigma = (rows[column].to_numpy()[good] for column in HEADINGS)
+    # the simulated world's main field is the IGRF: the declination has no error
+    stated = np.sqrt(sigma**2 - its_sigma**2)
+    return score(method, magnetic + declination, stated, log["heading"].to_numpy()[good])
+
+
+def with_tilt_errors(log: xr.Dataset, rng: np.random.Generator, offset_deg: float) -> xr.Dataset:
+    """Return a log with noise of roll and pitch, and with an offset in each run."""
+    _, runs = np.unique(log["run"], return_inverse=True)
+    for angle in ANGLES:
+        noise = rng.normal(0.0, TILT_SIGMA_DEG, len(runs)) + rng.normal(0.0, offset_deg, runs.max() + 1)[runs]
+        log = log.assign({angle: log[angle] + noise})
+    return log
+
+
+def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
+    """Yield the rows of a simulated vehicle: spirals, then a survey with exact headings as the truth."""
+    exact = {"roll_pitch_sigma": 0.0, "heading_sigma": 0.0}
+    rng = np.random.default_rng([seed, 5])
+    if name == "Bonne Bay twin":
+        parts = measure_trials(Twin.draw(load("bonne_bay").replace(telemetry=exact), seed), at_depth=True)
+        learned, survey = parts["trial 1"], parts["survey"]
+    else:
+        corner = CUTOFF_HZ if name == "gliders, filter" else 0.0
+        scenario = load("random_glider").replace(telemetry=exact, instrument={"corner": corner})
+        flown = glider(scenario, seed)
+        learned, survey = flown.runs, flown.survey
+    offset_deg = RUN_OFFSET_DEG if name == "gliders, tilt offsets" else 0.0
+    learned, survey = (with_tilt_errors(log, rng, offset_deg) for log in (learned, survey))
+    blind = learned.drop_vars("heading")
+    data = mb.observations(blind, MASSES)
+    if name == "gliders, filter":
+        yield from lagging(data, survey)
+        return
+    known = mb.fit(data).calibration
+    yield published("auto", known, survey)
+    yield published("nominal", mb.fit(mb.observations(blind, ()), "nominal").calibration, survey)
+    if name == "gliders, tilt offsets":
+        yield from after_pairs(known, learned, survey, blind)
+    yield score("raw compass", *levelled(channels(survey), survey), survey["heading"].to_numpy())
+    assert known.boresight is not None
+    turn = Rotation.from_rotvec(known.boresight.rotation)
+    for method, (A, T, failed) in other_methods(learned, peers):
+        vector = turn.apply((channels(survey) - T) @ A.T)
+        yield score(method, *levelled(vector, survey), survey["heading"].to_numpy()) | {"failed": failed}
+
+
+def levelled(vector: np.ndarray, log: xr.Dataset) -> tuple[np.ndarray, float]:
+    """Return the true heading (n,), deg, of vectors in body axes, and NaN: such a method states no sigma."""
+    _, ned, _ = earth_field(log)
+    assert ned is not None
+    declination = np.degrees(np.arctan2(ned[:, 1], ned[:, 0]))
+    roll, pitch = np.radians(side_by_side(log, ANGLES)).T
+    return mb.heading(vector, roll, pitch, declination).true, np.nan
+
+
+def after_pairs(
+    known: Calibration, learned: xr.Dataset, survey: xr.Dataset, blind: xr.Dataset
+) -> Iterator[Row]:
+    """Yield the rows of boresights of the first pairs of spirals alone."""
+    runs = np.unique(learned["run"])
+    for pairs in PAIRS:
+        first = blind.isel(time=np.isin(learned["run"], runs[: 2 * pairs]))
+        boresight = choose_boresight(known, mb.observations(first, MASSES))
+        if boresight is None:
+            yield {"method": f"auto, boresight of {pairs} pairs", "failed": "no boresight"}
+            continue
+        yield published(f"auto, boresight of {pairs} pairs", replace(known, boresight=boresight), survey)
+
+
+def lagging(known: Observations, log: xr.Dataset) -> Iterator[Row]:
+    """Yield the rows of a vehicle whose anti-alias filter lags, with and without the filter's correction."""
+    for method, data in (("auto, lag ignored", known), ("auto, lag undone", unfiltered(known, CUTOFF_HZ))):
+        yield published(method, mb.fit(data).calibration, log)
+
+
+def aircraft() -> Iterator[Row]:
+    """Yield the rows of the aircraft: each half of its calibration line is fitted, the other is corrected."""
+    folder = Path(os.environ.get("MAGBRIDGE_REAL_DATA", "../shared/data"))
+    if not (folder / AIRCRAFT).exists():
+        yield {"method": "auto", "failed": "no measured data"}
+        return
+    rows = np.loadtxt(folder / AIRCRAFT)[::AIRCRAFT_STEP]
+    pitch, roll, heading = rows[:, 4:7].T
+    ned = rows[:, 7:10]
+    line = Observations(
+        rows[:, 1:4], np.linalg.norm(ned, axis=1), np.empty((len(rows), 0)), time=FLOWN + rows[:, 0],
+        attitude=np.radians(np.column_stack([roll, pitch, heading])), reference_ned=ned,
+    )  # fmt: skip
+    first = np.arange(len(line)) < len(line) // 2
+    declination = np.degrees(np.arctan2(ned[:, 1], ned[:, 0]))
+    for half, part in (("first half", first), ("second half", ~first)):
+        known = mb.fit(line.part(part)).calibration
+        for method, boresight in (
+            ("tilt alone", known.boresight),
+            ("inertial headings", find_boresight(known, line.part(part))),
+        ):
+            assert boresight is not None
+            used = replace(known, boresight=boresight)
+            other = line.part(~part)
+            after = correct(used, other.field, other.parameters, other.time)
+            found = mb.heading(
+                after.vector, np.radians(roll[~part]), np.radians(pitch[~part]), declination[~part],
+                covariance=vector_covariance(used, other.field, other.parameters, other.time),
+                boresight_covariance=np.array(boresight.covariance), tilt_sigma_deg=boresight.tilt_sigma,
+            )  # fmt: skip
+            yield score(f"{half} fitted, boresight by {method}", found.true, found.sigma, heading[~part])
+
+
+STUDY = Study(
+    run,
+    ("data", "method"),
+    {
+        "error, deg RMS: median": Column("rms"),
+        "maximum": Column("rms", np.max),
+        "stated, deg": Column("stated"),
+        "normalised: median": Column("normalised"),
+    },
+)
+
+
+def main() -> None:
+    parser = study_options(__doc__)
+    parser.add_argument("--seeds", type=int, default=6, help="simulated vehicles of each kind")
+    peers = os.environ.get("MAGBRIDGE_PEERS", "")
+    parser.add_argument("--peers", default=peers, help="interpreter that has magyc and MAVProxy")
+    chosen = parser.parse_args()
+    cases = [(name, seed, chosen.peers) for name, seed in product(SIMULATED, range(chosen.seeds))]
+    STUDY.main("Heading, out of sample", [*cases, ("aircraft", 0, "")], chosen)
+
+
+if __name__ == "__main__":
+    main()
