@@ -27,8 +27,6 @@ from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Writer", "read", "read_chunks", "read_each", "without_companions", "write"]
-
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
 """Number of rows that no file reaches."""

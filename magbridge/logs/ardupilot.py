@@ -41,8 +41,6 @@ from magbridge.logs.fields import DEG_PER_RAD, FieldMap, field_maps, fields_of
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
 
-__all__ = ["WANTED", "chunks"]
-
 MIN_GPS_STATUS = 3
 """Least ``GPS.Status`` of a fix in three dimensions."""
 MAX_KIND_NUMBER = 8

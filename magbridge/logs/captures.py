@@ -28,9 +28,7 @@ import xarray as xr
 
 from magbridge.columns import CHANNELS, NT_PER_UNIT
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, with_losses
-
-__all__ = ["as_table", "reader"]
+from magbridge.logs.deployment import deployment, with_guesses, with_losses
 
 CAPTURE_RATE_HZ = 100.0
 """Lines a second that MotionCal's senders write."""
@@ -124,11 +122,7 @@ def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces
                 damaged += 1
 
     note = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {CAPTURE_RATE_HZ:g} lines a second"
-    attrs = {
-        "time_reference": "boot",
-        GUESSED_ATTRIBUTE: note,
-        HISTORY_ATTRIBUTE: f"{path.name} was read with: {note}",
-    }
+    attrs = with_guesses(path, {"time_reference": "boot"}, [note])
     found, done = wanted(), 0
     block = list(islice(found, rows))
     if not block:

@@ -34,11 +34,6 @@ from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
 from magbridge.logs.mapping import bare
 
-__all__ = [
-    "MEDIAN_ROWS", "Faults", "Validity", "boots", "checked", "in_order", "increasing", "known",
-    "mark_invalid", "states_validity", "validity_of",
-]  # fmt: skip
-
 Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
 YEAR_10000 = 253_402_300_800.0

@@ -25,11 +25,6 @@ import pandas as pd
 from magbridge.arrays import FloatArray
 from magbridge.logs.checks import MEDIAN_ROWS, boots
 
-__all__ = [
-    "DAY", "GPS_EPOCH", "SECONDS_OF_DAY", "WEEK", "CountState", "TimeFormat", "clock_of", "date_order",
-    "epoch", "leap_seconds", "seconds",
-]  # fmt: skip
-
 DAY = 86_400.0
 HOURS = ("%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S")
 DATES = (

@@ -30,11 +30,6 @@ from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sl
 from magbridge.logs.fields import latest
 from magbridge.wording import counted
 
-__all__ = [
-    "COMPASSES_ATTRIBUTE", "HEALTHY", "BootRun", "LogCompass", "Magnetometer", "Series", "by_columns",
-    "choose", "compass_notes", "compasses_in", "compasses_of", "further", "listed", "pieces", "rate",
-]  # fmt: skip
-
 Series = tuple[FloatArray, str, str, FloatArray]
 """Times (m,), s; column, unit and values (m,)."""
 MIN_BOOT_INTERVAL_S = 60.0

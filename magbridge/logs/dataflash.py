@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray, IndexArray
 
-__all__ = ["OWN_SCALE", "Flash", "Records", "read_binary", "read_text"]
-
 Bytes = NDArray[np.uint8]
 
 FMT = 128

@@ -16,13 +16,6 @@ from magbridge.errors import FormatError
 from magbridge.logs.mapping import split
 from magbridge.records import Quality
 
-__all__ = [
-    "CHANGES_SETTING", "COUNTERS", "GUESSED_ATTRIBUTE", "HISTORY_ATTRIBUTE", "LOSSES_ATTRIBUTE",
-    "MEANING", "NOTES", "SETTINGS", "deployment", "from_frame",
-    "join", "join_attrs", "lasting", "merged", "named_losses", "noted", "passed_over", "plain_attrs",
-    "same_columns", "sliced", "to_frame", "uncounted", "with_losses",
-]  # fmt: skip
-
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""
 SETTINGS = "align.", "telemetry."
@@ -191,6 +184,16 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
     if named := [*named_losses(dataset.attrs), *lines]:
         raised[LOSSES_ATTRIBUTE] = "\n".join(named)
     return dataset.assign_attrs(raised)
+
+
+def with_guesses(path: Path, attrs: Mapping[str, Any], guesses: Sequence[str]) -> dict[str, Any]:
+    """Return attributes with what was taken for granted when a file was read, also as a line of history."""
+    if not guesses:
+        return dict(attrs)
+    note = "; ".join(guesses)
+    before = [str(attrs[HISTORY_ATTRIBUTE])] if HISTORY_ATTRIBUTE in attrs else []
+    history = "\n".join([*before, f"{path.name} was read with: {note}"])
+    return {**attrs, GUESSED_ATTRIBUTE: note, HISTORY_ATTRIBUTE: history}
 
 
 def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:

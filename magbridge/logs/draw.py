@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 from magbridge.pictures import save
 from magbridge.records import Quality
 
-__all__ = ["corrected_panel", "draw_corrected"]
-
 DRAWN_SAMPLES = 20_000
 """Samples drawn; more only make a blot."""
 LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_field_sigma": "1-sigma, nT"}

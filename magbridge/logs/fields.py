@@ -18,11 +18,6 @@ from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 
-__all__ = [
-    "CIRCLES", "DEG_PER_RAD", "MAX_AGE", "FieldMap", "Track", "degrees", "field_maps", "fields_of",
-    "interpolated", "latest", "linear",
-]  # fmt: skip
-
 FIELDS_FILE = Path(__file__).with_name("fields.csv")
 DEG_PER_RAD = 180.0 / np.pi
 MAX_AGE = 30.0

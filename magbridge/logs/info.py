@@ -16,8 +16,6 @@ from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
 from magbridge.logs.naming import READING_RANGE_NT
 
-__all__ = ["INFO_GAP_INTERVALS", "USES", "conditions", "info", "lacking", "movers", "telemetry"]
-
 HORIZONTAL_POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
 RECKONING: tuple[tuple[str, ...], ...] = (

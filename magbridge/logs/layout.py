@@ -25,8 +25,6 @@ from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.mapping import CELL_NUMBER, ColumnMapping, declared_by_maker, is_unit
 from magbridge.wording import counted
 
-__all__ = ["BLANKS", "LAYOUT_LINES", "Layout", "Rows", "cells", "header_of", "is_remark", "rows_among"]
-
 Rows = Sequence[Sequence[str]]
 """The cells of some rows."""
 LAYOUT_LINES = 200

@@ -1,7 +1,5 @@
 """Bring several logs together: a stream sorted in time, and a vehicle's telemetry at a sensor's times.
 
-Logs are merged into one stream in bounded memory.
-
 A fluxgate with a logger of its own records the field, but neither attitude nor position; the vehicle's logs
 have these, on another time base. The sensor's rows stay as they are. Each column of the vehicle is brought to
 them by the rule for its kind:
@@ -16,10 +14,10 @@ intervals. Rows outside the vehicle's logs, and rows in gaps of these logs, stay
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
-from itertools import chain, pairwise
+from functools import partial
+from itertools import chain
 
 import numpy as np
 import xarray as xr
@@ -34,18 +32,15 @@ from magbridge.logs.deployment import (
     join_attrs,
     noted,
     same_columns,
+    sliced,
     uncounted,
     with_losses,
 )
 from magbridge.logs.fields import CIRCLES, latest, linear
 
-__all__ = ["combine", "merge", "refuse_offset"]
-
 Open = Callable[[int], Iterator[xr.Dataset]]
-Opened = tuple[xr.Dataset, Iterator[xr.Dataset]]
-"""A piece of a log, and those after it."""
 MAX_BUFFERED_BYTES = 1 << 28
-"""Bytes of first pieces that are kept while the others are opened: of small logs, all."""
+"""Bytes of first pieces that are kept while the others are opened: those of small logs, all."""
 MIN_GAP_S = 30.0
 """Shortest gap between two values of a column, s, across which it is not interpolated."""
 GAP_INTERVALS = 4.0
@@ -61,98 +56,50 @@ def merge(
 ) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
-    Each log is opened for its first piece, which gives its start and its columns; where memory does not
-    suffice for that, it is opened again when the stream has reached its start. Short pieces, as of many short
-    logs, are joined to pieces of `rows` rows. A log without a piece is left out.
-
-    A sensor's own logs, those `named` or found by :func:`_sensor_logs`, get the telemetry of the vehicle's
-    logs, which are held whole.
+    Each log is opened for its first piece, which gives its start and its columns. It is held whole from the
+    time at which the stream has reached its start to that at which it has reached its end. A log without a
+    piece is left out. A sensor's own logs and the vehicle's are all held (:func:`combine`).
     """
-    firsts: dict[int, xr.Dataset] = {}
-    opened: dict[int, Opened] = {}
+    firsts: list[xr.Dataset] = []
+    opened: list[Callable[[], Iterator[xr.Dataset]]] = []
+    declared = []
     room = MAX_BUFFERED_BYTES
     for k, source in enumerate(sources):
         pieces = source(rows)
         if (first := next(pieces, None)) is None:
             continue
-        firsts[k] = first.isel(time=slice(0, 1)).copy(deep=True)
+        firsts.append(first.isel(time=slice(0, 1)).copy(deep=True))
+        declared.append(k < len(named) and named[k])
         room -= first.nbytes
-        if room > 0:
-            opened[k] = first, pieces
-    places = list(firsts)
-    kinds = _sensor_logs([firsts[k] for k in places], [k < len(named) and named[k] for k in places])
-    if kinds[0]:
-        sensors, vehicles = ([places[k] for k in kind] for kind in kinds)
-        logs = []
-        for k in vehicles:
-            first_piece, pieces = opened.get(k, (None, iter(())))
-            logs += [*sources[k](rows)] if first_piece is None else [first_piece, *pieces]
-        telemetry = VehicleTelemetry(join(logs), clock_offset_s)
-        combined = {k: telemetry.opener(sources[k], is_first=k == sensors[0]) for k in sensors}
-        stream = merge([combined.get(k, sources[k]) for k in places if k not in vehicles], rows)
-        note_of = ", ".join(str(firsts[k].attrs["source"]) for k in sensors)
-        for piece, following in pairwise(chain(stream, [None])):
-            if piece is not None:
-                yield piece if following is not None else telemetry.noted(piece, note_of)
+        # where memory does not suffice, the log is opened again
+        opened.append(partial(chain, [first], pieces) if room > 0 else partial(source, rows))
+    if _sensor_logs(firsts, declared)[0]:
+        logs = [join([*pieces()]) for pieces in opened]
+        yield from sliced(join(combine(logs, declared, clock_offset_s)), rows)
         return
     refuse_offset(clock_offset_s)
-    whole = join(list(firsts.values()))  # also checks that they agree on units and on what heading means
+    whole = join(firsts)  # also checks that they agree on units and on what heading means
     columns = {str(name): dict(whole[name].attrs) for name in whole.data_vars}
+    # a file's attributes are those of the first piece, and must name all sources
     meaning = {key: whole.attrs[key] for key in ("source", "heading_reference") if key in whole.attrs}
-
-    def joined(parts: Sequence[xr.Dataset]) -> xr.Dataset:
-        # a file's attributes are those of the first piece, and must name all sources
-        return same_columns(join(parts), columns).assign_attrs(meaning)
-
+    starts = [float(first["time"].values[0]) for first in firsts]
+    order = sorted(range(len(firsts)), key=starts.__getitem__)
     parts: list[xr.Dataset] = []
-    held = 0  # rows in them, counted as they come: of thousands of short logs a sum would be quadratic
-    starts = {k: float(first["time"].values[0]) for k, first in firsts.items()}
-    for together in _in_order(sources, starts, opened, rows):
-        parts += together
-        held += sum(part.sizes["time"] for part in together)
-        if held >= rows:
-            yield joined(parts)
-            parts, held = [], 0
-    if parts:
-        yield joined(parts)
-
-
-def _in_order(
-    sources: Sequence[Open], starts: Mapping[int, float], opened: dict[int, Opened], rows: int
-) -> Iterator[list[xr.Dataset]]:
-    """Yield the logs' rows up to one time after another, up to which none can add another row.
-
-    `starts` are the times (s) of their first rows: none is opened before, except those in `opened`.
-    """
-    waiting = deque(sorted((start, k) for k, start in starts.items()))
-    active: dict[int, Opened] = {}
-
-    def advance(k: int, pieces: Iterator[xr.Dataset]) -> None:
-        piece = next(pieces, None)
-        if piece is None:
-            active.pop(k, None)
-        else:
-            active[k] = piece, pieces
-
-    while waiting or active:
-        horizon = min((float(piece["time"].values[-1]) for piece, _ in active.values()), default=np.inf)
-        if waiting and waiting[0][0] <= horizon:
-            _, k = waiting.popleft()
-            if k in opened:
-                active[k] = opened.pop(k)
-            else:
-                advance(k, sources[k](rows))
+    count = 0
+    for k, following in zip(order, [*order[1:], None], strict=True):
+        for piece in opened[k]():
+            parts.append(piece)
+            count += piece.sizes["time"]
+        end = np.inf if following is None else starts[following]
+        if following is not None and count < rows:
             continue
-        parts = []
-        for k, (piece, pieces) in sorted(active.items()):
-            n = int(np.searchsorted(piece["time"].values, horizon, side="right"))
-            if n == piece.sizes["time"]:
-                parts.append(piece)
-                advance(k, pieces)
-            elif n:
-                parts.append(piece.isel(time=slice(0, n)))
-                active[k] = uncounted(piece.isel(time=slice(n, None))), pieces
-        yield parts
+        held = same_columns(join(parts), columns).assign_attrs(meaning)
+        n = int(np.searchsorted(held["time"].values, end))
+        if n:
+            yield from sliced(held.isel(time=slice(0, n)), rows)
+            held = uncounted(held)
+        count = held.sizes["time"] - n
+        parts = [held.isel(time=slice(n, None))] if count else []
 
 
 def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: float) -> list[xr.Dataset]:
@@ -245,15 +192,6 @@ class VehicleTelemetry:
         combined = sensor.assign(columns)
         combined.attrs = attrs
         return with_losses(combined, {"rows_outside": int(outside.sum()), "rows_in_gaps": int(in_gaps.sum())})
-
-    def opener(self, source: Open, *, is_first: bool) -> Open:
-        """Return a function that opens a sensor's log as `source` does, with the vehicle's columns."""
-
-        def combined(rows: int) -> Iterator[xr.Dataset]:
-            for k, piece in enumerate(source(rows)):
-                yield self.add_to(piece, is_first=is_first and not k)
-
-        return combined
 
     def noted(self, log: xr.Dataset, source: str) -> xr.Dataset:
         """Return the last piece of the sensors' logs `source` with a note on how the logs were combined.

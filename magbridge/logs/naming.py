@@ -18,8 +18,6 @@ from magbridge.logs.clocks import DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import Layout, Rows
 from magbridge.logs.mapping import CELL_NUMBER, WITH_UNIT, aliases, bare, is_unit, split
 
-__all__ = ["HEMISPHERES", "READING_RANGE_NT", "name_columns", "on_side", "units_of_angles"]
-
 ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """Declaration of the time where a file has none: the rows, so many a second."""
 HOUR = re.compile(

@@ -49,8 +49,6 @@ try:
 except ImportError:
     raise MissingExtra("netCDF4", "analysis") from None
 
-__all__ = ["EPOCH", "floats"]
-
 EPOCH = "seconds since 1970-01-01T00:00:00Z"
 NANOSECONDS = re.compile(r"(nanosecond|nanosec|nsec|ns)s?(?= since)")
 WHOLE_AXIS = slice(None)

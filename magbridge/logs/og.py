@@ -21,8 +21,6 @@ from magbridge.errors import ConfigError, FormatError
 from magbridge.logs.netcdf import EPOCH, floats
 from magbridge.toml import Table, convert, load_toml
 
-__all__ = ["OgMetadata", "complete", "read_metadata"]
-
 TIME_FORMAT = "%Y%m%dT%H%M%S"
 MANDATORY_ATTRIBUTES = (
     *("title", "contributor_name", "contributor_email", "contributor_role", "contributor_role_vocabulary"),

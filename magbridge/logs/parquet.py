@@ -12,16 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from magbridge.arrays import FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import known
-from magbridge.logs.clocks import TimeFormat, clock_of, seconds
-from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, plain_attrs
+from magbridge.logs.checks import validity_of
+from magbridge.logs.clocks import TimeFormat
+from magbridge.logs.deployment import deployment, plain_attrs, with_guesses, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout
-from magbridge.logs.naming import name_columns, on_side
+from magbridge.logs.naming import name_columns
+from magbridge.logs.table import TableReader
 
 try:
     import pyarrow as pa
@@ -54,81 +55,60 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
         claimed = f"{file.metadata.num_rows} rows of {file.metadata.num_columns} columns"
         claimed += f" in {path.stat().st_size} bytes"
         raise FormatError(path, f"{claimed}: expected a file that is not damaged")
-    layout, clock = _layout(path, file, foreign=b"magbridge" not in (schema.metadata or {}))
+    foreign = b"magbridge" not in (schema.metadata or {})
+    layout, table = _layout(path, file, foreign=foreign)
+    attrs = {**attrs, **layout.attrs, **table.attrs}
+    if foreign:
+        attrs = with_guesses(path, attrs, [*layout.guesses, *table.guesses])
     row = 1
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
-        time = _times(batch, layout, clock)
-        columns = {
-            name: _floats(path, schema.field(k), batch.column(k))
-            for k, name in enumerate(layout.names)
-            if name and name != "time"
-        }
-        for name, k in layout.hemispheres.items():
-            columns[name] = on_side(name, columns[name], batch.column(k).to_pandas())
         numbers = range(row, row + batch.num_rows)
-        piece = deployment(path, time, columns, layout.column_units, {**attrs, **layout.attrs}, meanings)
-        yield known(path, piece, numbers) if layout.foreign else (piece, numbers)
+        kept = {*layout.stamp, *layout.hemispheres.values()}
+        frame = pd.DataFrame(
+            {
+                k: _cells(path, schema.field(k), batch.column(k), as_text=k in kept)
+                for k, name in enumerate(layout.names)
+                if name or k in kept
+            }
+        )
+        time, columns, there = table.read(frame, [*numbers])
+        piece = deployment(path, time, columns, layout.column_units, attrs, meanings)
+        yield with_losses(piece, *table.faults.since_last()), there
         row = numbers.stop
 
 
-def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TimeFormat | None]:
-    """Return the columns by names and first rows, and the format of times that are not timestamps."""
+def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TableReader]:
+    """Return the layout of the columns by their names and first rows, and their reader."""
     schema = file.schema_arrow
     first = next(file.iter_batches(batch_size=LAYOUT_LINES), None)
     if first is None:
         raise FormatError(path, "expected rows, there are none")
     cells = [["" if one is None else str(one) for one in column.to_pylist()] for column in first.columns]
+    rows = list(zip(*cells, strict=True))
     units = [_text(field.metadata, b"units") for field in schema]
-    layout = Layout(foreign=foreign, headings=tuple(schema.names))
-    layout = name_columns(path, layout, units, list(zip(*cells, strict=True)))
+    layout = name_columns(path, Layout(foreign=foreign, headings=tuple(schema.names)), units, rows)
     if not layout.stamp:
         raise FormatError(path, absent("time", schema.names), column="time")
-    time, unit = schema.field(layout.stamp[-1]), layout.units.get("time", "")
-    clock = None
-    if not pa.types.is_timestamp(time.type):
-        texts = [" ".join(parts) for parts in zip(*(cells[k] for k in layout.stamp), strict=True)]
-        try:
-            clock = clock_of(time.name, unit, texts, None)
-        except ValueError as error:
-            raise FormatError(path, str(error), column=time.name) from None
-        layout = layout.guessing(f"time: {clock.assumed}") if clock.assumed else layout
-        attrs = {**layout.attrs, **({"time_reference": "boot"} if clock.boot else {})}
-        layout = replace(layout, attrs=attrs)
-    if foreign and layout.guesses:
-        note = "; ".join(layout.guesses)
-        notes = {GUESSED_ATTRIBUTE: note, HISTORY_ATTRIBUTE: f"{path.name} was read with: {note}"}
-        layout = replace(layout, attrs={**layout.attrs, **notes})
-    return layout, clock
-
-
-def _times(batch: Any, layout: Layout, clock: TimeFormat | None) -> FloatArray:
-    """Return the times (n,) of a batch, s since 1970."""
-    columns = [batch.column(k) for k in layout.stamp]
-    if clock is None:
-        return _floats(Path(), batch.schema.field(layout.stamp[-1]), columns[-1])
-    if len(columns) == 1:
-        return seconds(clock, columns[0].to_pandas(), None)
-    joined, *others = (column.to_pandas().astype("string") for column in columns)
-    for one in others:
-        joined = joined + " " + one
-    return seconds(clock, joined, None)
+    layout = replace(layout, validity=tuple(validity_of(layout.names, ())) if foreign else ())
+    is_timestamp = pa.types.is_timestamp(schema.field(layout.stamp[-1]).type)
+    return layout, TableReader(path, layout, rows, clock=TimeFormat("s") if is_timestamp else None)
 
 
 def _text(metadata: dict[bytes, bytes] | None, key: bytes) -> str:
     return (metadata or {}).get(key, b"").decode()
 
 
-def _floats(path: Path, field: Any, array: Any) -> FloatArray:
-    scale = 1.0
+def _cells(path: Path, field: Any, array: Any, *, as_text: bool) -> Any:
+    """Return the cells of a column, timestamps in s since 1970; FormatError: texts, unless `as_text`."""
     if pa.types.is_timestamp(field.type):
         scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[field.type.unit]
-        array = array.cast(pa.int64())
-    elif not (
-        pa.types.is_integer(field.type) or pa.types.is_floating(field.type) or pa.types.is_boolean(field.type)
-    ):
-        raise FormatError(path, f"expected numbers, not {field.type}", column=field.name)
-    values: FloatArray = array.cast(pa.float64()).to_numpy(zero_copy_only=False)
-    return values * scale
+        return array.cast(pa.int64()).cast(pa.float64()).to_numpy(zero_copy_only=False) * scale
+    kinds = pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean
+    if any(is_kind(field.type) for is_kind in kinds):
+        return array.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    if as_text:
+        return array.to_pandas()
+    raise FormatError(path, f"expected numbers, not {field.type}", column=field.name)
 
 
 class FileWriter:

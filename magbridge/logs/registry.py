@@ -33,11 +33,6 @@ from magbridge.plugins import blamed, load, plugins
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-__all__ = [
-    "DECOMPRESSION_ERRORS", "FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "metadata_path",
-    "opened", "suffixes",
-]  # fmt: skip
-
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
 LEADS = {**FLIGHT, ".log": ".eng"}

@@ -41,8 +41,6 @@ from magbridge.field.reference import sphere_radius
 from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.fields import Track, degrees, field_maps, fields_of, interpolated, linear
 
-__all__ = ["CTD_FIELDS", "DIMENSION", "Dive", "chunks", "dive"]
-
 DIMENSION = "sg_data_point"
 COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
 """nT in a count, by the type of the compass: ``COMPASS_DEVICE`` is 16 times the type, and the port."""

@@ -16,40 +16,35 @@ from magbridge.columns import absent
 from magbridge.errors import FormatError
 from magbridge.logs.checks import Faults, Validity, mark_invalid
 from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
-from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
+from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, Rows, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.records import Quality
 from magbridge.wording import counted
-
-__all__ = ["TextTable"]
 
 EMPTY_CELLS = "-", "--", "*", "---"
 """Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 UNCLOSED_QUOTE = "expected every quote to be closed in its line"
 
 
-class TextTable:
-    """Read lines of one layout into columns.
+class TableReader:
+    """Convert the cells of a table to times and to columns of numbers.
 
+    `rows` are the cells of the first rows; `clock` is the format of the times where the file states it.
     `guesses` are the assumptions about the times, `attrs` what they mean for the deployment; `faults` counts
     the rows and values that were dropped.
     """
 
-    def __init__(self, path: Path, layout: Layout, first_lines: Sequence[str], *, strict: bool) -> None:
+    def __init__(
+        self, path: Path, layout: Layout, rows: Rows, *, strict: bool = False, clock: TimeFormat | None = None
+    ) -> None:
         self._path, self._layout, self._declared = path, layout, layout.declared
         self.faults = Faults(path, strict=strict)
         self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
         self.guesses: list[str] = []
         self._midnights, self._last = 0.0, 0.0
         self._counter = CountState(0.0, np.empty(0), 0.0)
-        if layout.rate:
-            self._clock = TimeFormat("s", f"{layout.rate:g} rows a second", boot=True)
-        elif layout.stamp:
-            self._clock = self._clock_by(first_lines)
-        else:
-            missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
-            raise FormatError(path, missing, row=layout.row, column="time")
-        self._start = self._start_by(first_lines)
+        self._clock = clock or self._clock_by(rows[: max(LAYOUT_LINES - layout.first, 1)])
+        self._start = self._start_by(rows)
         if self._clock.assumed and not self._start:
             self.guesses.insert(0, f"time: {self._clock.assumed}")
         self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._is_from_boot else {}
@@ -60,57 +55,61 @@ class TextTable:
     def _is_from_boot(self) -> bool:
         return self._clock.boot and not self._start
 
-    def _start_by(self, first_lines: Sequence[str]) -> float:
-        """Return the s since 1970 of a count's start, by other columns with date and time; 0 without them."""
+    def _clock_by(self, rows: Rows) -> TimeFormat:
+        """Return the format of the times, from the heading, the unit and the first cells."""
         layout = self._layout
+        if layout.rate:
+            return TimeFormat("s", f"{layout.rate:g} rows a second", boot=True)
+        if not layout.stamp:
+            missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
+            raise FormatError(self._path, missing, row=layout.row, column="time")
+        heading = layout.headings[layout.stamp[-1]].strip()
+        if order := date_order([layout.headings[k] for k in layout.stamp]):
+            heading = order
+        whole = [row for row in rows if len(row) == len(layout.headings)] or rows
+        texts = [text.replace(layout.decimal, ".") for text in _joined(whole, layout.stamp)]
+        if layout.by_hour:
+            self.guesses.append(f"{heading!r} as HHMM.mmm")
+            texts = [_seconds_of_day(text) for text in texts]
+        try:
+            return clock_of(heading, layout.units.get("time", ""), texts, self._declared.zone)
+        except ValueError as error:
+            raise FormatError(self._path, str(error), column="time") from None
+
+    def _start_by(self, rows: Rows) -> float:
+        """Return the s since 1970 of a count's start, by other columns with date and time; 0 without them."""
+        layout, zone = self._layout, self._declared.zone
         if not self._clock.boot or not layout.calendar or not layout.stamp:
             return 0.0
-        rows = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
         rows = [row for row in rows if max(*layout.calendar, *layout.stamp) < len(row)]
-        texts, counts = (pd.Series([" ".join(row[k] for k in places) for row in rows], dtype="str")
-                         for places in (layout.calendar, layout.stamp))  # fmt: skip
+        texts = pd.Series(_joined(rows, layout.calendar), dtype="str")
+        counts = pd.Series(_joined(rows, layout.stamp), dtype="str")
         headings = [layout.headings[k] for k in layout.calendar]
         try:
-            clock = clock_of(" ".join(headings), "", texts.tolist(), self._declared.zone)
+            clock = clock_of(" ".join(headings), "", texts.tolist(), zone)
         except ValueError:  # a date that can be read in two ways
             return 0.0
-        if clock.boot:
-            return 0.0
-        moments, since = seconds(clock, texts, self._declared.zone), seconds(self._clock, counts, None)
-        ahead = moments - since
-        if not np.isfinite(ahead).any():
+        moments = seconds(clock, texts, zone)
+        ahead = moments - seconds(self._clock, counts, None)
+        if clock.boot or not np.isfinite(ahead).any():
             return 0.0
         self.guesses.append(f"dated by {' and '.join(map(repr, headings))}")
         # whole seconds were cut off: on average by half a second, where there are several rows in one
         cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
         return float(np.nanmedian(ahead)) + cut
 
-    def _clock_by(self, first_lines: Sequence[str]) -> TimeFormat:
-        """Return the format of the times, from the heading, the unit and the first cells."""
-        layout = self._layout
-        heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.get("time", "")
-        if order := date_order([layout.headings[k] for k in layout.stamp]):
-            heading = order
-        lines = first_lines[layout.first : max(LAYOUT_LINES, layout.first + 1)]
-        first = [cells(line, layout.separator) for line in lines if line.strip()]
-        whole = [row for row in first if len(row) == len(layout.headings)] or first
-        texts = [" ".join(row[k] for k in layout.stamp) for row in whole if max(layout.stamp) < len(row)]
-        texts = [text.replace(layout.decimal, ".") for text in texts]
-        if layout.by_hour:
-            self.guesses.append(f"{heading!r} as HHMM.mmm")
-            texts = [_seconds_of_day(text) for text in texts]
-        try:
-            return clock_of(heading, unit, texts, self._declared.zone)
-        except ValueError as error:
-            raise FormatError(self._path, str(error), column="time") from None
-
-    def read(
+    def read_lines(
         self, lines: list[str], numbers: Sequence[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
         """Return the times (n,), the values (n,) of each column, and the numbers of the rows' lines."""
         self.faults.rows += len(lines)
         lines, kept = self._complete_lines(lines, numbers)
-        frame = self._frame(lines, kept)
+        return self.read(self._frame(lines, kept), kept)
+
+    def read(
+        self, frame: pd.DataFrame, kept: list[int]
+    ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
+        """Return the same of the cells, in columns by position, of rows with these numbers."""
         times, wrong = self._times(frame, kept)
         if wrong.any():
             frame, times = frame[~wrong], times[~wrong]
@@ -242,7 +241,7 @@ class TextTable:
         return times
 
     def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
-        if name == "quality":
+        if name == "quality" and not pd.api.types.is_numeric_dtype(column):
             return self._flags(column, numbers)
         if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
             values = column.to_numpy(np.float64, copy=True)
@@ -271,6 +270,11 @@ class TextTable:
                 expected = f"expected the names of flags, not {text!r}"
                 raise FormatError(self._path, expected, row=row, column="quality") from None
         return np.array([known[text] for text in texts])
+
+
+def _joined(rows: Rows, places: Sequence[int]) -> list[str]:
+    """Return the cells of some columns, joined by blanks, of each row that is long enough."""
+    return [" ".join(row[k] for k in places) for row in rows if max(places) < len(row)]
 
 
 def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray:

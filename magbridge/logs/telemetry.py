@@ -47,7 +47,7 @@ from magbridge.records import Channel
 if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
 
-__all__ = ["MAVLINK_FIELDS", "FileWriter", "chunks"]
+__all__ = ["FileWriter", "chunks"]
 
 Payloads = NDArray[np.uint8]
 """(n, size): the payloads of messages of one kind, without zeros cut off."""

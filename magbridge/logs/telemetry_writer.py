@@ -27,8 +27,6 @@ from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import east_e7
 from magbridge.records import Channel, Quality
 
-__all__ = ["POWER_CYCLE", "FileWriter", "short_name"]
-
 VEHICLE, AUTOPILOT, BRIDGE = 1, 1, 191
 ATTITUDE = ("roll", "pitch", "heading")
 POSITION_COLUMNS = ("latitude", "longitude", "depth")

@@ -37,12 +37,12 @@ from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
 from magbridge.logs.checks import validity_of
-from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, lasting, with_losses
-from magbridge.logs.layout import LAYOUT_LINES, Layout, cells, header_of, is_remark, rows_among
+from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, lasting, with_guesses, with_losses
+from magbridge.logs.layout import LAYOUT_LINES, Layout, Rows, cells, header_of, is_remark, rows_among
 from magbridge.logs.mapping import ColumnMapping, Options
 from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.registry import metadata_path, opened
-from magbridge.logs.table import TextTable
+from magbridge.logs.table import TableReader
 from magbridge.records import Quality
 
 DEFAULTS = Options()
@@ -108,23 +108,16 @@ def _chunks(
         lines, added = convert(chain(header, lines)), 1
         header = list(islice(lines, LAYOUT_LINES))
     further = list(islice(lines, FURTHER))
-    beside = _attributes(path)
     foreign = not metadata_path(path).is_file()
-    layout = layout_of(path, header, further, options.declared, foreign=foreign)
-    table = TextTable(path, layout, [*header, *further], strict=options.strict)
-    attrs = {**beside, **layout.attrs, **table.attrs}
-    if guesses := [*guess, *layout.guesses, *table.guesses]:
-        note = "; ".join(guesses)
-        before = [str(attrs[HISTORY_ATTRIBUTE])] if HISTORY_ATTRIBUTE in attrs else []
-        attrs |= {
-            GUESSED_ATTRIBUTE: note,
-            HISTORY_ATTRIBUTE: "\n".join([*before, f"{path.name} was read with: {note}"]),
-        }
+    layout, first_rows = layout_of(path, header, further, options.declared, foreign=foreign)
+    table = TableReader(path, layout, first_rows, strict=options.strict)
+    attrs = {**_attributes(path), **layout.attrs, **table.attrs}
+    attrs = with_guesses(path, attrs, [*guess, *layout.guesses, *table.guesses])
     marks = _LineMarks(header[: layout.first])
     numbered = enumerate(chain(header[layout.first :], further, lines), layout.first + 1 - added)
     wanted = ((row, line) for row, line in numbered if line.strip() and not marks.passes(row, line))
     while block := list(islice(wanted, rows)):
-        time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])
+        time, columns, numbers = table.read_lines([line for _, line in block], [row for row, _ in block])
         if marks.rows and "line" not in columns:
             columns["line"] = marks.labels(numbers)
         piece = deployment(path, time, columns, layout.column_units, attrs)
@@ -136,21 +129,21 @@ def _chunks(
 
 def layout_of(
     path: Path, lines: Sequence[str], further: Sequence[str], declared: ColumnMapping, *, foreign: bool
-) -> Layout:
-    """Return the layout of the file that begins with these lines; `foreign`: without metadata next to it.
+) -> tuple[Layout, Rows]:
+    """Return the layout of the file that begins with these lines, and the cells of its first rows.
 
-    `further` are lines behind them, by whose values units are found.
+    `further` are lines behind them, by whose values units are found; `foreign`: without metadata next to it.
 
     FormatError: no headings, two of one name, or a declared column that is not there.
     """
     layout, units, rows = header_of(path, lines, declared, foreign=foreign)
     layout = name_columns(path, layout, units, rows)
-    if not foreign:
-        return layout
     rows += [cells(line, layout.separator) for line in rows_among(further)]
+    if not foreign:
+        return layout, rows
     layout = units_of_angles(layout, rows)
     validity = validity_of(layout.names, rows)
-    return replace(layout, validity=tuple(validity)).guessing(*(rule.text for rule in validity))
+    return replace(layout, validity=tuple(validity)).guessing(*(rule.text for rule in validity)), rows
 
 
 def _lines(file: TextIO) -> Iterator[str]:
