@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from itertools import accumulate
 from math import nan
-from operator import itemgetter
 from struct import Struct, error
 from typing import Annotated, Any, ClassVar, NamedTuple
 from zlib import crc32
@@ -108,36 +107,27 @@ class StreamColumn(NamedTuple):
     type: int
 
 
-class StreamLayout(NamedTuple):
-    """Parts of a sample: sources (generation 1), or the numbers of the columns (generation 2).
-
-    `period` is in ticks of the `timebase` (generation 1 only).
-    """
-
-    parts: tuple[int, ...]
-    timebase: int = 0
-    period: int = 1
-
-
 class Segment(NamedTuple):
-    """Samples without a break: sample n was taken at ``(start * rate + n * decimation) / rate`` s."""
+    """Samples without a break: sample n of it is sample ``first + n``, taken at ``start + n * period``."""
 
     start: int
-    rate: int
-    decimation: int
+    """s on the device's clock."""
+    first: int
+    period: float
+    """s"""
 
 
-class _Row(NamedTuple):
-    """How a sample is read: `pick` takes channels and temperature from what `fields` unpacks.
+class SampleLayout(NamedTuple):
+    """How a sample is read."""
 
-    `size` is the length of a whole sample in bytes, `sizes` the lengths at which it may end, after any part.
-    """
-
-    sizes: frozenset[int]
-    size: int
-    fields: Struct
-    pick: Any
+    fields: list[tuple[int, Struct]]
+    """Place and format of the three channels, and of the temperature if there is one."""
+    needed: int
+    """Bytes up to the end of the last of these fields."""
+    sizes: list[int]
+    """Lengths at which a sample may end, after any part; the last is that of a whole sample."""
     scale: float
+    """nT per unit of the channels."""
 
 
 class Twinleaf(FramedDriver):
@@ -156,13 +146,15 @@ class Twinleaf(FramedDriver):
         self._routing = bytes(reversed(options.hops()))
         self.range_nt = options.range
         self._session: int | None = None
+        # generation 1: timebase -> s, source -> columns, stream -> sources, timebase, period in its ticks
         self._timebases: dict[int, float] = {}
         self._sources: dict[int, tuple[StreamColumn, ...]] = {}
-        self._streams: dict[int, StreamLayout] = {}
+        # generation 2: a part of a stream is a column; segments by stream and number
+        self._streams: dict[int, tuple[tuple[int, ...], int, int]] = {}
         self._columns: dict[tuple[int, int], StreamColumn] = {}
         self._segments: dict[tuple[int, int], Segment] = {}
-        self._rows: dict[int, _Row | None] = {}
-        self._last: tuple[int, int, int] = (0, 0, 0)
+        self._layouts: dict[int, SampleLayout | None] = {}
+        self._last = 0, 0, 0  # segment, sample number and wraps of the last packet
 
     def start(self) -> tuple[bytes, ...]:
         """Return a heartbeat, and the two generations' requests for descriptors."""
@@ -223,7 +215,7 @@ class Twinleaf(FramedDriver):
             number, timebase, period, _, _, count, _ = STREAM_HEADER.unpack_from(payload)
             places = range(STREAM_HEADER.size, STREAM_HEADER.size + COMPONENT.size * count, COMPONENT.size)
             parts = tuple(COMPONENT.unpack_from(payload, place)[0] for place in places)
-            self._remember(self._streams, number, StreamLayout(parts, timebase, period))
+            self._remember(self._streams, number, (parts, timebase, period))
 
     def _record(self, kind: int, record: bytes) -> None:
         """Read a record of generation 2."""
@@ -231,7 +223,7 @@ class Twinleaf(FramedDriver):
             self._session = int.from_bytes(record[2:6], "little")
         elif kind == STREAM_RECORD:
             _, number, columns, _, _, _, _ = STREAM_RECORD_HEADER.unpack_from(record)
-            self._remember(self._streams, number, StreamLayout(tuple(range(columns))))
+            self._remember(self._streams, number, (tuple(range(columns)), 0, 1))
         elif kind == COLUMN_RECORD:
             size, number, index, code, name, unit, _ = COLUMN_HEADER.unpack_from(record)
             text = record[size:]
@@ -239,7 +231,8 @@ class Twinleaf(FramedDriver):
             self._remember(self._columns, (number, index), StreamColumn(words[0], words[1], code))
         elif kind == SEGMENT_RECORD:
             header = SEGMENT_HEADER.unpack_from(record)
-            segment = Segment(header[7], header[8] or 1, header[9] or 1)
+            start, rate, decimation = header[7], header[8] or 1, header[9] or 1
+            segment = Segment(start, start * rate // decimation, decimation / rate)
             self._remember(self._segments, (header[1], header[2]), segment)
 
     def _remember(self, table: dict[Any, Any], key: Any, value: Any) -> None:
@@ -247,83 +240,79 @@ class Twinleaf(FramedDriver):
             if len(table) >= MAX_DESCRIPTORS:
                 table.clear()
             table[key] = value
-            self._rows.clear()
+            self._layouts.clear()
 
     def _samples(self, number: int, payload: bytes) -> list[Reading]:
         """Return the readings in a packet of samples of the stream `number`."""
-        if number not in self._rows:
-            parts = self._described(number)
-            if parts is None:
-                self._framer.skipped += len(payload)
-                return []
-            self._rows[number] = self._compile(parts)
-        row = self._rows[number]
-        if row is None:
-            return []
-        timing = self._timing(number, payload)
-        if timing is None:
+        if len(payload) < 4:
+            raise ValueError
+        if number not in self._layouts and (parts := self._parts(number)) is not None:
+            self._layouts[number] = self._layout(parts)
+        count = int.from_bytes(payload[:4], "little")
+        segment = self._segment(number, count >> 24)
+        if number not in self._layouts or segment is None:  # not described yet
             self._framer.skipped += len(payload)
             return []
-        first, begin, zero, period = timing
-        count, rest = divmod(len(payload) - 4, row.size)
+        layout = self._layouts[number]
+        if layout is None:  # a stream without our channels
+            return []
+        count = (
+            self._unwrap(count >> 24, count % WRAP_2, WRAP_2) if number else self._unwrap(0, count, WRAP_1)
+        )
+        size = layout.sizes[-1]
+        samples, rest = divmod(len(payload) - 4, size)
         if rest:
-            if len(payload) - 4 not in row.sizes:
+            if len(payload) - 4 not in layout.sizes:
                 raise ValueError
-            count = int(len(payload) - 4 >= row.fields.size)
+            samples = int(len(payload) - 4 >= layout.needed)
         readings = []
-        for n in range(first, first + count):
-            values = row.pick(row.fields.unpack_from(payload, 4 + (n - first) * row.size))
-            x, y, z = values[0] * row.scale, values[1] * row.scale, values[2] * row.scale
-            temperature = values[3] if len(values) == 4 else nan
+        for n in range(samples):
+            start = 4 + n * size
+            x, y, z, *more = [form.unpack_from(payload, start + place)[0] for place, form in layout.fields]
+            x, y, z = x * layout.scale, y * layout.scale, z * layout.scale
+            temperature = more[0] if more else nan
             is_field = abs(x) + abs(y) + abs(z) < MAX_MEASURED_NT  # False for NaN
             if not is_field or abs(temperature) > MAX_MEASURED_NT:
                 self.frames_bad += 1
-                self._framer.skipped += row.fields.size
+                self._framer.skipped += layout.needed
                 continue
             reading = Reading(
-                (x, y, z), None, (zero + n) % WRAP_1, begin + n * period, temperature=temperature,
+                (x, y, z), None, (segment.first + count + n) % WRAP_1,
+                segment.start + (count + n) * segment.period, temperature=temperature,
                 power_cycle=self._session, saturated=saturated(x, y, z, self.range_nt),
             )  # fmt: skip
             readings.append(reading)
         return readings
 
-    def _timing(self, number: int, payload: bytes) -> tuple[int, int, int, float] | None:
-        """Return a packet's first sample number, and its segment's start (s), number and period (s)."""
-        if len(payload) < 4:
-            raise ValueError
-        first = int.from_bytes(payload[:4], "little")
-        if number == 0:
-            stream = self._streams[0]
-            return self._unwrap(0, first, WRAP_1), 0, 0, self._timebases[stream.timebase] * stream.period
-        segment = self._segments.get((number, first >> 24))
-        if segment is None:
+    def _segment(self, number: int, segment: int) -> Segment | None:
+        """Return a segment of a stream; the whole stream is one in generation 1. None if not described."""
+        if number:
+            return self._segments.get((number, segment))
+        _, timebase, period = self._streams.get(0, ((), -1, 0))
+        if timebase not in self._timebases:
             return None
-        zero = segment.start * segment.rate // segment.decimation
-        first = self._unwrap(first >> 24, first % WRAP_2, WRAP_2)
-        return first, segment.start, zero, segment.decimation / segment.rate
+        return Segment(0, 0, self._timebases[timebase] * period)
 
-    def _unwrap(self, key: int, number: int, wrap: int) -> int:
+    def _unwrap(self, segment: int, number: int, wrap: int) -> int:
         """Return the sample number with its wraps within the segment undone."""
-        last_key, last, turns = self._last
-        if key != last_key:
+        last_segment, last, turns = self._last
+        if segment != last_segment:
             turns = 0
         elif last - number > wrap // 2:
             turns += 1
-        self._last = key, number, turns
+        self._last = segment, number, turns
         return number + turns * wrap
 
-    def _described(self, number: int) -> list[tuple[StreamColumn, ...]] | None:
+    def _parts(self, number: int) -> list[tuple[StreamColumn, ...]] | None:
         """Return the parts of a stream's samples, each with its columns; None where not all are known yet."""
-        stream = self._streams.get(number)
-        if stream is None or (number == 0 and stream.timebase not in self._timebases):
-            return None
-        if number == 0:
-            sources = [self._sources.get(part) for part in stream.parts]
-            return [source for source in sources if source is not None] if all(sources) else None
-        columns = [self._columns.get((number, part)) for part in stream.parts]
-        return [(column,) for column in columns if column is not None] if all(columns) else None
+        parts = []
+        for part in self._streams.get(number, ((), 0, 1))[0]:
+            column = self._columns.get((number, part))
+            columns = (column,) if column is not None else ()
+            parts.append(columns if number else self._sources.get(part, ()))
+        return parts if parts and all(parts) else None
 
-    def _compile(self, parts: list[tuple[StreamColumn, ...]]) -> _Row | None:
+    def _layout(self, parts: list[tuple[StreamColumn, ...]]) -> SampleLayout | None:
         """Return the layout of samples of these parts; None if they lack our channels."""
         columns = [column for part in parts for column in part]
         names = [column.name for column in columns]
@@ -336,18 +325,9 @@ class Twinleaf(FramedDriver):
         if scale is None or any(columns[index].type not in TYPE_FORMATS for index in wanted):
             raise ValueError
         offsets = [0, *accumulate(column.type >> 4 for column in columns)]
-        text, at = "<", 0
-        for index in sorted(wanted):
-            text += f"{offsets[index] - at}x{TYPE_FORMATS[columns[index].type]}"
-            at = offsets[index + 1]
-        ends = accumulate(len(part) for part in parts)
-        return _Row(
-            frozenset(offsets[end] for end in ends),
-            offsets[-1],
-            Struct(text),
-            itemgetter(*(sorted(wanted).index(index) for index in wanted)),
-            scale,
-        )
+        fields = [(offsets[index], Struct(f"<{TYPE_FORMATS[columns[index].type]}")) for index in wanted]
+        sizes = [offsets[end] for end in accumulate(len(part) for part in parts)]
+        return SampleLayout(fields, offsets[max(wanted) + 1], sizes, scale)
 
 
 def unslip(frame: bytes) -> bytes:
