@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import nan, sqrt
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from msgspec.structs import replace
 
@@ -31,11 +31,11 @@ from magbridge.health.comparison import SensorComparison
 from magbridge.link.component import Component
 from magbridge.link.estimates import NO_ATTITUDE, Attitude
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
-from magbridge.link.publish import Condition, check_publish
+from magbridge.link.publish import MASK, check_publish
 from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, Sources, TelemetryMap, is_possible, needed_rates
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Message, Signing, Spec, load_key, spec
-from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver
@@ -107,7 +107,7 @@ class Pipeline:
         self._by_id = {one.sensor_id: one for one in self.streams}
         lines = {one.sensor_id: one.line for one in self.streams}
         if len(self.streams) > 1:
-            self.component.more_reports += [one.report for one in self.streams]
+            self.component.reports.more += [one.report for one in self.streams]
         self._changes = StateChanges(self.component.codec, self.component.announcer, lines)
         self._comparisons = [
             SensorComparison((config.sensor.label, one.label)) for one in config.more_sensors
@@ -147,7 +147,6 @@ class Pipeline:
             version=__version__,
             kept=start.parameters,
             status=self._status,
-            speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
             streams=streams,
         )
 
@@ -398,8 +397,8 @@ class Pipeline:
         """Return the frames that record how the run started, with these values of the parameters."""
         return beginning(self._config, self._start, self._calibration_id, parameters)
 
-    def _status(self) -> Condition:
-        """Return the state of sensor, samples and log for MAG_STATUS."""
+    def _status(self) -> dict[str, Any]:
+        """Return the fields of MAG_STATUS about sensor, samples and log."""
         now_us, main = self.component.codec.now_us, self.streams[0]
         tracks = self._correction.aligner.by_name
         stale = sum(
@@ -407,20 +406,21 @@ class Pipeline:
             for bit, name in enumerate(self._config.telemetry)
             if bit < 32 and name in tracks and tracks[name].stale(now_us)
         )
-        return Condition(
-            main.samples,
-            main.lost,
-            main.driver.bytes_skipped,
-            main.driver.frames_bad,
-            main.line.state,
-            -main.clock.drift_ppm,
-            main.sample_rate,
-            stale,
-            # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
-            self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0,
-            self._changes.log_lost,
-            self._changes.log_state,
-        )
+        # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
+        records = self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0
+        return {
+            "samples": main.samples & MASK,
+            "samples_lost": main.lost & MASK,
+            "sensor_bytes_skipped": main.driver.bytes_skipped & MASK,
+            "sensor_frames_bad": main.driver.frames_bad & MASK,
+            "sensor_state": main.line.state,
+            "sensor_clock_drift": -main.clock.drift_ppm,
+            "sample_rate": main.sample_rate,
+            "telemetry_stale": stale,
+            "log_records": records & MASK,
+            "log_lost": self._changes.log_lost & MASK,
+            "log_state": self._changes.log_state,
+        }
 
 
 class Edge(Protocol):

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from math import isfinite
+from math import isfinite, nan
+from typing import Any
 
 from magbridge.config import Link
-from magbridge.link.files import GENERAL, metadata_files
+from magbridge.link.files import GENERAL, crc32, metadata_files, uri
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.parameters import Authority, Parameters, ParameterService, Tunable, rates
-from magbridge.link.publish import (
-    DEFAULT_RATES_HZ,
-    LIMITS,
-    PUBLISHED,
-    Condition,
-    MessageRates,
-    Publisher,
-    Reports,
-)
+from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS, MASK, PUBLISHED, MessageRates, Publisher
 from magbridge.link.telemetry import Stream, StreamRequests
 from magbridge.link.vehicle import VehicleState
 from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.codec import NOT_SIGNED
-from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from magbridge.mavlink.enums import (
+    FIRMWARE_VERSION_TYPE,
+    MAG_PORT_STATE,
+    MAV_AUTOPILOT,
+    MAV_CMD,
+    MAV_PROTOCOL_CAPABILITY,
+    MAV_RESULT,
+    MAV_SEVERITY,
+    MAV_STATE,
+    MAV_TYPE,
+)
 from magbridge.mavlink.messages import is_signed
 
 __all__ = ["TIMESYNC_US", "Component"]
@@ -47,26 +51,20 @@ class Commands:
     concerns messages of its own dialect and never refuses, because a ground station would take the refusal
     for the autopilot's. Calibration of the autopilot's own compass (DO_START_MAG_CAL and the like) is the
     autopilot's business; a request to the bridge itself gets a STATUSTEXT on how ours is calibrated.
-
-    `messages`: what can be requested, by message id; sends the message, and returns False where there is
-        nothing to send yet.
-    `interval_us`: interval of a message id in µs: -1 off, 0 unknown; KeyError where it has none.
-    `set_rate`: takes a message id and a rate in Hz (-1 off, None for the default); returns whether it is
-        allowed. KeyError where the message has no rate.
-    `authority`: knows who may change a rate.
     """
 
-    def __init__(
-        self,
-        outbox: Outbox,
-        messages: Mapping[int, Callable[[], bool]],
-        interval_us: Callable[[int], int],
-        set_rate: Callable[[int, float | None], bool],
-        authority: Authority,
-        announcer: Announcer,
-    ) -> None:
-        self._outbox, self._authority, self._announcer = outbox, authority, announcer
-        self._messages, self._interval_us, self._set_rate = messages, interval_us, set_rate
+    def __init__(self, component: Component) -> None:
+        self._component, self._outbox, self._announcer = component, component.outbox, component.announcer
+        reports = component.reports
+        by_name: dict[str, Callable[[], bool]] = {
+            "HEARTBEAT": reports.heartbeat,
+            "MAG_STATUS": reports.status,
+            "AUTOPILOT_VERSION": reports.version,
+            "COMPONENT_INFORMATION_BASIC": reports.information,
+            "COMPONENT_METADATA": reports.metadata,
+            **{name: partial(component.publisher.repeat, name) for name in PUBLISHED},
+        }
+        self._messages: dict[int, Callable[[], bool]] = by_id(**by_name)
         self._second_us = 0
         self._asked: dict[tuple[int, int], int] = {}
         self._commands = {
@@ -76,11 +74,9 @@ class Commands:
             MAV_CMD.REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
         }
 
-    def handle(self, message: Message, system: int, component: int) -> None:
-        """Execute and acknowledge a command, if it is addressed to `component` of `system`."""
+    def handle(self, message: Message) -> None:
+        """Execute and acknowledge a command that is addressed to the bridge or to all components."""
         target = message["target_component"]
-        if message["target_system"] not in (0, system) or target not in (0, component):
-            return
         number = message["command"]
         values = [message["param1"], message["param2"]]
         if target == 0 and not self._only_us(number, values[0]):
@@ -90,7 +86,7 @@ class Commands:
             text = f"more than {MAX_COMMAND_RATE} commands a second from {message.system}:{message.component}"
             self._announcer.state("flood", text, MAV_SEVERITY.WARNING)
             result = MAV_RESULT.TEMPORARILY_REJECTED
-        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._authority.may_change(message):
+        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._component.authority.may_change(message):
             text = f"{message.system}:{message.component} may not set a rate: no station, no autopilot"
             self._announcer.state("rate", text, MAV_SEVERITY.WARNING, recurring=True)
             result = MAV_RESULT.DENIED
@@ -139,20 +135,16 @@ class Commands:
         if not isfinite(interval) or (interval < 0 and interval != -1):
             return MAV_RESULT.DENIED
         rate = None if interval == 0 else -1.0 if interval < 0 else 1e6 / interval
-        try:
-            allowed = self._set_rate(to_integer(values[0]), rate)
-        except KeyError:
-            allowed = False
-        return MAV_RESULT.ACCEPTED if allowed else MAV_RESULT.DENIED
+        parameter = self._component.message_rates.set(to_integer(values[0]), rate)
+        if parameter:
+            self._component.parameter_service.send(parameter)
+        return MAV_RESULT.ACCEPTED if parameter else MAV_RESULT.DENIED
 
     def _get_interval(self, values: list[float]) -> MAV_RESULT:
         number = to_integer(values[0])
-        try:
-            interval = self._interval_us(number)
-        except KeyError:
-            interval = 0
         if not 0 <= number <= 0xFFFF:
             return MAV_RESULT.DENIED
+        interval = self._component.message_rates.interval_us(number, self._component.reports.sample_rate)
         self._outbox.send("MESSAGE_INTERVAL", message_id=number, interval_us=interval)
         return MAV_RESULT.ACCEPTED
 
@@ -165,6 +157,117 @@ class Commands:
 def to_integer(value: float) -> int:
     """Return a float parameter as an integer, or -1 (no message has this id) if it is not finite."""
     return int(value) if isfinite(value) else -1
+
+
+HEARTBEAT = spec("HEARTBEAT")
+ALIVE, CRITICAL = (
+    HEARTBEAT.payload(
+        type=MAV_TYPE.ONBOARD_CONTROLLER,
+        autopilot=MAV_AUTOPILOT.INVALID,
+        system_status=state,
+        mavlink_version=3,
+    )
+    for state in (MAV_STATE.ACTIVE, MAV_STATE.CRITICAL)
+)
+CAPABILITIES = (
+    MAV_PROTOCOL_CAPABILITY.PARAM_FLOAT
+    | MAV_PROTOCOL_CAPABILITY.COMMAND_INT
+    | MAV_PROTOCOL_CAPABILITY.MAVLINK2
+    | MAV_PROTOCOL_CAPABILITY.FTP
+    | MAV_PROTOCOL_CAPABILITY.PARAM_ENCODE_C_CAST
+)
+
+
+class Reports:
+    """Send HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the description of the component.
+
+    `version`: of the program, ``"0.1.0"``.
+    `condition`: returns the fields of MAG_STATUS that the link cannot know itself.
+    `calibration_id`: CRC-32 of the calibration's file; 0 is none.
+    `more`: functions that send the messages with the rate of MAG_STATUS.
+    """
+
+    def __init__(
+        self, component: Component, version: str, calibration_id: int, condition: Callable[[], dict[str, Any]]
+    ) -> None:
+        self._component, self._outbox = component, component.outbox
+        self._version, self.calibration_id, self._condition = version, calibration_id, condition
+        self._start_us = component.codec.now_us
+        self.more: list[Callable[[], object]] = []
+
+    def heartbeat(self) -> bool:
+        """Send HEARTBEAT: active while readings come from the sensor, else critical; return True."""
+        speaks = self._condition().get("sensor_state") == MAG_PORT_STATE.OK
+        self._outbox.put(HEARTBEAT, ALIVE if speaks else CRITICAL)
+        return True
+
+    def status(self) -> bool:
+        """Send MAG_STATUS and the messages of the same rate; return True."""
+        codec, vehicle = self._component.codec, self._component.vehicle
+        clock = vehicle.clock
+        self._outbox.send(
+            "MAG_STATUS",
+            time_usec=codec.utc_us,
+            vehicle_clock_offset=(
+                round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0
+            ),
+            uptime=(codec.now_us - self._start_us) // 1_000_000 & MASK,
+            calibration_id=self.calibration_id,
+            link_frames=codec.frames & MASK,
+            link_frames_lost=vehicle.frames_lost & MASK,
+            link_bytes_skipped=codec.bytes_skipped & MASK,
+            link_refused=codec.signing.refused & MASK if codec.signing else 0,
+            vehicle_clock_sigma=clock.sigma,
+            vehicle_clock_drift=clock.drift_ppm,
+            vehicle_reboots=vehicle.reboots & 0xFFFF,
+            autopilot_state=vehicle.state,
+            **{"sample_rate": nan, "sensor_clock_drift": nan} | self._condition(),
+        )
+        for send in self.more:
+            send()
+        return True
+
+    def version(self) -> bool:
+        """Send AUTOPILOT_VERSION; return True."""
+        numbers = [int(number) & 0xFF for number in re.findall(r"\d+", self._version)[:3]]
+        version = bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,))
+        self._outbox.send(
+            "AUTOPILOT_VERSION", capabilities=CAPABILITIES, flight_sw_version=int.from_bytes(version, "big")
+        )
+        return True
+
+    def information(self) -> bool:
+        """Send COMPONENT_INFORMATION_BASIC; return True."""
+        self._outbox.send(
+            "COMPONENT_INFORMATION_BASIC",
+            time_boot_ms=self._boot_ms,
+            capabilities=CAPABILITIES,
+            vendor_name="magbridge",
+            model_name="magnetometer bridge",
+            software_version=self._version,
+        )
+        return True
+
+    def metadata(self) -> bool:
+        """Send COMPONENT_METADATA with the URI of the files that describe the parameters; return True."""
+        general, component = self._component.metadata[GENERAL], self._component.codec.component
+        self._outbox.send(
+            "COMPONENT_METADATA",
+            time_boot_ms=self._boot_ms,
+            file_crc=crc32(general),
+            uri=uri(component, GENERAL),
+        )
+        return True
+
+    @property
+    def sample_rate(self) -> float:
+        """Recent rate of the samples, Hz; NaN while unknown."""
+        rate: float = self._condition().get("sample_rate", nan)
+        return rate
+
+    @property
+    def _boot_ms(self) -> int:
+        return (self._component.codec.now_us - self._start_us) // 1000 & MASK
 
 
 TIMESYNC = spec("TIMESYNC")
@@ -185,16 +288,14 @@ class Component:
     `calibration_id`: CRC-32 of the calibration's file; 0 is none.
     `version`: of the program, ``"0.1.0"``.
     `kept`: parameters that a station changed in an earlier run.
-    `status`: returns the part of MAG_STATUS that the component cannot know itself (samples, log, sensor).
-    `speaking`: says whether readings come from the sensor: the heartbeat's state is critical where they do
-        not.
+    `status`: returns the fields of MAG_STATUS that the component cannot know itself (samples, log, sensor).
     `outbox`: messages to send.
     `received`: everything that came, as frames for the log; the bridge empties it.
     `genuine`: the signed frames of the last :meth:`receive` that were accepted.
     `file_requests`: requests for files; the bridge takes them out.
-    `more_reports`: functions that send the messages with the rate of MAG_STATUS.
     `metadata`: the files that describe the parameters, by path.
-    `parameters`, `rates`, `announcer`, `vehicle`, `publisher`: the services, for use by the bridge.
+    `authority`, `parameters`, `parameter_service`, `message_rates`, `announcer`, `vehicle`, `publisher`,
+    `reports`: the services.
     """
 
     def __init__(
@@ -208,8 +309,7 @@ class Component:
         calibration_id: int = 0,
         version: str = "0.0.0",
         kept: Mapping[str, float] | None = None,
-        status: Callable[[], Condition] = Condition,
-        speaking: Callable[[], bool] = bool,
+        status: Callable[[], dict[str, Any]] = dict,
         streams: Mapping[Stream, tuple[float, float]] | None = None,
     ) -> None:
         self._link = link
@@ -218,7 +318,6 @@ class Component:
         self._frame_log = FrameLogWriter(link.system, link.component)
         self.outbox, self.timers = Outbox(self.codec), Timers()
         self.received: list[bytes] = []
-        self.more_reports: list[Callable[[], None]] = []
         self.genuine: list[bytes] = []
         self._whole = link.shared
         self._refusals_reported = 0
@@ -236,55 +335,34 @@ class Component:
             )
         if changed := self.parameters.changed():
             self.announcer.send_statustext(f"kept from the link, not as configured: {', '.join(changed)}")
-        self._message_rates = MessageRates(self.parameters, self.timers, self.codec)
-        self.rates = self._message_rates.by_name
+        self.message_rates = MessageRates(self.parameters, self.timers, self.codec)
+        self.rates = self.message_rates.by_name
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
         self.metadata = metadata_files(self.parameters.table.values(), link.component)
         self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
-        self._reports = Reports(
-            self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking,
-            self.metadata[GENERAL],
-        )  # fmt: skip
-        by_clock = {"HEARTBEAT": self._reports.heartbeat, "MAG_STATUS": self._report_status}
-        self._authority = Authority(link.system, link.autopilot)
-        self._service = ParameterService(
-            self.parameters, self.outbox, self.timers, self.announcer, self._authority
+        self.reports = Reports(self, version, calibration_id, status)
+        self.authority = Authority(link.system, link.autopilot)
+        self.parameter_service = ParameterService(
+            self.parameters, self.outbox, self.timers, self.announcer, self.authority
         )
-        self._commands = self._open_commands(by_clock)
         self._handlers = self._open_handlers()
-        for name, report in by_clock.items():
-            self._message_rates.send_by_clock(name, report)
+        self.message_rates.send_by_clock("HEARTBEAT", self.reports.heartbeat)
+        self.message_rates.send_by_clock("MAG_STATUS", self.reports.status)
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
-
-    def _open_commands(self, by_clock: Mapping[str, Callable[[], None]]) -> Commands:
-        """Return the service that executes commands."""
-        return Commands(
-            self.outbox,
-            self._requestable(by_clock),
-            lambda number: self._message_rates.interval_us(number, self._reports.sample_interval_us),
-            self._set_rate,
-            self._authority,
-            self.announcer,
-        )
 
     def _open_handlers(self) -> dict[int, Callable[[Message], None]]:
         """Return the handler of each message that is a request, an answer or a heartbeat."""
+        service, command = self.parameter_service, self._if_ours(Commands(self).handle)
         return by_id(
-            PARAM_REQUEST_LIST=self._if_ours(self._service.list),
-            PARAM_REQUEST_READ=self._if_ours(self._service.read),
-            PARAM_SET=self._if_ours(self._service.write),
+            PARAM_REQUEST_LIST=self._if_ours(service.list),
+            PARAM_REQUEST_READ=self._if_ours(service.read),
+            PARAM_SET=self._if_ours(service.write),
             TIMESYNC=self._timesync,
             HEARTBEAT=self._heartbeat,
             LOG_ERASE=self._if_to_us_alone(self._erase),
-            **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), self._command),
+            **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), command),
             **dict.fromkeys(FILE_REQUESTS, self._if_to_us_alone(self.file_requests.append)),
         )
-
-    def _report_status(self) -> None:
-        """Send MAG_STATUS and the messages of the same rate."""
-        self._reports.status()
-        for report in self.more_reports:
-            report()
 
     @property
     def peer(self) -> tuple[int, int]:
@@ -293,11 +371,11 @@ class Component:
 
     def use_calibration(self, calibration_id: int) -> None:
         """Set the calibration id of all later messages."""
-        self.publisher.calibration_id = self._reports.calibration_id = calibration_id
+        self.publisher.calibration_id = self.reports.calibration_id = calibration_id
 
     def another_publisher(self, sensor_id: int, calibration_id: int) -> Publisher:
         """Return the sender of another sensor's samples: MAG_RAW and MAG_FIELD with its id."""
-        rates = {name: self._message_rates.another(name) for name in ("MAG_RAW", "MAG_FIELD")}
+        rates = {name: self.message_rates.another(name) for name in ("MAG_RAW", "MAG_FIELD")}
         return Publisher(self.outbox, rates, calibration_id, sensor_id=sensor_id)
 
     @property
@@ -370,12 +448,9 @@ class Component:
     def _if_ours(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
         return lambda message: handler(message) if self._for_us(message) else None
 
-    def _command(self, message: Message) -> None:
-        self._commands.handle(message, self._link.system, self._link.component)
-
     def _heartbeat(self, message: Message) -> None:
-        if self._authority.heartbeat(message):
-            self._service.greet((message.system, message.component))
+        if self.authority.heartbeat(message):
+            self.parameter_service.greet((message.system, message.component))
 
     def _if_to_us_alone(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
         """Return the handler of a service that the autopilot also offers: files and logs."""
@@ -401,28 +476,3 @@ class Component:
     def _ask_time(self, t_us: int) -> None:
         ts1 = self.vehicle.clock.ask(t_us)
         self.outbox.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
-
-    def _requestable(self, by_clock: Mapping[str, Callable[[], None]]) -> dict[int, Callable[[], bool]]:
-        """Return the messages that REQUEST_MESSAGE can request: id to a function that sends the message."""
-        reports = {
-            **by_clock,
-            "AUTOPILOT_VERSION": self._reports.version,
-            "COMPONENT_INFORMATION_BASIC": self._reports.component,
-            "COMPONENT_METADATA": self._reports.metadata,
-        }
-        return {
-            **{spec(name).id: partial(always, report) for name, report in reports.items()},
-            **{spec(name).id: partial(self.publisher.repeat, name) for name in PUBLISHED},
-        }
-
-    def _set_rate(self, number: int, hertz: float | None) -> bool:
-        parameter = self._message_rates.set(number, hertz)
-        if parameter:
-            self._service.send(parameter)
-        return bool(parameter)
-
-
-def always(report: Callable[[], None]) -> bool:
-    """Send a report; return True, because a report is always available."""
-    report()
-    return True

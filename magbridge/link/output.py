@@ -62,15 +62,15 @@ class Timers:
 
     def __init__(self) -> None:
         self._deadlines: dict[str, int] = {}
-        self._actions: dict[str, tuple[int, Callable[[int], None]]] = {}  # period in µs, and action
+        self._actions: dict[str, tuple[int, Callable[[int], object]]] = {}  # period in µs, and action
         self._next = ""
         self.next_deadline = FOREVER
 
-    def every(self, name: str, period_us: int, action: Callable[[int], None], first_us: int) -> None:
+    def every(self, name: str, period_us: int, action: Callable[[int], object], first_us: int) -> None:
         """Call ``action(deadline)`` at `first_us` and every `period_us` (a multiple of 4) from there."""
         self._set(name, first_us, max(period_us & ~3, 4), action)
 
-    def run_once(self, name: str, time_us: int, action: Callable[[int], None]) -> None:
+    def run_once(self, name: str, time_us: int, action: Callable[[int], object]) -> None:
         """Call ``action(time_us)`` once."""
         self._set(name, time_us, 0, action)
 
@@ -99,7 +99,7 @@ class Timers:
             begin(deadline)
             action(deadline)
 
-    def _set(self, name: str, deadline: int, period: int, action: Callable[[int], None]) -> None:
+    def _set(self, name: str, deadline: int, period: int, action: Callable[[int], object]) -> None:
         self._deadlines[name], self._actions[name] = deadline, (period, action)
         if name == self._next or deadline <= self.next_deadline:
             self._find_next()

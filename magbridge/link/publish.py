@@ -1,39 +1,29 @@
-"""Messages that the bridge sends: each sample, and reports on itself (heartbeat, status, version)."""
+"""Messages of each sample, and the rates of all messages."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from math import isfinite, nan
 from pathlib import Path
 from struct import Struct
-from typing import Final, NamedTuple
+from typing import Final
 
 from magbridge.align import Sample, nearest
 from magbridge.errors import ConfigError
 from magbridge.link.estimates import NO_ATTITUDE, Attitude, send_attitude
-from magbridge.link.files import GENERAL, crc32, uri
 from magbridge.link.output import Outbox, Rate, Timers, period_us
 from magbridge.link.parameters import (
     Parameters,
     rate_name,
 )
-from magbridge.link.vehicle import VehicleState
 from magbridge.mavlink import Codec, spec
-from magbridge.mavlink.enums import (
-    FIRMWARE_VERSION_TYPE,
-    MAG_RAW_FLAGS,
-    MAV_AUTOPILOT,
-    MAV_PROTOCOL_CAPABILITY,
-    MAV_STATE,
-    MAV_TYPE,
-)
+from magbridge.mavlink.enums import MAG_RAW_FLAGS
+from magbridge.mavlink.messages import MESSAGES
 from magbridge.records import Corrected
 from magbridge.wording import one_of
 
 __all__ = [
-    "DEFAULT_RATES_HZ", "LIMITS", "PUBLISHED", "Condition", "MessageRates", "Publisher", "Reports",
-    "check_publish",
+    "DEFAULT_RATES_HZ", "LIMITS", "MASK", "PUBLISHED", "MessageRates", "Publisher", "check_publish",
 ]  # fmt: skip
 
 RAW: Final = spec("MAG_RAW")
@@ -181,125 +171,6 @@ PUBLISHED: dict[str, str] = {
 """The messages that follow the samples, and which method of `Publisher` sends each."""
 
 
-HEARTBEAT, STATUS = spec("HEARTBEAT"), spec("MAG_STATUS")
-ALIVE, CRITICAL = (
-    HEARTBEAT.payload(
-        type=MAV_TYPE.ONBOARD_CONTROLLER,
-        autopilot=MAV_AUTOPILOT.INVALID,
-        system_status=state,
-        mavlink_version=3,
-    )
-    for state in (MAV_STATE.ACTIVE, MAV_STATE.CRITICAL)
-)
-CAPABILITIES = (
-    MAV_PROTOCOL_CAPABILITY.PARAM_FLOAT
-    | MAV_PROTOCOL_CAPABILITY.COMMAND_INT
-    | MAV_PROTOCOL_CAPABILITY.MAVLINK2
-    | MAV_PROTOCOL_CAPABILITY.FTP
-    | MAV_PROTOCOL_CAPABILITY.PARAM_ENCODE_C_CAST
-)
-
-
-class Condition(NamedTuple):
-    """The part of MAG_STATUS that the link cannot know itself; fields, units and states as in the message."""
-
-    samples: int = 0
-    samples_lost: int = 0
-    sensor_bytes_skipped: int = 0
-    sensor_frames_bad: int = 0
-    sensor_state: int = 0
-    sensor_clock_drift: float = nan
-    sample_rate: float = nan
-    telemetry_stale: int = 0
-    log_records: int = 0
-    log_lost: int = 0
-    log_state: int = 0
-
-
-class Reports:
-    """Send HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the description of the component.
-
-    `start_us`: µs, when the bridge started.
-    `version`: of the program, ``"0.1.0"``.
-    `status`: returns the Condition.
-    `speaking`: says whether readings come from the sensor.
-    `general`: the general metadata file.
-    """
-
-    def __init__(
-        self,
-        outbox: Outbox,
-        vehicle: VehicleState,
-        start_us: int,
-        version: str,
-        calibration_id: int,
-        status: Callable[[], Condition],
-        speaking: Callable[[], bool],
-        general: bytes,
-    ) -> None:
-        self._outbox, self._vehicle, self._status = outbox, vehicle, status
-        self._speaking, self._general = speaking, general
-        self._start_us, self._version, self.calibration_id = start_us, version, calibration_id
-
-    def heartbeat(self) -> None:
-        """Send HEARTBEAT: active while readings come from the sensor, else critical."""
-        self._outbox.put(HEARTBEAT, ALIVE if self._speaking() else CRITICAL)
-
-    def status(self) -> None:
-        """Send MAG_STATUS."""
-        codec, vehicle, clock = self._outbox.codec, self._vehicle, self._vehicle.clock
-        condition = self._status()
-        payload = STATUS.struct.pack(
-            codec.utc_us, round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0,
-            (codec.now_us - self._start_us) // 1_000_000 & MASK, self.calibration_id,
-            condition.samples & MASK, condition.samples_lost & MASK, condition.sensor_bytes_skipped & MASK,
-            condition.sensor_frames_bad & MASK, codec.frames & MASK, vehicle.frames_lost & MASK,
-            codec.bytes_skipped & MASK, codec.signing.refused & MASK if codec.signing else 0,
-            condition.log_records & MASK, condition.log_lost & MASK, condition.telemetry_stale,
-            condition.sample_rate, condition.sensor_clock_drift, clock.sigma, clock.drift_ppm,
-            vehicle.reboots & 0xFFFF, condition.sensor_state, vehicle.state, condition.log_state,
-        )  # fmt: skip
-        self._outbox.put(STATUS, payload)
-
-    def version(self) -> None:
-        """Send AUTOPILOT_VERSION."""
-        numbers = [int(number) & 0xFF for number in re.findall(r"\d+", self._version)[:3]]
-        self._outbox.send(
-            "AUTOPILOT_VERSION",
-            capabilities=CAPABILITIES,
-            flight_sw_version=int.from_bytes(
-                bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,)), "big"
-            ),
-        )
-
-    def component(self) -> None:
-        """Send COMPONENT_INFORMATION_BASIC."""
-        codec = self._outbox.codec
-        self._outbox.send(
-            "COMPONENT_INFORMATION_BASIC",
-            time_boot_ms=(codec.now_us - self._start_us) // 1000 & MASK,
-            capabilities=CAPABILITIES,
-            vendor_name="magbridge",
-            model_name="magnetometer bridge",
-            software_version=self._version,
-        )
-
-    def metadata(self) -> None:
-        """Send COMPONENT_METADATA with the URI of the files that describe the parameters."""
-        codec = self._outbox.codec
-        self._outbox.send(
-            "COMPONENT_METADATA",
-            time_boot_ms=(codec.now_us - self._start_us) // 1000 & MASK,
-            file_crc=crc32(self._general),
-            uri=uri(codec.component, GENERAL),
-        )
-
-    def sample_interval_us(self) -> int:
-        """Return the recent mean interval between samples in µs; 0 while unknown."""
-        rate = self._status().sample_rate
-        return round(1e6 / rate) if rate > 0 else 0
-
-
 LIMITS = {
     "HEARTBEAT": (0.2, 10.0),
     "MAG_STATUS": (-1.0, 10.0),
@@ -313,7 +184,7 @@ LIMITS = {
 DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 
 
-LONGEST_US = 0x7FFFFFFF
+MAX_INTERVAL_US = 0x7FFFFFFF
 """Longest interval that a MESSAGE_INTERVAL holds, µs (36 min)."""
 
 
@@ -333,65 +204,55 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
 
 
 class MessageRates:
-    """Rate of each message; each rate is also a parameter."""
+    """Rate of each message; each rate is also a parameter.
+
+    `by_name`: the rates of the messages of the main sensor, and of reports.
+    """
 
     def __init__(self, parameters: Parameters, timers: Timers, codec: Codec) -> None:
         self._parameters, self._timers, self._codec = parameters, timers, codec
         self.by_name = {name: Rate(parameters[rate_name(name)]) for name in LIMITS}
-        self._by_clock: dict[str, Callable[[], None]] = {}
-        self._more: list[tuple[str, Rate]] = []
+        self._by_clock: dict[str, Callable[[], object]] = {}
+        self._rates = [(rate_name(name), rate) for name, rate in self.by_name.items()]
         parameters.watch(self._changed)
 
     def another(self, name: str) -> Rate:
         """Return one more rate of a message, with its own times: for the samples of another sensor."""
         rate = Rate(self.by_name[name].hertz)
-        self._more.append((name, rate))
+        self._rates.append((rate_name(name), rate))
         return rate
 
-    def send_by_clock(self, name: str, report: Callable[[], None]) -> None:
+    def send_by_clock(self, name: str, report: Callable[[], object]) -> None:
         """Send a message by the clock instead of with the samples; a rate of 0 is off."""
-        self._by_clock[name] = report
-        self._start_timer(name)
+        self._by_clock[rate_name(name)] = report
+        self._changed(rate_name(name))
 
-    def interval_us(self, number: int, sample_us: Callable[[], int]) -> int:
-        """Return a message's interval in µs, with `sample_us` that of the samples; -1 off, 0 unknown.
-
-        KeyError: its rate cannot be set.
-        """
-        hertz = self.by_name[name_of(number)].hertz
-        return -1 if hertz < 0 else min(period_us(hertz) if hertz else sample_us(), LONGEST_US)
+    def interval_us(self, number: int, sample_rate: float) -> int:
+        """Return a message's interval in µs; -1 off, 0 if it has no rate or an unknown `sample_rate`, Hz."""
+        rate = self.by_name.get(spec(number).name) if number in MESSAGES else None
+        if rate is None or rate.hertz < 0:
+            return 0 if rate is None else -1
+        hertz = rate.hertz or sample_rate
+        return min(period_us(hertz), MAX_INTERVAL_US) if hertz > 0 else 0
 
     def set(self, number: int, hertz: float | None) -> str:
-        """Set a message's rate (None: the default); return the parameter's name, empty if out of range.
-
-        KeyError: its rate cannot be set.
-        """
-        parameter = rate_name(name_of(number))
+        """Set a message's rate (None: the default); return the parameter's name, empty if impossible."""
+        name = spec(number).name if number in MESSAGES else ""
+        if name not in LIMITS:
+            return ""
+        parameter = rate_name(name)
         value = self._parameters.table[parameter].default if hertz is None else hertz
         return parameter if self._parameters.set(parameter, value) else ""
 
     def _changed(self, parameter: str) -> None:
         """Apply a changed parameter if it is the rate of a message."""
-        for name, rate in self._more:
-            if rate_name(name) == parameter:
+        for name, rate in self._rates:
+            if name == parameter and rate.hertz != self._parameters[parameter]:
                 rate.set(self._parameters[parameter])
-        for name, rate in self.by_name.items():
-            if rate_name(name) == parameter:
-                rate.set(self._parameters[parameter])
-                if name in self._by_clock:
-                    self._start_timer(name)
-
-    def _start_timer(self, name: str) -> None:
-        hertz, report = self.by_name[name].hertz, self._by_clock[name]
+        if (report := self._by_clock.get(parameter)) is None:
+            return
+        hertz = self._parameters[parameter]
         if hertz > 0:
-            self._timers.every(name, period_us(hertz), lambda _: report(), self._codec.now_us)
+            self._timers.every(parameter, period_us(hertz), lambda _: report(), self._codec.now_us)
         else:
-            self._timers.cancel(name)
-
-
-def name_of(number: int) -> str:
-    """Return the name of a message whose rate can be set, else raise KeyError."""
-    name = spec(number).name
-    if name not in LIMITS:
-        raise KeyError(name)
-    return name
+            self._timers.cancel(parameter)

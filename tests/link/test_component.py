@@ -16,7 +16,7 @@ from magbridge.config import Align, Link
 from magbridge.errors import ConfigError
 from magbridge.link.component import Component
 from magbridge.link.parameters import alignment
-from magbridge.link.publish import Condition, check_publish
+from magbridge.link.publish import check_publish
 from magbridge.mavlink import Codec, FrameLogReader, Signing, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE
 
@@ -54,8 +54,7 @@ def test_next_deadline_is_when_something_is_sent(link: Line) -> None:
 def test_status(make_link: MakeLine) -> None:
     link = make_link(
         calibration_id=7,
-        status=lambda: Condition(samples=5, sensor_state=MAG_PORT_STATE.OK, log_records=(1 << 32) + 3),
-        speaking=lambda: True,
+        status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": 3},
     )
     link.to(0)
     link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
