@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from magbridge.calibration.model import Calibration
 from magbridge.columns import TEMPERATURE
 from magbridge.logs.fields import field_maps
-from magbridge.sensors.options import options_of
+from magbridge.sensors.options import Option, options_of
 
 __all__ = ["PLACEHOLDER", "Answers", "bridge_toml"]
 
@@ -45,84 +48,38 @@ def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str
     `calibration`: its parameters get a table each, in its own units.
     ConfigError: no such driver.
     """
-    units = dict(map(_named, answers.parameters))
+    units = {}
     if calibration is not None:
-        own = calibration.units
-        units = {**{name: own.get(name, "") for name in calibration.channels if name != TEMPERATURE}, **units}
-    return "\n".join(
-        [
-            "# What each key means, and all others: magbridge's documentation, 'On a vehicle'.",
-            "# magbridge run --check --config THIS says what would go wrong; with --live, what arrives.",
-            "",
-            *_sensor(answers),
-            "",
-            "[link]",
-            f"url = {_text(answers.link)}    # udpin:, udpout:, tcp:, tcpin: HOST:PORT, or a serial device",
-            f"system = {answers.system}    # the vehicle's system id, the only one listened to",
-            "component = 191    # our own id: an onboard computer",
-            "",
-            *_telemetry(units),
-            *_calibration(answers.calibration),
-            "",
-            "[publish]    # message = rate in Hz; 0: with every sample; negative: never",
-            "MAG_FIELD = 0",
-            "HIGHRES_IMU = 0",
-            "NAMED_VALUE_FLOAT = 1",
-            "",
-            "[log]    # every byte that comes and goes: a run can be replayed",
-            'directory = "logs"    # relative to this file',
-            "",
-        ]
+        units = {
+            name: calibration.units.get(name, "") for name in calibration.channels if name != TEMPERATURE
+        }
+    for parameter in answers.parameters:
+        name, _, unit = parameter.partition("[")
+        units[name.strip()] = unit.rstrip("] ")
+    engine = Environment(  # noqa: S701 - TOML has nothing to escape
+        loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined, trim_blocks=True,
+        keep_trailing_newline=True,
+    )  # fmt: skip
+    engine.filters |= {"text": _text, "key": _key}
+    return engine.get_template("bridge.toml.j2").render(
+        answers=answers,
+        options=[_option(one, answers.options) for one in options_of(answers.driver)],
+        telemetry=[(name, unit, _source(name, unit)) for name, unit in units.items()],
     )
 
 
-def _sensor(answers: Answers) -> list[str]:
-    lines = [
-        "[sensor]",
-        f"driver = {_text(answers.driver)}",
-        f"port = {_text(answers.port)}    # a device, a pattern (/dev/ttyUSB*), or socket://HOST:PORT",
-        f"baudrate = {answers.baudrate}",
-        "# timeout = 10.0    # s without a reading, then the sensor counts as silent",
-        "[sensor.options]",
-    ]
-    for one in options_of(answers.driver):
-        meaning = one.meaning.replace("``", "").partition(". ")[0].rstrip(".")
-        if one.name in answers.options:
-            lines.append(f"{one.name} = {_value(answers.options[one.name])}    # {meaning}")
-        elif one.required:
-            lines.append(f"# {one.name} =     # {PLACEHOLDER}: {meaning}")
-        elif one.default is not None:
-            lines.append(f"# {one.name} = {_value(one.default)}    # {meaning}")
-        else:
-            lines.append(f"# {one.name} =     # {meaning}")
-    return lines
+def _option(option: Option, given: Mapping[str, Any]) -> tuple[str, str, str, bool]:
+    """Return name, value and meaning of a driver's option, and whether the line is not a comment."""
+    meaning = option.meaning.replace("``", "").partition(". ")[0].rstrip(".")
+    if option.name in given:
+        return option.name, _value(given[option.name]), meaning, True
+    if option.required:
+        return option.name, "", f"{PLACEHOLDER}: {meaning}", False
+    return option.name, "" if option.default is None else _value(option.default), meaning, False
 
 
-def _telemetry(units: dict[str, str]) -> list[str]:
-    if not units:
-        return [
-            "# [telemetry.battpos]    # a table for each moving mass: any field of any MAVLink message",
-            '# message = "NAMED_VALUE_FLOAT"',
-            '# match = {name = "battpos"}',
-            '# field = "value"',
-            '# unit = "in"',
-            "# max_age = 30.0    # s; an older value is stale",
-            "",
-        ]
-    lines = []
-    for name, unit in units.items():
-        lines += [
-            f"[telemetry.{_key(name)}]    # any field of any MAVLink message; value = scale * field + offset",
-            *_source(name, unit),
-            f"unit = {_text(unit)}    # the calibration's",
-            "max_age = 30.0    # s; an older value is stale",
-            "",
-        ]
-    return lines
-
-
-def _source(name: str, unit: str) -> list[str]:
-    """Return the keys of the message that carries a parameter: the autopilot's own one if known.
+def _source(name: str, unit: str) -> Any:
+    """Return the autopilot's own message that carries a parameter; None if there is none.
 
     The columns that magbridge reads from a telemetry log are named in ``logs/fields.csv``; a calibration that
     was fitted to such a log has these names.
@@ -130,27 +87,8 @@ def _source(name: str, unit: str) -> list[str]:
     for fields in field_maps("mavlink").values():
         for one in fields:
             if one.column == name and unit in ("", one.unit):
-                scale = [f"scale = {one.factor:g}"] if one.factor != 1.0 else []
-                return [f'message = "{one.record}"', f'field = "{one.field}"', *scale]
-    return [
-        'message = "NAMED_VALUE_FLOAT"',
-        f"match = {{name = {_text(name[:10])}}}    # at most 10 characters",
-        'field = "value"',
-    ]
-
-
-def _calibration(file: str | None) -> list[str]:
-    if file is None:
-        return [
-            "# [calibration]    # from magbridge calibrate; without one, samples are sent as uncalibrated",
-            '# file = "cal.json"',
-        ]
-    return ["[calibration]", f"file = {_text(file)}    # from magbridge calibrate; relative to this file"]
-
-
-def _named(text: str) -> tuple[str, str]:
-    name, _, unit = text.partition("[")
-    return name.strip(), unit.rstrip("] ")
+                return one
+    return None
 
 
 def _key(name: str) -> str:
