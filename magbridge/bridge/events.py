@@ -255,8 +255,9 @@ class Recorder:
 
     def sent(self, frames: list[tuple[int, bytes]]) -> None:
         """Record the frames sent over the link, each with its event time (µs)."""
-        if self.active and frames:
-            self._records += [(time_us, SENT, frame) for time_us, frame in frames]
+        if self.active:
+            for time_us, frame in frames:
+                self._records.append((time_us, SENT, frame))
             self.count += len(frames)
 
     def link(self, time_us: int, frames: list[bytes]) -> None:
@@ -268,8 +269,8 @@ class Recorder:
         """Record bytes as they came from a sensor."""
         if not self.active:
             return
-        while data:
-            piece, data = data[:RECORDED_BYTES], data[RECORDED_BYTES:]
+        for start in range(0, len(data), RECORDED_BYTES):
+            piece = data[start : start + RECORDED_BYTES]
             frame = self._scribe.frame(BYTES, BYTES_HEADER.pack(sensor_id, len(piece)) + piece)
             self._add(time_us, SENSOR, frame)
 

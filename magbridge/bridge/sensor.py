@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING, Final
@@ -294,14 +294,14 @@ class SensorStream:
         self.samples = self.lost = self.quality = 0
         self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
 
-    def receive(self, data: bytes, time_us: int) -> list[tuple[Reading, Stamp]]:
+    def receive(self, data: bytes, time_us: int) -> Iterable[tuple[Reading, Stamp]]:
         """Parse bytes; return the readings that they complete, each with its time."""
         readings = self.driver.feed(data)
         if not readings:
             self.line.on_unparsed(data, time_us)
-            return []
+            return ()
         self.line.on_reading(time_us)
-        return list(zip(readings, self.clock.stamp(readings, time_us), strict=True))
+        return zip(readings, self.clock.stamp(readings, time_us), strict=True)
 
     def correct(
         self,
@@ -318,12 +318,12 @@ class SensorStream:
         `position`: deg, latitude and longitude; None where not known.
         `depth`: m; NaN where not known.
         """
-        self.samples += 1
-        self.lost += stamp.missing
-        self._times.append(stamp.time_us)
-        self.line.read(reading.field, stamp.time_us)
         correction, time_us = self.correction, stamp.time_us
         restarted, missing = stamp.restarted, stamp.missing
+        self.samples += 1
+        self.lost += missing
+        self._times.append(time_us)
+        self.line.read(reading.field, time_us)
         if isinstance(correction, Correction):
             return [
                 correction.reading(

@@ -71,7 +71,11 @@ def pack_record(time_us: int, channel: int, frame: bytes) -> bytes:
 
 def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
     """Return the bytes of records: time, channel and frame of each."""
-    return b"".join([pack_record(time_us, channel, frame) for time_us, channel, frame in records])
+    pieces: list[bytes] = []
+    for time_us, channel, frame in records:
+        pieces.append(TLOG_STAMP.pack(time_us & ~3 | channel))
+        pieces.append(frame)
+    return b"".join(pieces)
 
 
 class RecordBlock(NamedTuple):

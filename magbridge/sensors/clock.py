@@ -96,7 +96,8 @@ class Floor:
         """
         if not self._count:
             self._began, self._least = x, inf
-        self.delay += (max(0.0, min(above, STALL)) - self.delay) * 0.02
+        delay = above if 0.0 < above < STALL else max(0.0, min(above, STALL))
+        self.delay += (delay - self.delay) * 0.02
         if above < self._least:
             self._least, self.lowest = max(above, 0.0), (x, y)
             self._drop += min(above, 0.0)
@@ -306,7 +307,8 @@ class DeviceClock:
             self._turned += turns * self._time_modulo
         floor = self._floor
         x = device_time + self._turned - self._zero
-        y = arrival_us - origin_us - 1e6 * x
+        elapsed_us = 1e6 * x
+        y = arrival_us - origin_us - elapsed_us
         above = y - floor.value_at(x)
         fell_back = device_time < 0.5 * self._device_time
         restarted = fell_back and (step < 0.0 or abs(above) > RESTART)
@@ -317,7 +319,7 @@ class DeviceClock:
         late = floor.add(x, y, above, tolerance) if informative else 0.0
         if late:
             floor.restart(*floor.lowest)
-        return origin_us + 1e6 * x + floor.value_at(x), False, late > 0.0
+        return origin_us + elapsed_us + floor.value_at(x), False, late > 0.0
 
     def _by_count(
         self, arrival_us: int, origin_us: int, missing: int, informative: bool
