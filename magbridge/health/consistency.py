@@ -11,9 +11,14 @@ by
 
 A Kalman filter predicts the total field from the crustal field along the track alone
 (:mod:`magbridge.estimation.track_process`); :mod:`magbridge.estimation.sequential` tests its innovations for
-each of these errors. The calibration's own uncertainty is part of the null hypothesis. After an alarm, sigma
-includes the estimated error of the present sample and its uncertainty, weighted over the onsets and errors
-that fit.
+each of these errors.
+
+The calibration's own uncertainty is part of the null hypothesis. With the effect f of a unit error, an
+error of amplitude :math:`N(0, a^2 I)` changes the total field by the variance
+:math:`a^2\, \mathrm{tr\, Var}(f)` over the samples; their mean is hidden by the reference's level, except
+where masses move. The null hypothesis has an offset, a gain or a mass's telemetry with the amplitude a for
+which that is the mean variance that the calibration states. After an alarm, sigma includes the estimated
+error of the present sample and its uncertainty, weighted over the onsets and errors that fit.
 """
 
 from __future__ import annotations
@@ -55,8 +60,8 @@ CONSISTENCY_ALARM_LOG_RATIO: Final = 15.0
 """L above which an alarm begins: by chance once in a million tested samples at most."""
 NOISE_DOF: Final = 8.0
 """Degrees of freedom with which the noise of the innovations is known."""
-MIN_ERROR_SIGMA: Final = 2.0
-"""Size of an error, in sigmas of the total field, from which it is an alarm: 1 has false alarms."""
+MIN_ERROR_SIGMA: Final = 1.0
+"""Size of an error, in sigmas of the total field, from which it is an alarm."""
 CLEAR_LOG_RATIO: Final = 4.0
 """L below which an alarm ends."""
 COMPETING_LOG_RATIO: Final = 5.0
@@ -74,9 +79,8 @@ MAX_CONSISTENCY_SQUARE: Final = 4.0
 MAX_LOG_ROUGHNESS: Final = 5.0
 """How the logarithm of the crust's roughness follows a normalised squared innovation; its bounds."""
 ERROR_KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
-DEGENERATE_NT: Final = 1e-6
-SCALE_GAIN: Final = 0.02
-"""Smallest scale of a mass's effect, nT, and by how much the scale follows a sample."""
+MIN_EFFECT_NT: Final = 1e-6
+"""Smallest 1-sigma of an effect, nT."""
 
 
 class TestedSample(NamedTuple):
@@ -123,7 +127,6 @@ class ConsistencyCheck:
         self._test = SequentialTest(since_onset, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
         self._log_roughness, self._straight_samples = 0.0, 0
         self._course = nan
-        self._scale = np.full(masses, np.nan)
         self.restart()
 
     def restart(self) -> None:
@@ -136,6 +139,8 @@ class ConsistencyCheck:
         self._last_unit = np.zeros(3)
         self._temperature = 0.0
         self._variance = 0.0
+        self._tested, self._systematic = 0, 0.0
+        self._mean_effect, self._mean_square = np.zeros((4 + self._masses, 3)), np.zeros(4 + self._masses)
         self.is_wrong = False
 
     def forget_crust(self) -> None:
@@ -193,7 +198,7 @@ class ConsistencyCheck:
         seconds_now = 1e-6 * time_us
         regressors = np.array([1.0, self._temperature, seconds_now / 3600.0] + [1.0] * (1 + self._masses))
         effects = self._effects(np.array(unit), np.array(mass_changes))
-        null = self._null(max(sigma * sigma - self._noise2, 0.0) ** 0.5)
+        null = self._null(effects, max(sigma * sigma - self._noise2, 0.0))
         largest = self._test.test(self._filter, seconds_now, regressors, effects, null)
         self._learn_roughness(self._test.squared_residual, np.array(unit))
         self._test.update(self._filter.update())
@@ -209,11 +214,24 @@ class ConsistencyCheck:
             self._log_roughness += ADAPTATION * (min(squared, MAX_CONSISTENCY_SQUARE) - 1.0)
             self._log_roughness = min(max(self._log_roughness, -MAX_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
 
-    def _null(self, systematic: float) -> FloatArray:
-        """Return the amplitude (kinds,) that the calibration's own uncertainty (nT) allows."""
+    def _null(self, effects: FloatArray, systematic: float) -> FloatArray:
+        """Return the 1-sigma amplitude (kinds,) that the calibration's own uncertainty allows.
+
+        `effects` (kinds, 3) are those of the present sample, `systematic` the calibration's variance, nT².
+        """
+        # running moments of the samples that the evidence comes from
+        self._tested = min(self._tested + 1, int(RETENTION_SAMPLES))
+        share = 1.0 / self._tested
+        self._systematic += share * (systematic - self._systematic)
+        self._mean_effect += share * (effects - self._mean_effect)
+        self._mean_square += share * (np.sum(effects**2, axis=1) - self._mean_square)
+        variance = self._mean_square.copy()
+        variance[:4] -= np.sum(self._mean_effect[:4] ** 2, axis=1)
+        # a^2 = systematic variance / tr Var(f), see the module
+        allowed = self._systematic / np.maximum(variance, MIN_EFFECT_NT**2)
         # no drift and no temperature effect belong to the null hypothesis
-        units = [OFFSET_NT, np.inf, np.inf, GAIN_NT, *np.maximum(np.nan_to_num(self._scale), DEGENERATE_NT)]
-        return np.minimum(systematic / np.array(units), 1.0)
+        allowed[1:3] = 0.0
+        return np.minimum(np.sqrt(allowed), 1.0)
 
     def _effects(self, u: FloatArray, mass_changes: FloatArray) -> FloatArray:
         """Return the change of the total field with one unit of each kind's regressor, (kinds, 3), nT."""
@@ -221,11 +239,7 @@ class ConsistencyCheck:
         # effects of the module, in the unit of each error
         effects[:3] = np.outer([OFFSET_NT, PER_DEGREE_NT, DRIFT_NT_PER_H], u)
         effects[3] = GAIN_NT * np.array([u[0] * u[0], u[1] * u[1], u[0] * u[1]])
-        if self._masses:
-            effects[4:, 0] = mass_changes
-            size = np.abs(mass_changes)
-            self._scale += np.where(np.isnan(self._scale), np.nan, SCALE_GAIN * (size - self._scale))
-            self._scale = np.where(np.isnan(self._scale), size, self._scale)
+        effects[4:, 0] = mass_changes
         return effects
 
     def _decide(self, largest: float, sigma: float) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Noise
+from magbridge.estimation.residual import rms
 from magbridge.health import HealthMonitor
 from magbridge.records import Quality
 
@@ -40,9 +41,16 @@ def glide(seed: int, n: int = 2700) -> tuple[FloatArray, FloatArray]:
 
 
 def monitor(
-    total: FloatArray, u: FloatArray, warmth: FloatArray, *, speed: float, step: float
+    total: FloatArray,
+    u: FloatArray,
+    warmth: FloatArray,
+    *,
+    speed: float,
+    step: float,
+    own: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, list[str]]:
-    """Return sigma (n,), flags (n,) and messages; each sample's own sigma is 1.5 nT."""
+    """Return sigma (n,), flags (n,) and messages; each sample's own sigma (n,) is 1.5 nT by default."""
+    own = np.full(len(total), 1.5) if own is None else own
     health, rng = HealthMonitor(Noise(1.0)), np.random.default_rng(9)
     sigma, flags = np.empty((2, len(total)))
     for k, F in enumerate(total.tolist()):
@@ -50,8 +58,9 @@ def monitor(
         health.set_position(time_us, 47.0 + speed * step * k / 111_200.0, -59.0)
         field = tuple((F * u[k]).tolist())
         raw = tuple((F * u[k] + rng.normal(0.0, 0.1, 3)).tolist())
-        more = health.check(time_us, raw, field, (F, 1.5), 0, (FIELD, 145.0), float(warmth[k]), 0.0, list)
-        sigma[k], flags[k] = (1.5**2 + more) ** 0.5, health.flags
+        fields = F, float(own[k])
+        more = health.check(time_us, raw, field, fields, 0, (FIELD, 145.0), float(warmth[k]), 0.0, list)
+        sigma[k], flags[k] = (own[k] ** 2 + more) ** 0.5, health.flags
     return sigma, flags, health.messages
 
 
@@ -78,6 +87,20 @@ def test_error_that_follows_the_attitude_widens_sigma(fault: str) -> None:
     plain = (flags == 0) & (time > 5000.0)
     assert np.count_nonzero((np.abs(error + noise) > 3.0 * sigma) & plain) < 0.02 * len(u)
     assert messages
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_error_that_the_calibration_states_hardly_widens_sigma(seed: int) -> None:
+    """On the way up sigma is 1.9 nT with an error of 1.5, on the way down it is that of the noise."""
+    u, crust = glide(seed)
+    rising = u[:, 0] > 0.3
+    noise = np.random.default_rng(seed).normal(0.0, 1.0, len(u))
+    own = np.where(rising, 1.9, 1.0)
+    warmth = np.full(len(u), nan)
+    total = FIELD + 0.2 * crust + 1.5 * rising + noise
+    sigma, flags, _ = monitor(total, u, warmth, speed=0.35, step=4.0, own=own)
+    assert not flags.any()
+    assert rms(sigma) < 1.1 * rms(own)
 
 
 @pytest.mark.parametrize("seed", range(2))
