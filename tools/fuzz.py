@@ -210,7 +210,9 @@ TARGETS: dict[str, Target] = {
     ),
     "calibration": Target("bytes", lambda _: decode_calibration, _calibration),
     "config": _file(
-        "bridge.toml", config.load, lambda path: path.write_text(bridge_text(publish={"MAG_FIELD": 0}))
+        "bridge.toml",
+        config.load,
+        lambda path: path.write_text(bridge_text(calibration=False, publish={"MAG_FIELD": 0})),
     ),
     "polygon": _file(
         "mask.csv",
