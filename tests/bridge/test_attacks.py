@@ -6,14 +6,27 @@ import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from math import isnan, nan
 from pathlib import Path
 
 import pytest
 from attacks import ALLOWED, ATTACKS, Attack, run
 from checks import replays
+from extremes import events, feed, make_bridge
 from rig import Rig
+from small import START, small_bridge
 
-from magbridge.mavlink import Codec
+from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.file_server import FileServer
+from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.position import Position
+from magbridge.calibration.model import Parameter
+from magbridge.correction import Correction
+from magbridge.mavlink import Codec, Message
+from magbridge.one_time import OneTime
+from magbridge.parts import OptionalParts
+from magbridge.records import Channel
+from magbridge.sensors.clock import DeviceClock
 
 KEY = bytes(range(1, 33))
 SECRET = bytes(range(101, 133))
@@ -87,3 +100,115 @@ def test_an_attack_costs_the_autopilot_nothing_or_is_reported(
     lost, out, _, reported = run(rig, attack, 0.3)
     assert max(lost, out) <= ALLOWED or reported
     assert any(attack.reported in text for text in rig.texts()), "each once while it lasts"
+
+
+# ---- Valid frames and lines with extreme values end neither the bridge nor, unnoticed, a part of it ------
+
+
+INT32_MAX = 2**31 - 1
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_extreme_values_raise_nothing(seed: int, tmp_path: Path) -> None:
+    bridge = make_bridge(tmp_path, seed)
+    files = FileServer(bridge.component.metadata, tmp_path, lambda: 1e9, lambda _: None)
+    for event in events(4000, seed):
+        feed(bridge, files, event)
+    files.close()
+    assert bridge.streams[0].samples > 500
+    assert bridge.navigation is not None
+    assert bridge.navigation.navigator.estimate.begun
+
+
+def global_position(component: int = 1, **fields: int) -> bytes:
+    return Codec(1, component).pack("GLOBAL_POSITION_INT", **fields)
+
+
+def parsed(frame: bytes) -> Message:
+    (message,) = Codec(0, 0).parse(frame)
+    return message
+
+
+@pytest.mark.parametrize(
+    "place", [(INT32_MAX, INT32_MAX), (495_000_000, -1_900_000_000), (950_000_000, 0)], ids=str
+)
+def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[int, int]) -> None:
+    position = Position(print)
+    position.update(parsed(global_position(lat=place[0], lon=place[1])), START)
+    assert position.last_position is None
+    assert isnan(position.main_field(START, START))
+
+
+def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
+    reports: list[str] = []
+    position = Position(reports.append)
+    here, away = (495_000_000, -579_000_000), (500_000_000, -579_000_000)  # 56 km
+    for second in range(900):
+        lat, lon = away if 100 <= second < 700 else here
+        position.update(parsed(global_position(lat=lat, lon=lon)), START + second * 1_000_000)
+        field = position.main_field(START + second * 1_000_000, START + second * 1_000_000)
+        assert isnan(field) == (100 <= second < 700)
+    assert reports == ["the position jumps farther than the vehicle can move"]
+
+
+def bridge_of(folder: Path) -> Pipeline:
+    return small_bridge(
+        folder, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"]
+    )
+
+
+def sent(bridge: Pipeline, second: int) -> list[Message]:
+    line = b"1000 2000 50000 4 %d %d\n" % (second, second)
+    frames = bridge.feed(Event(START + second * 1_000_000, Channel.SENSOR, line))
+    ear = Codec(0, 0)
+    return [message for _, frame in frames for message in ear.parse(frame)]
+
+
+def test_the_position_of_another_component_is_ignored_and_reported(tmp_path: Path) -> None:
+    bridge = bridge_of(tmp_path)
+    bridge.feed(Event(START, Channel.LINK, global_position(lat=495_000_000, lon=-579_000_000)))
+    (before,) = (message for message in sent(bridge, 1) if message.name == "MAG_FIELD")
+    bridge.feed(Event(START + 1, Channel.LINK, global_position(25, lat=505_000_000, lon=-579_000_000)))
+    messages = sent(bridge, 2)
+    (after,) = (message for message in messages if message.name == "MAG_FIELD")
+    assert after["anomaly"] == pytest.approx(before["anomaly"], abs=0.1)
+    assert "position of component 25 ignored" in [text for _, text in bridge.component.announcer.texts]
+
+
+def test_a_part_that_raises_is_switched_off_and_the_sample_is_published(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge = bridge_of(tmp_path)
+    monkeypatch.setattr(OptionalParts, "propagate", False)
+
+    def fail(*_: object, **__: object) -> float:
+        raise ZeroDivisionError("made for this test")
+
+    correction = bridge.streams[0].correction
+    assert isinstance(correction, Correction)
+    assert correction.health is not None
+    health = correction.health
+    monkeypatch.setattr(health, "check", fail)
+    for second in (1, 2, 3):
+        assert [message.name for message in sent(bridge, second)].count("MAG_FIELD") == 1
+    texts = [text for _, text in bridge.component.announcer.texts]
+    expected = "plausibility check is off after an internal error: ZeroDivisionError: made for this test"
+    assert texts.count(expected) == 1
+    assert list(bridge._correction.parts.failures) == ["plausibility check"]
+
+
+def test_zero_counts_of_channels_sampled_in_turn() -> None:
+    align = OneTime()
+    for k in range(4):
+        out, _ = align.bring((0.0, 0.0, 0.0), (0.0, 0.16, 0.32), 1_000_000 + 4_000_000 * k)
+        assert out == (0.0, 0.0, 0.0)
+    assert align.variance == 0.0
+
+
+@pytest.mark.parametrize("device_time", [1e308, -1e308, float("inf"), 1e300])
+def test_an_absurd_device_time_dates_a_reading_by_its_arrival(device_time: float) -> None:
+    clock = DeviceClock()
+    clock.update(10.0, START)
+    stamp = clock.update(device_time, START + 1_000_000)
+    assert stamp.time_us == pytest.approx(START + 1_000_000, abs=4)
+    assert clock.update(nan, START + 2_000_000).time_us == pytest.approx(START + 2_000_000, abs=4)

@@ -1,21 +1,30 @@
-"""The Earth's main field where the vehicle says it is."""
+"""The bridge's position, and GNSS receivers that are wrong."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import cache, partial
 from math import isnan
 from pathlib import Path
 
 import numpy as np
 import pytest
+from passages import AIRCRAFT, PLACE, flight, steep_map
+from referee import ArduPilot
+from referee.loop import Run, sail
+from referee.receiver import Receiver, carried_off, frozen, honest, jammed, jumped
 from small import small_bridge
+from vehicle import Bench
 
 from magbridge.bridge.events import Event, StartEvent, clock_step
 from magbridge.bridge.position import Position
 from magbridge.calibration.model import Parameter
+from magbridge.field.geodesy import offset
 from magbridge.field.igrf import igrf, total_field
 from magbridge.mavlink import Codec
+from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
+from magbridge.navigate.record import NavigationState
 from magbridge.records import Channel
 
 START, SECOND, YEAR = 1_780_000_000_000_000, 1_000_000, 31_557_600_000_000
@@ -96,3 +105,157 @@ def test_why_there_is_no_field_is_reported() -> None:
     assert isnan(position.main_field(START, round(datetime(2031, 1, 1, tzinfo=UTC).timestamp() * 1e6)))
     assert len(reported) == 1
     assert "2031-01-01" in reported[0]
+
+
+# ---- GPS positions are tested before the navigator uses them: a plane over a map of 120 nT and 1 km ------
+
+
+BEGIN, END = 180.0, 420.0
+"""s: GPS is wrong or absent between these times, of a flight of 9 minutes."""
+NEVER = 1e9
+
+
+def fly(receiver: Receiver = honest, lost: float = NEVER, minutes: float = 9.0, back: float = END) -> Run:
+    make = partial(ArduPilot, streams=("VFR_HUD",))
+    passage = flight(minutes, lost, back if lost < NEVER else NEVER, receiver)
+    return sail(passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
+
+
+@cache
+def without_gps() -> Run:
+    return fly(lost=BEGIN)
+
+
+def window(run: Run, begin: float, end: float) -> np.ndarray:
+    return (run.seconds >= begin) & (run.seconds < end)
+
+
+def first(run: Run, state: GnssState, after: float) -> float:
+    """Return the seconds after a time at which GPS first was in a state."""
+    found = run.seconds[(run.gnss == state) & (run.seconds >= after)]
+    return float(found[0] - after) if found.size else np.inf
+
+
+def test_a_consistent_receiver_is_never_rejected() -> None:
+    run = fly()
+    assert (run.gnss == GnssState.GOOD).all()
+    assert run.sent[-1] == 0
+    assert np.median(run.error[60:]) < 3.0
+
+
+@pytest.mark.parametrize("accuracy", [None, 18.0])
+def test_a_jammed_receiver_is_rejected_and_fixes_go_out(accuracy: float | None) -> None:
+    run = fly(jammed(BEGIN, END, accuracy=accuracy))
+    assert first(run, GnssState.REJECTED, BEGIN) <= 6.0 + 5.0, "5 s after the 1 to 6 s without a fix"
+    jam = window(run, BEGIN, END)
+    alone = without_gps()
+    assert np.nanpercentile(run.error[jam], 90) <= 1.2 * np.nanpercentile(alone.error[jam], 90) + 5.0
+    assert run.sent[jam][-1] - run.sent[jam][0] > 200
+    assert first(run, GnssState.GOOD, END) <= 60.0
+    assert any(text.startswith("GPS rejected: its position jumps") for _, text in run.texts)
+    assert any(text == "GPS good" for _, text in run.texts)
+
+
+def test_a_receiver_that_is_led_away_is_rejected() -> None:
+    """3 m/s, in a wind of which the navigator knows 4 m/s (1-sigma)."""
+    run = fly(carried_off(BEGIN, 3.0, 0.0))
+    assert first(run, GnssState.REJECTED, BEGIN) <= 15.0
+    wrong = window(run, BEGIN + 15.0, NEVER)
+    assert (run.gnss[wrong] != GnssState.GOOD).all()
+    assert (run.error[wrong] < 60.0).all()
+
+
+def test_a_receiver_that_is_led_away_slowly_is_noticed_by_the_field() -> None:
+    """1 m/s is within what the wind may change by; on this map the field tells it before 100 m."""
+    run = fly(carried_off(BEGIN, 0.7, 0.7))
+    noticed = run.seconds[(run.gnss >= GnssState.SUSPECT) & (run.seconds >= BEGIN)]
+    assert noticed.size
+    assert noticed[0] - BEGIN < 100.0
+    assert (run.gnss[run.seconds >= noticed[0]] != GnssState.GOOD).all()
+
+
+def test_a_jump_of_5_km_is_rejected_at_once_and_the_return_accepted() -> None:
+    run = fly(jumped(BEGIN, END, 4000.0, 3000.0))
+    assert first(run, GnssState.REJECTED, BEGIN) <= 1.0
+    assert (run.gnss[window(run, BEGIN, END)] == GnssState.REJECTED).all()
+    assert (run.error[window(run, BEGIN, NEVER)] < 80.0).all()
+    assert first(run, GnssState.GOOD, END) <= 60.0
+
+
+def test_a_frozen_receiver_is_rejected() -> None:
+    run = fly(frozen(BEGIN, END))
+    assert first(run, GnssState.REJECTED, BEGIN) <= 5.0
+    assert (run.error[window(run, BEGIN, NEVER)] < 80.0).all()
+    assert first(run, GnssState.GOOD, END) <= 60.0
+
+
+def test_an_hour_without_gps_with_turns_at_stock_rates() -> None:
+    """ATTITUDE and VFR_HUD at 1 Hz, a turn of 90 degrees in 6 s every 5 minutes."""
+    lost, back = 300.0, 3900.0
+    run = fly(lost=lost, back=back, minutes=67.0)
+    hour = window(run, lost, back)
+    assert np.percentile(run.error[hour], 90) <= 50.0
+    far = hour & (run.error > 200.0)
+    assert (run.state[far] == NavigationState.LOST).all()
+    standardised = np.sqrt(np.mean(run.error[hour] ** 2 / 2.0 / run.sigma[hour] ** 2))
+    assert standardised <= 1.25
+    assert run.sent[run.seconds == lost + 10.0] > 0, "the first fix comes within 10 s"
+    assert first(run, GnssState.GOOD, back) <= 60.0
+    assert np.median(run.error[run.seconds > back + 60.0]) < 5.0
+
+
+def test_the_claimed_sigma_is_that_of_a_wind_that_changes_as_the_options_state() -> None:
+    """In a steady wind, the options claim too much change, and the error is a third of sigma."""
+    standardised = []
+    for seed in (2, 4):
+        passage = flight(15.0, BEGIN, 840.0, seed=seed, changing_wind=True)
+        make = partial(ArduPilot, streams=("VFR_HUD",))
+        run = sail(passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
+        alone = window(run, BEGIN, 840.0)
+        standardised += list(run.error[alone] ** 2 / 2.0 / run.sigma[alone] ** 2)
+        assert (run.error[alone] < 200.0).all()
+    assert 0.5 <= np.sqrt(np.mean(standardised)) <= 1.25
+
+
+@pytest.mark.parametrize(("jamming", "spoofing", "word"), [(1, 3, "rejected"), (3, 1, "suspect")])
+def test_the_receiver_s_own_report_counts(jamming: int, spoofing: int, word: str) -> None:
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    place = {"fix_type": 3, "lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7), "h_acc": 2000}
+    bench.receive("GPS_RAW_INT", **place)
+    bench.to(1)
+    bench.receive("GNSS_INTEGRITY", jamming_state=jamming, spoofing_state=spoofing)
+    bench.receive("GPS_RAW_INT", **place)
+    assert bench.navigation.navigator.gnss.state.name.lower() == word
+    for second in range(2, 40):
+        bench.to(second)
+        bench.receive("GNSS_INTEGRITY", jamming_state=1, spoofing_state=1)
+        bench.receive("GPS_RAW_INT", **place)
+    bench.to(41)
+    reported = [text for text in bench.texts if text.startswith("GPS ")]
+    assert reported[0].startswith(f"GPS {word}: the receiver reports")
+    assert reported[-1] == "GPS good"
+
+
+def test_positions_that_go_on_drifting_are_not_used_again() -> None:
+    """A wide covariance of the navigator agrees with any position; a carry-off of 3 m/s goes on all the same.
+
+    A real ArduPlane that followed the wrong GPS had a wrong heading, so that its covariance grew.
+    """
+    returned = {}
+    for drift in (0.0, 3.0):
+        monitor = GnssMonitor(steep_map(), AIRCRAFT)
+        states = []
+        for k in range(241):  # twice a second: right for 30 s, then a step of 60 m
+            seconds = 0.5 * k
+            late = max(seconds - 30.0, 0.0)
+            north = 60.0 * (late > 0.0) + drift * late
+            P = np.eye(2) * (3.0 if late == 0.0 else 200.0) ** 2
+            prediction = Prediction(
+                np.zeros(2), P, P, np.zeros(2), 0.3, 22.0 * seconds, 22.0, 0.0, lost=False, informed=True
+            )
+            place = offset(*PLACE, north + 22.0 * seconds, 0.0)
+            states.append(monitor.check(round(5e5 * k) + 1, place, (north, 0.0), 1.0, prediction))
+        assert states[50] is GnssState.GOOD
+        assert states[62] is GnssState.REJECTED
+        returned[drift] = GnssState.GOOD in states[62:150]
+    assert returned == {0.0: True, 3.0: False}

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import ast
 from dataclasses import replace
+from inspect import getsource
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
 from posed import FIELD, T0, calibrated, right, surveyed, walk
 
+import magbridge
 from magbridge.calibration.effects import lagged
 from magbridge.calibration.terms import Polynomial
+from magbridge.diagnose import causes
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.instrument import OffsetDrift, OffsetStep
 from magbridge.diagnose.causes.reference import DiurnalVariation, MapError, ReferenceBias
@@ -22,6 +28,7 @@ from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.search import beside_slow_noise, search
 from magbridge.diagnose.survey import ANY, TelemetryChannel, kinds_of
+from magbridge.learning import alarms
 
 
 @pytest.mark.parametrize(
@@ -185,3 +192,69 @@ def test_a_gradient_over_the_whole_region_is_the_maps_error_alone() -> None:
     every = [candidate for cause in causes for candidate in cause.candidates(problem)]
     found = beside_slow_noise(search(problem, every, 4), every, 4)
     assert [h.candidate.cause for h in found.chosen] == ["map_error"]
+
+
+# ---- The causes: each is one class, and nothing else in the package asks for one by its name -------------
+
+
+ROOM = Path(causes.__file__).parent
+ELSEWHERE = {"magbridge/learning"}
+"""A learning bridge has a filter of its own, with states that are named after what they stand for."""
+
+
+def strings(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text("utf-8"))
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+
+
+def test_a_cause_is_named_in_its_own_room_alone() -> None:
+    package = Path(magbridge.__file__).parent
+    unlike_words = set(CAUSES) - {
+        "hysteresis",
+        "map_error",
+    }  # a shape's name; a column that navigation writes
+    asked = {
+        path.relative_to(package.parent).as_posix(): sorted(unlike_words & strings(path))
+        for path in package.rglob("*.py")
+        if ROOM not in path.parents and unlike_words & strings(path)
+    }
+    assert {path for path in asked if Path(path).parent.as_posix() not in ELSEWHERE} == set()
+
+
+def test_a_cause_is_one_short_class() -> None:
+    """Its name stands in one module only, and the class has at most forty lines beside its docstring."""
+    for name, cause in CAUSES.items():
+        places = [path for path in ROOM.glob("*.py") if name in strings(path)]
+        assert len(places) == 1, (name, places)
+        assert all((cause.needs, cause.disambiguation, cause.meaning))
+        (node,) = ast.parse(getsource(type(cause))).body
+        assert isinstance(node, ast.ClassDef)
+        first = node.body[1]  # after the docstring
+        assert (node.end_lineno or 0) - first.lineno < 60, name
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_columns_are_derivatives_of_the_nonlinear_model(name: str, problem: Problem) -> None:
+    """For every candidate whose effect the corrector computes as the search does."""
+    for candidate in CAUSES[name].candidates(problem)[::7]:
+        assert CAUSES[name].jacobian_error(problem, candidate) < 1e-3, candidate.names
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_what_a_row_puts_forward_has_its_name_and_can_be_written(name: str, problem: Problem) -> None:
+    """A number of numpy's, as is read off a spectrum, is none to a file."""
+    made = CAUSES[name].candidates(problem)
+    assert {one.cause for one in made} <= {name}
+    msgspec.to_builtins([one.effects for one in made])
+
+
+# ---- one vocabulary of causes ------------------------------------------------------------------------------
+
+
+def test_a_cause_learned_in_flight_has_a_name_of_the_diagnosis() -> None:
+    assert set(alarms.CAUSE_UNITS) <= set(CAUSES)
+    assert set(alarms.FROM_ZERO) <= set(alarms.CAUSE_UNITS)

@@ -7,11 +7,14 @@ from datetime import UTC, datetime
 import numpy as np
 import ppigrf
 import pytest
+import xarray as xr
 from pace import cost
 
 from magbridge.errors import OutOfRange
 from magbridge.field import igrf as module
-from magbridge.field.igrf import coverage, igrf
+from magbridge.field.geodesy import offset
+from magbridge.field.igrf import NearbyField, coverage, igrf, total_field
+from magbridge.field.reference import with_true_heading
 
 
 def at(year: int, month: int, day: int) -> float:
@@ -115,3 +118,79 @@ def test_a_million_samples_take_a_few_seconds(places: tuple[np.ndarray, ...]) ->
     lon, lat, depth = (np.resize(part, n) for part in places)
     times = np.linspace(at(2020, 1, 1), at(2020, 2, 1), n)
     assert cost(lambda: igrf(lon, lat, depth, times)) < 200.0
+
+
+# ---- Magnetic headings made true -------------------------------------------------------------------------
+
+
+TIME = 1_400_000_000.0 + np.arange(3.0)
+
+
+def deployment(**attrs: str) -> xr.Dataset:
+    columns = {
+        "heading": [350.0, 10.0, 200.0],
+        "latitude": [49.5] * 3,
+        "longitude": [-57.9] * 3,
+        "depth": [0.0] * 3,
+    }
+    return xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": TIME}, attrs)
+
+
+def test_the_declination_is_that_of_another_implementation() -> None:
+    ppigrf = pytest.importorskip("ppigrf")
+    east, north, _ = ppigrf.igrf(-57.9, 49.5, 0.0, datetime.fromtimestamp(TIME[0], UTC).replace(tzinfo=None))
+    declination = float(np.degrees(np.arctan2(east, north)).item())
+    true = with_true_heading(deployment(heading_reference="magnetic"))
+    np.testing.assert_allclose(
+        true["heading"], (np.array([350.0, 10.0, 200.0]) + declination) % 360, atol=1e-3
+    )
+    assert true.attrs["heading_reference"] == "true"
+    assert declination < -15  # west of north off Newfoundland
+
+
+def test_a_true_heading_stays() -> None:
+    assert with_true_heading(deployment())["heading"].to_numpy().tolist() == [350.0, 10.0, 200.0]
+
+
+def test_without_a_position_a_magnetic_heading_is_unknown() -> None:
+    unplaced = deployment(heading_reference="magnetic").drop_vars(["latitude", "longitude"])
+    assert np.isnan(with_true_heading(unplaced)["heading"]).all()
+
+
+# ---- The quadratic that stands in for the series, against the series -------------------------------------
+
+
+NEARBY_S = 1.7e9
+
+
+@pytest.mark.parametrize("place", [(49.5, -57.9), (-30.0, 10.0), (75.0, 179.9), (0.0, -70.0)])
+def test_is_the_series_within_its_reach(place: tuple[float, float]) -> None:
+    """0.05 nT anywhere within 20 km, a dive and twenty days; and it goes along when the vehicle leaves."""
+    rng = np.random.default_rng(0)
+    nearby = NearbyField()
+    nearby.field_and_slopes(*place, 0.0, NEARBY_S)
+    for reach in (20_000.0, 60_000.0):
+        for _ in range(40):
+            there = offset(*place, *rng.uniform(-reach, reach, 2).tolist())
+            depth, time = rng.uniform(0.0, 1000.0), NEARBY_S + rng.uniform(-1e6, 1e6)
+            field = nearby.field_and_slopes(*there, depth, time)[0]
+            assert field == pytest.approx(total_field(there[1], there[0], depth, time)[0], abs=0.05)
+
+
+def test_its_slopes_are_its_own() -> None:
+    nearby = NearbyField()
+    nearby.field_and_slopes(49.5, -57.9, 0.0, NEARBY_S)
+    here = offset(49.5, -57.9, 5000.0, -6000.0)
+    _, north, east = nearby.field_and_slopes(*here, 100.0, NEARBY_S)
+    for slope, step in ((north, (50.0, 0.0)), (east, (0.0, 50.0))):
+        ahead = nearby.field_and_slopes(*offset(*here, *step), 100.0, NEARBY_S)[0]
+        behind = nearby.field_and_slopes(*offset(*here, -step[0], -step[1]), 100.0, NEARBY_S)[0]
+        assert slope == pytest.approx((ahead - behind) / 100.0, abs=1e-5)
+
+
+def test_refuses_what_the_series_refuses() -> None:
+    with pytest.raises(OutOfRange, match="the IGRF covers"):
+        NearbyField().field_and_slopes(0.0, 0.0, 0.0, 4e9)
+    assert (
+        NearbyField().field_and_slopes(0.0, 0.0, 0.0, 1.89e9)[0] > 20_000
+    )  # less than LONG before the model's end

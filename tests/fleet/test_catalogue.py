@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any, cast
 
+import numpy as np
 import polars as pl
 import pytest
 from fleets import fly
 
-from magbridge.calibration.fitting.pose import Mounting
+from magbridge.arrays import FloatArray
+from magbridge.calibration.file import load
+from magbridge.calibration.fitting.pose import LATENT, MOMENT, Mounting, mass_columns
+from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import catalogue as room
+from magbridge.fleet.catalogue import FolderCatalogue
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
+from magbridge.fleet.learn import shape_groups, shapes_of
+from magbridge.fleet.memory import fleet_of, lessons
+from magbridge.fleet.page import write_pages
+from magbridge.fleet.process import work
 from magbridge.fleet.register import (
     Deployment,
     Vehicle,
@@ -23,6 +33,7 @@ from magbridge.fleet.register import (
     jobs,
     masses,
     read_fleet,
+    status,
     vehicles,
 )
 
@@ -190,3 +201,132 @@ def test_a_damaged_or_foreign_catalogue_is_one_line(
         assert all(text.startswith("magbridge: ") for text in err.splitlines())
     with pytest.raises(FormatError, match=words):
         list(map(masses, vehicles(empty).values()))
+
+
+# ---- A calibration made elsewhere: recorded, and learned from once, as far as its data determined it -----
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A log of a sensor, and its calibration."""
+    folder = tmp_path_factory.mktemp("made")
+    log, cal = fly(folder / "log.nc", 1, 0, sensor="HMR 1"), folder / "cal.json"
+    assert main(["calibrate", str(log), "--parameter", "battpos", "-o", str(cal)]) == 0
+    return log, cal
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> FolderCatalogue:
+    catalogue = FolderCatalogue(tmp_path / "fleet", create=True)
+    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
+    return catalogue
+
+
+def add(catalogue: FolderCatalogue, cal: Path, *more: str) -> int:
+    of = "--vehicle", "comet", "--deployment", "may", "--catalogue", catalogue.name
+    return main(["fleet", "add", str(cal), *of, *more])
+
+
+def test_it_teaches_what_its_data_determined(catalogue: FolderCatalogue, made: tuple[Path, Path]) -> None:
+    log, cal = made
+    assert add(catalogue, cal, "--date", "2026-05-01") == 0
+    assert add(catalogue, cal, "--date", "2026-05-01") == 0
+    assert status(catalogue)["vehicles"][0]["given"] == 1
+    (given,) = lessons(catalogue, "comet")
+    known = fleet_of(catalogue, "comet").known("comet", "may").rescaled(load(cal).parameters, given.field)
+    sigma = np.sqrt(np.diag(known.covariance))
+    assert (np.abs(known.mean - load(cal).coefficients) < 3.0 * sigma).all()
+    assert sigma[6:9].max() < 200.0  # against 3,000 of a vehicle of which nothing is known
+    # the same data calibrated here, too, count once
+    add_logs(catalogue, "comet", Deployment("may", ()), [log])
+    (job,) = jobs(catalogue)
+    for table, rows in work(job, catalogue.results).tables.items():
+        catalogue.add(table, rows)
+    assert len(catalogue.rows("calibrations")) == 2
+    (own,) = lessons(catalogue, "comet")
+    # the fleet learns the information of its data, in the directions that these determine
+    off = given.information.vector - given.information.precision @ load(cal).coefficients
+    own_off = own.information.vector - own.information.precision @ load(cal).coefficients
+    scale = np.sqrt(np.diag(own.information.precision))
+    assert (np.abs(off - own_off) < 3.0 * scale).all()
+
+
+def test_what_does_not_fit_is_a_line(
+    catalogue: FolderCatalogue, made: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, cal = made
+
+    def output(*more: str) -> str:
+        assert add(catalogue, cal, *more) == 2
+        return capsys.readouterr().err
+
+    when = "--date", "2026-05-01"
+    assert "expected --date YYYY-MM-DD, the day on which its deployment began" in output()
+    reported = output(*when, "--sensor", "HMR 9")
+    assert "comet may: expected a calibration of sensor 'HMR 9', got one of 'HMR 1'" in reported
+    add_vehicle(catalogue, "other", Vehicle(parameters=("ballast",)))
+    of = "--vehicle", "other", "--deployment", "may", "--catalogue", catalogue.name
+    assert main(["fleet", "add", str(cal), *of, *when]) == 2
+    assert "other: expected a calibration with the parameters ballast, got battpos" in capsys.readouterr().err
+    assert add(catalogue, cal, *when) == 0
+    (other := tmp_path / "other.json").write_text(cal.read_text().replace('"auto"', '"mine"'))
+    assert add(catalogue, other, *when) == 2
+    assert "comet may: has another calibration already; name another deployment" in capsys.readouterr().err
+    (broken := tmp_path / "broken.json").write_text("{")
+    assert add(catalogue, broken, *when) == 1
+
+
+# ---- How a refit moves coefficients is how a dipole's coefficients move when it is exchanged or shifted ----
+
+
+AT, TRAVEL = np.array([-0.5, 0.02, 0.05]), np.array([0.0254, 0.0, 0.0])
+BATTPOS = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
+EXPONENTS = ((0,), (1,), (2,), (3,))
+
+
+def coefficients(at: FloatArray, moment: FloatArray) -> FloatArray:
+    """(36,) nT, of a mass with a permanent moment (nT at the sensor, from :data:`AT`) at a place."""
+    numbers = np.zeros(LATENT)
+    numbers[:3] = moment
+    numbers[6:9] = at - AT
+    return (mass_columns(AT, TRAVEL, BATTPOS, 3, numbers)[..., :6] @ numbers[:6]).ravel()
+
+
+@pytest.fixture
+def known() -> tuple[FloatArray, FloatArray]:
+    """The vehicle's moment, and the shapes found where the mass was measured 2 cm off."""
+    moment = np.array([1500.0, -800.0, 2100.0])
+    where = {"battpos": Mounting(tuple(np.add(AT, [0.02, -0.01, 0.0])), tuple(TRAVEL))}
+    P = np.diag(np.tile([0.1] * 6 + [1.0] * 3, 4) ** 2)
+    return moment, shapes_of(where, EXPONENTS, (BATTPOS,), 50_000.0, coefficients(AT, moment), P)
+
+
+def test_another_pack_moves_all_powers_together(known: tuple[FloatArray, FloatArray]) -> None:
+    moment, shapes = known
+    assert shapes.shape == (36, len(shape_groups(1)))
+    changed = np.array([600.0, 900.0, -300.0])
+    moved = coefficients(AT, moment + changed) - coefficients(AT, moment)
+    foretold = shapes[:, :3] @ changed / MOMENT
+    assert np.linalg.norm(foretold - moved) < 0.1 * np.linalg.norm(moved)
+    first, foretold_first = moved[9:18], foretold[9:18]  # a small part of the whole, and what matters
+    assert np.linalg.norm(foretold_first - first) < 0.15 * np.linalg.norm(first)
+
+
+def test_a_shift_moves_them_by_the_moment_that_was_found(known: tuple[FloatArray, FloatArray]) -> None:
+    moment, shapes = known
+    for axis in range(3):
+        shift = 0.005 * np.eye(3)[axis]
+        moved = coefficients(AT + shift, moment) - coefficients(AT, moment)
+        foretold = shapes[:, 6 + axis] * 0.005 / 0.05
+        assert np.linalg.norm(foretold - moved) < 0.15 * np.linalg.norm(moved)
+
+
+# ---- Names in a catalogue never form a path outside the folder of the pages ------------------------------
+
+
+@pytest.mark.parametrize("name", ["../escaped", "a\\b", ".hidden", "", "two\nlines"])
+def test_a_name_that_is_a_path_is_refused_before_anything_is_written(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "pages"
+    with pytest.raises(WriteError, match="expected a name without slashes"):
+        write_pages({name: cast(Any, None)}, folder, {})
+    assert not list(tmp_path.iterdir())

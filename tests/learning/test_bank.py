@@ -8,8 +8,16 @@ from worlds import FIELD, World, calibration
 
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.model import Calibration, Noise
+from magbridge.learning.alarms import (
+    LOG_RATIO_PER_CAUSE,
+    MIN_GROWTH,
+    SILENT_SAMPLES,
+    AlarmState,
+    LearningAlarm,
+)
 from magbridge.learning.estimator import MEAN_SAMPLES, Estimator, EstimatorBank, Nuisance
+from magbridge.learning.judge import CANDIDATE, FIRST, PUBLISHED, Coverage, Judge
 from magbridge.learning.samples import LearnedTerms, Way, observe
 
 PER_DEGREE = np.array([4.0, -3.0, 5.0])
@@ -124,3 +132,161 @@ def test_an_unobserved_level_is_kept() -> None:
     assert level(quiet.coefficients) == pytest.approx(level(published), abs=1e-6)
     share = 1.0 - (1.0 - 1.0 / MEAN_SAMPLES) ** 400  # of the mean derivative that is followed by now
     assert quiet.crust - crust == pytest.approx(by / share, rel=0.1)
+
+
+# ---- Which calibration predicts better: only samples that come after what was learned decide -------------
+
+
+LEG_SAMPLES = 200
+STEP_M, STEP_S = 1.4, 4.0
+
+
+def judged(hours: float, first: float, candidate: float, pulses: float = 0.0) -> Judge:
+    """Return it after a glider's legs, each with errors (nT) that change sign at every dive and climb.
+
+    `pulses` (nT) are added in two of every ten minutes, for both calibrations.
+    """
+    rng = np.random.default_rng(5)
+    nuisance = Nuisance(Noise(1.0), 145.0)
+    judge, F = Judge(nuisance), nuisance.transition(STEP_M, STEP_S)[0]
+    for k in range(int(hours * 3600.0 / STEP_S)):
+        sign = (-1.0) ** (k // LEG_SAMPLES)
+        crust = 7.0 * np.sin(STEP_M * k / 500.0)
+        seen = crust + rng.normal() + pulses * (k * STEP_S % 600.0 < 120.0)
+        judge.is_due(STEP_M, STEP_S, np.array([0.4 * sign, 0.0, 0.9]))
+        residuals = seen + first * sign, seen + first * sign, seen + candidate * sign
+        judge.judge(F, residuals, 1.0)
+    return judge
+
+
+def test_a_candidate_with_smaller_errors_is_adopted_after_some_turns() -> None:
+    assert not judged(0.5, 3.0, 0.0).adopt()
+    assert judged(2.0, 3.0, 0.0).adopt()
+    assert not judged(2.0, 3.0, 0.0).roll_back
+
+
+def test_a_candidate_with_errors_of_its_own_is_not_adopted() -> None:
+    """Not if its errors are as large as those of the first, and it is rolled back if they are larger."""
+    equal = judged(3.0, 1.0, -1.0)
+    assert (equal.adopt(), equal.roll_back) == (False, False)
+    worse = judged(3.0, 0.0, 3.0)
+    assert (worse.adopt(), worse.roll_back) == (False, True)
+    assert worse.mean_square[FIRST] == worse.mean_square[PUBLISHED] < worse.mean_square[CANDIDATE]
+
+
+def test_an_expected_change_is_adopted_after_one_turn() -> None:
+    """As after an alarm whose cause explains the samples."""
+    judge = judged(0.3, 3.0, 0.0)
+    assert judge.adopt(expected=True)
+    assert not judge.adopt()
+    assert not judged(0.3, 0.0, 3.0).adopt(expected=True)
+
+
+def test_pulses_that_no_calibration_explains_decide_nothing() -> None:
+    judge = judged(3.0, 0.3, -0.3, pulses=20.0)
+    assert (judge.adopt(), judge.roll_back) == (False, False)
+
+
+def test_a_new_candidate_begins_with_the_level_of_the_last() -> None:
+    judge = judged(2.0, 3.0, 0.0)
+    better = judge.better
+    judge.replace(CANDIDATE, 50.0, 1.0)
+    F = np.eye(4)
+    judge.judge(F, (0.0, 0.0, 50.0), 1.0)
+    assert abs(judge.better - better) < 20.0  # 2,500 if the level counted
+
+
+def test_a_change_is_significant_only_if_it_is_known_at_all_attitudes() -> None:
+    """Of an offset that is known along two axes, but not along the third."""
+    coverage, covariance = Coverage(3), np.diag([1.0, 1.0, 400.0])
+    change = np.array([10.0, 10.0, 0.0])
+    for direction in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)):
+        unit = np.array(direction)
+        assert not coverage.is_significant(change, covariance)
+        coverage.add(unit, unit)
+    assert coverage.is_significant(change, covariance)
+    assert not coverage.is_significant(0.1 * change, covariance)
+    for direction in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)):
+        coverage.add(np.array(direction), np.array(direction))
+    assert not coverage.is_significant(change, covariance)
+
+
+# ---- The state of an alarm: its reports, and when its cause is learned -----------------------------------
+
+
+def alarm(strength: float, *causes: str) -> LearningAlarm:
+    return LearningAlarm(causes, ("",) * len(causes), since=0.0, size=5.0, strength=strength)
+
+
+def standing(*alarms: LearningAlarm, telling: int = 0) -> AlarmState:
+    """Return how it stands after these, and so many telling samples and as many that are not."""
+    one = AlarmState()
+    for each in alarms:
+        one.update(each)
+    return counted(one, telling)
+
+
+def counted(one: AlarmState, telling: int, error: float = 0.0) -> AlarmState:
+    """Return it after so many telling samples, predicted within `error` (nT), and as many that are not."""
+    for _ in range(telling):
+        one.count(error, 1.0, informative=True)
+        one.count(0.0, 1.0, informative=False)
+    return one
+
+
+def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
+    """One more cause asks for as much more evidence."""
+    two = "offset_drift", "temperature_offset"
+    first = alarm(20.0, *two)
+    assert not standing(first, alarm(20.1 + MIN_GROWTH, *two)).is_certain
+    assert standing(first, alarm(20.1 + MIN_GROWTH + LOG_RATIO_PER_CAUSE, *two)).is_certain
+    assert standing(first, alarm(20.1 + MIN_GROWTH, "offset_drift")).is_certain
+    assert standing(first).update(alarm(22.0, "offset_drift")) == ""  # its cause is reported at its end
+
+
+def relapsed() -> AlarmState:
+    """Return one whose cause was learned, and mistaken: errors of 30 nT were seen."""
+    one = standing(alarm(20.0, "offset_step"))
+    one.try_cause()
+    assert one.variance == 25.0  # until it is confirmed
+    assert one.confirm()
+    counted(one, SILENT_SAMPLES - 1, 30.0)
+    assert one.update(alarm(19.0, "offset_drift")) == "unexplained still: 5 nT, offset drift"
+    return one
+
+
+def test_a_learned_change_with_another_alarm_was_mistaken() -> None:
+    """The alarm stays the same, sigma includes the seen error, and the next threshold is higher."""
+    one = relapsed()
+    assert (one.relapses, one.alarm and one.alarm.since) == (1, 0.0)
+    assert 28.0 < one.variance**0.5 < 30.0
+    assert one.update(alarm(19.0 + 2 * MIN_GROWTH, "offset_step")) == ""
+    assert not one.is_certain
+    one.update(alarm(20.0 + 4 * MIN_GROWTH, "offset_step"))
+    assert one.is_certain
+
+
+def test_a_relapsed_alarm_ends_when_the_learned_change_has_explained_many_samples() -> None:
+    """Without a message before; a significant error restarts its count."""
+    one = relapsed()
+    one.try_cause()
+    assert not one.confirm()
+    assert one.is_tried
+    assert not one.is_certain
+    counted(one, SILENT_SAMPLES, 0.0)
+    counted(one, 1, 5.0)
+    assert not one.is_silent
+    assert one.flags
+    assert counted(one, SILENT_SAMPLES + 1).is_silent
+
+
+def test_the_next_alarm_after_a_long_time_is_another() -> None:
+    """The learned change has explained the data, so it was not a mistake."""
+    one = standing(alarm(20.0, "offset_step"))
+    one.try_cause()
+    one.confirm()
+    counted(one, SILENT_SAMPLES + 1)
+    assert one.update(alarm(19.0, "offset_drift")) == "unexplained: 5 nT, offset drift"
+    assert one.relapses == 0
+    one.mark_mistaken()  # rolled back meanwhile: on trial
+    assert (one.relapses, one.is_tried) == (1, True)

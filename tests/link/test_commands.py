@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import inf, nan
+from pathlib import Path
 from typing import Any
 
 import pytest
 from line import Line
+from small import START, small_bridge
 
-from magbridge.mavlink import Codec
+from magbridge.bridge.events import Event, StartEvent
+from magbridge.calibration.model import Parameter
+from magbridge.config import Telemetry
+from magbridge.link.output import Announcer, Outbox, Timers
+from magbridge.link.telemetry import Sources, Stream, StreamRequests, needed_rates
+from magbridge.mavlink import Codec, Message, spec
+from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
+from magbridge.records import Channel
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
 FIELD, HEARTBEAT, STATUS, HIGHRES_IMU, VERSION, METADATA = 60101, 0, 60102, 105, 148, 397
@@ -135,3 +145,273 @@ def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Lin
     assert reported == ["more than 100 commands a second from 255:190"]
     link.to(2.0)
     assert result(link, link.command(REQUEST, METADATA)) == ACCEPTED
+
+
+# ---- The bridge requests the messages that it needs, and never lowers a rate -----------------------------
+
+
+SECOND = 1_000_000
+ATTITUDE, VFR_HUD = (1, spec("ATTITUDE").id), (1, spec("VFR_HUD").id)
+NEEDED = {ATTITUDE: (10.0, 4.0), VFR_HUD: (5.0, 2.0)}
+
+
+class Bench:
+    """An autopilot that sends messages at given rates, and answers each request with one result."""
+
+    def __init__(
+        self,
+        kind: int,
+        result: int = MAV_RESULT.ACCEPTED,
+        needed: Mapping[Stream, tuple[float, float]] = NEEDED,
+    ) -> None:
+        self.codec = Codec(1, 191)
+        self.outbox, self.timers = Outbox(self.codec), Timers()
+        self.announcer = Announcer(self.outbox, self.timers)
+        self.requests = StreamRequests((1, 1), needed, self.outbox, self.timers, self.announcer)
+        self._ear, self._kind, self._result = Codec(0, 0), kind, result
+        self._codecs = {1: Codec(1, 1), 25: Codec(1, 25)}
+        self.receivers: set[int] = set()
+        self.asked: list[tuple[str, float]] = []
+        self.now_us = 0
+
+    def run(self, seconds: int, component: int = 1, **rates: int) -> None:
+        for _ in range(seconds):
+            self._give("HEARTBEAT", type=self._kind)
+            for name, rate in rates.items():
+                for _ in range(rate):
+                    self._give(name, component)
+            self.now_us += SECOND
+            self.codec.now_us = self.now_us
+            self.timers.advance(self.now_us, lambda _: None)
+            self._answer()
+
+    def _give(self, name: str, component: int = 1, **fields: object) -> None:
+        (message,) = self._ear.parse(self._codecs[component].pack(name, **fields))
+        self.requests.receive(message, self.now_us)
+
+    def _answer(self) -> None:
+        while frames := self.outbox.drain():
+            for _, frame in frames:
+                (message,) = Codec(0, 0).parse(frame)
+                if message.name == "COMMAND_LONG":
+                    self._keep(message)
+
+    def _keep(self, message: Message) -> None:
+        assert message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL
+        assert message["target_system"] == 1
+        self.receivers.add(message["target_component"])
+        self.asked.append((spec(int(message["param1"])).name, 1e6 / message["param2"]))
+        self._give(
+            "COMMAND_ACK",
+            message["target_component"],
+            command=MAV_CMD.SET_MESSAGE_INTERVAL,
+            result=self._result,
+        )
+
+
+def test_messages_that_arrive_too_rarely_are_requested_at_the_rates_of_the_vehicle() -> None:
+    plane, glider = Bench(1), Bench(int(MAV_TYPE.SUBMARINE))
+    for bench in (plane, glider):
+        bench.run(12, ATTITUDE=1, VFR_HUD=1)
+    assert plane.asked == [("ATTITUDE", 10.0), ("VFR_HUD", 5.0)]
+    assert glider.asked == [("ATTITUDE", 4.0), ("VFR_HUD", 2.0)]
+    assert plane.receivers == {1}
+
+
+def test_a_rate_that_is_high_enough_stays_as_another_client_has_set_it() -> None:
+    bench = Bench(1)
+    bench.run(60, ATTITUDE=50, VFR_HUD=4)
+    assert bench.asked == []
+    assert bench.requests.measured["ATTITUDE"] == 50.0
+
+
+def test_a_request_is_repeated_a_few_times_and_again_after_a_reboot() -> None:
+    bench = Bench(1)
+    bench.run(120, ATTITUDE=1, VFR_HUD=5)
+    assert bench.asked == [("ATTITUDE", 10.0)] * 3
+    bench.requests.rebooted()
+    bench.run(12, ATTITUDE=1, VFR_HUD=5)
+    assert len(bench.asked) == 4
+
+
+def test_a_denial_is_reported_and_not_repeated() -> None:
+    bench = Bench(1, MAV_RESULT.DENIED)
+    bench.run(60, ATTITUDE=1, VFR_HUD=5)
+    assert bench.asked == [("ATTITUDE", 10.0)]
+    assert [text for _, text in bench.announcer.texts] == [
+        "the autopilot does not send ATTITUDE at 10 Hz: DENIED"
+    ]
+
+
+def test_telemetry_is_requested_from_the_component_that_is_its_source() -> None:
+    battery = Telemetry("BATTERY_STATUS", "current_battery", component=25)
+    needed = needed_rates(1, [battery], attitude=False, navigation=False)
+    bench = Bench(1, MAV_RESULT.UNSUPPORTED, needed)
+    bench.run(12, 1, GLOBAL_POSITION_INT=5, BATTERY_STATUS=5)
+    assert bench.asked == [("BATTERY_STATUS", 5.0)]
+    assert bench.receivers == {25}
+    assert bench.requests.denied == {
+        "BATTERY_STATUS": "component 25 does not send BATTERY_STATUS at 5 Hz: UNSUPPORTED"
+    }
+
+
+def test_telemetry_that_another_component_sends_is_not_requested_from_the_autopilot() -> None:
+    needed = needed_rates(1, [Telemetry("RPM", "rpm1")], attitude=False, navigation=False)
+    bench = Bench(1, needed={stream: pair for stream, pair in needed.items() if stream[1] == spec("RPM").id})
+    bench.run(30, 25, RPM=5)
+    assert bench.asked == []
+    assert bench.requests.measured == {"RPM": 5.0}
+    bench.run(12, 25, RPM=1)
+    assert bench.receivers == {1}
+
+
+def test_what_is_needed_depends_on_the_task() -> None:
+    telemetry = [Telemetry("NAMED_VALUE_FLOAT", "value"), Telemetry("SYS_STATUS", "current_battery")]
+    plain = needed_rates(1, telemetry, attitude=False, navigation=False)
+    assert sorted(spec(number).name for _, number in plain) == ["GLOBAL_POSITION_INT", "SYS_STATUS"]
+    full = {spec(number).name for _, number in needed_rates(1, attitude=True, navigation=True)}
+    assert full == {
+        *("ATTITUDE", "EKF_STATUS_REPORT", "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
+        "VFR_HUD",
+    }
+
+
+# ---- Who may change what the bridge does, and whose telemetry counts -------------------------------------
+
+
+GCS, QUADROTOR, ONBOARD = 6, 2, 18
+
+
+def spoken(link: Line, frames: bytes) -> tuple[list[Any], str]:
+    received = link.give(frames)
+    return received, "".join(link.texts(received))
+
+
+def texts_by(system: int, component: int, kind: int | None, name: str, **fields: object) -> bytes:
+    """Return what a component says after a heartbeat of that kind, or without one."""
+    codec = Codec(system, component)
+    beat = b"" if kind is None else codec.pack("HEARTBEAT", type=kind)
+    return beat + codec.pack(name, target_system=1, target_component=191, **fields)
+
+
+@pytest.mark.parametrize(
+    ("system", "component", "kind", "may"),
+    [
+        (1, 1, QUADROTOR, True),  # the autopilot
+        (255, 190, GCS, True),
+        (255, 190, None, True),  # a script that sends no heartbeat
+        (1, 190, GCS, True),  # a station on board
+        (1, 99, None, False),
+        (1, 99, ONBOARD, False),
+        (2, 1, QUADROTOR, False),  # another vehicle
+    ],
+)
+def test_who_may_change_parameters_and_rates(
+    link: Line, system: int, component: int, kind: int | None, may: bool
+) -> None:
+    fields = {"param_id": "MB_AGE_BATTPOS", "param_value": 1e6, "param_type": 9}
+    received, text = spoken(link, texts_by(system, component, kind, "PARAM_SET", **fields))
+    age = 1e6 if may else 30.0
+    assert [v.param_value for v in link.only(received, "PARAM_VALUE") if v.param_id == "MB_AGE_BATTPOS"] == [
+        age
+    ]
+    assert link.component.parameters["MB_AGE_BATTPOS"] == age
+    assert f"{system}:{component}" in text
+    interval = {"command": MAV_CMD.SET_MESSAGE_INTERVAL, "param1": 60101, "param2": -1}
+    received, text = spoken(link, texts_by(system, component, kind, "COMMAND_LONG", **interval))
+    (ack,) = link.only(received, "COMMAND_ACK")
+    assert ack.result == (MAV_RESULT.ACCEPTED if may else MAV_RESULT.DENIED)
+    assert link.component.rates["MAG_FIELD"].hertz == (-1.0 if may else 0.0)
+    assert (f"{system}:{component} may not set a rate" in text) is not may
+
+
+def sources(**what: Any) -> tuple[Sources, Announcer]:
+    announcer = Announcer(Outbox(Codec(1, 191)), Timers())
+    telemetry = {"battpos": Telemetry("NAMED_VALUE_FLOAT", "value", max_age=2.0, **what)}
+    return Sources(telemetry, 1, 1, announcer), announcer
+
+
+@pytest.mark.parametrize(
+    ("wanted", "order", "admitted"),
+    [
+        (None, [(0, 1), (0, 99), (1, 1), (1, 99)], [True, False, True, False]),
+        (None, [(0, 99), (0, 1), (1, 99), (1, 1)], [True, True, False, True]),  # the autopilot goes first
+        (None, [(0, 25), (1, 99), (2, 25), (3, 99)], [True, False, True, False]),
+        (None, [(0, 25), (5, 99), (6, 25)], [True, True, False]),  # it had become stale
+        (25, [(0, 99), (0, 1), (0, 25), (9, 99)], [False, False, True, False]),
+    ],
+)
+def test_two_sources_of_one_parameter(
+    wanted: int | None, order: list[tuple[int, int]], admitted: list[bool]
+) -> None:
+    both, announcer = sources(component=wanted)
+    assert [both.admit("battpos", who, s * 1_000_000) for s, who in order] == admitted
+    reported = [text for _, text in announcer.texts]
+    refused = {who for (_, who), good in zip(order, admitted, strict=True) if not good}
+    assert {who for who in refused if f"battpos also from 1:{who}: not used" in reported} == refused
+
+
+def test_another_component_s_value_changes_no_sample(tmp_path: Path) -> None:
+    pipeline = small_bridge(tmp_path, StartEvent(START), Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5), [])
+    for component, value in ((1, 0.25), (99, 9.0)):
+        frame = Codec(1, component).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
+        pipeline.feed(Event(START + component * 1000, Channel.LINK, frame))
+    assert pipeline._correction.aligner.by_name["battpos"].last == 0.25
+    assert "battpos also from 1:99: not used" in [text for _, text in pipeline.component.announcer.texts]
+
+
+@pytest.mark.parametrize(
+    "number", [MAV_CMD.DO_START_MAG_CAL, MAV_CMD.DO_CANCEL_MAG_CAL, MAV_CMD.FIXED_MAG_CAL_YAW]
+)
+def test_a_calibration_is_refused_in_words_and_left_to_the_autopilot(link: Line, number: MAV_CMD) -> None:
+    received = link.command(number, 0.0)
+    (ack,) = link.only(received, "COMMAND_ACK")
+    assert ack.result == MAV_RESULT.UNSUPPORTED
+    assert "magbridge calibrate" in "".join(link.texts(received))
+    assert link.command(number, 0.0, target=(1, 0)) == []
+    assert link.command(number, 0.0, target=(1, 1)) == []
+
+
+def beat(link: Line, component: int = 190, kind: int = GCS) -> None:
+    link.give(Codec(255, component).pack("HEARTBEAT", type=kind))
+
+
+def values(link: Line, until: float) -> list[Any]:
+    return link.only(link.to(until), "PARAM_VALUE")
+
+
+def test_a_station_that_never_asks_gets_the_parameters_twice(link: Line) -> None:
+    names = link.component.parameters.names
+    assert not values(link, 1.0)
+    received = []
+    for second in range(1, 60):
+        beat(link)
+        received += values(link, 1.0 + second)
+    times = [at for at, frame in link.sent if frame[7:10] == b"\x16\0\0"]
+    assert times[len(names)] - times[0] == 10_000_000
+    for one in (received[: len(names)], received[len(names) :]):
+        assert [value.param_id for value in one] == names
+        assert [value.param_index for value in one] == list(range(len(names)))
+        assert {value.param_count for value in one} == {len(names)}
+    beat(link, kind=ONBOARD, component=1)
+    assert not values(link, 75.0)
+
+
+def test_a_crowd_of_stations_is_not_a_flood(link: Line) -> None:
+    """Two thousand names in ten seconds; a station that comes then still gets its two lists."""
+    for k in range(200):
+        for component in range(10):
+            link.give(Codec(200 + k % 50, component + 1).pack("HEARTBEAT", type=GCS))
+        link.to(0.1 + 0.05 * k)
+    before = len([1 for _, frame in link.sent if frame[7:10] == b"\x16\0\0"])
+    names = len(link.component.parameters.names)
+    assert before <= 2 * names
+    assert len(values(link, 45.0)) == 2 * names
+
+
+def test_requests_without_end_do_not_keep_the_list_from_its_end(link: Line) -> None:
+    received = []
+    for k in range(40):
+        link.send_message("param_request_list", 1, 191)
+        received += values(link, 1.0 + 0.1 * k)
+    assert {value.param_id for value in received} == set(link.component.parameters.names)

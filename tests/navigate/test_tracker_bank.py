@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 from voyages import PLACE
 
+from magbridge.calibration.model import Calibration, Noise, identity
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid, Local
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.model import Block, prior
-from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.model import Block, block_length, prior, resolution, transition
+from magbridge.navigate.options import NavigationOptions, informed
 
 Moments = tuple[np.ndarray, np.ndarray]
 
@@ -39,8 +44,8 @@ def correlated() -> Moments:
 def test_a_map_s_variance_counts_with_the_measurement_s(grid: AnomalyGrid, correlated: Moments) -> None:
     x, P = correlated
     unsure = AnomalyGrid(grid.longitude, grid.latitude, grid.anomaly, 3.0)
-    for scale, resolution in ((1.0, np.inf), (1e-6, 500.0)):
-        banks = (Bank(one, x, scale * P, resolution, gate=25.0) for one in (grid, unsure))
+    for scale, finest in ((1.0, np.inf), (1e-6, 500.0)):
+        banks = (Bank(one, x, scale * P, finest, gate=25.0) for one in (grid, unsure))
         sure, not_sure = (bank.update(block(0.0)).variance for bank in banks)
         assert not_sure - sure == pytest.approx(9.0, rel=1e-3)
 
@@ -133,3 +138,63 @@ def test_hypotheses_off_the_map_stay_in_the_running(grid: AnomalyGrid) -> None:
     off = np.isnan(around(grid, bank.x[0], bank.x[1]).anomaly)
     assert 0.02 < bank.w[off].sum() < 0.98
     assert np.isfinite(bank.moments()[1]).all()
+
+
+# ---- The motion of the states, and how fine a map must be cut --------------------------------------------
+
+
+def test_many_short_steps_are_one_long_step() -> None:
+    options = NavigationOptions()
+    f, q = np.eye(6), np.zeros((6, 6))
+    for _ in range(100):
+        step_f, step_q = transition(options, 3.0, 1.0)
+        f, q = step_f @ f, step_f @ q @ step_f.T + step_q
+    long_f, long_q = transition(options, 300.0, 100.0)
+    np.testing.assert_allclose(f, long_f, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(q, long_q, rtol=0.01, atol=1e-9)
+
+
+def test_gauss_markov_states_keep_their_variance() -> None:
+    options = NavigationOptions()
+    _, P = prior(options)
+    f, q = transition(options, 600.0, 200.0)
+    np.testing.assert_allclose((f @ P @ f.T + q)[2:, 2:], P[2:, 2:], rtol=1e-12)
+
+
+def test_no_time_is_not_motion() -> None:
+    f, q = transition(NavigationOptions(), 0.0, 0.0)
+    np.testing.assert_array_equal(f, np.eye(6))
+    np.testing.assert_array_equal(q, np.zeros((6, 6)))
+
+
+def test_resolution_follows_the_map(grid: AnomalyGrid) -> None:
+    fine, coarse = resolution(grid, NavigationOptions(), 0.1), resolution(grid, NavigationOptions(), 10.0)
+    assert 0 < fine < coarse <= 0.25 * grid.correlation_length
+    flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
+    assert resolution(flat, NavigationOptions(), 1.0) == np.inf
+    assert block_length(flat) == np.inf
+
+
+def test_options_refuse_what_they_do_not_know() -> None:
+    with pytest.raises(msgspec.ValidationError, match="unknown field `gait`"):
+        msgspec.convert({"gait": 1.0}, NavigationOptions)
+    assert msgspec.convert({"gate": 9.0}, NavigationOptions).gate == 9.0
+
+
+def test_a_calibration_separates_white_and_slow_noise() -> None:
+    known = NavigationOptions(bias_sigma=1.0)
+    white = with_noise(Noise(2.0))
+    assert informed(known, white, 2.0) == replace(known, noise=2.0)
+    slow = informed(known, white, 10.0)
+    assert slow.bias_sigma == pytest.approx(np.sqrt(1.0 + 100.0 - 4.0))
+    assert slow.bias_time < known.bias_time
+    lasting = informed(known, with_noise(Noise(10.0, autocorrelation=0.99, interval=4.0)), 10.0)
+    assert lasting.noise == pytest.approx(10.0 * np.sqrt(1.0 - 0.99**2))
+    assert lasting.bias_sigma == pytest.approx(np.hypot(1.0, 10.0 * 0.99))
+    assert informed(
+        known, with_noise(Noise(5.0, autocorrelation=0.9, interval=4.0)), 5.0
+    ).noise_time == pytest.approx(38, 0.01)
+
+
+def with_noise(noise: Noise) -> Calibration:
+    return dataclasses.replace(identity(), noise=noise)
