@@ -75,12 +75,9 @@ def read(
 
 
 def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
-    """Return the deployment of each file; a Slocum's flight and science file are one.
+    """Return the deployment of each file as :func:`read` does; a Slocum's flight and science file are one.
 
-    A sensor's own logs get the telemetry of the vehicle's logs, which are then not among the results
-    (:mod:`magbridge.logs.merge`). Files that were skipped are counted in the first.
-
-    FormatError, MissingExtra: as :func:`read`.
+    A sensor's own logs get the telemetry of the vehicle's logs, which are then not among the results.
     """
     from magbridge.logs.merge import combine  # noqa: PLC0415 - xarray is for ashore
 
@@ -97,13 +94,10 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
 def read_chunks(
     paths: Paths, rows: int = 65536, *, required: Iterable[str] = (), options: Options = DEFAULTS
 ) -> Iterator[xr.Dataset]:
-    """Yield the result of :func:`read` in pieces of about `rows` rows, in bounded memory.
+    """Yield the result of :func:`read` in pieces of about `rows` rows with the same columns.
 
-    Every piece has the same columns. CSV, netCDF and Parquet are streamed; files of the other
-    formats are held in memory one at a time. Of files that overlap in time, one piece each is held. A file
-    that cannot be read to its end is read up to there.
-
-    FormatError, MissingExtra: as :func:`read`.
+    One CSV, netCDF or Parquet is streamed in bounded memory. A file of another format is held in memory, and
+    each of several files until the times of the next begin.
     """
     from magbridge.logs.merge import merge, refuse_offset  # noqa: PLC0415 - xarray is for ashore
 
@@ -253,7 +247,7 @@ def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]
 
 
 def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
-    """Return a deployment whose times count from the boot with that at `date` (s), where it is given."""
+    """Return a deployment whose times count from the boot, with the boot at `date` (s) if that is given."""
     if date is None or not counts_from_boot(part):
         return part
     moved = part.assign_coords(time=part["time"].copy(data=part["time"].values + date))
@@ -265,7 +259,7 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
 
 
 def _origin(source: str) -> str:
-    """Return the origin of the file in `source` (``a.csv`` for ``b.nc (a.csv)``), or `source`."""
+    """Return ``a.csv`` of ``b.nc (a.csv)``, else `source`."""
     name, opened, inside = source.partition(" (")
     depths = list(accumulate((char == "(") - (char == ")") for char in inside))
     # one pair of brackets around the rest, and not several files
@@ -274,12 +268,10 @@ def _origin(source: str) -> str:
 
 
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a deployment in the format of the suffix of `path`, which is complete or as it was before.
-
-    Times are s since 1970, or datetime64.
+    """Write a deployment in the format of the suffix of `path`; times are s since 1970, or datetime64.
 
     FormatError: the suffix is not that of a format that can be written. WriteError: the file cannot be
-    written.
+    written, and is as it was before.
     """
     with Writer(path) as writer:
         writer.append(dataset)

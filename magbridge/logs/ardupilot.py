@@ -33,7 +33,7 @@ from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
 from magbridge.logs.checks import boots
 from magbridge.logs.clocks import GPS_EPOCH, WEEK, leap_seconds
-from magbridge.logs.compasses import BootRun, LogCompass, Magnetometer, Series, pieces, rate
+from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, sampled, symmetric
 from magbridge.logs.dataflash import OWN_SCALE, Flash, Records, read_binary, read_text
 from magbridge.logs.deployment import NOTES
 from magbridge.logs.fields import DEG_PER_RAD, FieldMap, field_maps, fields_of
@@ -45,7 +45,6 @@ MIN_GPS_STATUS = 3
 """Least ``GPS.Status`` of a fix in three dimensions."""
 MAX_KIND_NUMBER = 8
 """Highest number in the name of a kind, as ``ESC8``."""
-DIAGONAL, OFF = ("DIA_X", "DIA_Y", "DIA_Z"), ("ODI_X", "ODI_Y", "ODI_Z")
 ID_PARAMETERS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
 """Parameters that hold a compass' device id, the first that is there; the second has no number 1."""
 
@@ -58,7 +57,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     with path.open("rb") as file:
         text = b"FMT," in file.read(4096)
     flash = (read_text if text else read_binary)(path, WANTED)
-    fields, notes = in_hundredths(flash, in_declared_units(flash))
+    fields, notes = _in_own_units(flash)
     records = {name: _in_microseconds(name, one) for name, one in flash.records.items()}
     runs = [run for part in _boots(records) if (run := _run(fields, part)).magnetometers]
     if not runs:
@@ -139,9 +138,8 @@ def _magnetometer(
 ) -> Magnetometer:
     """Return the raw channels in nT, and the log's description of the compass."""
     fields = records.fields
-    time = fields["TimeUS"] * 1e-6
     field: FloatArray = np.stack([fields[f"Mag{axis}"] for axis in "XYZ"])
-    none = np.zeros(len(time))
+    none = np.zeros(len(records.at))
     # the motors' share is MOX, up to ArduPilot 4.0 MOfsX
     field -= np.stack([fields.get(f"MO{axis}", fields.get(f"MOfs{axis}", none)) for axis in "XYZ"])
     if (matrix := _soft_iron(parameters, _numbered(number))) is not None:
@@ -151,18 +149,16 @@ def _magnetometer(
     device = next((parameters[name] for name in names if parameters.get(name)), 0.0)
     use = parameters.get(f"COMPASS_USE{_numbered(number)}")
     health = fields.get("Health")
-    compass = LogCompass(
+    return sampled(
         number,
-        len(time),
-        rate(time),
-        f"{device:.0f}" if device else "",
-        None if use is None else use != 0,
-        None if health is None else float((health > 0).mean()),
-        number + 1 if names[0] in parameters else None,
-        number == chosen,
+        fields["TimeUS"] * 1e-6,
+        NT_PER_UNIT["mG"] * field,
+        id=f"{device:.0f}" if device else "",
+        enabled=None if use is None else use != 0,
+        healthy=None if health is None else float((health > 0).mean()),
+        priority=number + 1 if names[0] in parameters else None,
+        in_use=number == chosen,
     )
-    nanotesla = NT_PER_UNIT["mG"] * field
-    return Magnetometer(compass, time, dict(zip("xyz", nanotesla, strict=True)))
 
 
 def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetometer]:
@@ -174,11 +170,10 @@ def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetome
     found: list[Magnetometer] = []
     for numbers in np.unique(np.column_stack(parts), axis=0):
         here = np.all([part == number for part, number in zip(parts, numbers, strict=True)], axis=0)
-        time = fields["TimeUS"][here] * 1e-6
         device = f"{SURVEY} {':'.join(f'{number:g}' for number in numbers)}"
-        compass = LogCompass(first + len(found), len(time), rate(time), device)
-        axes = [NT_PER_UNIT["G"] * fields[name][here] for name in SURVEY_AXES]
-        found.append(Magnetometer(compass, time, dict(zip("xyz", axes, strict=True))))
+        gauss = np.stack([fields[name][here] for name in SURVEY_AXES])
+        time = fields["TimeUS"][here] * 1e-6
+        found.append(sampled(first + len(found), time, NT_PER_UNIT["G"] * gauss, id=device))
     return found
 
 
@@ -189,10 +184,10 @@ def _numbered(number: int) -> str:
 
 def _soft_iron(parameters: Mapping[str, float], number: str) -> FloatArray | None:
     """Return the matrix of ``COMPASS_DIA`` and ``COMPASS_ODI``; None where it is not used."""
-    x, y, z = (parameters.get(f"COMPASS_{name[:3]}{number}{name[3:]}", 0.0) for name in DIAGONAL)
-    xy, xz, yz = (parameters.get(f"COMPASS_{name[:3]}{number}{name[3:]}", 0.0) for name in OFF)
-    matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
-    return matrix if x * y * z and abs(np.linalg.det(matrix)) > 1e-3 else None
+    diagonal, off = ([parameters.get(f"COMPASS_{kind}{number}_{axis}", 0.0) for axis in "XYZ"]
+                     for kind in ("DIA", "ODI"))  # fmt: skip
+    matrix = symmetric(diagonal, off)
+    return matrix if all(diagonal) and abs(np.linalg.det(matrix)) > 1e-3 else None
 
 
 def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
@@ -287,25 +282,19 @@ UNIT_FACTORS = {
 """Label of a unit that a log declares to ours and its factor."""
 
 
-def in_declared_units(flash: Flash) -> Fields:
-    """Return :data:`ARDUPILOT_FIELDS` with the units and factors that the log itself declares."""
-    declared = _declared(flash)
-    return {
-        kind: [_converted(one, declared.get((kind, one.field))) for one in fields]
-        for kind, fields in ARDUPILOT_FIELDS.items()
-    }
-
-
-def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
-    """Return `fields` with the factor 0.01 for powers in hundredths, and a note for the user.
+def _in_own_units(flash: Flash) -> tuple[Fields, list[str]]:
+    """Return :data:`ARDUPILOT_FIELDS` in the units that the log itself declares, and notes for the user.
 
     Logs up to 2015 hold voltage and current of ``CURR`` as integers in hundredths, and do not declare it.
     """
-    found, notes = dict(fields), []
     declared = _declared(flash)
+    found = {
+        kind: [_converted(one, declared.get((kind, one.field))) for one in fields]
+        for kind, fields in ARDUPILOT_FIELDS.items()
+    }
+    notes = []
     for name in POWER_MESSAGES:
-        table = flash.records[name].fields if name in flash.records else {}
-        volts = table.get("Volt", np.empty(0))
+        volts = flash.records[name].fields.get("Volt", np.empty(0)) if name in flash.records else np.empty(0)
         is_whole = bool((volts == np.round(volts)).all())
         if (name, "Curr") in declared or not len(volts) or not is_whole or np.median(volts) < MAX_VOLTAGE_V:
             continue

@@ -77,11 +77,8 @@ def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf)
 def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) -> Iterator[xr.Dataset]:
     """Yield the pieces of a deployment, given with the numbers of their rows, without impossible data.
 
-    Attributes of a piece count its losses, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
-    line for the first in each column of the file.
-
-    FormatError: at least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names
-    the first. Or the error of `pieces`, after the pieces before it.
+    The attributes of a piece count and name its losses. FormatError: at least half of the rows, or of a
+    column's values, are impossible (if `strict`: any); or the error of `pieces`, after the pieces before it.
     """
     faults = Faults(file, strict=strict)
     previous = -np.inf
@@ -213,10 +210,9 @@ def _expected(time: float, previous: float, following: float = np.inf) -> str:
 
 
 def _rows_to_keep(time: FloatArray, previous: float) -> IndexArray:
-    """Return the indices of the rows to keep of `time` (n,), s, in which rows at one time may remain.
+    """Return the indices of the longest series of `time` (n,), s, that does not decrease, after `previous`.
 
-    They are the longest series that does not decrease, all of it after `previous`, without the few rows that
-    are far from all others.
+    The few rows that are far in time from all others are left out.
     """
     index = np.flatnonzero((time > previous) & (np.abs(time) < YEAR_10000))
     if (np.diff(time[index]) < 0).any():
@@ -233,7 +229,7 @@ MAX_WRONG_FRACTION = 0.5
 
 
 class Faults:
-    """The faults of a file so far; `rows` counts the rows seen, also the wrong ones."""
+    """The faults of a file so far; `rows` counts all rows seen."""
 
     def __init__(self, file: str | Path, *, strict: bool) -> None:
         self._file, self._strict = file, strict
@@ -374,10 +370,7 @@ def states_validity(name: str) -> bool:
 
 
 def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Validity]:
-    """Return the rules by which columns state which values are valid, from the cells of the first `rows`.
-
-    A column that is not read has the name ''.
-    """
+    """Return the rules by which columns state which values are valid, from the cells of the first `rows`."""
     found = []
     words = [bare(name) if name else None for name in names]
     for k, name in enumerate(names):
@@ -429,8 +422,8 @@ MIN_FILL_VALUE = 1e30
 def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
     """Return the undeclared missing-value codes among columns (n,) as masks.
 
-    They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
-    three axes are 0, or the same code, is none, nor is a place at 0, 0: a receiver without a fix writes it.
+    A code is huge, or one of :data:`CODES` beyond all other values by half their range. A field with 0 or
+    the same code on its three axes is missing; so is a position at 0, 0, as a receiver without a fix writes.
     """
     found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
     for together in (CHANNELS, ("latitude", "longitude")):
@@ -461,10 +454,9 @@ def mark_invalid(
     *,
     codes: bool = True,
 ) -> BoolArray:
-    """Set the values that are not valid to NaN, in place, and return the rows (n,) to keep.
+    """Set missing-value `codes` and what the rules mark to NaN, in place; return the rows (n,) to keep.
 
-    These are missing-value `codes`, and what the rules mark. `note` takes a column ("" for whole rows), its
-    wrong values (n,) and what was expected.
+    `note` takes a column ("" for whole rows), its wrong values (n,) and what was expected.
     """
     for name, wrong in (unknown(columns) if codes else {}).items():
         note(name, wrong, f"{EXPECTED_VALUE}{float(columns[name][wrong][0])!r}")
@@ -480,10 +472,7 @@ def mark_invalid(
 
 
 def known(path: Path, dataset: xr.Dataset, numbers: Sequence[int]) -> tuple[xr.Dataset, Sequence[int]]:
-    """Return a deployment of another program and the numbers of its rows without what is not valid.
-
-    Missing-value codes, and what a column such as ``Valid`` marks, are counted and named.
-    """
+    """Return a deployment of another program and the numbers of its rows, without what is not valid."""
     columns = {str(name): column.to_numpy().copy() for name, column in dataset.data_vars.items()}
     lines: list[str] = []
     dropped = {"values_dropped": 0, "rows_dropped": 0}

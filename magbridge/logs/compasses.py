@@ -91,6 +91,19 @@ class Magnetometer(NamedTuple):
     """(n,) each, nT, by axis (``x``, ``y``, ``z``)."""
 
 
+def sampled(number: int, time: FloatArray, axes: FloatArray, **facts: Any) -> Magnetometer:
+    """Return a magnetometer by its times (n,), s, and its axes (3, n), nT; `facts` are of its compass."""
+    compass = LogCompass(number, len(time), rate(time), **facts)
+    return Magnetometer(compass, time, dict(zip("xyz", axes, strict=True)))
+
+
+def symmetric(diagonal: Sequence[float], off_diagonal: Sequence[float]) -> FloatArray:
+    """Return a symmetric matrix (3, 3) from its elements xx, yy, zz and xy, xz, yz."""
+    x, y, z = diagonal
+    xy, xz, yz = off_diagonal
+    return np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
+
+
 class BootRun(NamedTuple):
     """The records between one boot and the next."""
 
@@ -110,11 +123,9 @@ def rate(time: Sequence[float] | np.ndarray[Any, Any]) -> float:
 
 
 def choose(path: Path, found: Sequence[LogCompass], wanted: str | None) -> list[LogCompass]:
-    """Return the compasses with one marked as chosen.
+    """Return the compasses with one marked as chosen: that with the number or id `wanted`.
 
-    `wanted` is a number or an id; None: the one in use, else the first that is enabled and healthy.
-
-    FormatError: no compass has that number or id.
+    None: the one in use, else the first that is enabled and healthy. FormatError: there is none of that name.
     """
     if wanted is None:
         best = min(found, key=lambda one: (not one.fit, not one.in_use, one.number))
@@ -145,11 +156,9 @@ def listed(found: Sequence[LogCompass]) -> dict[str, str]:
 
 
 def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
-    """Return a deployment whose ``mag_x`` is another of its columns, as ``mag2_x`` for the compass 1.
+    """Return a deployment whose ``mag_x`` is that of the compass `wanted`: ``mag2_x`` for the compass 1.
 
-    For formats that know columns, but no compasses: the rows stay those of the first.
-
-    FormatError: there are no such columns.
+    The rows stay those of the first compass. FormatError: there are no such columns.
     """
     if wanted in (None, "0"):
         return deployment
@@ -175,8 +184,12 @@ def further(deployment: xr.Dataset) -> xr.Dataset:
 
 
 def compasses_in(log: xr.Dataset) -> list[LogCompass]:
-    """Return the compasses of a deployment: those that it lists, or those that its columns are."""
-    return compasses_of(log.attrs) or _by_names(log)
+    """Return the compasses of a deployment: those that it lists, or those that its columns are.
+
+    A log of several boots lists those of its first.
+    """
+    text = log.attrs.get(COMPASSES_ATTRIBUTE)
+    return msgspec.json.decode(text, type=list[LogCompass]) if isinstance(text, str) else _by_names(log)
 
 
 def _by_names(log: xr.Dataset) -> list[LogCompass]:
@@ -192,22 +205,12 @@ def _by_names(log: xr.Dataset) -> list[LogCompass]:
     return found
 
 
-def compasses_of(attrs: Mapping[Any, Any]) -> list[LogCompass]:
-    """Return the compasses that the attributes of a deployment list; none where they do not.
-
-    A log of several boots lists those of its first.
-    """
-    text = attrs.get(COMPASSES_ATTRIBUTE)
-    return msgspec.json.decode(text, type=list[LogCompass]) if isinstance(text, str) else []
-
-
 def pieces(
     path: Path, rows: int, runs: Sequence[BootRun], attrs: Mapping[str, Any], compass: str | None = None
 ) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows, run by run.
+    """Yield the log in pieces of at most `rows` rows, run by run; the first has the counts of `attrs`.
 
-    `attrs` are of the whole log: its first piece has what they count. Runs without a date are left out, and
-    counted, where others have one.
+    Runs without a date are left out, and counted, where others have one.
     """
     dated = [run for run in runs if run.offset is not None]
     chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)

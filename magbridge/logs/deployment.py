@@ -130,13 +130,10 @@ def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return several deployments as one, sorted in time.
+    """Return several deployments as one, sorted in time, with NaN where a part lacks a column.
 
-    A part that lacks a column has NaN there. Of rows with the same time the first part's is kept, its NaNs
-    filled from the later ones; the attribute ``duplicate_rows`` counts the rows dropped.
-
-    FormatError: two parts that disagree on an attribute that changes what values mean, as
-    ``heading_reference``, or on the unit of a column.
+    Of rows with the same time the first part's is kept, its NaNs filled from the later ones, and the others
+    are counted. FormatError: two parts disagree on what headings or times refer to, or on a unit.
     """
     if len(parts) == 1:
         return parts[0]
@@ -148,18 +145,13 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
             if attrs.get("units") != own.get("units"):
                 expected = f"expected {attrs.get('units')!r} as in the files before, not {own.get('units')!r}"
                 raise FormatError(part.attrs.get("source", ""), expected, column=str(name))
-    time = np.concatenate([part["time"].values for part in parts])
-    order = np.argsort(time, kind="stable")
-    variables = {}
-    for name, attrs in described.items():
-        columns = [
-            part.variables[name].values if name in part else np.full(part.sizes["time"], np.nan)
-            for part in parts
-        ]
-        variables[name] = ("time", np.concatenate(columns)[order], attrs)
-    joined = merged(xr.Dataset(variables, coords={"time": ("time", time[order], parts[0]["time"].attrs)}))
-    joined.attrs = join_attrs(parts)
-    return with_losses(joined, {"duplicate_rows": len(time) - joined.sizes["time"]})
+    alike = [same_columns(part, described) for part in parts]
+    names = ["time", *described]
+    whole = {name: np.concatenate([part.variables[name].values for part in alike]) for name in names}
+    coords = {"time": ("time", whole.pop("time"), parts[0]["time"].attrs)}
+    columns = {name: ("time", values, described[name]) for name, values in whole.items()}
+    joined = merged(xr.Dataset(columns, coords, join_attrs(parts)))
+    return with_losses(joined, {"duplicate_rows": len(coords["time"][1]) - joined.sizes["time"]})
 
 
 def merged(dataset: xr.Dataset) -> xr.Dataset:
@@ -235,9 +227,7 @@ def noted(*pieces: Mapping[str, Any]) -> list[str]:
 
 
 def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
-    """Return the attributes of several deployments as those of one.
-
-    What headings refer to counts only for parts that have headings.
+    """Return the attributes of several deployments as those of one; only headed parts say what headings mean.
 
     FormatError: two parts disagree on an attribute that changes what values mean.
     """

@@ -102,8 +102,8 @@ def interpolated(
 def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
     """Return the last value at or before each time `target` (n,), s, as known live, (n,).
 
-    `time` (m,), s, does not decrease; NaN among the `values` (m,) received then is a missing value. The
-    result is NaN before the first value, and once the last is older than `max_age`, s.
+    `time` (m,), s, does not decrease; NaN among the `values` (m,) is a missing value. The result is NaN
+    before the first value, and once the last is older than `max_age`, s.
     """
     known = np.isfinite(values)
     time, values = time[known], values[known]
@@ -117,11 +117,10 @@ def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: fl
 def linear(
     target: FloatArray, time: FloatArray, values: FloatArray, max_gap: float, column: str
 ) -> FloatArray:
-    """Return the values of a column at `target` (n,), s, interpolated linearly in `time` (m,), s, (n,).
+    """Return the values (m,) of a column at `time` (m,), s, interpolated linearly to `target` (n,), s.
 
-    The values of a column in :data:`CIRCLES` go along the shorter arc. NaN among `values` (m,) is a missing
-    value. The result is NaN between neighbours with an interval longer than `max_gap`, s, except at the
-    neighbours' own times, and farther beyond an end. Nearer to an end, the value there is held.
+    A column in :data:`CIRCLES` goes along the shorter arc. NaN is a missing value. The result is NaN between
+    neighbours more than `max_gap`, s, apart and farther than that beyond an end; nearer, the end is held.
     """
     known = np.isfinite(values) & np.isfinite(time)
     time, values = time[known], values[known]

@@ -155,10 +155,7 @@ class Options:
 
 
 def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:
-    """Return the declarations of a ``columns.toml``, and of ``--column``, which overrule it.
-
-    ConfigError: a key of the mapping file is wrong. WrongUse: a text without its name.
-    """
+    """Return the declarations of a ``columns.toml``, and of ``--column``, which overrule it."""
     declaration = ColumnMapping()
     if file:
         table = load_toml(file)
@@ -175,10 +172,7 @@ def _named(text: str) -> tuple[str, ColumnSource]:
 
 
 def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
-    """Rename the columns of a deployment as declared, for formats with column names of their own.
-
-    FormatError: a column that is not there, or a unit that does not fit ours.
-    """
+    """Rename the columns of a deployment as declared, for formats with column names of their own."""
     from magbridge.columns import require  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import deployment  # noqa: PLC0415
 
@@ -218,10 +212,7 @@ def _makers() -> dict[str, Maker]:
 
 
 def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple[str, ColumnMapping]:
-    """Return the instrument's name and its maker's declarations; the user's declarations have priority.
-
-    The name is empty where the headings are of no known instrument.
-    """
+    """Return an instrument's name ("" for an unknown one) and the declarations of its maker and the user."""
     names = {heading.replace(" ", "") for heading in headings}
     for name, maker in _makers().items():
         if maker.headings <= names:
@@ -263,8 +254,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     """Return a mapping from position to our name for columns with a known other name.
 
     The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
-    units of a magnetic field, with names that differ only in x, y and z, are the axes whatever they are
-    called.
+    units of a magnetic field, with names that differ only in x, y and z, are the axes.
     """
     words = list(map(bare, names))
     found: dict[int, str] = {}

@@ -106,22 +106,27 @@ def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: f
     """Return the sensors' logs among `logs` with the vehicle's telemetry, and the logs that have both.
 
     `named` are those that the user calls a sensor's log; `clock_offset_s` is added to the sensors' times, s.
-
-    FormatError: no time in common; times of which only one kind counts from 1970. WrongUse: a clock offset is
-    given, but no sensor's log next to a vehicle's.
+    FormatError: no time in common, or times of which only one kind counts from 1970.
     """
     sensors, vehicles = _sensor_logs(logs, named)
     if not sensors:
         refuse_offset(clock_offset_s)
         return list(logs)
-    telemetry = VehicleTelemetry(join([logs[k] for k in vehicles]), clock_offset_s)
-    combined = [
-        telemetry.add_to(log, is_first=k == sensors[0]) if k in sensors else log
-        for k, log in enumerate(logs)
-        if k not in vehicles
-    ]
-    sources = ", ".join(dict.fromkeys(str(logs[k].attrs.get("source", "")) for k in sensors))
-    return [telemetry.noted(combined[0], sources), *combined[1:]]
+    vehicle = join([logs[k] for k in vehicles])
+    combined = []
+    covered = [np.empty(0)]
+    for k, log in enumerate(logs):
+        if k in sensors:
+            sensor = _on_clock_of(vehicle, log, clock_offset_s)
+            combined.append(_with_telemetry(sensor, vehicle, is_first=k == sensors[0]))
+            time, limits = sensor["time"].to_numpy(), vehicle["time"].to_numpy()[[0, -1]]
+            covered.append(time[(time >= limits[0]) & (time <= limits[1])])
+        elif k not in vehicles:
+            combined.append(log)
+    source = ", ".join(dict.fromkeys(str(logs[k].attrs.get("source", "")) for k in sensors))
+    note = _note(source, vehicle, np.concatenate(covered), clock_offset_s)
+    first = combined[0].assign_attrs({NOTES: "\n".join([*noted(combined[0].attrs), note])})
+    return [first, *combined[1:]]
 
 
 def refuse_offset(clock_offset_s: float) -> None:
@@ -134,9 +139,7 @@ def _sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[lis
     """Return the indices of the sensors' own logs, and of the vehicle's; both empty where there are not both.
 
     `named` are those that the user calls a sensor's log. If none: a log with the field and without a position
-    is a sensor's, a log without any magnetic column is the vehicle's.
-
-    FormatError: the user calls a log a sensor's that has no field.
+    is a sensor's, a log without any magnetic column is the vehicle's. FormatError: a named log has no field.
     """
     if any(named):
         sensors = [k for k, is_named in enumerate(named) if is_named]
@@ -156,85 +159,64 @@ def _has_field(log: xr.Dataset) -> bool:
     return (vector or SCALAR_COLUMN in log) and "observatory" not in log.attrs
 
 
-class VehicleTelemetry:
-    """The telemetry of a vehicle's joined logs, interpolated to the times of sensors' logs, in pieces."""
+def _with_telemetry(sensor: xr.Dataset, vehicle: xr.Dataset, *, is_first: bool) -> xr.Dataset:
+    """Return a sensor's log with the columns of the vehicle; the first has the vehicle's losses, too."""
+    time, known = sensor["time"].to_numpy(), vehicle["time"].to_numpy()
+    if set(CHANNELS) <= set(sensor.data_vars):
+        vehicle = further(vehicle)
+    columns = {
+        str(name): ("time", _interpolated(time, known, str(name), column.to_numpy()), dict(column.attrs))
+        for name, column in vehicle.data_vars.items()
+        if name not in sensor and name not in CHANNEL_TIMES
+    }
+    outside = (time < known[0]) | (time > known[-1])
+    right = np.minimum(np.clip(np.searchsorted(known, time), 1, None), len(known) - 1)
+    widths = np.diff(known, prepend=known[0])[right]
+    in_gaps = ~outside & (widths > _max_gap(known)) & ~np.isin(time, known)
+    combined = sensor.assign(columns)
+    combined.attrs = join_attrs([sensor, vehicle if is_first else uncounted(vehicle)])
+    combined.attrs.pop(COMPASSES_ATTRIBUTE, None)
+    return with_losses(combined, {"rows_outside": int(outside.sum()), "rows_in_gaps": int(in_gaps.sum())})
 
-    def __init__(self, vehicle: xr.Dataset, clock_offset_s: float) -> None:
-        self._vehicle, self._offset_s = vehicle, clock_offset_s
-        self._time = vehicle["time"].to_numpy()
-        self._max_gap_s = _max_gap(self._time)
-        self._start, self._end = np.inf, -np.inf  # of the rows with telemetry
 
-    def add_to(self, sensor: xr.Dataset, *, is_first: bool) -> xr.Dataset:
-        """Return a piece of a sensor's log with the vehicle's columns that it lacks.
+def _note(source: str, vehicle: xr.Dataset, covered: FloatArray, clock_offset_s: float) -> str:
+    """Return a note on how the sensors' logs `source` and the vehicle's were combined.
 
-        Losses of the vehicle's logs are counted with the first piece.
-
-        FormatError: the sensor's times count from a boot and the vehicle's do not, or the other way round.
-        """
-        sensor = self._shifted(sensor)
-        time = sensor["time"].to_numpy()
-        vehicle = further(self._vehicle) if set(CHANNELS) <= set(sensor.data_vars) else self._vehicle
-        columns = {}
-        for name, column in vehicle.data_vars.items():
-            if name not in sensor and name not in CHANNEL_TIMES:
-                values = _interpolated(time, self._time, str(name), column.to_numpy())
-                columns[str(name)] = ("time", values, dict(column.attrs))
-        outside = (time < self._time[0]) | (time > self._time[-1])
-        right = np.clip(np.searchsorted(self._time, time), 1, max(len(self._time) - 1, 1))
-        widths = np.diff(self._time, prepend=self._time[0])[np.minimum(right, len(self._time) - 1)]
-        in_gaps = ~outside & (widths > self._max_gap_s) & ~np.isin(time, self._time)
-        covered = time[~outside]
-        if len(covered):
-            self._start, self._end = min(self._start, covered[0]), max(self._end, covered[-1])
-        attrs = join_attrs([sensor, vehicle if is_first else uncounted(vehicle)])
-        attrs.pop(COMPASSES_ATTRIBUTE, None)
-        combined = sensor.assign(columns)
-        combined.attrs = attrs
-        return with_losses(combined, {"rows_outside": int(outside.sum()), "rows_in_gaps": int(in_gaps.sum())})
-
-    def noted(self, log: xr.Dataset, source: str) -> xr.Dataset:
-        """Return the last piece of the sensors' logs `source` with a note on how the logs were combined.
-
-        FormatError: the sensor's and the vehicle's logs have no time in common.
-        """
-        names = str(self._vehicle.attrs.get("source", "the vehicle's logs")).split(", ")
-        vehicle = " and ".join(names)
-        if len(names) > 2:
-            vehicle = f"{names[0]} to {names[-1]} ({len(names)} logs)"
-        first, last = (_moment(self._vehicle, time) for time in self._time[[0, -1]])
-        if self._end < self._start:
-            raise FormatError(
-                source,
-                f"expected times from {first} to {last}, those of {vehicle}; "
-                "--clock-offset S adds S seconds to the sensor's times",
-            )
-        clocks = f"with {self._offset_s:+g} s on the sensor's clock (--clock-offset)"
-        if not self._offset_s:
-            clocks = "the clocks are assumed to agree (--clock-offset S shifts the sensor's)"
-        note = (
-            f"{source}: with the telemetry of {vehicle}, from {first} to {last}; "
-            f"{self._end - self._start:.0f} s in common; {clocks}"
+    `covered` (n,) are the sensors' times, s, within the vehicle's. FormatError: there are none.
+    """
+    names = str(vehicle.attrs.get("source", "the vehicle's logs")).split(", ")
+    called = " and ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]} ({len(names)} logs)"
+    first, last = (_moment(vehicle, time) for time in vehicle["time"].to_numpy()[[0, -1]])
+    if not len(covered):
+        raise FormatError(
+            source,
+            f"expected times from {first} to {last}, those of {called}; "
+            "--clock-offset S adds S seconds to the sensor's times",
         )
-        return log.assign_attrs({NOTES: "\n".join([*noted(log.attrs), note])})
+    clocks = f"with {clock_offset_s:+g} s on the sensor's clock (--clock-offset)"
+    if not clock_offset_s:
+        clocks = "the clocks are assumed to agree (--clock-offset S shifts the sensor's)"
+    common = f"{covered.max() - covered.min():.0f} s in common"
+    return f"{source}: with the telemetry of {called}, from {first} to {last}; {common}; {clocks}"
 
-    def _shifted(self, sensor: xr.Dataset) -> xr.Dataset:
-        """Return a sensor's log on the vehicle's clock."""
-        from_boot, vehicle_from_boot = counts_from_boot(sensor), counts_from_boot(self._vehicle)
-        if self._offset_s:
-            sensor = sensor.assign_coords(time=sensor["time"].copy(data=sensor["time"] + self._offset_s))
-            for name in set(CHANNEL_TIMES) & set(sensor.data_vars):
-                sensor[name] = sensor[name].copy(data=sensor[name] + self._offset_s)
-            if from_boot and not vehicle_from_boot:
-                sensor.attrs.pop("time_reference", None)
-        elif from_boot != vehicle_from_boot:
-            which = "the sensor's" if from_boot else "the vehicle's"
-            raise FormatError(
-                sensor.attrs.get("source", "the sensor's log"),
-                f"{which} times count from a start that the log does not state: "
-                "--clock-offset S is added to the sensor's times",
-            )
-        return sensor
+
+def _on_clock_of(vehicle: xr.Dataset, sensor: xr.Dataset, offset_s: float) -> xr.Dataset:
+    """Return a sensor's log on the vehicle's clock, that is `offset_s` later."""
+    from_boot, vehicle_from_boot = counts_from_boot(sensor), counts_from_boot(vehicle)
+    if offset_s:
+        sensor = sensor.assign_coords(time=sensor["time"].copy(data=sensor["time"] + offset_s))
+        for name in set(CHANNEL_TIMES) & set(sensor.data_vars):
+            sensor[name] = sensor[name].copy(data=sensor[name] + offset_s)
+        if from_boot and not vehicle_from_boot:
+            sensor.attrs.pop("time_reference", None)
+    elif from_boot != vehicle_from_boot:
+        which = "the sensor's" if from_boot else "the vehicle's"
+        raise FormatError(
+            sensor.attrs.get("source", "the sensor's log"),
+            f"{which} times count from a start that the log does not state: "
+            "--clock-offset S is added to the sensor's times",
+        )
+    return sensor
 
 
 def _interpolated(target: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:

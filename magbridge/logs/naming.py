@@ -58,9 +58,8 @@ HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -> Layout:
     """Return a layout with name and unit of each column: as declared, by its heading, or by another name.
 
-    `units` are those of a row of units, or empty; `rows` the cells of the first rows.
-
-    FormatError: a declared column that is not there, or two of one name of ours.
+    `units` are those of a row of units, or empty. FormatError: a declared column is not there, or two have
+    one name of ours.
     """
     if layout.separator != ",":
         sign = {"\t": "tabs", " ": "blanks"}.get(layout.separator, repr(layout.separator))
@@ -294,10 +293,7 @@ NEAR_HALF_TURN_RAD = 0.1
 
 
 def units_of_angles(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with the unit of an attitude that has none: rad, if headings end at a turn.
-
-    Headings in rad that cover half a circle end just below pi or 2 pi.
-    """
+    """Return the layout with rad for an attitude without a unit, if headings end just below pi or 2 pi."""
     names = [name for name in ANGLES if name in layout.names and name not in layout.units]
     if "heading" not in names:
         return layout

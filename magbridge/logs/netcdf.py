@@ -40,6 +40,7 @@ from magbridge.files import systems_reason
 from magbridge.logs import seaglider
 from magbridge.logs.checks import known
 from magbridge.logs.deployment import deployment, sliced, with_losses
+from magbridge.logs.fields import field_maps
 from magbridge.logs.mapping import aliases
 from magbridge.records import Quality
 from magbridge.version import __version__
@@ -71,16 +72,8 @@ NO_FLAGS = -1
 """Stands for flags that are not known."""
 STORED_ROWS = 8192
 """Rows stored together."""
-STANDARD_NAMES = {
-    **{str(attrs["standard_name"]): column for column, attrs in CF_ATTRIBUTES.items() if column != "time"},
-    **dict.fromkeys(("platform_roll_angle", "platform_roll_starboard_down"), "roll"),
-    **dict.fromkeys(("platform_pitch_angle", "platform_pitch_fore_up"), "pitch"),
-    **dict.fromkeys(("platform_yaw_angle", "platform_yaw_fore_starboard"), "heading"),
-    **dict.fromkeys(("platform_orientation", "platform_heading"), "heading"),
-}
-"""Standard name to column; the unit is the variable's."""
-OPPOSITE_NAMES = {"platform_roll_starboard_up": "roll", "platform_pitch_fore_down": "pitch"}
-"""Standard name to the column that has the opposite sign."""
+STANDARD_NAMES = {one.field: one for one in field_maps("cf")[""]}
+"""Standard name to the column, with the factor of its sign; the unit is the variable's."""
 KNOWN_NAMES = {name.lower(): column for column, name in OG1_NAMES.items()}
 FLAG_VARIABLE = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
 """Name of a variable with the flags of another."""
@@ -221,11 +214,8 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
     """Return the column that a variable is, and the factor that its sign needs; `called` goes by its name."""
     if hasattr(variable, "column"):
         return str(variable.column), 1.0
-    standard, sign = str(getattr(variable, "standard_name", "")), 1.0
-    if standard in OPPOSITE_NAMES:
-        column, sign = OPPOSITE_NAMES[standard], -1.0
-    else:
-        column = STANDARD_NAMES.get(standard) or KNOWN_NAMES.get(called, called)
+    known = STANDARD_NAMES.get(str(getattr(variable, "standard_name", "")))
+    column, sign = (known.column, known.factor) if known else (KNOWN_NAMES.get(called, called), 1.0)
     if _is_ours(variable):
         column = variable.name.lower()
     if column == "depth" and str(getattr(variable, "positive", "down")).lower() == "up":
@@ -269,10 +259,7 @@ def _bad(flags: Any, rows: slice) -> BoolArray:
 
 
 def _seaglider(path: Path, file: Any) -> seaglider.Dive:
-    """Return the dive in a basestation's file; variables of another length than their times are left out.
-
-    FormatError: it has no time.
-    """
+    """Return the dive in a basestation's file; variables of another length than their times are left out."""
     rows = file.dimensions[seaglider.DIMENSION].size
     if (time := _numbers(file, "time", rows)) is None:
         raise FormatError(path, "expected this variable, as of a Seaglider", column="time")
@@ -314,10 +301,7 @@ def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
 
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:
-    """Return the s since 1970 at which a time variable is 0, and the s in one of its units.
-
-    FormatError: its unit is not a time since a date.
-    """
+    """Return the s since 1970 at which a time variable is 0, and the s in one of its units."""
     units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
     unit = 1.0
     if nano := NANOSECONDS.match(units):  # which the library does not know

@@ -28,7 +28,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.compasses import BootRun, LogCompass, Magnetometer, Series, pieces, rate
+from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, rate, sampled, symmetric
 from magbridge.logs.fields import field_maps, fields_of
 
 try:
@@ -139,22 +139,10 @@ def _most(tables: Mapping[int, Table]) -> float:
 def _magnetometer(
     number: int, device: float, table: Table, axes: Sequence[str], parameters: Parameters, in_use: Any
 ) -> Magnetometer:
-    time = _time(table)
-    slot = _calibration(device, parameters)
-    priority = parameters.get(f"CAL_MAG{slot}_PRIO") if slot is not None else None
-    known = priority is not None and priority >= 0
-    compass = LogCompass(
-        number,
-        len(time),
-        rate(time),
-        f"{device:.0f}" if device else "",
-        priority != 0 if known else None,
-        None,
-        int(priority) if known and priority is not None else None,
-        bool(in_use),
-    )
-    field = {axis: NT_PER_UNIT["G"] * table[name] for axis, name in zip("xyz", axes, strict=True)}
-    return Magnetometer(compass, time, field)
+    priority = parameters.get(f"CAL_MAG{_calibration(device, parameters)}_PRIO", -1)
+    facts: dict[str, Any] = {"enabled": priority != 0, "priority": int(priority)} if priority >= 0 else {}
+    facts |= {"id": f"{device:.0f}" if device else "", "in_use": bool(in_use)}
+    return sampled(number, _time(table), NT_PER_UNIT["G"] * np.stack([table[name] for name in axes]), **facts)
 
 
 def _uncalibrated(
@@ -170,9 +158,8 @@ def _uncalibrated(
     rotated = slot is not None and parameters.get(f"CAL_MAG{slot}_ROT", 0) > 0
     if slot is not None and not rotated:
         header = f"CAL_MAG{slot}_"
-        x, y, z = (parameters.get(f"{header}{axis}SCALE", 1.0) or 1.0 for axis in "XYZ")
-        xy, xz, yz = (parameters.get(f"{header}{axis}ODIAG", 0.0) for axis in "XYZ")
-        matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
+        scales = [parameters.get(f"{header}{axis}SCALE", 1.0) or 1.0 for axis in "XYZ"]
+        matrix = symmetric(scales, [parameters.get(f"{header}{axis}ODIAG", 0.0) for axis in "XYZ"])
         offset = np.array([[parameters.get(f"{header}{axis}OFF", 0.0)] for axis in "XYZ"])
         raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in GAUSS_AXES])) + offset
         table = {**table, **dict(zip(GAUSS_AXES, raw, strict=True))}

@@ -30,7 +30,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.compasses import BootRun, LogCompass, Magnetometer, Series, pieces, rate
+from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, sampled
 from magbridge.logs.deployment import NOTES, noted
 from magbridge.logs.fields import field_maps, fields_of
 
@@ -104,9 +104,7 @@ def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetomete
     if unit != "T":
         notes.append(f"{stream.topic}: {length:.3g} T is not a field on Earth: read as {length:.3g} {unit}")
     x, y, z = NT_PER_UNIT[unit] * tesla
-    time = stream.time
-    compass = LogCompass(number, len(time), rate(time), stream.topic)
-    return Magnetometer(compass, time, {"x": x, "y": -y, "z": -z})
+    return sampled(number, stream.time, np.stack([x, -y, -z]), id=stream.topic)
 
 
 def _unit(length: float) -> str:

@@ -75,10 +75,7 @@ class Dive:
 
 
 def dive(path: Path, known: Dive) -> xr.Dataset:
-    """Return one dive as a deployment; without the field, and with a note, if the compass was not logged raw.
-
-    FormatError: one of the compass' axes is there, and another is not.
-    """
+    """Return one dive as a deployment; without the field, and with a note, if that was not logged raw."""
     raw = [name for name in CHANNELS if name in known.sampled]
     for axis in "xyz":
         if raw and f"mag_{axis}" not in raw:
@@ -174,10 +171,7 @@ GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the dive that a glider sent in pieces; it is held whole.
-
-    FormatError: the file with the samples is missing.
-    """
+    """Yield the dive that a glider sent in pieces; it is held whole."""
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():
         raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")

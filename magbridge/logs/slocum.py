@@ -169,11 +169,7 @@ def _read_ascii(path: Path) -> Tracks:
 
 
 def _check_header(path: Path) -> list[Path]:
-    """Check the header of a Slocum's file, and the list of its sensors; return where that list may be.
-
-    FormatError: the header is cut off, or a line of the ``.cac`` is damaged. A compressed file is not looked
-    into.
-    """
+    """Check the header of a file, and the list of its sensors; return where that may be."""
     with path.open("rb") as file:
         lines = file.read(MAX_HEADER_BYTES).split(b"\n")
     if not lines[0].startswith(b"dbd_label:"):

@@ -251,6 +251,13 @@ def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
     return {number: _joined(found) for number, found in parts.items()}, lost
 
 
+def _of(kinds: Kinds, number: int) -> Messages:
+    """Return the messages of one id, which may be none."""
+    nothing = np.empty(0, np.int64)
+    arrays: list[Any] = [*[nothing] * 5, np.empty((0, spec(number).size), np.uint8)]
+    return kinds.get(number, Messages(number, *arrays))
+
+
 def _joined(parts: Sequence[Messages]) -> Messages:
     arrays = zip(*(part[1:] for part in parts), strict=True)
     return Messages(parts[0].number, *map(np.concatenate, arrays))
@@ -274,13 +281,12 @@ class TelemetryLog:
                 number: one if number in (RAW, FIELD) else one.where(one.channel != Channel.SENT)
                 for number, one in kinds.items()
             }
-        declared = self._declarations(kinds.get(COLUMN))
-        steps = kinds.get(STEP)
-        self._steps_at = steps.at if steps else np.empty(0, np.intp)
-        self._steps_us = np.cumsum([0, *(one["step"] for one in steps.decoded())] if steps else [0])
+        declared = self._declarations(_of(kinds, COLUMN))
+        steps = _of(kinds, STEP)
+        self._steps_at = steps.at
+        self._steps_us = np.cumsum([0, *(one["step"] for one in steps.decoded())])
         self.source, (system, self._component) = self._source_of(path, kinds)
-        mine = {number: one.where(one.system == system) for number, one in kinds.items()}
-        self._kinds = {number: one for number, one in mine.items() if len(one.at)}
+        self._kinds = {number: one.where(one.system == system) for number, one in kinds.items()}
         is_of_bridge = self.source in ("MAG_RAW", "MAG_FIELD")
         self.is_plain = not (is_of_bridge or self.ours or declared or self._steps_us[-1])
         self._updates: dict[str, list[Update]] = {}
@@ -293,22 +299,19 @@ class TelemetryLog:
     def _source_of(self, path: Path, kinds: Kinds) -> tuple[str, tuple[int, int]]:
         """Return the message that makes the rows, and its most frequent sender."""
         for source in SOURCES:
-            messages = kinds.get(spec(source).id)
+            senders = _of(kinds, spec(source).id).senders()
             # the autopilot's compass does not replace the instrument
-            if messages and len(messages.at) and not (self.ours and "IMU" in source):
-                senders = messages.senders()
+            if senders and not (self.ours and "IMU" in source):
                 return source, max(senders, key=senders.__getitem__)
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
 
     def _count_settings(self, kinds: Kinds) -> None:
         """Count how often a station has set what the alignment computes with; the bridge confirms it."""
         asked: dict[str, float] = {}
-        both = [kinds[number] for number in (SET, VALUE) if number in kinds]
-        stated = [
-            (at, one.number, channel, fields["param_id"], fields["param_value"])
-            for one in both
-            for at, channel, fields in zip(one.at.tolist(), one.channel.tolist(), one.decoded(), strict=True)
-        ]
+        stated = []
+        for one in (_of(kinds, SET), _of(kinds, VALUE)):
+            for at, channel, fields in zip(one.at, one.channel, one.decoded(), strict=True):
+                stated.append((at, one.number, channel, fields["param_id"], fields["param_value"]))
         for _, number, channel, name, value in sorted(stated):
             if number == SET:
                 asked[name] = value
@@ -317,10 +320,10 @@ class TelemetryLog:
                 aligns = name.startswith("MB_") and not name.startswith("MB_R_")
                 self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
-    def _declarations(self, messages: Messages | None) -> list[DeclaredField]:
+    def _declarations(self, messages: Messages) -> list[DeclaredField]:
         """Return the columns that the log declares; its attributes are kept."""
         found: dict[str, DeclaredField] = {}
-        for one in messages.decoded() if messages else ():
+        for one in messages.decoded():
             if not one["message"]:
                 self.attrs[one["column"]] = one["unit"] or one["scale"]
                 continue
@@ -344,11 +347,7 @@ class TelemetryLog:
 
     def _samples(self, message: str) -> Messages:
         """Return the messages of one kind from the component that sends the rows."""
-        found = self._kinds.get(spec(message).id)
-        if found is None:
-            nothing = np.empty(0, np.int64)
-            arrays: list[Any] = [*[nothing] * 5, np.empty((0, spec(message).size), np.uint8)]
-            return Messages(spec(message).id, *arrays)
+        found = _of(self._kinds, spec(message).id)
         return found.where(found.component == self._component)
 
     def _telemetry(self, declared: set[str]) -> dict[str, str]:
@@ -360,14 +359,14 @@ class TelemetryLog:
         units: dict[str, str] = {}
         read = []
         for number, fields in TELEMETRY.items():
-            if (messages := self._kinds.get(number)) is None:
+            messages = _of(self._kinds, number)
+            ranks = [
+                (one == self._component, one == AUTOPILOT, one not in GIMBALS, n, one)
+                for (_, one), n in messages.senders().items()
+            ]
+            if not ranks:
                 continue
-            counts = {component: n for (_, component), n in messages.senders().items()}
-            ranks = {
-                one: (one == self._component, one == AUTOPILOT, one not in GIMBALS, n)
-                for one, n in counts.items()
-            }
-            messages = messages.where(messages.component == max(ranks, key=ranks.__getitem__))
+            messages = messages.where(messages.component == max(ranks)[-1])
             for field in fields:
                 values = field.values(messages.payloads)
                 read.append((field.column, messages, values))
@@ -380,16 +379,14 @@ class TelemetryLog:
 
     def _columns_of_bridge(self) -> dict[str, str]:
         """Return the units of the columns of a bridge's messages that have a value."""
-        units: dict[str, str] = {}
-        if (raw := self._kinds.get(RAW)) is not None:
-            columns = source_columns(RAW, raw.payloads[raw.is_of_main_sensor])
-            possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
-            there = [name for name in possible if not np.isnan(columns[name]).all()]
-            there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
-            units |= {name: RAW_COLUMNS.get(name, "") for name in there}
-        if (field := self._kinds.get(FIELD)) is not None and field.is_of_main_sensor.any():
-            units |= dict.fromkeys(CORRECTED, "")
-        return units
+        raw = _of(self._kinds, RAW)
+        columns = source_columns(RAW, raw.payloads[raw.is_of_main_sensor])
+        possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
+        there = [name for name in possible if not np.isnan(columns[name]).all()]
+        there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
+        units = {name: RAW_COLUMNS.get(name, "") for name in there}
+        is_corrected = _of(self._kinds, FIELD).is_of_main_sensor.any()
+        return units | dict.fromkeys(CORRECTED, "") if is_corrected else units
 
     def _add_declared(self, declared: Sequence[DeclaredField]) -> None:
         """Add the columns that the log declares, with the ages of their values in a bridge's own log."""
@@ -398,9 +395,9 @@ class TelemetryLog:
             self._units[one.column] = one.unit
             if self.ours and one.message not in (RAW, FIELD):
                 self._units[AGE + one.column] = "s"
-            messages = self._kinds.get(one.message)
-            if one.is_named_value or one.message == source or messages is None:
+            if one.is_named_value or one.message == source:
                 continue
+            messages = _of(self._kinds, one.message)
             messages = messages.where(one.matches(messages.payloads))
             self._add_admitted(one.column, one.component, messages, one.values(messages.payloads))
 
@@ -416,8 +413,7 @@ class TelemetryLog:
 
     def _add_named(self, declared: Sequence[DeclaredField]) -> None:
         """Add each ``NAMED_VALUE_FLOAT`` as the columns that the log declares, else by its name."""
-        if (named := self._kinds.get(NAMED)) is None:
-            return
+        named = _of(self._kinds, NAMED)
         start = NAME_LETTERS.offset
         letters = named.payloads[:, start : start + NAME_LETTERS.struct.size]
         for row in np.unique(letters, axis=0):
@@ -437,9 +433,8 @@ class TelemetryLog:
             if not self.is_plain:
                 self._add_admitted(own, None, messages, values)
                 continue
-            counts = {component: n for (_, component), n in messages.senders().items()}
-            speaker = AUTOPILOT if AUTOPILOT in counts else max(counts, key=counts.__getitem__)
-            here = messages.component == speaker
+            counts = [(one == AUTOPILOT, n, one) for (_, one), n in messages.senders().items()]
+            here = messages.component == max(counts)[-1]
             self._updates.setdefault(own, []).append((messages.where(here), values[here]))
 
     def table(self) -> tuple[FloatArray, dict[str, FloatArray], dict[str, str]]:
@@ -503,12 +498,13 @@ class TelemetryLog:
 
     def _correct(self, rows: Messages, columns: dict[str, FloatArray]) -> None:
         """Add each ``MAG_FIELD`` to the row before it, that of its reading, unless that has one already."""
-        if (found := self._kinds.get(FIELD)) is None:
-            return
+        found = _of(self._kinds, FIELD)
         found = found.where(found.is_of_main_sensor & ~np.isin(found.at, rows.at))
+        if not len(found.at):
+            return
         row = np.searchsorted(rows.at, found.at, side="right") - 1
         values = source_columns(FIELD, found.payloads)
-        is_free = (row >= 0) & np.isnan(columns["total_field"][row]) if len(rows.at) else np.zeros(0, bool)
+        is_free = (row >= 0) & np.isnan(columns["total_field"][row])
         # of several, the first with a total field counts: it is written last
         has_total = ~np.isnan(values["total_field"])
         order = np.concatenate(

@@ -11,7 +11,7 @@ from ulogs import Output, ulog_of
 
 from magbridge import logs
 from magbridge.errors import FormatError
-from magbridge.logs.compasses import compasses_of
+from magbridge.logs.compasses import compasses_in
 
 KINDS = {
     # name: (type, letters, struct, fields)
@@ -237,7 +237,7 @@ def test_the_compass_that_vehicle_magnetometer_names(tmp_path: Path) -> None:
     assert back.sizes["time"] == 20
     np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
     assert (back["mag1_x"] == 900_000).all()
-    assert [(one.id, one.enabled, one.in_use) for one in compasses_of(back.attrs)] == [
+    assert [(one.id, one.enabled, one.in_use) for one in compasses_in(back)] == [
         ("11", False, False),
         ("22", True, True),
     ]

@@ -10,7 +10,7 @@ from flash import Log
 
 from magbridge import logs
 from magbridge.errors import FormatError
-from magbridge.logs.compasses import compasses_of
+from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import noted, passed_over
 from magbridge.logs.mapping import Options
 
@@ -128,7 +128,7 @@ def test_the_compass_that_flew_is_read(tmp_path: Path) -> None:
     back = logs.read(path)
     assert (back["mag_x"] == 100).all()
     assert {"mag1_x", "mag3_x"} <= set(back.data_vars)
-    found = compasses_of(back.attrs)
+    found = compasses_in(back)
     assert [one.chosen for one in found] == [False, True, False]
     assert [one.enabled for one in found] == [False, True, True]
     assert [one.healthy for one in found] == [0, 1, 1]

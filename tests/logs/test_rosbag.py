@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from magbridge import logs
 from magbridge.errors import FormatError
-from magbridge.logs.compasses import compasses_of
+from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import noted
 
 pytest.importorskip("rosbags")
@@ -100,7 +100,7 @@ def test_a_bag_in_our_frames(kind: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(back[name], values, atol=1e-6, err_msg=name)
     np.testing.assert_allclose(back["arm_lift"], 0.01 * np.arange(40))
     assert "ENU to NED" in back.attrs["history"]
-    assert [one.id for one in compasses_of(back.attrs)] == ["/imu/mag"]
+    assert [one.id for one in compasses_in(back)] == ["/imu/mag"]
     assert not noted(back.attrs)
 
 

@@ -12,7 +12,7 @@ import xarray as xr
 
 from magbridge import logs
 from magbridge.logs import telemetry
-from magbridge.logs.compasses import compasses_of
+from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import noted
 from magbridge.logs.mapping import Options
 from magbridge.mavlink import Codec, pack_record
@@ -99,7 +99,7 @@ def test_another_compass_makes_the_rows(tmp_path: Path) -> None:
         log.write_message(k, "RAW_IMU", xmag=k)
         log.write_message(k + 0.5, "SCALED_IMU2", xmag=50 + k)
     path = log.write(tmp_path)
-    assert [one.number for one in compasses_of(logs.read(path).attrs)] == [0, 1]
+    assert [one.number for one in compasses_in(logs.read(path))] == [0, 1]
     back = logs.read(path, options=Options(compass="1"))
     np.testing.assert_allclose(back["mag_x"], 100.0 * (50 + np.arange(5)))
     np.testing.assert_allclose(back["time"] - T0 / S, 0.5 + np.arange(5))
