@@ -40,39 +40,19 @@ CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
 WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)) ?([a-zA-Z°µ%/]+)")
 """A cell that is a number with its unit."""
-KNOWN_UNITS = {
-    *NT_PER_UNIT,
-    *(column.units for column in COLUMNS.values() if column.units != "1"),
-    *("ms", "us", "ns", "min", "h", "UTC", "iso", "deg/s", "rad/s", "rad", "cm", "km", "mm", "in", "cm3"),
-    *("A", "mA", "V", "mV", "Hz", "%", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar", "g", "m/s2", "m/s^2"),
-    *("cm/s", "kn"),
-}
+NAMES = load_toml(Path(__file__).with_name("names.toml"))
+"""How other programs call columns and units."""
+KNOWN_UNITS = {*NT_PER_UNIT, *(column.units for column in COLUMNS.values()), *NAMES["units"].split()} - {"1"}
 """Units by which a row of units under the headings is known."""
 AXES = "x", "y", "z"
 PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
-VECTORS = (
-    "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "flux{}", "b{}",
-    "m{}", "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}", "magn{}", "compass{}", "fgm{}",
-)  # fmt: skip
+VECTORS = NAMES["vectors"].split()
 """What the three axes are called elsewhere, with neither capitals nor punctuation."""
 ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
 """What they end in, behind the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
-TIME_NAMES = (
-    "timestamp ts datetime timeutc utctime datetimeutc dateandtime isotime unixtime unixtimestamp posixtime"
-    " epoch epochtime utc gpstime gpsseconds jd mjd juliandate julianday julian exceltime exceldate datenum"
-    " timeiso isoformat zeit zeitstempel uhrzeit heure hora timeofday secondsofday sod tod seconds t tempo"
-)
-ALIASES = {
-    "time": TIME_NAMES.split(),
-    "roll": ["rollangle"],
-    "pitch": ["pitchangle"],
-    "heading": ["yaw", "hdg", "compassheading", "trueheading", "magneticheading"],
-    "latitude": ["lat", "breite", "geobreite"],
-    "longitude": ["lon", "long", "lng", "laenge", "lnge", "geolaenge"],
-    "depth": ["depthm", "tiefe", "profondeur", "profundidad"],
-}
+ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
 """Our name -> names in other programs, the surest first."""
-TOWED = "magnetometer", "mag", "sensor", "towfish", "fish", "tow", "layback"
+TOWED = NAMES["towed"].split()
 """Words before a position that say that it is the towed sensor's, not the ship's."""
 PREFIXED_NAME = re.compile(
     rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"

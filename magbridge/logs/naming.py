@@ -16,7 +16,7 @@ from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usua
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import Layout, Rows
-from magbridge.logs.mapping import CELL_NUMBER, WITH_UNIT, aliases, bare, is_unit, split
+from magbridge.logs.mapping import CELL_NUMBER, NAMES, WITH_UNIT, aliases, bare, is_unit, split
 
 ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """Declaration of the time where a file has none: the rows, so many a second."""
@@ -37,18 +37,7 @@ HOUR_AND_MINUTE = re.compile(r"([01]?\d|2[0-3])?[0-5]?\d(\.\d+)?")
 """A cell that is a time of day as HHMM.mmm, as in the exchange format MGD77T."""
 SECONDS_HEADING = re.compile("day|sod|utc|midnight", re.IGNORECASE)
 """What in a heading says that seconds count from midnight, next to a date."""
-JOINED = {
-    "seconds and nanoseconds": ("(.*stamp)?(secs?|seconds)", "(.*stamp)?(nanosecs?|nsecs?|nanoseconds)"),
-    "GPS week and seconds": (
-        "gps(week|wk)|gwk", "(gps|gnss)?(i?tow|sow|seconds?|timeofweek|secondsofweek)(s|sec|ms)?|gms|gpsms",
-    ),
-    "year to second": (
-        "years?|yyyy|yr", "months?|mon", "days?|dd", "hours?|hh|hr", "mi|min(ute)?s?", "ss|sec(ond)?s?",
-    ),
-    "year, day and time": (
-        "years?|yyyy|yr", "doy|dayofyear|yday", "hours?|hh|hr", "mi|min(ute)?s?", "ss|sec(ond)?s?",
-    ),
-}  # fmt: skip
+JOINED: dict[str, list[str]] = NAMES["times"]
 """What several columns are together -> what they are called, with neither capitals nor punctuation."""
 UNIT_CELL_COLUMNS = "depth", "total_field", "sensor_temperature"
 """Columns of ours before whose cells a unit may stand, as in 5.8m; a position has its own letters."""
