@@ -15,8 +15,8 @@ The likelihood of a drift d(t) is
 
 .. math:: K_{ij} = s^2 k(|x_i + d_i - x_j - d_j| / \ell) + \beta_{ij} + R_{ij}
 
-The Gaussian field (Rasmussen & Williams 2006, eq. 2.30; gradient eq. 5.9) has the size s and the length l.
-Its covariance k is one of :data:`COVARIANCE_KINDS`, from rough to smooth.
+The Gaussian field (Rasmussen & Williams 2006, eq. 2.30; gradient eq. 5.9) has the size s and the length l;
+its covariance k is Matérn's of smoothness 5/2 (eq. 4.17).
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.findings import reference_track, with_errors
 from magbridge.navigate.model import Block, Collector, transition
 from magbridge.navigate.options import NavigationOptions
-from magbridge.navigate.particles import Particles, sample
+from magbridge.navigate.particles import sample
 
-__all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions", "localise", "own_bound"]
+__all__ = ["OwnField", "drift_functions", "localise", "own_bound"]
 
 BLOCK_LENGTH_M, MIN_BLOCKS_PER_LOG, MAX_TRACK_BLOCKS = 60.0, 100.0, 400
 """Limits of a block: its length, m, and the number of blocks that a log has at least. Of more than the last
@@ -63,29 +63,26 @@ MAX_IMPROVED_RATIO = 0.85
 
 @dataclass(frozen=True, eq=False)
 class _PosteriorTracks:
-    """The tracks that agree with the field: their errors (k, n, 2), m, and the likeliest kind of field.
+    """The tracks that agree with the field: their errors (k, n, 2), m.
 
-    `typical` (q,) is the track of that kind nearest to the mean; `scales` (3,) are the median amplitude,
-    length and noise. Tracks that differ by more than the field's length agree with it at different
-    repetitions, most of which so few particles miss. Then `lost` is set, and the errors are those of dead
-    reckoning alone.
+    `typical` (q,) is the track nearest to the mean; `scales` (3,) are the median amplitude, length and noise.
+    Tracks that differ by more than the field's length agree with it at different repetitions, most of which
+    so few particles miss. Then `lost` is set, and the errors are those of dead reckoning alone.
     """
 
     moved: FloatArray
-    kind: int
     typical: FloatArray
     scales: FloatArray
     lost: bool
 
     @classmethod
-    def from_particles(cls, field: OwnField, particles: Particles) -> _PosteriorTracks:
-        moved = field.moved(particles.u)
-        kind = int(np.bincount(particles.kind, minlength=len(COVARIANCE_KINDS)).argmax())
-        off = ((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2))
-        nearest = int(np.where(particles.kind == kind, off, np.inf).argmin())
-        scales = np.median(field.scales(particles.u), axis=0)
-        lost = _lost(field, particles.u)
-        return cls(_unaided(field) if lost else moved, kind, particles.u[nearest], scales, lost)
+    def from_particles(cls, field: OwnField, u: FloatArray) -> _PosteriorTracks:
+        """Return the tracks of the particles u (k, q)."""
+        moved = field.moved(u)
+        nearest = int(((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2)).argmin())
+        lost = _lost(field, u)
+        scales = np.median(field.scales(u), axis=0)
+        return cls(_unaided(field) if lost else moved, u[nearest], scales, lost)
 
 
 def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
@@ -138,13 +135,12 @@ def localise(
     field = OwnField(blocks, np.stack(separation(*origin, rows[:, 1], rows[:, 2]), axis=1), options)
     counts = [len(blocks) * stage // STAGE_COUNT for stage in range(1, STAGE_COUNT + 1)]
     with threadpool_limits(1, "blas"):
-        kinds, stop = len(COVARIANCE_KINDS), partial(_lost, field)
-        particles = sample(field.log_likelihood, field.q, kinds, counts, PARTICLE_COUNT, stop)
-        found = _PosteriorTracks.from_particles(field, particles)
+        u = sample(field.log_likelihood, field.q, counts, PARTICLE_COUNT, partial(_lost, field))
+        found = _PosteriorTracks.from_particles(field, u)
         known = reference_track(deployment, frozenset(MOTIONS[motion]))
         result = with_errors(_dataset(field, found, options, origin, rows[:, 7]), known)
         if known is not None:
-            result = with_bound(result, field, found.moved.mean(axis=0), found.typical, found.kind)
+            result = with_bound(result, field, found.moved.mean(axis=0), found.typical)
     attrs = {"source": source, "map": "none: its own survey", "motion": motion}
     return result.assign_attrs(
         attrs | {"findings": "\n".join(finding.text for finding in _findings(result, field, found, step))}
@@ -195,7 +191,7 @@ def _dataset(
     latitude, longitude = offset(*origin, place[:, 0], place[:, 1])
     there = field.moved(found.typical)
     # Posterior mean of the field, y - R K^-1 y: the anomaly without the noise.
-    K, R = field.covariance(field.place + there, found.typical, found.kind)
+    K, R = field.covariance(field.place + there, found.typical)
     y = field.anomaly - field.mean - (field.slope * there).sum(axis=1)
     alone = np.sqrt(2.0 * (field.drift**2).sum(axis=1))
     sigma = np.sqrt(C[:, 0, 0] + C[:, 1, 1])
@@ -240,8 +236,6 @@ def _findings(
         yield Diagnostic("own_track.little")
 
 
-COVARIANCE_KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")
-"""Matern's covariances of smoothness 3/2 and 5/2, and the limit of both (Rasmussen & Williams, eq. 4.17)."""
 FIELD_AMPLITUDE_NT, AMPLITUDE_SPREAD = 50.0, np.log(4.0)
 """nT of the crustal field, and the 1-sigma of its logarithm: sea floor and land by airborne surveys."""
 LENGTH_SPREAD, NOISE_SPREAD = np.log(6.0), np.log(1.3)
@@ -319,7 +313,7 @@ class OwnField:
         at_zero = np.array([FIELD_AMPLITUDE_NT, self._middle, 1.0])
         return np.asarray(at_zero * np.exp(u[..., -3:] * (AMPLITUDE_SPREAD, LENGTH_SPREAD, NOISE_SPREAD)))
 
-    def log_likelihood(self, u: FloatArray, kind: int, count: int) -> tuple[float, FloatArray]:
+    def log_likelihood(self, u: FloatArray, count: int) -> tuple[float, FloatArray]:
         """Return log p of the first `count` blocks, up to a constant, and its gradient by u (q,)."""
         gradient = np.zeros(self.q)
         if np.abs(u[-3:]).max() > MAX_PRIOR_SIGMAS:
@@ -328,7 +322,7 @@ class OwnField:
         size, length, noise = self.scales(u)
         d, W = self.moved(u)[n], self.drift[n]
         x, y = self.place[n] + d, self.anomaly[n] - self.mean - (self.slope[n] * d).sum(axis=1)
-        squared, k, h, K, R = self._covariance(x, kind, size, length, noise)
+        squared, k, h, K, R = self._covariance(x, size, length, noise)
         # log p = -y' K^-1 y / 2 - log |L| with K = L L'.
         L, info = dpotrf(K.T, lower=1)
         if info:
@@ -348,12 +342,12 @@ class OwnField:
         gradient[-1] = float(G.diagonal() @ R) * NOISE_SPREAD
         return value, gradient
 
-    def covariance(self, place: FloatArray, u: FloatArray, kind: int) -> tuple[FloatArray, FloatArray]:
+    def covariance(self, place: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return K (n, n), nT², with the blocks at places (n, 2), m, and its part R (n,) that is noise."""
-        _, _, _, K, R = self._covariance(place, kind, *self.scales(u))
+        _, _, _, K, R = self._covariance(place, *self.scales(u).tolist())
         return K, R
 
-    def slopes(self, place: FloatArray, u: FloatArray, kind: int) -> FloatArray:
+    def slopes(self, place: FloatArray, u: FloatArray) -> FloatArray:
         """Return the slopes (n, 2), nT/m, of the field that the blocks show if they are at places (n, 2), m.
 
         Notes
@@ -361,39 +355,25 @@ class OwnField:
         The mean, ``∂k(x_i, x) K^-1 y`` (Rasmussen & Williams 2006, eq. 2.25 and section 9.4).
         """
         size, length, noise = self.scales(u)
-        _, _, h, K, _ = self._covariance(place, kind, size, length, noise)
+        _, _, h, K, _ = self._covariance(place, size, length, noise)
         y = self.anomaly - self.mean - (self.slope * (place - self.place)).sum(axis=1)
         weight = (size / length) ** 2 * h * np.linalg.solve(K, y)
         return np.asarray(weight.sum(axis=1)[:, None] * place - weight @ place)
 
-    def _covariance(
-        self, x: FloatArray, kind: int, size: float, length: float, noise: float
-    ) -> tuple[FloatArray, ...]:
+    def _covariance(self, x: FloatArray, size: float, length: float, noise: float) -> tuple[FloatArray, ...]:
         """Return ``|x_i - x_j|²``, k and h (n, n) of it, K (n, n), and R (n,)."""
         squared = (x[:, None, 0] - x[:, 0]) ** 2 + (x[:, None, 1] - x[:, 1]) ** 2
-        k, h = _kind(np.sqrt(squared) / length, kind)
+        # Matern 5/2 in a = sqrt(5) r / l, and h = (dk/dr) l^2 / r
+        a = np.sqrt(5.0 * squared) / length
+        falling = np.exp(-a)
+        k, h = (1.0 + a + a * a / 3.0) * falling, -(5.0 / 3.0) * (1.0 + a) * falling
         K = size * size * k + self._other[: len(x), : len(x)]
         R = self.variance[: len(x)] * noise**2
         K.flat[:: len(x) + 1] += R
         return squared, k, h, K, R
 
 
-def _kind(a: FloatArray, kind: int) -> tuple[FloatArray, FloatArray]:
-    """Return covariances of unit variance at distances a over the length, and h = k'(a)/a."""
-    if kind == 2:
-        k = np.exp(-0.5 * a * a)
-        return k, -k
-    # Matern 3/2 and 5/2 (eq. 4.17), in the scaled distance a = sqrt(2 nu) r / l.
-    a = np.sqrt(2.0 * kind + 3.0) * a
-    falling = np.exp(-a)
-    if kind == 0:
-        return (1.0 + a) * falling, -3.0 * falling
-    return (1.0 + a + a * a / 3.0) * falling, -(5.0 / 3.0) * (1.0 + a) * falling
-
-
-def own_bound(
-    field: OwnField, place: FloatArray, slopes: FloatArray, typical: FloatArray, kind: int
-) -> FloatArray:
+def own_bound(field: OwnField, place: FloatArray, slopes: FloatArray, typical: FloatArray) -> FloatArray:
     """Return the smallest covariance (n, 2, 2), m², that any estimator of the drift could reach.
 
     `place` (m) and `slopes` (nT/m), (n, 2), are the true places and the field's slopes there; blocks where
@@ -407,7 +387,7 @@ def own_bound(
     as known.
     """
     whole = np.asarray(np.isfinite(np.hstack([place, slopes])).all(axis=1))
-    K = field.covariance(np.where(whole[:, None], place, 0.0), typical, kind)[0][np.ix_(whole, whole)]
+    K = field.covariance(np.where(whole[:, None], place, 0.0), typical)[0][np.ix_(whole, whole)]
     # G: change of the measured anomaly by each weight of the drift's functions.
     felt = slopes[whole] + field.slope[whole]
     W = field.drift
@@ -416,14 +396,12 @@ def own_bound(
     return np.asarray(np.einsum("nr,arbs,ns->nab", W, P.reshape(2, field.r, 2, field.r), W))
 
 
-def with_bound(
-    result: xr.Dataset, field: OwnField, moved: FloatArray, typical: FloatArray, kind: int
-) -> xr.Dataset:
+def with_bound(result: xr.Dataset, field: OwnField, moved: FloatArray, typical: FloatArray) -> xr.Dataset:
     """Add the smallest error possible, m, to a track that is `moved` (n, 2), m, and whose error is known."""
     error = np.stack([result["error_north"], result["error_east"]], axis=1)
     true = field.place + moved - error
     whole = np.isfinite(true).all(axis=1)
-    slopes = field.slopes(np.where(whole[:, None], true, field.place), typical, kind)
-    P = own_bound(field, true, slopes, typical, kind)
+    slopes = field.slopes(np.where(whole[:, None], true, field.place), typical)
+    P = own_bound(field, true, slopes, typical)
     about = {"units": "m", "long_name": "smallest possible position error (DRMS)"}
     return result.assign(bound_sigma=("time", np.sqrt(np.trace(P, axis1=1, axis2=2)), about))

@@ -3,22 +3,23 @@
 Between two stages of data the new likelihood is let in by a power that grows from 0 to 1 in steps which leave
 half of the particles effective; after each they are resampled and moved by Hamiltonian Monte Carlo, in the
 metric of their own covariance (Del Moral, Doucet & Jasra 2006, section 3; adaptive steps: Jasra et al. 2011).
-Where a posterior is bent or has several maxima, they show it; no Gaussian would.
+Where a posterior is bent or has several maxima, the particles show it; a Gaussian would not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from magbridge.arrays import FloatArray, IntArray
+from magbridge.arrays import FloatArray
 
-__all__ = ["Likelihood", "Particles", "sample"]
+__all__ = ["Likelihood", "sample"]
 
-Likelihood = Callable[[FloatArray, int, int], tuple[float, FloatArray]]
-"""``f(u, kind, count)``: log likelihood of the first `count` data, and its gradient by u (q,)."""
+Evaluation = tuple[float, FloatArray]
+"""A log density and its gradient by u (q,)."""
+Likelihood = Callable[[FloatArray, int], Evaluation]
+"""``f(u, count)``: log likelihood of the first `count` data."""
 
 MIN_EFFECTIVE_FRACTION = 0.5
 """Fraction of the particles that stays effective in a step."""
@@ -32,67 +33,40 @@ DIAGONAL_FRACTION = 0.1
 """Fraction of the metric that takes the unknowns as independent: few particles do not tell."""
 
 
-@dataclass(frozen=True, eq=False)
-class Particles:
-    """Equally likely values of the unknowns: u (k, q), and which kind of model each has (k,)."""
-
-    u: FloatArray
-    kind: IntArray
-
-
-@dataclass(eq=False)
-class _Tempered:
-    """Log likelihood and gradient with the data of the last stage, and with those of this one."""
-
-    before: tuple[float, FloatArray]
-    now: tuple[float, FloatArray]
-
-    def log_posterior(self, power: float, u: FloatArray) -> tuple[float, FloatArray]:
-        """Return log posterior and gradient, the prior being N(0, 1)."""
-        (a, da), (b, db) = self.before, self.now
-        return (1.0 - power) * a + power * b - 0.5 * float(u @ u), (1.0 - power) * da + power * db - u
-
-
 def sample(
     likelihood: Likelihood,
     q: int,
-    kinds: int,
     counts: Sequence[int],
     number: int,
     stop: Callable[[FloatArray, int], bool] = lambda _u, _count: False,
-) -> Particles:
-    """Return `number` particles of the posterior of u (q,), N(0, 1) beforehand, and of one of `kinds` models.
+) -> FloatArray:
+    """Return particles u (number, q) of the posterior of unknowns that are N(0, 1) beforehand.
 
-    `counts` says how many data each stage has; after one that is `stop`, by its u (k, q) and its count,
-    no more are used.
+    `counts` is the number of data after each stage. The sampler ends early where `stop`, given the particles
+    and the count, is True.
     """
-    rng = np.random.default_rng(0)
-    u, kind = rng.normal(size=(number, q)), rng.integers(0, kinds, number)
-    nothing = 0.0, np.zeros(q)
-    last = [nothing] * number
-    mover = _Mover(likelihood, kinds, rng)
-    for before, count in zip((0, *counts), counts, strict=False):
-        seen = [_Tempered(last[i], likelihood(u[i], int(kind[i]), count)) for i in range(number)]
-        mover.before, mover.count, power = before, count, 0.0
+    mover = _Mover(likelihood, np.random.default_rng(0))
+    u = mover.rng.normal(size=(number, q))
+    for count in counts:
+        mover.begin_stage(count)
+        seen = [mover.evaluate(one) for one in u]
         # Tempering: raise the power of the new likelihood in steps, resample, and move the particles.
-        while power < 1.0:
-            gained = np.array([one.now[0] - one.before[0] for one in seen])
-            power, weights = _step(gained, power)
-            metric = _metric(u, weights)
+        while mover.power < 1.0:
+            gained = np.array([now[0] - before[0] for before, now in seen])
+            power, weights = _next_power(gained, mover.power)
+            mover.root = _metric(u, weights)
             # Systematic resampling: one uniform number for all particles.
-            chosen = np.searchsorted(np.cumsum(weights), (np.arange(number) + rng.uniform()) / number)
+            chosen = np.searchsorted(np.cumsum(weights), (np.arange(number) + mover.rng.uniform()) / number)
             chosen = np.minimum(chosen, number - 1)
-            u, kind, seen = u[chosen], kind[chosen], [seen[i] for i in chosen.tolist()]
-            mover.power, mover.root = power, metric
-            mover.move(u, kind, seen)
+            u, seen, mover.power = u[chosen], [seen[i] for i in chosen.tolist()], power
+            mover.move(u, seen)
         if stop(u, count):
             break
-        last = [one.now for one in seen]
-    return Particles(u, kind)
+    return u
 
 
-def _step(gained: FloatArray, power: float) -> tuple[float, FloatArray]:
-    """Return the next fraction of the new likelihood, and the particles' weights (k,) by their gain."""
+def _next_power(gained: FloatArray, power: float) -> tuple[float, FloatArray]:
+    """Return the next power of the new likelihood, and the particles' weights (k,) by their gain."""
 
     def weighed(to: float) -> FloatArray:
         w = np.exp((to - power) * (gained - gained.max()))
@@ -120,56 +94,53 @@ def _metric(u: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 class _Mover:
-    """Moves particles without changing what they are a sample of."""
+    """Hamiltonian moves of particles, which leave their distribution unchanged (Neal 2011, fig. 2)."""
 
-    def __init__(self, likelihood: Likelihood, kinds: int, rng: np.random.Generator) -> None:
-        self.likelihood, self.kinds, self.rng = likelihood, kinds, rng
+    def __init__(self, likelihood: Likelihood, rng: np.random.Generator) -> None:
+        self.likelihood, self.rng = likelihood, rng
         self.before = self.count = 0
         self.power, self.root, self.step_size = 0.0, np.eye(1), 0.5 * MAX_STEP_SIZE
 
-    def move(self, u: FloatArray, kind: IntArray, seen: list[_Tempered]) -> None:
-        """Move particles u (k, q) of `kind` (k,) in place."""
-        for _ in range(MOVES_PER_STEP):
-            accepted = 0
-            for i in range(len(u)):
-                # Metropolis move between kinds of field, then a Hamiltonian move of the unknowns.
-                other = int(kind[i] + self.rng.integers(1, self.kinds)) % self.kinds
-                there = self._evaluate(u[i], other)
-                if self._accept(
-                    there.log_posterior(self.power, u[i])[0] - seen[i].log_posterior(self.power, u[i])[0]
-                ):
-                    kind[i], seen[i] = other, there
-                accepted += self._hamiltonian_move(u, int(kind[i]), seen, i)
-            self.step_size = min(
-                self.step_size * float(np.exp(0.5 * (accepted / len(u) - TARGET_ACCEPTANCE))), MAX_STEP_SIZE
-            )
+    def begin_stage(self, count: int) -> None:
+        """Begin a stage that ends with the first `count` data."""
+        self.before, self.count, self.power = self.count, count, 0.0
 
-    def _hamiltonian_move(self, u: FloatArray, kind: int, seen: list[_Tempered], i: int) -> bool:
-        """Move one particle along its posterior's slope (Neal 2011, fig. 2); return whether it moved."""
+    def evaluate(self, u: FloatArray) -> tuple[Evaluation, Evaluation]:
+        """Return the log likelihood of the data before this stage, and of all after it."""
+        before = self.likelihood(u, self.before) if self.before else (0.0, np.zeros(len(u)))
+        return before, self.likelihood(u, self.count)
+
+    def move(self, u: FloatArray, seen: list[tuple[Evaluation, Evaluation]]) -> None:
+        """Move particles u (k, q) in place, and their likelihoods `seen`; adapt the step size."""
+        for _ in range(MOVES_PER_STEP):
+            accepted = sum(self._move_one(u, seen, i) for i in range(len(u)))
+            growth = np.exp(0.5 * (accepted / len(u) - TARGET_ACCEPTANCE))
+            self.step_size = min(self.step_size * float(growth), MAX_STEP_SIZE)
+
+    def _move_one(self, u: FloatArray, seen: list[tuple[Evaluation, Evaluation]], i: int) -> bool:
+        """Move one particle along its posterior's slope; return True if the move was accepted."""
         step_size = self.step_size * float(self.rng.uniform(0.7, 1.3))
         x, here = u[i], seen[i]
         # Leapfrog integration of H = -log posterior + p'p / 2, in the metric root root'.
         p = np.asarray(self.rng.normal(size=u.shape[1]))
-        value, slope = here.log_posterior(self.power, x)
+        value, slope = self._log_posterior(x, here)
         begun = value - 0.5 * float(p @ p)
         for _ in range(LEAPFROG_STEPS):
             p = p + 0.5 * step_size * (self.root.T @ slope)
             x = x + step_size * (self.root @ p)
-            here = self._evaluate(x, kind)
-            value, slope = here.log_posterior(self.power, x)
+            here = self.evaluate(x)
+            value, slope = self._log_posterior(x, here)
             if not value - begun > -MAX_ENERGY_ERROR:
                 return False
             p = p + 0.5 * step_size * (self.root.T @ slope)
-        if not self._accept(value - 0.5 * float(p @ p) - begun):
+        # Metropolis test of the change of H
+        if not np.log(self.rng.uniform()) < value - 0.5 * float(p @ p) - begun:
             return False
         u[i], seen[i] = x, here
         return True
 
-    def _evaluate(self, u: FloatArray, kind: int) -> _Tempered:
-        now = self.likelihood(u, kind, self.count)
-        if self.power == 1.0 or not self.before:
-            return _Tempered((0.0, np.zeros(len(u))), now)
-        return _Tempered(self.likelihood(u, kind, self.before), now)
-
-    def _accept(self, gained: float) -> bool:
-        return bool(np.log(self.rng.uniform()) < gained)
+    def _log_posterior(self, u: FloatArray, seen: tuple[Evaluation, Evaluation]) -> Evaluation:
+        """Return log posterior and gradient, with the prior N(0, 1) and the new data's `power`."""
+        (a, da), (b, db) = seen
+        t = self.power
+        return (1.0 - t) * a + t * b - 0.5 * float(u @ u), (1.0 - t) * da + t * db - u

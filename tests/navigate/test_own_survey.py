@@ -68,9 +68,9 @@ def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning
     """
     asked, likelihood = set(), OwnField.log_likelihood
 
-    def counted(field: OwnField, u: FloatArray, kind: int, count: int) -> tuple[float, FloatArray]:
+    def counted(field: OwnField, u: FloatArray, count: int) -> tuple[float, FloatArray]:
         asked.add(count / len(field.time))
-        return likelihood(field, u, kind, count)
+        return likelihood(field, u, count)
 
     monkeypatch.setattr(OwnField, "log_likelihood", counted)
     lost = localise(flown(straight=True), structs.replace(OPTIONS, current_sigma=1.0), start=START)
