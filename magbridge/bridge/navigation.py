@@ -311,7 +311,6 @@ GPS_REASONS = {
     GnssReason.FROZEN: "its position stays the same while the vehicle moves",
     GnssReason.JUMP: "its position jumps",
     GnssReason.POSITION: "it differs from the navigator's position",
-    GnssReason.DRIFT: "it drifts away from the navigator's position",
     GnssReason.FIELD: "the map does not describe the field at its position",
 }
 

@@ -7,7 +7,6 @@ against what else is known:
 jump        two positions differ by more than dead reckoning and its errors allow between them
 frozen      the position stays the same while the vehicle moves
 position    it differs from the navigator's position by more than both claim
-drift       the mean of that difference over 20 s is larger than the errors of both
 field       the map does not describe the measured field at the position
 spoofing,   the receiver reports it (GNSS_INTEGRITY)
 jamming
@@ -48,8 +47,6 @@ WINDOW_US = 30_000_000
 """µs over which the motion by GNSS is compared with dead reckoning."""
 MEAN_TIME_S = 20.0
 """Time constant of the mean deviation from the navigator, s."""
-LASTING_FRACTION = 0.5
-"""Part of the receiver's sigma that a mean over MEAN_TIME_S does not reduce."""
 HOLD_US, LONG_HOLD_US = 20_000_000, 45_000_000
 """µs for which positions must agree with each other until they are used again: if the navigator or the field
 agrees, and if neither can tell."""
@@ -95,7 +92,6 @@ class GnssReason(IntEnum):
     FROZEN = 3
     JUMP = 4
     POSITION = 5
-    DRIFT = 6
     FIELD = 7
 
 
@@ -137,13 +133,13 @@ class _Position(NamedTuple):
 class GnssMonitor:
     """Tests GNSS positions, in order of time; `state` and, where they are not used, the `reason`.
 
-    `deviation` and `drift` are the last position's distance from the navigator's, m, and its mean over 20 s;
+    `drift` (m) is the mean distance of the positions that were used from the navigator's, over 20 s, and
     `evidence` compares the field with the map at its position.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.state, self.reason = GnssState.NONE, GnssReason.NONE
-        self.deviation = self.drift = 0.0
+        self.drift = 0.0
         self._grid, self._options = grid, options
         self._history: deque[_Position] = deque()
         self._place: tuple[float, float] | None = None
@@ -213,9 +209,7 @@ class GnssMonitor:
         frozen = self._frozen(place, sigma, prediction.travelled)
         self.evidence.move(time_us, offset_m, sigma, restart=jumped)
         away = np.array(offset_m) - prediction.position
-        self.deviation = hypot(*away.tolist())
         agrees = self._agrees(away, sigma, prediction)
-        drifts = self._drifts(time_us, away, sigma, prediction)
         if self.state is GnssState.NONE:
             self.state = GnssState.GOOD
         if reported := self._receiver_reports(time_us):
@@ -226,13 +220,14 @@ class GnssMonitor:
         elif jumped:
             self._set(GnssState.REJECTED, GnssReason.JUMP, time_us)
         elif self.state is GnssState.GOOD:
-            self._leave_good(time_us, agrees=agrees, drifts=drifts, lost=prediction.lost)
+            self._leave_good(time_us, agrees=agrees, lost=prediction.lost)
         elif self._returns(time_us, agrees, prediction):
             self.state, self.reason, self._chained = GnssState.GOOD, GnssReason.NONE, True
             self._trusted = None
-            self._mean, self.drift = np.zeros(2), 0.0
         elif not agrees and prediction.informed:
             self.state = GnssState.REJECTED
+        if self.state is GnssState.GOOD:
+            self._average(time_us, away)
         return self.state
 
     def observe(self, block: Block, step: Step, filter_likelihood: float) -> None:
@@ -300,29 +295,22 @@ class GnssMonitor:
         P = prediction.alone if prediction.lost else prediction.covariance
         return squared_mahalanobis(away, P + sigma**2 * np.eye(2)) <= MAX_DEVIATION_SIGMA**2
 
-    def _drifts(self, time_us: int, away: FloatArray, sigma: float, prediction: Prediction) -> bool:
-        """Return True if the mean deviation from the navigator is larger than the errors allow."""
+    def _average(self, time_us: int, away: FloatArray) -> None:
+        """Add the deviation (2,), m, of a position that is used to the mean."""
         seconds = (time_us - self._history[-2].time_us) * 1e-6 if len(self._history) > 1 else inf
-        # Exponential mean of the deviation, with the time constant MEAN_TIME_S.
-        kept = exp(-seconds / MEAN_TIME_S)
-        if self.state is not GnssState.GOOD or seconds > MEAN_TIME_S:
-            self._mean, kept = np.zeros(2), 1.0  # starts again after a pause
+        # Exponential mean with the time constant MEAN_TIME_S; it starts again after a pause.
+        kept = exp(-seconds / MEAN_TIME_S) if seconds < MEAN_TIME_S else 0.0
         self._mean = kept * self._mean + (1.0 - kept) * away
         self.drift = hypot(*self._mean.tolist())
-        # The mean keeps the navigator's error whole, and half of the receiver's: that part changes slowly.
-        P = prediction.covariance + (LASTING_FRACTION * sigma) ** 2 * np.eye(2)
-        return squared_mahalanobis(self._mean, P) > MAX_DEVIATION_SIGMA**2
 
     def _receiver_reports(self, time_us: int) -> GnssReason:
         return self._reported if time_us - self._reported_us < MAX_GNSS_AGE_US else GnssReason.NONE
 
     # ---- changes of state ----------------------------------------------------------------------------
 
-    def _leave_good(self, time_us: int, *, agrees: bool, drifts: bool, lost: bool) -> None:
+    def _leave_good(self, time_us: int, *, agrees: bool, lost: bool) -> None:
         if not agrees:
             self._set(GnssState.REJECTED, GnssReason.POSITION, time_us)
-        elif drifts:
-            self._set(GnssState.REJECTED, GnssReason.DRIFT, time_us)
         elif self.evidence.contradicts or (lost and self.evidence.log_odds_of_map < 0.0):
             self._set(GnssState.SUSPECT, GnssReason.FIELD, time_us)
 
