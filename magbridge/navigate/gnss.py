@@ -66,6 +66,8 @@ MAX_GNSS_AGE_US = 10_000_000
 """µs for which a position, or a report of the receiver's, holds."""
 CORRELATION_TIME_S = 30.0
 """s over which the errors of successive positions are correlated."""
+SEPARATION_TIME_S = 120.0
+"""s for which a filter goes on without the positions that the navigator uses; then it starts again."""
 OK_STATE, DETECTED_STATE = 1, 3
 """GPS_JAMMING_STATE and GPS_SPOOFING_STATE: nothing found; found and not mitigated."""
 
@@ -230,11 +232,16 @@ class GnssMonitor:
             self._average(time_us, away)
         return self.state
 
-    def observe(self, block: Block, step: Step, filter_likelihood: float) -> None:
+    def observe(
+        self, block: Block, step: Step, filter_likelihood: float, x: FloatArray, P: FloatArray
+    ) -> None:
         """Compare a measurement of the field with the map at the last position.
 
-        It is one `step` after the previous one, with a log-likelihood by the navigator's filter.
+        It is one `step` after the previous one, with a log-likelihood by the navigator's filter, whose
+        estimate is now x (6,), P (6, 6).
         """
+        if self.state is GnssState.GOOD:
+            self.evidence.separate(x, P)
         self.evidence.update(block, step, filter_likelihood)
 
     # ---- single tests --------------------------------------------------------------------------------
@@ -362,6 +369,7 @@ class _FieldTest:
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.limit = log(options.alarm_odds)
         self._grid, self._options = grid, any_level(options, grid)
+        self._claimed = options
         self._time_us = -MAX_GNSS_AGE_US
         self._restart()
 
@@ -370,14 +378,16 @@ class _FieldTest:
         self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)
         self._unmapped = Unmapped(self._grid, self._options)
         self._filter: Bank | None = None
+        self._separate: Bank | None = None
+        self._separated_s = self._log_odds_separate = 0.0
         self._filtered = self._offset = np.zeros(2)  # position at the last measurement, and the latest
         self._sigma = inf
         self._step = Step()  # since the last measurement that was used
 
     @property
     def contradicts(self) -> bool:
-        """Return True if the map does not describe the field at the position."""
-        return self._against >= self.limit
+        """Return True if the map does not describe the field there, or describes it better without it."""
+        return self._against >= self.limit or self._log_odds_separate >= self.limit
 
     @property
     def confirms(self) -> bool:
@@ -403,7 +413,27 @@ class _FieldTest:
     def begin_comparison(self) -> None:
         """Discard the evidence so far: from now on the navigator does not use the positions."""
         self.log_odds_of_map = min(self.log_odds_of_map, 0.0)
-        self.log_odds_of_position = 0.0
+        self.log_odds_of_position = self._log_odds_separate = 0.0
+        self._separate = None
+
+    def separate(self, x: FloatArray, P: FloatArray) -> None:
+        """Start a filter without the positions, from the navigator's estimate x (6,), P (6, 6), if it is due.
+
+        Notes
+        -----
+        Solution separation: its log-likelihood ratio against the navigator begins at 0. As long as the
+        positions are right, it exceeds c with a probability of at most 1/c in each period (Ville 1939).
+        """
+        if self._separate is None or self._separated_s > SEPARATION_TIME_S:
+            self._separate = Bank(self._grid, x, P, inf, self._options.gate)
+            self._separated_s = self._log_odds_separate = 0.0
+
+    def _compare_separate(self, block: Block, step: Step, filter_likelihood: float) -> None:
+        """Add a measurement to the odds of the filter without positions against the navigator with them."""
+        if self._separate is not None:
+            self._separated_s += step.seconds
+            self._separate.predict(*transition(self._claimed, *step))
+            self._log_odds_separate += self._separate.update(block).log_likelihood - filter_likelihood
 
     def update(self, block: Block, step: Step, filter_likelihood: float) -> None:
         """Add a measurement, one `step` after the previous one."""
@@ -411,6 +441,7 @@ class _FieldTest:
         if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US:
             return
         whole, self._step = self._step, Step()
+        self._compare_separate(block, whole, filter_likelihood)
         is_first = self._filter is None
         if self._filter is None:
             x, P = prior(self._options, self._sigma)

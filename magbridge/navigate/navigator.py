@@ -204,7 +204,7 @@ class Navigator:
         # Estimate first; then the receiver's test uses the same measurement and its likelihood.
         seen = now.update(block, where.travelled, where.noise)
         if isfinite(seen.anomaly):
-            self.gnss.observe(block, now.step, seen.log_likelihood)
+            self.gnss.observe(block, now.step, seen.log_likelihood, now.x, now.P)
         north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
         (nn, ne), (_, ee) = now.P[:2, :2].tolist()
