@@ -182,7 +182,7 @@ def main() -> None:
         console.print(f"not learned from: {error}")
     widths = np.sqrt(np.median(fleet.population.variances.own, axis=1))
     console.print(
-        f"learned in {fleet.population.rounds} iterations; median of the physical widths: "
+        "learned: median of the physical widths: "
         + ", ".join(f"{name} {width:.2g}" for name, width in zip(FLEET_LEVELS, widths, strict=True))
     )
     STUDY.main(f"{options.vehicles} vehicles, {options.deployments} deployments", cases, options)

@@ -238,20 +238,19 @@ ALARM = 1e-3
 """Chance of a false alarm in a deployment, over all its coefficients."""
 
 
-@dataclass(frozen=True)
-class Change:
-    """One coefficient that left its band."""
+class Change(NamedTuple):
+    """A coefficient that left its band; the names are those of the JSON output."""
 
     what: str
-    """As a technician would say it."""
-    by: float
-    """Change of the coefficient, nT."""
+    """Name of the coefficient for a technician."""
+    by_nT: float  # noqa: N815 - the JSON key
+    """Change of the coefficient."""
     sigmas: float
     """Change divided by its standard deviation."""
     chance: float
-    """Of one as large in any coefficient of a deployment like the others."""
+    """Probability that any coefficient of an unchanged vehicle changes as much in one deployment."""
     cause: str
-    """What does such a thing, and whether a refit was on record."""
+    """Likely cause, and whether a refit was on record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,13 +316,7 @@ def facts(history: History) -> dict[str, Any]:
                 "deployment": lesson.deployment, "refit": lesson.refit,
                 "date": datetime.fromtimestamp(lesson.time, UTC).date().isoformat(),
                 **{key: column[k].tolist() for key, column in zip(keys, columns, strict=True)},
-                "changes": [
-                    {
-                        "what": one.what, "by_nT": one.by, "sigmas": one.sigmas, "chance": one.chance,
-                        "cause": one.cause,
-                    }
-                    for one in history.changes[k]
-                ],
+                "changes": [change._asdict() for change in history.changes[k]],
             }
             for k, lesson in enumerate(history.lessons)
         ],
