@@ -43,28 +43,22 @@ from types import ModuleType
 TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge import plot
-    from magbridge.api import (
-        calibrate,
-        correct,
-        correct_rows,
-        diagnose,
-        navigate,
-        observations,
-        plan,
-        reference_field,
-        survey,
-        write,
-    )
+    from magbridge.api import calibrate, correct, navigate, survey
     from magbridge.calibration.corrector import Corrector
     from magbridge.calibration.file import load, save
     from magbridge.calibration.fitting.fit import fit
+    from magbridge.calibration.fitting.observe import observations
     from magbridge.calibration.heading import heading
     from magbridge.calibration.model import Calibration
+    from magbridge.calibration.planning.plan import flight_plan as plan
     from magbridge.correction import Correction
+    from magbridge.diagnose.run import diagnose
     from magbridge.errors import MagbridgeError
     from magbridge.field.read import read_grid
-    from magbridge.logs import read
+    from magbridge.field.reference import reference_field
+    from magbridge.logs import read, write
     from magbridge.logs.deployment import from_frame, to_frame
+    from magbridge.rows import correct_rows
     from magbridge.version import __version__
 
 __all__ = [
@@ -74,30 +68,25 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
+    **dict.fromkeys(["calibrate", "correct", "navigate", "survey"], "api"),
+    **dict.fromkeys(["load", "save"], "calibration.file"),
+    **dict.fromkeys(["from_frame", "to_frame"], "logs.deployment"),
+    **dict.fromkeys(["read", "write"], "logs"),
     "Calibration": "calibration.model",
     "Correction": "correction",
     "Corrector": "calibration.corrector",
     "MagbridgeError": "errors",
     "__version__": "version",
-    "calibrate": "api",
-    "correct": "api",
-    "correct_rows": "api",
-    "diagnose": "api",
+    "correct_rows": "rows",
+    "diagnose": "diagnose.run",
     "fit": "calibration.fitting.fit",
-    "from_frame": "logs.deployment",
     "heading": "calibration.heading",
-    "load": "calibration.file",
-    "navigate": "api",
-    "observations": "api",
-    "plan": "api",
-    "read": "logs",
+    "observations": "calibration.fitting.observe",
+    "plan": "calibration.planning.plan",
     "read_grid": "field.read",
-    "reference_field": "api",
-    "save": "calibration.file",
-    "survey": "api",
-    "to_frame": "logs.deployment",
-    "write": "api",
+    "reference_field": "field.reference",
 }
+"""Name to the module that has it."""
 
 
 def __getattr__(name: str) -> object:
@@ -107,7 +96,8 @@ def __getattr__(name: str) -> object:
 
     if name == "plot":
         return import_module(f"{__name__}.plot")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home = import_module(f"{__name__}.{_HOMES[name]}")
+    return home.flight_plan if name == "plan" else getattr(home, name)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""Functions of ``import magbridge`` that accept Datasets with times in seconds or as ``datetime64``."""
+"""Functions of ``import magbridge`` that combine several packages."""
 
 from __future__ import annotations
 
@@ -12,55 +12,21 @@ from numpy.typing import ArrayLike
 from magbridge.calibration.correct import CorrectedArrays
 from magbridge.calibration.correct import correct as correct_arrays
 from magbridge.calibration.corrector import Corrector
-from magbridge.calibration.fitting import observe
+from magbridge.calibration.fitting.observe import observations
 from magbridge.columns import in_seconds
 from magbridge.errors import CalibrationError, WrongUse
-from magbridge.field import reference
 from magbridge.records import Corrected
-from magbridge.rows import correct_rows as correct_rows_in_seconds
+from magbridge.rows import correct_rows
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import xarray as xr
 
-    from magbridge.arrays import FloatArray
-    from magbridge.calibration.fitting.observations import Observations
     from magbridge.calibration.model import Calibration
-    from magbridge.calibration.planning.plan import Plan
-    from magbridge.correction import Correction
-    from magbridge.diagnose.assessment import DiagnosisResult
     from magbridge.field.grid import AnomalyGrid
     from magbridge.navigate.options import NavigationOptions
     from magbridge.survey.run import Result
 
-__all__ = [
-    "calibrate", "correct", "correct_rows", "diagnose", "navigate", "observations", "plan",
-    "reference_field", "survey", "write",
-]  # fmt: skip
-
-
-def observations(
-    deployment: xr.Dataset, parameters: str | Sequence[str] = (), **options: Any
-) -> Observations:
-    """Return the complete rows of a log for a fit.
-
-    Parameters
-    ----------
-    deployment : Dataset
-        On ``time``, with ``mag_x mag_y mag_z`` (nT).
-    parameters : str or sequence of str
-        Columns that move masses.
-    **options
-        Further arguments of :func:`magbridge.calibration.fitting.observe.observations`.
-    """
-    names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
-    return observe.observations(in_seconds(deployment), names, **options)
-
-
-def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> FloatArray:
-    """Return the total field of the main-field model, and of a grid, at every row, (n,) nT."""
-    return reference.reference_field(in_seconds(deployment), grid)
+__all__ = ["calibrate", "correct", "navigate", "survey"]
 
 
 def calibrate(
@@ -184,45 +150,8 @@ def _corrected_log(calibration: Calibration, deployment: xr.Dataset) -> xr.Datas
     from magbridge.correction import Correction  # noqa: PLC0415 - as the other imports of this function
 
     log = in_seconds(deployment)
-    corrected = with_scalar(correct_rows_in_seconds(Correction(calibration), log), log, calibration.sensors)
+    corrected = with_scalar(correct_rows(Correction(calibration), log), log, calibration.sensors)
     return corrected.assign_coords(time=deployment["time"])
-
-
-def plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
-    """Choose the calibration runs to fly next for a mission like a log.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Calibration so far.
-    mission : Dataset (time)
-        With attitude, position and masses as the mission will have them.
-    runs : int
-        Number of runs.
-    roll : float
-        deg, largest bank either way.
-    """
-    from magbridge.calibration.planning.plan import flight_plan  # noqa: PLC0415 - scipy only where it is used
-
-    return flight_plan(calibration, in_seconds(mission), runs=runs, roll=roll)
-
-
-def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
-    """Correct a log as the bridge does; the result has the input's kind of ``time``."""
-    corrected = correct_rows_in_seconds(correction, in_seconds(deployment))
-    return corrected.assign_coords(time=deployment["time"])
-
-
-def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **options: Any) -> DiagnosisResult:
-    """Find what the model gets wrong in these logs; :func:`magbridge.diagnose.run.diagnose`.
-
-    WrongUse: the sequence is empty.
-    """
-    from magbridge.diagnose import run  # noqa: PLC0415 - scipy only where it is used
-
-    if not deployments:
-        raise WrongUse("deployments: expected at least one Dataset, got none")
-    return run.diagnose([in_seconds(deployment) for deployment in deployments], calibration, **options)
 
 
 def navigate(
@@ -272,10 +201,3 @@ def survey(
     if scalar:
         return run.scalar_survey(logs, scalar, calibrations=calibrations, **options)
     return run.survey(run.samples_of(logs, calibrations))
-
-
-def write(deployment: xr.Dataset, path: str | Path) -> None:
-    """Write a Dataset to a file, in the format of its suffix."""
-    from magbridge import logs  # noqa: PLC0415 - pandas only where it is used
-
-    logs.write(in_seconds(deployment), path)

@@ -11,7 +11,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import vector_covariance
 from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
-from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, require
+from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, in_seconds, require
 from magbridge.correction import Correction
 from magbridge.field.igrf import HeldField, magnitude
 from magbridge.field.reference import main_field
@@ -60,6 +60,8 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
+    given = deployment
+    deployment = in_seconds(given)
     require(deployment, CHANNELS)
     correction.as_declared(deployment.attrs)
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
@@ -100,7 +102,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         columns |= _headings(calibration, samples, results[:, 2:5], tilt, vectors, sigma, deployment)
     return xr.Dataset(
         {name: ("time", column, COLUMNS[name]._asdict()) for name, column in columns.items()},
-        coords={"time": deployment["time"]},
+        coords={"time": given["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )
 

@@ -14,6 +14,7 @@ from magbridge.arrays import BoolArray
 from magbridge.calibration.effects import TimeEffect
 from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.model import Calibration
+from magbridge.columns import in_seconds
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.instrument import InterferenceTone
@@ -44,7 +45,7 @@ from magbridge.diagnose.problem import Problem, pose, with_slow_noise
 from magbridge.diagnose.search import SearchOutcome, beside_slow_noise, outliers, search
 from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.diagnose.survey import Survey, days_of, load_survey
-from magbridge.errors import DataError
+from magbridge.errors import DataError, WrongUse
 from magbridge.field.grid import AnomalyGrid
 
 if TYPE_CHECKING:
@@ -221,9 +222,15 @@ def diagnose(
 
     Raises
     ------
+    WrongUse
+        There is no dataset.
     DataError
         The data do not allow it: one line that says which column is missing or too short.
     """
+    if not datasets:
+        raise WrongUse("deployments: expected at least one Dataset, got none")
+    datasets = [in_seconds(dataset) for dataset in datasets]
+    training_logs = [in_seconds(dataset) for dataset in training_logs]
     causes = known() if causes is None else causes
     # one thread: for matrices this narrow more only wait, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.columns import CHANNELS, counts_from_boot
+from magbridge.columns import CHANNELS, counts_from_boot, in_seconds
 from magbridge.errors import DataError, FormatError
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
@@ -49,8 +49,8 @@ def reference_field(
     Parameters
     ----------
     deployment : Dataset
-        On ``time``; the column ``reference_field`` is used where it holds a number, elsewhere the field is
-        computed from ``latitude longitude depth``.
+        On ``time`` (s or datetime64); the column ``reference_field`` is used where it holds a number,
+        elsewhere the field is computed from ``latitude longitude depth``.
     grid : AnomalyGrid, optional
         Added to the main field; if its altitude is known, continued to the deployment's depth.
     site_bias : float, optional
@@ -76,6 +76,7 @@ def reference_field(
     at its own altitude. Depth matters: about 0.02 nT/m in the main field, and far more in the anomalies of
     shallow crustal sources.
     """
+    deployment = in_seconds(deployment)
     size = deployment.sizes["time"]
     given = np.array(np.broadcast_to(deployment.get("reference_field", np.nan), size), float)
     unknown = np.isnan(given)

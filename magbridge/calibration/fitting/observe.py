@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, require
+from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, in_seconds, require
 from magbridge.errors import CalibrationError
 from magbridge.field.geodesy import separation
 from magbridge.field.reference import earth_field, placed, positions, with_true_heading
@@ -33,15 +33,16 @@ FOLLOWED = (TEMPERATURE, "depth")
 
 
 def observations(
-    ds: xr.Dataset, parameters: str | Sequence[str], *, grid: AnomalyGrid | None = None
+    ds: xr.Dataset, parameters: str | Sequence[str] = (), *, grid: AnomalyGrid | None = None
 ) -> Observations:
     """Make the observations of a fit from a deployment's columns.
 
     Parameters
     ----------
     ds : Dataset
-        A deployment. Its reference is :func:`~magbridge.field.reference.earth_field`; headings that it
-        declares to be magnetic are made true.
+        A deployment, with times in s or as datetime64. Its reference is
+        :func:`~magbridge.field.reference.earth_field`; headings that it declares to be magnetic are made
+        true.
     parameters : str or sequence of str
         Columns that move masses.
     grid : AnomalyGrid, optional
@@ -59,7 +60,7 @@ def observations(
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
     # channels that were read in turn first, because everything else refers to the rows' times
-    ds = at_one_time(ds)
+    ds = at_one_time(in_seconds(ds))
     columns = {name: _column(ds, name) for name in names}
     total, vector, model = earth_field(ds, grid)
     if "daily_variation" in ds:
