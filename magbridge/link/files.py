@@ -12,7 +12,8 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 from io import BytesIO
@@ -292,11 +293,12 @@ class Request(NamedTuple):
         return (header + data).ljust(FTP_HEADER.size + DATA, b"\0")
 
 
+@dataclass
 class Session:
-    """A file that a station has open."""
+    """A file that a station has open, and when it was last used, s."""
 
-    def __init__(self, file: BinaryIO, now_s: float) -> None:
-        self.file, self.used = file, now_s
+    file: BinaryIO
+    used: float
 
     def read(self, offset: int, size: int) -> bytes:
         """Return bytes of the file; none beyond its end."""
@@ -314,15 +316,6 @@ class FtpServer:
         self._tree, self._now = tree, now_s
         self._sessions: dict[tuple[Sender, int], Session] = {}
         self._last: dict[Sender, tuple[Request, bytes]] = {}
-        self._simple: dict[int, Callable[[Sender, Request], bytes]] = {
-            Opcode.NONE: lambda _, request: request.reply(Opcode.ACK),
-            Opcode.TERMINATE: self._terminate,
-            Opcode.RESET: self._reset,
-            Opcode.LIST: self._list,
-            Opcode.OPEN_READ: self._open,
-            Opcode.READ: self._read,
-            Opcode.CRC32: self._crc32,
-        }
 
     def handle(self, sender: Sender, payload: bytes) -> Iterator[bytes]:
         """Yield the payloads of the replies to a request: one, or a burst, read as it is taken.
@@ -342,6 +335,8 @@ class FtpServer:
             reply = self._answer(sender, request)
         except Refused as refused:
             reply = request.reply(Opcode.NAK, refused.data)
+        except (FileNotFoundError, PermissionError, UnicodeError):  # or a path that leads elsewhere
+            reply = request.reply(Opcode.NAK, Refused(Error.FILE_NOT_FOUND).data)
         except OSError as error:
             reply = request.reply(Opcode.NAK, Refused(Error.FAIL_ERRNO, error.errno or 0).data)
         self._last[sender] = request, reply
@@ -363,41 +358,43 @@ class FtpServer:
 
     def _answer(self, sender: Sender, request: Request) -> bytes:
         self._check(request)
-        if request.opcode in WRITES:
-            raise Refused(Error.FILE_PROTECTED)
-        answer = self._simple.get(request.opcode)
-        if answer is None:
-            raise Refused(Error.UNKNOWN_COMMAND)
-        return answer(sender, request)
-
-    def _terminate(self, sender: Sender, request: Request) -> bytes:
-        self._session(sender, request)
-        self._close((sender, request.session))
+        match request.opcode:
+            case Opcode.NONE:
+                pass
+            case Opcode.TERMINATE:
+                self._session(sender, request)
+                self._close((sender, request.session))
+            case Opcode.RESET:  # closes no file of another station
+                for key in [key for key in self._sessions if key[0] == sender]:
+                    self._close(key)
+            case Opcode.LIST:
+                return self._list(request)
+            case Opcode.OPEN_READ:
+                return self._open(sender, request)
+            case Opcode.READ:
+                return self._read(sender, request)
+            case Opcode.CRC32:
+                return self._crc32(request)
+            case _:
+                raise Refused(Error.FILE_PROTECTED if request.opcode in WRITES else Error.UNKNOWN_COMMAND)
         return request.reply(Opcode.ACK)
 
-    def _reset(self, sender: Sender, request: Request) -> bytes:
-        """Close all files that this station has open, but not those of other stations."""
-        for key in [key for key in self._sessions if key[0] == sender]:
-            self._close(key)
-        return request.reply(Opcode.ACK)
-
-    def _list(self, _: Sender, request: Request) -> bytes:
-        with _no_such_file():
-            entries = self._tree.entries(request.path)
+    def _list(self, request: Request) -> bytes:
+        entries = self._tree.entries(request.path)
         if request.offset >= len(entries):
             raise Refused(Error.END_OF_FILE)
         data = b""
-        for one in entries[request.offset :]:
-            text = _described(one)
-            if len(data) + len(text) > DATA:
+        for entry in entries[request.offset :]:
+            text = f"D{entry.name}" if entry.size is None else f"F{entry.name}\t{entry.size}"
+            text_data = text.encode("utf-8", "replace") + b"\0"
+            if len(data) + len(text_data) > DATA:
                 break
-            data += text
+            data += text_data
         return request.reply(Opcode.ACK, data)
 
     def _open(self, sender: Sender, request: Request) -> bytes:
         number = self._free(sender, request.session)
-        with _no_such_file():
-            file, size = self._tree.open(request.path)
+        file, size = self._tree.open(request.path)
         self._sessions[sender, number] = Session(file, self._now())
         size_data = min(size, 0xFFFFFFFF).to_bytes(4, "little")
         return request.reply(Opcode.ACK, size_data, session=number)
@@ -408,9 +405,8 @@ class FtpServer:
             raise Refused(Error.END_OF_FILE)
         return request.reply(Opcode.ACK, data)
 
-    def _crc32(self, _: Sender, request: Request) -> bytes:
-        with _no_such_file():
-            file, _size = self._tree.open(request.path)
+    def _crc32(self, request: Request) -> bytes:
+        file, _ = self._tree.open(request.path)
         total = 0
         with file:
             while data := file.read(FTP_BLOCK_BYTES):
@@ -465,18 +461,3 @@ class FtpServer:
     def _close(self, key: tuple[Sender, int]) -> None:
         with suppress(OSError):
             self._sessions.pop(key).file.close()
-
-
-@contextmanager
-def _no_such_file() -> Iterator[None]:
-    """Turn 'no such file', or a path that leads elsewhere, into the protocol's error."""
-    try:
-        yield
-    except (FileNotFoundError, PermissionError, UnicodeError) as error:
-        raise Refused(Error.FILE_NOT_FOUND) from error
-
-
-def _described(device: Entry) -> bytes:
-    """Return an entry of a listing."""
-    text = f"D{device.name}" if device.size is None else f"F{device.name}\t{device.size}"
-    return text.encode("utf-8", "replace") + b"\0"
