@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import msgspec
 
-from magbridge.bridge.port import Port
 from magbridge.bridge.position import CLOCK_SET_US
 from magbridge.bridge.sensor import SensorLine
 from magbridge.config import Config, Sensor, Telemetry
@@ -22,8 +21,7 @@ from magbridge.version import __version__
 
 __all__ = [
     "Event", "HostClock", "Recorder", "StartEvent", "StateChanges", "beginning", "clock_step", "declarations",
-    "interleaved", "log_state", "notice", "opened", "port", "port_number", "source_of", "standstill",
-    "too_slow",
+    "interleaved", "notice", "port_number", "port_state", "source_of", "standstill",
 ]  # fmt: skip
 
 
@@ -127,30 +125,15 @@ def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:
     return _frame("STATUSTEXT", severity=int(severity), text=text)
 
 
-def port(number: int, link: Port, reason: str) -> bytes:
-    """Return the frame for a port that opened (no `reason`) or that is not open, with the reason."""
-    state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
-    # the name last, because the end of a long text is cut off
-    why = f"{reason}: {link.name}" if reason else ""
-    return _frame("MAG_PORT", port=number, state=int(state), dropped=link.dropped, reason=why)
+def port_state(number: int, reason: str = "", dropped: int = 0, *, is_open: bool | None = None) -> bytes:
+    """Return the frame for a port, or the log, that opened (no `reason`) or that is not open.
 
-
-def too_slow(number: int, link: Port) -> bytes:
-    """Return the frame for an open port that is too slow for the sent data."""
-    why = f"too slow, {link.overrun} bytes not sent so far"
-    state = int(MAG_PORT_STATE.OK)
-    return _frame("MAG_PORT", port=number, state=state, dropped=link.dropped, reason=why)
-
-
-def opened(name: int) -> bytes:
-    """Return the frame for a port that opened, for a replay, which has no `Port`."""
-    return _frame("MAG_PORT", port=int(name), state=int(MAG_PORT_STATE.OK))
-
-
-def log_state(reason: str, lost: int) -> bytes:
-    """Return the frame for the log's state: written (no `reason`) or not, and the lost records."""
-    state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
-    return _frame("MAG_PORT", port=int(MAG_PORT_NAME.LOG), state=int(state), dropped=lost, reason=reason)
+    `number`: its MAG_PORT_NAME. `dropped`: bytes, or records of the log, that were lost. `is_open`: the port
+    is open all the same.
+    """
+    well = not reason if is_open is None else is_open
+    state = MAG_PORT_STATE.OK if well else MAG_PORT_STATE.LOST
+    return _frame("MAG_PORT", port=int(number), state=int(state), dropped=dropped, reason=reason)
 
 
 INTERLEAVED = spec("MAG_INTERLEAVED").id
@@ -328,8 +311,6 @@ def declarations(
 ) -> list[bytes]:
     """Return the frames that declare source and correction of each column of the log.
 
-    `system`, `component`: the bridge's own.
-    `telemetry`: by parameter.
     `nt_per_count`: nT per count of the sensor, 0 for one without counts. A reader then takes the channels
         from the counts, because MAG_RAW's float32 fields are less precise than the values that were
         corrected.

@@ -99,7 +99,9 @@ class LiveEdge:
         if text := self._ports[Channel.LINK].notice():
             yield events.notice(text)
         if self._too_slow(now_us):
-            yield events.too_slow(Channel.LINK, self._ports[Channel.LINK])
+            link = self._ports[Channel.LINK]
+            reason = f"too slow, {link.overrun} bytes not sent so far"
+            yield events.port_state(Channel.LINK, reason, link.dropped, is_open=True)
 
     def send(self, number: int, data: bytes) -> None:
         """Send to a port; while the port is down, data are dropped and counted."""
@@ -184,7 +186,13 @@ class LiveEdge:
         return True
 
     def _lost(self, number: int, error: PortError) -> None:
-        self.notify(events.port(number, self._ports[number], error.reason))
+        self._report(number, error.reason)
+
+    def _report(self, number: int, reason: str) -> None:
+        """Report that a port is not open, or with no `reason` that it opened."""
+        port = self._ports[number]
+        # the name last, because the end of a long text is cut off
+        self.notify(events.port_state(number, f"{reason}: {port.name}" if reason else "", port.dropped))
 
     def _keep_open(self, number: int, port: Port, tried: threading.Event) -> None:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
@@ -199,7 +207,7 @@ class LiveEdge:
                 except PortError as error:
                     reason = error.reason
                 if not reason or reported != reason:
-                    self.notify(events.port(number, port, reason))
+                    self._report(number, reason)
                 reported = reason
             tried.set()
             time.sleep(PORT_RETRY_S)

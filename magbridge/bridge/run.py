@@ -32,7 +32,7 @@ from magbridge.errors import FormatError
 from magbridge.files import atomic_path
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import readable_by_all
-from magbridge.mavlink.enums import MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_PORT_NAME, MAV_SEVERITY
 from magbridge.records import Channel
 
 __all__ = ["Keeper", "leave_wrong_devices", "ports", "run"]
@@ -254,7 +254,7 @@ def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter 
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
-    edge.notify(events.log_state("", 0))
+    edge.notify(events.port_state(MAG_PORT_NAME.LOG))
     limits = config.log
     return TlogWriter(
         directory, max_size=limits.max_size, max_age=limits.max_age, header=pipeline.declarations
@@ -309,4 +309,4 @@ class Upkeep:
         state = log.failure, log.lost
         if state != self._reported:
             self._reported = state
-            self._edge.notify(events.log_state(*state))
+            self._edge.notify(events.port_state(MAG_PORT_NAME.LOG, *state))

@@ -57,7 +57,7 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
     driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
     answers = b"".join(fluxgate.feed(command) for command in driver.start())
     for port in (MAG_PORT_NAME.SENSOR, MAG_PORT_NAME.LINK):
-        yield Event(begin_us, Channel.STATE, events.opened(port))
+        yield Event(begin_us, Channel.STATE, events.port_state(port))
     if answers:
         yield Event(begin_us, Channel.SENSOR, answers)
     last_us = begin_us

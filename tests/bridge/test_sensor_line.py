@@ -41,7 +41,7 @@ class Bench:
                     self.texts.append(message["text"])
 
     def open(self, seconds: float) -> None:
-        self.feed(seconds, Channel.STATE, events.opened(MAG_PORT_NAME.SENSOR))
+        self.feed(seconds, Channel.STATE, events.port_state(MAG_PORT_NAME.SENSOR))
 
     def receive(self, seconds: float, data: bytes) -> None:
         self.feed(seconds, Channel.SENSOR, data)

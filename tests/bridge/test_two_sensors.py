@@ -107,7 +107,7 @@ class Bench:
         self.messages: list[Message] = []
         self._ear = Codec(0, 0)
         for sensor_id in (0, 1):
-            self.feed(0.0, Channel.STATE, events.opened(port_number(sensor_id)))
+            self.feed(0.0, Channel.STATE, events.port_state(port_number(sensor_id)))
 
     def feed(self, seconds: float, channel: Channel, data: bytes, sensor_id: int = 0) -> None:
         """Feed one event at a time after the start, s."""
