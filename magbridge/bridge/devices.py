@@ -24,8 +24,8 @@ import serial
 from magbridge.bridge.port import READ_BYTES, PacedPort, Port
 from magbridge.config import Sensor
 from magbridge.errors import ConfigError, PortError
-from magbridge.sensors import open_driver
-from magbridge.sensors.rm3100 import Bus, Rm3100
+from magbridge.sensors import Bus, open_driver
+from magbridge.sensors.rm3100 import Rm3100
 
 __all__ = ["BusPort", "SerialPort", "may_be_device", "sensor_port", "serial_line"]
 

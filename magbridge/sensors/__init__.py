@@ -19,7 +19,7 @@ from magbridge.records import Reading
 from magbridge.toml import convert
 from magbridge.wording import one_of
 
-__all__ = ["DRIVERS", "Driver", "driver_class", "is_scalar", "open_driver"]
+__all__ = ["DRIVERS", "Bus", "Driver", "driver_class", "is_scalar", "open_driver"]
 
 DRIVERS: dict[str, tuple[str, str]] = {
     "ascii": ("magbridge.sensors.ascii", "Ascii"),
@@ -85,6 +85,18 @@ class Driver(Protocol):
 
     def feed(self, data: bytes) -> list[Reading]:
         """Process received bytes; return the readings that they complete."""
+        ...
+
+
+class Bus(Protocol):
+    """Registers on a bus; each method raises OSError where the part does not answer."""
+
+    def read(self, register: int, count: int) -> bytes:
+        """Return `count` bytes from `register` on."""
+        ...
+
+    def write(self, register: int, data: bytes) -> None:
+        """Write bytes from `register` on."""
         ...
 
 

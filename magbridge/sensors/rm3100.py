@@ -10,39 +10,22 @@ from __future__ import annotations
 
 from math import log2
 from time import monotonic
-from typing import Annotated, ClassVar, Literal, Protocol
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta
 
 from magbridge.records import MAX_DEVICE_TIME_S, Reading
+from magbridge.sensors import Bus
 from magbridge.sensors.ascii import strip_checksum
 from magbridge.sensors.framing import FramedDriver, nmea_checksum, saturated
-
-__all__ = ["Bus", "Rm3100", "Rm3100Options", "nt_per_count"]
 
 POLL, CMM, CYCLE_COUNTS, TMRC, RESULTS, BIST, STATUS = 0x00, 0x01, 0x04, 0x0B, 0x24, 0x33, 0x34
 REVISION = 0x22
 ALL_AXES, CONTINUOUS, SELF_TEST = 0x70, 0x71, 0x8F
-FASTEST_TMRC, FASTEST_HZ = 0x92, 600.0
-SELF_TEST_S = 0.5
-"""s in which the self-test must complete."""
+FASTEST_TMRC, FASTEST_HZ, SELF_TEST_S, MAX_COUNT = 0x92, 600.0, 0.5, 0x7FFFFF
 CYCLES_PER_SECOND = 29_400
 """Cycles of all three axes a second: 147 Hz at a cycle count of 200."""
-MAX_COUNT = 0x7FFFFF
-PREFIX = b"$RM3100,"
-
-
-class Bus(Protocol):
-    """Registers on a bus; each method raises OSError where the part does not answer."""
-
-    def read(self, register: int, count: int) -> bytes:
-        """Return `count` bytes from `register` on."""
-        ...
-
-    def write(self, register: int, data: bytes) -> None:
-        """Write bytes from `register` on."""
-        ...
 
 
 class Rm3100Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,39 +65,24 @@ class Rm3100(FramedDriver):
         bus.write(CYCLE_COUNTS, self._options.cycle_count.to_bytes(2, "big") * 3)
         bus.write(TMRC, bytes([FASTEST_TMRC + self._step]))
         if self._options.self_test:
-            bus.write(BIST, bytes([SELF_TEST]))
-            bus.write(POLL, bytes([ALL_AXES]))
-            end = monotonic() + SELF_TEST_S
-            while not _is_ready(bus):
-                if monotonic() > end:
-                    raise OSError("self-test: no measurement completes")
-            passed = bus.read(BIST, 1)[0]
-            bus.write(BIST, b"\0")
-            if failed := [axis for bit, axis in enumerate("xyz", 4) if not passed >> bit & 1]:
-                raise OSError(f"self-test failed: {' '.join(failed)}")
-        self.start_measurement(bus, first=True)
-
-    def start_measurement(self, bus: Bus, *, first: bool = False) -> None:
-        """Start the next measurement; in continuous mode only the `first` needs a start."""
-        if self._options.mode == "single":
-            bus.write(POLL, bytes([ALL_AXES]))
-        elif first:
-            bus.write(CMM, bytes([CONTINUOUS]))
+            _test(bus)
+        is_single = self._options.mode == "single"
+        bus.write(*((POLL, bytes([ALL_AXES])) if is_single else (CMM, bytes([CONTINUOUS]))))
 
     def poll(self, bus: Bus, time: float) -> bytes:
         """Return the line of the reading that is ready at `time` (s, any steady clock); empty if none is."""
         if not _is_ready(bus):
             return b""
         line = encode_line(bus.read(RESULTS, 9), time)
-        self.start_measurement(bus)
+        if self._options.mode == "single":
+            bus.write(POLL, bytes([ALL_AXES]))
         return line
 
     def read_frame(self, frame: bytes) -> Reading:
         """Return the reading in a line; ValueError: it does not hold one."""
-        text = strip_checksum(frame, "nmea")
-        time_text, digits = text.removeprefix(PREFIX).split(b",")
+        prefix, time_text, digits = strip_checksum(frame, "nmea").split(b",")
         data, time = bytes.fromhex(digits.decode("ascii")), float(time_text)
-        if not text.startswith(PREFIX) or len(data) != 9 or not abs(time) < MAX_DEVICE_TIME_S:
+        if prefix != b"$RM3100" or len(data) != 9 or not abs(time) < MAX_DEVICE_TIME_S:
             raise ValueError
         x, y, z = (int.from_bytes(data[i : i + 3], "big", signed=True) for i in (0, 3, 6))
         field = (x * self.nt_per_count, y * self.nt_per_count, z * self.nt_per_count)
@@ -128,8 +96,22 @@ def nt_per_count(cycle_count: int) -> float:
 
 def encode_line(results: bytes, time: float) -> bytes:
     """Return the line of nine bytes of results, read at `time` (s)."""
-    text = b"%s%.6f,%s" % (PREFIX, time, results.hex().encode())
+    text = b"$RM3100,%.6f,%s" % (time, results.hex().encode())
     return b"%s*%02X\n" % (text, nmea_checksum(text))
+
+
+def _test(bus: Bus) -> None:
+    """Run the self-test of the three coils; OSError: it does not complete, or a coil fails."""
+    bus.write(BIST, bytes([SELF_TEST]))
+    bus.write(POLL, bytes([ALL_AXES]))
+    end = monotonic() + SELF_TEST_S
+    while not _is_ready(bus):
+        if monotonic() > end:
+            raise OSError("self-test: no measurement completes")
+    passed = bus.read(BIST, 1)[0]
+    bus.write(BIST, b"\0")
+    if failed := [axis for bit, axis in enumerate("xyz", 4) if not passed >> bit & 1]:
+        raise OSError(f"self-test failed: {' '.join(failed)}")
 
 
 def _is_ready(bus: Bus) -> bool:
