@@ -23,7 +23,7 @@ from magbridge.config import Align
 from magbridge.one_time import OneTime
 from magbridge.records import Quality, Reading, Vector
 
-__all__ = ["NEVER", "Aligner", "Input", "Sample", "Track", "nearest"]
+__all__ = ["NEVER", "Aligner", "Input", "Sample", "Track"]
 
 
 NEVER: Final = -(1 << 62)
@@ -140,8 +140,6 @@ SATURATED_FLAG: Final = int(Quality.SATURATED)
 OFFSET_SUSPECT: Final = int(Quality.OFFSET_SUSPECT)
 GAP: Final = int(Quality.GAP)
 LATE_JOIN: Final = int(Quality.LATE_JOIN)
-WHOLE: Final = 1.5 * 2.0**52
-"""Adding and then subtracting it rounds a number below 2^51."""
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
@@ -243,7 +241,7 @@ class Aligner:
             quality |= SATURATED_FLAG
             variance = inf
 
-        sample_us = time_us + nearest(first * 1e6) - nearest(settings.filter_delay * 1e6)
+        sample_us = time_us + round(first * 1e6) - round(settings.filter_delay * 1e6)
         undated = self.late_since_us != 0 and isnan(reading.device_time)
         values, spans, age, more, growth = self._parameters(sample_us, undated)
         variance += growth
@@ -307,8 +305,3 @@ class Aligner:
             return True
         self._period_us += (step - self._period_us) * (0.1 if self._period_us else 1.0)
         return False
-
-
-def nearest(value: float) -> int:
-    """Return the nearest integer, of two the even one: ``round`` without a call of Python."""
-    return int(value + WHOLE - WHOLE) if abs(value) < 0.25 * WHOLE else round(value)

@@ -113,7 +113,7 @@ class OneTime:
         after `time_us` when each was sampled.
         """
         x_late, y_late, z_late = delay
-        earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - two numbers need no call
+        earliest = min(x_late, y_late, z_late)
         x_late, y_late, z_late = x_late - earliest, y_late - earliest, z_late - earliest
         step = (time_us - self._us) * 1e-6
         out, slope, lever = field, (nan, nan, nan), (nan, nan, nan)

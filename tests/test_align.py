@@ -10,7 +10,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magbridge.align import Aligner, Input, Sample, nearest
+from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.fitting.observe import at_one_time
 from magbridge.config import Align
 from magbridge.one_time import OneTime, interpolate_to_rows
@@ -224,15 +224,6 @@ def test_a_saturated_sample_is_kept_with_infinite_sigma() -> None:
     assert flags(sample) == {"saturated"}
     assert sample.sigma == inf
     assert sample.field == (65000.0,) * 3
-
-
-@given(
-    st.one_of(
-        st.floats(allow_nan=False, allow_infinity=False), st.integers(-(10**6), 10**6).map(lambda n: n / 2)
-    )
-)
-def test_the_nearest_integer_is_what_round_gives(value: float) -> None:
-    assert nearest(value) == round(value)
 
 
 # ---- Channels sampled in turn: what a slope that is known late does to the field -------------------------

@@ -21,8 +21,8 @@ import numpy as np
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.run import FileServer
 from magbridge.calibration.model import Boresight, Parameter
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid

@@ -16,11 +16,9 @@ from typing import Any, Final, NamedTuple
 from msgspec.structs import replace
 
 from magbridge.bridge.devices import sensor_port
-from magbridge.bridge.events import Event, HostClock
-from magbridge.bridge.heading import nmea_port
+from magbridge.bridge.events import Event, HostClock, LiveEdge
 from magbridge.bridge.learning import first_calibration, open_learner
-from magbridge.bridge.links import LINKS, open_link
-from magbridge.bridge.live import LiveEdge
+from magbridge.bridge.links import LINKS, nmea_port, open_link
 from magbridge.bridge.pipeline import Pipeline, drive
 from magbridge.bridge.port import cut
 from magbridge.bridge.run import Keeper, leave_wrong_devices, ports

@@ -1,4 +1,4 @@
-"""Links by UDP, TCP (client and server) or a serial line; addresses are HOST:PORT or [IPV6]:PORT."""
+"""Links by UDP, TCP (client and server) or serial line, and NMEA outputs; HOST:PORT or [IPV6]:PORT."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import re
 import select
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from ipaddress import IPv6Address
@@ -15,11 +16,13 @@ from math import inf
 from operator import itemgetter
 from typing import Any, cast
 
+from magbridge.bridge import events
 from magbridge.bridge.devices import may_be_device, serial_line
 from magbridge.bridge.port import PEER_READ_BYTES, READ_BYTES, PacedPort, Peer, Peers, Port, cut
+from magbridge.config import Config
 from magbridge.errors import ConfigError, PortError
 
-__all__ = ["LINKS", "open_link"]
+__all__ = ["LINKS", "NmeaOutput", "nmea_port", "open_link"]
 
 ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
 UNSENT = 4096
@@ -413,3 +416,55 @@ def open_link(
     if kind in CLIENT_LINKS:
         return CLIENT_LINKS[kind](url, (host, port))
     return SHARED[kind](url, (host, port), Peers(autopilot, budget=budget, signed=signed), signed)
+
+
+NMEA_RETRY_US = 1_000_000
+"""µs between two attempts to open the port."""
+
+
+def nmea_port(config: Config) -> Port | None:
+    """Return the (unopened) port of ``[heading] nmea``, None without one.
+
+    ConfigError: it is neither ``udp:HOST:PORT`` nor a serial device.
+    """
+    name = config.heading.nmea
+    if name is None:
+        return None
+    url = f"udpout:{name.removeprefix('udp:')}" if name.startswith("udp:") else f"serial:{name}"
+    return open_link(url, config.heading.nmea_baudrate, str(config.path), "heading.nmea")
+
+
+class NmeaOutput:
+    """Sends sentences on a port, which it opens again when it is lost.
+
+    `notify`: receives a state frame when the port cannot be opened or is lost, once for each reason.
+    """
+
+    def __init__(self, port: Port, notify: Callable[[bytes], None]) -> None:
+        self._port, self._notify = port, notify
+        self._reported = ""
+        self._retry_us = 0
+
+    def send(self, sentences: deque[bytes], time_us: int) -> None:
+        """Send the sentences and empty the queue; those that come while the port is down are dropped."""
+        if not sentences:
+            return
+        data = b"".join(sentences)
+        sentences.clear()
+        try:
+            if not self._port.is_open:
+                if time_us < self._retry_us:
+                    return
+                self._retry_us = time_us + NMEA_RETRY_US
+                self._port.open()
+                self._reported = ""
+            self._port.write(data)
+            self._port.flush()
+        except PortError as error:
+            if error.reason != self._reported:
+                self._reported = error.reason
+                self._notify(events.notice(f"heading.nmea: {error.reason}"[:50]))
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()

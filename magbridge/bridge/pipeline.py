@@ -19,9 +19,8 @@ from magbridge.bridge.events import (
     declarations,
     port_number,
 )
-from magbridge.bridge.heading import LiveHeading
 from magbridge.bridge.learning import LearningService, first_calibration, open_learner
-from magbridge.bridge.position import Position
+from magbridge.bridge.position import LiveHeading, Position
 from magbridge.bridge.sensor import SensorStream, open_correction, open_drivers, other_calibrations
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration

@@ -8,7 +8,7 @@ from pathlib import Path
 from struct import Struct
 from typing import Final
 
-from magbridge.align import Sample, nearest
+from magbridge.align import Sample
 from magbridge.errors import ConfigError
 from magbridge.link.estimates import NO_ATTITUDE, Attitude, send_attitude
 from magbridge.link.output import Outbox, Rate, Timers, period_us
@@ -118,7 +118,7 @@ class Publisher:
         return RAW.struct.pack(
             max(sample.reading_us + self._codec.utc_offset_us, 0), (sequence or 0) & MASK,
             x, y, z, x_count, y_count, z_count,
-            nearest(x_late * 1e6), nearest(y_late * 1e6), nearest(z_late * 1e6),
+            round(x_late * 1e6), round(y_late * 1e6), round(z_late * 1e6),
             reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, self._sensor_id, flags,
         )  # fmt: skip
 

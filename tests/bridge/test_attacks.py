@@ -17,7 +17,7 @@ from rig import Rig
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.file_server import FileServer
+from magbridge.bridge.run import FileServer
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.position import Position
 from magbridge.calibration.model import Parameter

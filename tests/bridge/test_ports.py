@@ -21,9 +21,8 @@ from checks import soon
 from standstill import standstill
 
 from magbridge.bridge.devices import SerialPort
-from magbridge.bridge.events import HostClock
+from magbridge.bridge.events import HostClock, LiveEdge
 from magbridge.bridge.links import TcpServer, open_link
-from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.port import MAX_WAIT_S, MAX_WAITING_MESSAGES, Peers
 from magbridge.errors import ConfigError, PortError
 from magbridge.mavlink import Codec, Message, Signing
