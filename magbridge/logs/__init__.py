@@ -16,8 +16,24 @@ reads and writes all of them; :mod:`.mapping` is what a user can say about a log
 stream of several. :mod:`.tlog` is separate: it writes the bridge's log.
 """
 
-from magbridge.logs.access import Writer, read, read_chunks, read_each, write
-from magbridge.logs.mapping import Options
-from magbridge.logs.registry import FORMATS, suffixes
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magbridge.logs.access import Writer, read, read_chunks, read_each, write
+    from magbridge.logs.mapping import Options
+    from magbridge.logs.registry import FORMATS, suffixes
 
 __all__ = ["FORMATS", "Options", "Writer", "read", "read_chunks", "read_each", "suffixes", "write"]
+
+MODULES = {"FORMATS": "registry", "suffixes": "registry", "Options": "mapping"}
+"""The module of each name that is not in :mod:`.access`."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name when it is first used: a bridge, which only writes its log, starts sooner."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{MODULES.get(name, 'access')}"), name)
