@@ -325,7 +325,7 @@ class BusPort(Port):
         """Close the port; opening it configures a silent part again."""
         self.close()
 
-    def write(self, data: bytes) -> None:
+    def _send(self, data: bytes, address: Any) -> None:
         """Drop the bytes: the part accepts no commands from the pipeline."""
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from contextlib import suppress
 from ipaddress import IPv6Address
 from math import inf
 from operator import itemgetter
-from typing import Any, cast
+from typing import Any
 
 from magbridge.bridge import events
 from magbridge.bridge.devices import may_be_device, serial_line
@@ -90,12 +90,12 @@ class TcpConnection(PacedPort):
         self.since = time.monotonic()
         self._connection, self._fd = connection, connection.fileno()
 
-    def write(self, data: bytes) -> None:
-        """Send as :meth:`PacedPort.write` does; without a connection, `data` are dropped."""
+    def _send(self, data: bytes, address: Any) -> None:
+        """Send as other paced ports do; without a connection, `data` are dropped."""
         if self._connection is None:
             self.dropped += len(data)
         else:
-            super().write(data)
+            super()._send(data, address)
 
     def _room(self) -> bool:
         return self._connection is not None and bool(select.select([], [self._connection], [], 0)[1])
@@ -144,52 +144,44 @@ class TcpServer(Port):
         """Return the listener's descriptor and the clients'."""
         return super().fds() + list(self._clients)
 
-    def read(self) -> bytes:
+    def _receive(self) -> list[tuple[Any, bytes]]:
         """Accept clients that wait, then return the bytes of all; a client that leaves is not an error."""
         assert self._listener is not None
         with suppress(OSError):  # no client waits, or it has gone, or there are too many open files
             for _ in range(ACCEPTED):
                 self._accept(self._listener.accept()[0])
+        received = []
         for fd, client in list(self._clients.items()):
             try:
-                if data := client.read():
-                    self._peers.receive(fd, data)
+                received.append((fd, client.read()))
             except PortError:
                 self._dismiss(fd)
-        return self._peers.drain()
+        return [(fd, data) for fd, data in received if data]
 
     def write(self, data: bytes) -> None:
         """Send to the accepted clients; drop `data` without one."""
-        peers = self._chosen()
-        chosen = [fd for fd, peer in peers.items() if self._peers.affords(peer, len(data))]
-        for fd in chosen:
-            self._write_one(fd, data)
-        if not chosen:
+        first = next((fd for fd, _ in self._receivers()), None)
+        super().write(data)
+        if first is None:
             self.dropped += len(data)
-        elif (first := self._clients.get(chosen[0])) is not None:  # the others have no use for it
-            self.dropped, self.overrun = self.dropped + first.dropped, self.overrun + first.overrun
-            first.dropped = first.overrun = 0
+        elif (client := self._clients.get(first)) is not None:  # the losses of the others are of no use
+            self.dropped, self.overrun = self.dropped + client.dropped, self.overrun + client.overrun
+            client.dropped = client.overrun = 0
 
-    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
-        """Send only to the client from which a system and component was last heard."""
-        peer = self._peers.route(sender)
-        if peer is not None and peer.address in self._clients and self._peers.affords(peer, len(data)):
-            self._write_one(peer.address, data)
-
-    def _write_one(self, fd: int, data: bytes) -> None:
+    def _send(self, data: bytes, address: Any) -> None:
         """Send to one client; one that leaves is not an error."""
         try:
-            self._clients[fd].write(data)
+            if address in self._clients:
+                self._clients[address].write(data)
         except PortError:
-            self._dismiss(fd)
+            self._dismiss(address)
 
-    def _chosen(self) -> dict[int, Peer | None]:
-        """Return those to send to by their descriptors, in the order in which to send."""
-        valid = {cast(int, peer.address): peer for peer in self._peers.answered()}
-        chosen: dict[int, Peer | None] = {fd: peer for fd, peer in valid.items() if fd in self._clients}
-        if not self._signed:
-            chosen |= {fd: None for fd in self._clients if fd not in chosen}
-        return chosen
+    def _receivers(self) -> list[tuple[Any, Peer | None]]:
+        """Return the clients to send to by their descriptors, in the order in which to send."""
+        chosen = [(fd, peer) for fd, peer in super()._receivers() if fd in self._clients]
+        answered = {fd for fd, _ in chosen}
+        others = [] if self._signed else [(fd, None) for fd in self._clients if fd not in answered]
+        return [*chosen, *others]
 
     @property
     def waiting(self) -> bool:
@@ -281,18 +273,18 @@ class UdpPort(Port):
             raise
         return opened
 
-    def read(self) -> bytes:
+    def _receive(self) -> list[tuple[Any, bytes]]:
         """Return the datagrams that have come; an unreachable peer is nothing, not an error.
 
         All that are waiting are returned at once, as from a stream, so that samples that queued up while the
         bridge stood still meet the telemetry that queued up with them.
         """
         assert self._socket is not None
-        datagrams: list[bytes] = []
+        datagrams: list[tuple[Any, bytes]] = []
         size = 0
         while size < READ_BYTES and len(datagrams) < DATAGRAMS:
             try:
-                datagram, peer = self._socket.recvfrom(READ_BYTES)
+                datagram, address = self._socket.recvfrom(READ_BYTES)
             except BlockingIOError:
                 break
             except OSError as error:
@@ -300,32 +292,15 @@ class UdpPort(Port):
                     break  # first return the received bytes
                 raise self.lost(error.strerror) from error
             size += len(datagram)
-            datagrams.append(datagram)
-            if self._peers is not None:
-                self._peers.receive(peer, datagram)
+            datagrams.append((address, datagram))
         if datagrams:
             self._received = time.monotonic()
-        return b"".join(datagrams) if self._peers is None else self._peers.drain()
+        return datagrams
 
-    def write(self, data: bytes) -> None:
-        """Send to each peer, mostly one datagram; what cannot be sent is dropped and counted."""
-        if self._peers is None:
-            self._send(data, None)
-            return
-        for peer in self._peers.answered():
-            if self._peers.affords(peer, len(data)):
-                self._send(data, peer.address)
-
-    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
-        """Send only to the peer from which a system and component was last heard."""
-        if self._peers is None:
-            self._send(data, None)
-        elif (peer := self._peers.route(sender)) is not None and self._peers.affords(peer, len(data)):
-            self._send(data, peer.address)
-
-    def _send(self, data: bytes, peer: Any) -> None:
+    def _send(self, data: bytes, address: Any) -> None:
+        """Send mostly one datagram; what cannot be sent is dropped and counted."""
         for datagram in _datagrams(data):
-            self._send_one(datagram, peer)
+            self._send_one(datagram, address)
 
     def _send_one(self, data: bytes, peer: Any) -> None:
         assert self._socket is not None

@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator
 from math import inf
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from magbridge.errors import PortError
 from magbridge.link.publish import LIMITS
@@ -245,23 +245,49 @@ class Port(ABC):
 
         A serial line that is ready and yet has nothing is one that hung up, so do not ask when none is ready.
         """
+        received = self._receive()
+        if self._peers is None:
+            return b"".join(data for _, data in received)
+        for address, data in received:
+            self._peers.receive(address, data)
+        return self._peers.drain()
+
+    def _receive(self) -> list[tuple[Any, bytes]]:
+        """Return the pieces of bytes that have come, each with the address of its sender."""
         try:
             data = os.read(self._fd, self._read_bytes)
         except BlockingIOError:
-            return b""
+            return []
         except OSError as error:
             raise self.lost(error.strerror) from error
         if not data:
             raise self.lost(self._ended)
-        return data
+        return [(None, data)]
 
-    @abstractmethod
     def write(self, data: bytes) -> None:
         """Send each message in `data` whole or drop it; raises :class:`PortError` when the port is gone."""
+        if self._peers is None:
+            self._send(data, None)
+            return
+        for address, peer in self._receivers():
+            if self._peers.affords(peer, len(data)):
+                self._send(data, address)
 
-    def write_to(self, sender: tuple[int, int], data: bytes) -> None:  # noqa: ARG002 - most ports have one peer
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
         """Send as :meth:`write` does, only to the peer from which a system and component was last heard."""
-        self.write(data)
+        if self._peers is None:
+            self._send(data, None)
+        elif (peer := self._peers.route(sender)) is not None and self._peers.affords(peer, len(data)):
+            self._send(data, peer.address)
+
+    def _receivers(self) -> list[tuple[Any, Peer | None]]:
+        """Return addresses and peers of those to send to, in the order in which to send."""
+        assert self._peers is not None
+        return [(peer.address, peer) for peer in self._peers.answered()]
+
+    @abstractmethod
+    def _send(self, data: bytes, address: Any) -> None:
+        """Send to an address, or to the only peer."""
 
     @property
     def waiting(self) -> bool:
@@ -320,7 +346,7 @@ class PacedPort(Port):
         self._waiting: deque[_Waiting] = deque()
         self._begun = bytearray()
 
-    def write(self, data: bytes) -> None:
+    def _send(self, data: bytes, address: Any) -> None:  # noqa: ARG002 - a line has one peer
         """Send messages, each whole or not at all; the others wait until the line takes them."""
         free = not self.waiting and len(data) <= self._piece
         if free and self._room():  # as on most lines at most times: nothing need be cut into messages

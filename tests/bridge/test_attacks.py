@@ -17,9 +17,9 @@ from rig import Rig
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.run import FileServer
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.position import Position
+from magbridge.bridge.run import FileServer
 from magbridge.calibration.model import Parameter
 from magbridge.correction import Correction
 from magbridge.mavlink import Codec, Message
