@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import FloatArray, IndexArray
+from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
 from magbridge.logs.checks import boots
@@ -68,8 +68,15 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
 
 
 def _run(fields: Fields, records: dict[str, Records]) -> BootRun:
-    parameters = _parameters(records.get("PARM"))
-    chosen = _estimators(records.get("XKFS"))
+    parameters: dict[str, float] = {}
+    parm = records.get("PARM")
+    if parm is not None and "Name" in parm.texts and "Value" in parm.fields:
+        pairs = zip(parm.texts["Name"], parm.fields["Value"].tolist(), strict=True)
+        parameters = dict(reversed(list(pairs)))  # as they were at the boot
+    chosen = None
+    if (estimator := records.get("XKFS")) is not None and len(estimator.fields.get("MI", ())):
+        numbers, counts = np.unique(estimator.fields["MI"], return_counts=True)
+        chosen = int(numbers[counts.argmax()])  # the compass that the estimator used most
     mags = [
         _magnetometer(number, records_of, parameters, chosen)
         for number, records_of in _instances(records, "MAG").items()
@@ -105,32 +112,13 @@ def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:
     starts[0] = 0
     ends = [*starts[1:].tolist(), np.iinfo(np.intp).max]
     for first, last in zip(starts.tolist(), ends, strict=True):
-        yield {name: _part(one, np.searchsorted(one.at, [first, last])) for name, one in records.items()}
-
-
-def _part(records: Records, bounds: IndexArray) -> Records:
-    part = slice(*bounds.tolist())
-    return Records(
-        records.at[part],
-        {name: values[part] for name, values in records.fields.items()},
-        {name: values[part] for name, values in records.texts.items()},
-    )
-
-
-def _parameters(records: Records | None) -> dict[str, float]:
-    """Return the vehicle's parameters as they were at the boot."""
-    if records is None or "Name" not in records.texts or "Value" not in records.fields:
-        return {}
-    pairs = zip(records.texts["Name"], records.fields["Value"].tolist(), strict=True)
-    return dict(reversed(list(pairs)))
-
-
-def _estimators(records: Records | None) -> int | None:
-    """Return the number of the compass that the estimator used most."""
-    if records is None or "MI" not in records.fields or not len(records.at):
-        return None
-    numbers, counts = np.unique(records.fields["MI"], return_counts=True)
-    return int(numbers[counts.argmax()])
+        found = {}
+        for name, one in records.items():
+            part = slice(*np.searchsorted(one.at, [first, last]).tolist())
+            fields = {field: values[part] for field, values in one.fields.items()}
+            texts = {field: values[part] for field, values in one.texts.items()}
+            found[name] = Records(one.at[part], fields, texts)
+        yield found
 
 
 def _magnetometer(
@@ -142,8 +130,11 @@ def _magnetometer(
     none = np.zeros(len(records.at))
     # the motors' share is MOX, up to ArduPilot 4.0 MOfsX
     field -= np.stack([fields.get(f"MO{axis}", fields.get(f"MOfs{axis}", none)) for axis in "XYZ"])
-    if (matrix := _soft_iron(parameters, _numbered(number))) is not None:
-        field = np.asarray(np.linalg.solve(matrix, field), dtype=np.float64)
+    diagonal, off = ([parameters.get(f"COMPASS_{kind}{_numbered(number)}_{axis}", 0.0) for axis in "XYZ"]
+                     for kind in ("DIA", "ODI"))  # fmt: skip
+    soft_iron = symmetric(diagonal, off)
+    if all(diagonal) and abs(np.linalg.det(soft_iron)) > 1e-3:
+        field = np.asarray(np.linalg.solve(soft_iron, field), dtype=np.float64)
     field -= np.stack([fields.get(f"Ofs{axis}", none) for axis in "XYZ"])
     names = (ID_PARAMETERS[0].format(number + 1), ID_PARAMETERS[1].format(_numbered(number)))
     device = next((parameters[name] for name in names if parameters.get(name)), 0.0)
@@ -180,14 +171,6 @@ def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetome
 def _numbered(number: int) -> str:
     """Return the number of a compass in the names of parameters: none for the first, 2 for the second."""
     return str(number + 1) if number else ""
-
-
-def _soft_iron(parameters: Mapping[str, float], number: str) -> FloatArray | None:
-    """Return the matrix of ``COMPASS_DIA`` and ``COMPASS_ODI``; None where it is not used."""
-    diagonal, off = ([parameters.get(f"COMPASS_{kind}{number}_{axis}", 0.0) for axis in "XYZ"]
-                     for kind in ("DIA", "ODI"))  # fmt: skip
-    matrix = symmetric(diagonal, off)
-    return matrix if all(diagonal) and abs(np.linalg.det(matrix)) > 1e-3 else None
 
 
 def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:

@@ -363,7 +363,7 @@ class Validity(NamedTuple):
 
 
 def states_validity(name: str) -> bool:
-    """Return True if a column of this name is about the validity of others."""
+    """Return True if a column of this name states the validity of other columns."""
     word = bare(name)
     named = any(pattern.fullmatch(word) for pattern in (VALID, MAG_VALID, FLAG))
     return named or bool(QUALITY_OF.fullmatch(name))
@@ -423,7 +423,7 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
     """Return the undeclared missing-value codes among columns (n,) as masks.
 
     A code is huge, or one of :data:`CODES` beyond all other values by half their range. A field with 0 or
-    the same code on its three axes is missing; so is a position at 0, 0, as a receiver without a fix writes.
+    the same code on its three axes is missing, and a position at 0, 0, as a receiver without a fix writes.
     """
     found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
     for together in (CHANNELS, ("latitude", "longitude")):
@@ -456,7 +456,7 @@ def mark_invalid(
 ) -> BoolArray:
     """Set missing-value `codes` and what the rules mark to NaN, in place; return the rows (n,) to keep.
 
-    `note` takes a column ("" for whole rows), its wrong values (n,) and what was expected.
+    `note` takes a column ("" for whole rows), its wrong values (n,) and the expectation.
     """
     for name, wrong in (unknown(columns) if codes else {}).items():
         note(name, wrong, f"{EXPECTED_VALUE}{float(columns[name][wrong][0])!r}")
@@ -472,7 +472,7 @@ def mark_invalid(
 
 
 def known(path: Path, dataset: xr.Dataset, numbers: Sequence[int]) -> tuple[xr.Dataset, Sequence[int]]:
-    """Return a deployment of another program and the numbers of its rows, without what is not valid."""
+    """Return a deployment of another program and the numbers of its rows, without invalid values."""
     columns = {str(name): column.to_numpy().copy() for name, column in dataset.data_vars.items()}
     lines: list[str] = []
     dropped = {"values_dropped": 0, "rows_dropped": 0}

@@ -257,17 +257,10 @@ def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
     for name, rows in lines.items():
         letters, columns = described[name]
         kept |= {(name, one): letter for one, letter in zip(columns, letters, strict=False)}
-        records[name] = _records(at[name], rows, letters, columns, wanted[name])
+        records[name] = Records(np.array(at[name], dtype=np.intp), {}, {})
+        for column, letter, values in zip(columns, letters, zip(*rows, strict=True), strict=False):
+            if column in wanted[name] and letter in TEXT_TYPES:
+                records[name].texts[column] = list(values)
+            elif column in wanted[name]:
+                records[name].fields[column] = np.array([number_of(value) for value in values])
     return Flash(records, kept, skipped)
-
-
-def _records(
-    rows_at: list[int], rows: list[list[str]], letters: str, columns: tuple[str, ...], wanted: Collection[str]
-) -> Records:
-    fields, texts = {}, {}
-    for name, letter, values in zip(columns, letters, zip(*rows, strict=True), strict=False):
-        if name in wanted and letter in TEXT_TYPES:
-            texts[name] = list(values)
-        elif name in wanted:
-            fields[name] = np.array([number_of(value) for value in values])
-    return Records(np.array(rows_at, dtype=np.intp), fields, texts)

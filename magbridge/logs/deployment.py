@@ -179,7 +179,7 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
 
 
 def with_guesses(path: Path, attrs: Mapping[str, Any], guesses: Sequence[str]) -> dict[str, Any]:
-    """Return attributes with what was taken for granted when a file was read, also as a line of history."""
+    """Return attributes with the assumptions under which a file was read, also as a line of history."""
     if not guesses:
         return dict(attrs)
     note = "; ".join(guesses)

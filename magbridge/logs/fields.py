@@ -119,8 +119,8 @@ def linear(
 ) -> FloatArray:
     """Return the values (m,) of a column at `time` (m,), s, interpolated linearly to `target` (n,), s.
 
-    A column in :data:`CIRCLES` goes along the shorter arc. NaN is a missing value. The result is NaN between
-    neighbours more than `max_gap`, s, apart and farther than that beyond an end; nearer, the end is held.
+    A column in :data:`CIRCLES` goes along the shorter arc. NaN is a missing value. The result is NaN in
+    intervals longer than `max_gap`, s, and farther than that beyond an end; nearer, the end is held.
     """
     known = np.isfinite(values) & np.isfinite(time)
     time, values = time[known], values[known]

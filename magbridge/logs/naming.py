@@ -170,7 +170,8 @@ def _with_time(layout: Layout, rows: Rows) -> Layout:
 def _with_date(layout: Layout, date: int, place: int, rows: Rows) -> Layout:
     """Return the layout in which a date belongs to the time, if the time is a time of day."""
     cells = [row[place] for row in rows if len(row) > place]
-    counted = SECONDS_HEADING.search(layout.headings[place]) and all(map(_in_a_day, cells))
+    numbers = pd.to_numeric(pd.Series([cell.replace(",", ".") or "0" for cell in cells]), errors="coerce")
+    counted = SECONDS_HEADING.search(layout.headings[place]) and numbers.between(0.0, DAY, "left").all()
     unit = layout.units.get("time", "")
     undated = "%" in unit and not {"%d", "%j"} & {*re.findall("%.", unit)}
     by_hour = not unit and not counted and _by_hour(cells)
@@ -220,13 +221,6 @@ def _with_calendar(layout: Layout, rows: Rows) -> Layout:
     return layout
 
 
-def _in_a_day(cell: str) -> bool:
-    try:
-        return 0.0 <= float(cell.replace(",", ".") or 0) < DAY
-    except ValueError:
-        return False
-
-
 def _without_texts(layout: Layout, rows: Rows) -> Layout:
     """Return the layout without columns of text; N and S, E and W are the signs of a position."""
     names, units, hemispheres = list(layout.names), dict(layout.units), dict(layout.hemispheres)
@@ -265,7 +259,7 @@ def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
     return np.asarray(np.where(side.isin([*HEMISPHERES[name]]), signed, np.nan))
 
 
-READING_RANGE_NT = 15_000.0, 90_000.0
+READING_RANGE_NT = LOWEST_NT, HIGHEST_NT = 15_000.0, 90_000.0
 """Range of the Earth's field with a vehicle's own, nT."""
 TOTAL_NAME = re.compile(
     "f|nt|mag|tm[fi]|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?(field|intensity)|magneticfield"
@@ -305,7 +299,10 @@ def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
         return layout
     stated = {layout.units.get(name, "") for name in CHANNELS}
     if stated == {""}:
-        unit = _unit_by_length(layout, rows)
+        length = _length(layout, rows, [layout.names.index(name) for name in CHANNELS])
+        units = {unit: length * factor for unit, factor in NT_PER_UNIT.items()}
+        fitting = [unit for unit, nanotesla in units.items() if LOWEST_NT < nanotesla < HIGHEST_NT]
+        unit = "" if "nT" in fitting else next(iter(fitting), "")
         guess = f"mag_x, mag_y, mag_z in {unit}, by the field's length"
     elif len(stated) == 2 and "" in stated:
         unit = max(stated)
@@ -316,17 +313,6 @@ def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
         return layout
     further = [name for name in layout.names if FURTHER_AXIS.fullmatch(name) and name not in layout.units]
     return layout.with_units(dict.fromkeys([*CHANNELS, *further], unit)).guessing(guess)
-
-
-def _unit_by_length(layout: Layout, rows: Rows) -> str:
-    """Return the unit in which the field has the length of the Earth's; "" for nT, or where there is none."""
-    length = _length(layout, rows, [layout.names.index(name) for name in CHANNELS])
-    if READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
-        return ""
-    factors = ((unit, factor) for unit, factor in NT_PER_UNIT.items() if unit != "nT")
-    return next(
-        (unit for unit, factor in factors if READING_RANGE_NT[0] < length * factor < READING_RANGE_NT[1]), ""
-    )
 
 
 def with_total(layout: Layout, rows: Rows) -> Layout:
@@ -342,7 +328,7 @@ def with_total(layout: Layout, rows: Rows) -> Layout:
     (k,) = fields
     unit = layout.units.get(layout.names[k], "nT")
     length = _length(layout, rows, fields) * NT_PER_UNIT.get(usual(unit), 0.0)
-    if not READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
+    if not LOWEST_NT < length < HIGHEST_NT:
         return layout
     units = {name: unit for name, unit in layout.units.items() if name != layout.names[k]}
     names = (*layout.names[:k], "total_field", *layout.names[k + 1 :])

@@ -86,8 +86,14 @@ def complete(path: Path, metadata: OgMetadata) -> None:
             if name not in file.variables:
                 raise FormatError(path, "expected this column: OG1.0 demands it", column=name.lower())
         known = {name: floats(file[name]) for name in OG1_POSITIONS}
-        _deployed(file, known)
-        start = datetime.fromtimestamp(float(file["DEPLOYMENT_TIME"][...]), UTC).strftime(TIME_FORMAT)
+        # the mission begins at the first row with a known position
+        first = int(np.argmax(np.isfinite(known["LATITUDE"]) & np.isfinite(known["LONGITUDE"])))
+        when = {"standard_name": "time", "calendar": "gregorian", "units": EPOCH}
+        _scalar(file, "DEPLOYMENT_TIME", "f8", known["TIME"][first], long_name="date of deployment", **when)
+        for name, unit in (("latitude", "degrees_north"), ("longitude", "degrees_east")):
+            place = {"long_name": f"{name} of deployment", "standard_name": name, "units": unit}
+            _scalar(file, f"DEPLOYMENT_{name.upper()}", "f8", known[name.upper()][first], **place)
+        start = datetime.fromtimestamp(float(known["TIME"][first]), UTC).strftime(TIME_FORMAT)
         trajectory = f"{metadata.platform['PLATFORM_SERIAL_NUMBER']}_{start}"
         file["TRAJECTORY"][...] = trajectory
         file.setncatts(
@@ -112,17 +118,6 @@ def _scalar(file: Any, name: str, kind: Any, value: object, **attributes: object
     variable = file.createVariable(name, kind)
     variable.setncatts(attributes)
     variable[...] = value
-
-
-def _deployed(file: Any, known: dict[str, Any]) -> None:
-    """Set start time and position of the mission from the first row with a known position."""
-    placed = np.isfinite(known["LATITUDE"]) & np.isfinite(known["LONGITUDE"])
-    first = int(np.argmax(placed))
-    when = {"standard_name": "time", "calendar": "gregorian", "units": EPOCH}
-    _scalar(file, "DEPLOYMENT_TIME", "f8", known["TIME"][first], long_name="date of deployment", **when)
-    for name, unit in (("latitude", "degrees_north"), ("longitude", "degrees_east")):
-        place = {"long_name": f"{name} of deployment", "standard_name": name, "units": unit}
-        _scalar(file, f"DEPLOYMENT_{name.upper()}", "f8", known[name.upper()][first], **place)
 
 
 def _fixes(file: Any, known: dict[str, Any]) -> None:

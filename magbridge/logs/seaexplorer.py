@@ -52,17 +52,12 @@ NAV_ONLY = {
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the file in pieces; it is held whole."""
     whole = _read(path)
-    if navigation := _navigation_of(path):
-        whole = _with_navigation(whole, _read(navigation), navigation)
+    if named := PAYLOAD.fullmatch(path.name):
+        dive = re.compile(rf"{re.escape(named['mission'])}\.gli\.\w+\.{named['dive']}(\.gz)?")
+        navigation = min((file for file in path.parent.iterdir() if dive.fullmatch(file.name)), default=None)
+        if navigation:
+            whole = _with_navigation(whole, _read(navigation), navigation)
     yield from sliced(whole, rows)
-
-
-def _navigation_of(path: Path) -> Path | None:
-    """Return the navigation file of the dive whose payload a file holds; None without one in its folder."""
-    if (named := PAYLOAD.fullmatch(path.name)) is None:
-        return None
-    dive = re.compile(rf"{re.escape(named['mission'])}\.gli\.\w+\.{named['dive']}(\.gz)?")
-    return min((file for file in path.parent.iterdir() if dive.fullmatch(file.name)), default=None)
 
 
 def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) -> xr.Dataset:

@@ -183,17 +183,13 @@ def _check_header(path: Path) -> list[Path]:
     crc = tags.get(b"sensor_list_crc", b"").decode("ascii", "replace").lower()
     lists = [cache for cache in _caches(path) if cache.stem.lower() == crc][:1]
     for cache in lists:
-        _check_cache(cache)
+        for row, line in enumerate(cache.read_bytes().splitlines(), 1):
+            if not SENSOR_LINE.fullmatch(line) and line.strip():
+                what = line[:40].decode("ascii", "backslashreplace")
+                raise FormatError(cache, f"expected a sensor, not {what!r}: damaged", row=row)
     return lists
 
 
 def _caches(path: Path) -> Iterator[Path]:
     for folder in CACHES:
         yield from (path.parent / folder).glob("*.[cC][aA][cC]")
-
-
-def _check_cache(cache: Path) -> None:
-    for row, line in enumerate(cache.read_bytes().splitlines(), 1):
-        if not SENSOR_LINE.fullmatch(line) and line.strip():
-            what = line[:40].decode("ascii", "backslashreplace")
-            raise FormatError(cache, f"expected a sensor, not {what!r}: damaged", row=row)

@@ -103,7 +103,20 @@ class TableReader:
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
         """Return the times (n,), the values (n,) of each column, and the numbers of the rows' lines."""
         self.faults.rows += len(lines)
-        lines, kept = self._complete_lines(lines, numbers)
+        open_quotes = [line.count('"') % 2 == 1 for line in lines]
+        lines, numbers = self._dropping(open_quotes, lines, numbers, UNCLOSED_QUOTE)
+        # a line that does not have as many fields as there are headings is dropped
+        separator, width = self._layout.separator, len(self._layout.headings)
+        counts = [
+            len(cells(line, separator)) if separator == BLANKS or '"' in line else line.count(separator) + 1
+            for line in lines
+        ]
+        if self._layout.open_ended:
+            lines = [separator.join(line.split(separator, width)[:width]) + "\n" for line in lines]
+            counts = [min(count, width) for count in counts]
+        wrong = [count != width for count in counts]
+        other = next((count for count in counts if count != width), width)
+        lines, kept = self._dropping(wrong, lines, numbers, f"expected {width} fields, not {other}")
         return self.read(self._frame(lines, kept), kept)
 
     def read(
@@ -138,22 +151,6 @@ class TableReader:
             return times, columns, kept
         kept = [number for number, is_valid in zip(kept, keep.tolist(), strict=True) if is_valid]
         return times[keep], {name: values[keep] for name, values in columns.items()}, kept
-
-    def _complete_lines(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
-        """Return the lines that have as many fields as there are headings, and their numbers."""
-        open_quotes = [line.count('"') % 2 == 1 for line in lines]
-        lines, numbers = self._dropping(open_quotes, lines, numbers, UNCLOSED_QUOTE)
-        separator, width = self._layout.separator, len(self._layout.headings)
-        counts = [
-            len(cells(line, separator)) if separator == BLANKS or '"' in line else line.count(separator) + 1
-            for line in lines
-        ]
-        if self._layout.open_ended:
-            lines = [separator.join(line.split(separator, width)[:width]) + "\n" for line in lines]
-            counts = [min(count, width) for count in counts]
-        wrong = [count != width for count in counts]
-        other = next((count for count in counts if count != width), width)
-        return self._dropping(wrong, lines, numbers, f"expected {width} fields, not {other}")
 
     def _dropping(
         self, wrong: list[bool], lines: list[str], numbers: Sequence[int], text: str
@@ -215,7 +212,12 @@ class TableReader:
             column = column.str.replace(",", ".")
         times = seconds(self._clock, column, self._declared.zone)
         if self._clock.is_text and self._clock.boot:
-            times = self._unwound(times)
+            known = np.isfinite(times)  # times of day go on after midnight
+            steps = np.diff(times[known], prepend=self._last)
+            days = self._midnights + DAY * np.cumsum(steps < -DAY / 2)
+            if known.any():
+                self._midnights, self._last = float(days[-1]), float(times[known][-1])
+                times[known] += days
         elif self._is_from_boot and len(times):
             self._counter, boots = self._counter.go_on(times, self._clock.kind)
             if boots:
@@ -229,16 +231,6 @@ class TableReader:
             text = str(column.iloc[int(wrong.argmax())]).strip()
             self._note("time", wrong, numbers, f"expected {self._clock.expected}, not {text!r}")
         return times, wrong
-
-    def _unwound(self, times: FloatArray) -> FloatArray:
-        """Return times of day (n,) unwrapped at midnight."""
-        known = np.isfinite(times)
-        steps = np.diff(times[known], prepend=self._last)
-        days = self._midnights + DAY * np.cumsum(steps < -DAY / 2)
-        if known.any():
-            self._midnights, self._last = float(days[-1]), float(times[known][-1])
-            times[known] += days
-        return times
 
     def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
         if name == "quality" and not pd.api.types.is_numeric_dtype(column):

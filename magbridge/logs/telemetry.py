@@ -58,7 +58,7 @@ SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": [
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
-NAMED = spec("NAMED_VALUE_FLOAT").id
+NAMED_VALUE_FLOAT = spec("NAMED_VALUE_FLOAT").id
 RAW_COLUMNS = {one.column: one.unit for one in SOURCES["MAG_RAW"]}
 COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
 """Message to the number of the compass whose field it holds; of several for one, the first is read."""
@@ -114,7 +114,7 @@ class DeclaredField(MessageField):
     @property
     def is_named_value(self) -> bool:
         """Return True if the column is a ``NAMED_VALUE_FLOAT`` of one name."""
-        return self.message == NAMED and self.match.keys() == {"name"}
+        return self.message == NAMED_VALUE_FLOAT and self.match.keys() == {"name"}
 
     def matches(self, payloads: Payloads) -> BoolArray:
         """Return which of the payloads (n, size) hold the column, (n,)."""
@@ -143,9 +143,9 @@ DELAY_FIELDS = [
     for axis, name in zip("xyz", CHANNEL_TIMES, strict=True)
 ]
 NAMED_FIELD = MessageField(FieldMap("NAMED_VALUE_FLOAT", "value", "value", "1"))
-NAME_LETTERS = spec(NAMED).fields["name"]
+NAME_LETTERS = spec(NAMED_VALUE_FLOAT).fields["name"]
 RAW_FLAGS = MessageField(FieldMap("MAG_RAW", "flags", "flags", ""))
-WANTED = [*TELEMETRY, *SOURCE_FIELDS, NAMED, COLUMN, STEP, START, BYTES, SET, VALUE]
+READ_MESSAGES = [*TELEMETRY, *SOURCE_FIELDS, NAMED_VALUE_FLOAT, COLUMN, STEP, START, BYTES, SET, VALUE]
 """Ids of the messages that are read, with those in which a log declares a column: at its start."""
 
 
@@ -166,8 +166,8 @@ def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
     return columns
 
 
-class Messages(NamedTuple):
-    """Messages of one kind in the order of the log; the arrays are (n,)."""
+class LogMessages(NamedTuple):
+    """LogMessages of one kind in the order of the log; the arrays are (n,)."""
 
     number: int
     at: IndexArray
@@ -180,10 +180,10 @@ class Messages(NamedTuple):
     component: IndexArray
     payloads: Payloads
 
-    def where(self, keep: BoolArray) -> Messages:
+    def chosen(self, keep: BoolArray) -> LogMessages:
         """Return the messages of a mask (n,)."""
         arrays: list[Any] = [array[keep] for array in self[1:]]
-        return Messages(self.number, *arrays)
+        return LogMessages(self.number, *arrays)
 
     @property
     def is_of_main_sensor(self) -> BoolArray:
@@ -203,10 +203,10 @@ class Messages(NamedTuple):
         return [{name: one.get(row.tobytes()) for name, one in fields.items()} for row in self.payloads]
 
 
-Kinds = dict[int, Messages]
-"""Messages by their id."""
-Update = tuple[Messages, FloatArray]
-"""Messages (n), and the values (n,) of a column in them."""
+Kinds = dict[int, LogMessages]
+"""LogMessages by their id."""
+Update = tuple[LogMessages, FloatArray]
+"""LogMessages (n), and the values (n,) of a column in them."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
@@ -219,7 +219,8 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     if compasses:
         found = choose(path, compasses, wanted)
         log.source = next(one for one in found if one.chosen).id
-        found = log.with_rates(found)
+        span_s = log.span_s()
+        found = [replace(one, rate=(one.samples - 1) / span_s if span_s > 0 else 0.0) for one in found]
         attrs |= listed(found)
         notes = [*notes, *compass_notes(found, wanted)]
     if notes:
@@ -229,10 +230,10 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
 
 
 def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
-    """Return the messages of a log that are read, and what was skipped."""
-    parts: dict[int, list[Messages]] = {}
+    """Return the messages of a log that are read, and the counts of its losses."""
+    parts: dict[int, list[LogMessages]] = {}
     lost = {"bytes_skipped": 0, "damages": 0}
-    wanted, before = {*WANTED}, 0
+    wanted, before = {*READ_MESSAGES}, 0
     with path.open("rb") as file:
         for block in blocks(file):
             lost["bytes_skipped"] += block.bytes_skipped
@@ -243,7 +244,7 @@ def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
             for number in np.intersect1d(block.number, [*wanted]).tolist():
                 at = np.flatnonzero(block.number == number)
                 sender = block.system[at], block.component[at]
-                part = Messages(
+                part = LogMessages(
                     number, before + at, block.time_us[at], block.channel[at], *sender, block.payloads(at)
                 )
                 parts.setdefault(number, []).append(part)
@@ -251,23 +252,23 @@ def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
     return {number: _joined(found) for number, found in parts.items()}, lost
 
 
-def _of(kinds: Kinds, number: int) -> Messages:
+def _messages_of(kinds: Kinds, number: int) -> LogMessages:
     """Return the messages of one id, which may be none."""
     nothing = np.empty(0, np.int64)
     arrays: list[Any] = [*[nothing] * 5, np.empty((0, spec(number).size), np.uint8)]
-    return kinds.get(number, Messages(number, *arrays))
+    return kinds.get(number, LogMessages(number, *arrays))
 
 
-def _joined(parts: Sequence[Messages]) -> Messages:
+def _joined(parts: Sequence[LogMessages]) -> LogMessages:
     arrays = zip(*(part[1:] for part in parts), strict=True)
-    return Messages(parts[0].number, *map(np.concatenate, arrays))
+    return LogMessages(parts[0].number, *map(np.concatenate, arrays))
 
 
 class TelemetryLog:
     """The messages of a log, and the source of each column.
 
-    `source` is the message that makes the rows, `ours` a bridge's own log, `attrs` what the log declares,
-    `lost` what was skipped.
+    `source` is the message that makes the rows, `ours` a bridge's own log, `attrs` its declared attributes,
+    `lost` its losses.
     """
 
     def __init__(self, path: Path) -> None:
@@ -278,28 +279,28 @@ class TelemetryLog:
         if self.ours:  # the bridge's own messages are not telemetry
             self._count_settings(kinds)
             kinds = {
-                number: one if number in (RAW, FIELD) else one.where(one.channel != Channel.SENT)
+                number: one if number in (RAW, FIELD) else one.chosen(one.channel != Channel.SENT)
                 for number, one in kinds.items()
             }
-        declared = self._declarations(_of(kinds, COLUMN))
-        steps = _of(kinds, STEP)
+        declared = self._declarations(_messages_of(kinds, COLUMN))
+        steps = _messages_of(kinds, STEP)
         self._steps_at = steps.at
         self._steps_us = np.cumsum([0, *(one["step"] for one in steps.decoded())])
         self.source, (system, self._component) = self._source_of(path, kinds)
-        self._kinds = {number: one.where(one.system == system) for number, one in kinds.items()}
+        self._kinds = {number: one.chosen(one.system == system) for number, one in kinds.items()}
         is_of_bridge = self.source in ("MAG_RAW", "MAG_FIELD")
         self.is_plain = not (is_of_bridge or self.ours or declared or self._steps_us[-1])
         self._updates: dict[str, list[Update]] = {}
         self._units = self._telemetry({one.column for one in declared})
         self._units |= self._columns_of_bridge()
-        self._declared = [one for one in declared if not one.is_named_value]
-        self._add_declared(declared)
-        self._add_named([one for one in declared if one.is_named_value])
+        self._declared = declared
+        self._add_declared()
+        self._add_named({one.match["name"] for one in declared if one.is_named_value})
 
     def _source_of(self, path: Path, kinds: Kinds) -> tuple[str, tuple[int, int]]:
         """Return the message that makes the rows, and its most frequent sender."""
         for source in SOURCES:
-            senders = _of(kinds, spec(source).id).senders()
+            senders = _messages_of(kinds, spec(source).id).senders()
             # the autopilot's compass does not replace the instrument
             if senders and not (self.ours and "IMU" in source):
                 return source, max(senders, key=senders.__getitem__)
@@ -309,7 +310,7 @@ class TelemetryLog:
         """Count how often a station has set what the alignment computes with; the bridge confirms it."""
         asked: dict[str, float] = {}
         stated = []
-        for one in (_of(kinds, SET), _of(kinds, VALUE)):
+        for one in (_messages_of(kinds, SET), _messages_of(kinds, VALUE)):
             for at, channel, fields in zip(one.at, one.channel, one.decoded(), strict=True):
                 stated.append((at, one.number, channel, fields["param_id"], fields["param_value"]))
         for _, number, channel, name, value in sorted(stated):
@@ -320,7 +321,7 @@ class TelemetryLog:
                 aligns = name.startswith("MB_") and not name.startswith("MB_R_")
                 self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
-    def _declarations(self, messages: Messages) -> list[DeclaredField]:
+    def _declarations(self, messages: LogMessages) -> list[DeclaredField]:
         """Return the columns that the log declares; its attributes are kept."""
         found: dict[str, DeclaredField] = {}
         for one in messages.decoded():
@@ -339,16 +340,15 @@ class TelemetryLog:
                 found[number] = LogCompass(number, n, 0.0, message)
         return [found[number] for number in sorted(found)]
 
-    def with_rates(self, compasses: Sequence[LogCompass]) -> list[LogCompass]:
-        """Return the compasses with their mean rates over the time of the rows."""
+    def span_s(self) -> float:
+        """Return the s from the first to the last of the messages that make the rows."""
         time_us = self._samples(self.source).time_us
-        span_s = float(time_us[-1] - time_us[0]) / 1e6
-        return [replace(one, rate=(one.samples - 1) / span_s if span_s > 0 else 0.0) for one in compasses]
+        return float(time_us[-1] - time_us[0]) / 1e6
 
-    def _samples(self, message: str) -> Messages:
+    def _samples(self, message: str) -> LogMessages:
         """Return the messages of one kind from the component that sends the rows."""
-        found = _of(self._kinds, spec(message).id)
-        return found.where(found.component == self._component)
+        found = _messages_of(self._kinds, spec(message).id)
+        return found.chosen(found.component == self._component)
 
     def _telemetry(self, declared: set[str]) -> dict[str, str]:
         """Add the values of :data:`TELEMETRY`; return the units of the columns that have one.
@@ -359,14 +359,14 @@ class TelemetryLog:
         units: dict[str, str] = {}
         read = []
         for number, fields in TELEMETRY.items():
-            messages = _of(self._kinds, number)
+            messages = _messages_of(self._kinds, number)
             ranks = [
                 (one == self._component, one == AUTOPILOT, one not in GIMBALS, n, one)
                 for (_, one), n in messages.senders().items()
             ]
             if not ranks:
                 continue
-            messages = messages.where(messages.component == max(ranks)[-1])
+            messages = messages.chosen(messages.component == max(ranks)[-1])
             for field in fields:
                 values = field.values(messages.payloads)
                 read.append((field.column, messages, values))
@@ -379,52 +379,49 @@ class TelemetryLog:
 
     def _columns_of_bridge(self) -> dict[str, str]:
         """Return the units of the columns of a bridge's messages that have a value."""
-        raw = _of(self._kinds, RAW)
+        raw = _messages_of(self._kinds, RAW)
         columns = source_columns(RAW, raw.payloads[raw.is_of_main_sensor])
         possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
         there = [name for name in possible if not np.isnan(columns[name]).all()]
         there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
         units = {name: RAW_COLUMNS.get(name, "") for name in there}
-        is_corrected = _of(self._kinds, FIELD).is_of_main_sensor.any()
+        is_corrected = _messages_of(self._kinds, FIELD).is_of_main_sensor.any()
         return units | dict.fromkeys(CORRECTED, "") if is_corrected else units
 
-    def _add_declared(self, declared: Sequence[DeclaredField]) -> None:
+    def _add_declared(self) -> None:
         """Add the columns that the log declares, with the ages of their values in a bridge's own log."""
         source = spec(self.source).id
-        for one in declared:
+        for one in self._declared:
             self._units[one.column] = one.unit
             if self.ours and one.message not in (RAW, FIELD):
                 self._units[AGE + one.column] = "s"
-            if one.is_named_value or one.message == source:
+            if one.message == source:
                 continue
-            messages = _of(self._kinds, one.message)
-            messages = messages.where(one.matches(messages.payloads))
+            messages = _messages_of(self._kinds, one.message)
+            messages = messages.chosen(one.matches(messages.payloads))
             self._add_admitted(one.column, one.component, messages, one.values(messages.payloads))
 
     def _add_admitted(
-        self, column: str, component: int | None, messages: Messages, values: FloatArray
+        self, column: str, component: int | None, messages: LogMessages, values: FloatArray
     ) -> None:
         """Add the values (n,) of a column: of several components that send it one counts, as live."""
         max_age_s = self.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)
         source = Source(AUTOPILOT, round(1e6 * max_age_s), component)
         senders = zip(messages.component.tolist(), messages.time_us.tolist(), strict=True)
         admitted = np.array([source.admit(one, time_us) for one, time_us in senders], bool)
-        self._updates.setdefault(column, []).append((messages.where(admitted), values[admitted]))
+        self._updates.setdefault(column, []).append((messages.chosen(admitted), values[admitted]))
 
-    def _add_named(self, declared: Sequence[DeclaredField]) -> None:
-        """Add each ``NAMED_VALUE_FLOAT`` as the columns that the log declares, else by its name."""
-        named = _of(self._kinds, NAMED)
+    def _add_named(self, declared: set[str]) -> None:
+        """Add each ``NAMED_VALUE_FLOAT`` by its name, except those that the log has declared."""
+        named = _messages_of(self._kinds, NAMED_VALUE_FLOAT)
         start = NAME_LETTERS.offset
         letters = named.payloads[:, start : start + NAME_LETTERS.struct.size]
         for row in np.unique(letters, axis=0):
             name = NAME_LETTERS.get(bytes(start) + row.tobytes())
-            messages = named.where((letters == row).all(axis=1))
-            values = NAMED_FIELD.values(messages.payloads)
-            fields = [one for one in declared if one.match["name"] == name]
-            for one in fields:
-                self._add_admitted(one.column, one.component, messages, values * one.factor + one.offset)
-            if fields:
+            if name in declared:
                 continue
+            messages = named.chosen((letters == row).all(axis=1))
+            values = NAMED_FIELD.values(messages.payloads)
             own = f"named_{name}" if name in self._units or name in RESERVED_COLUMNS else name
             if own != name:
                 why = f"the log has a {name} of its own"
@@ -435,14 +432,21 @@ class TelemetryLog:
                 continue
             counts = [(one == AUTOPILOT, n, one) for (_, one), n in messages.senders().items()]
             here = messages.component == max(counts)[-1]
-            self._updates.setdefault(own, []).append((messages.where(here), values[here]))
+            self._updates.setdefault(own, []).append((messages.chosen(here), values[here]))
 
     def table(self) -> tuple[FloatArray, dict[str, FloatArray], dict[str, str]]:
         """Return the times (n,), s, the columns (n,), and their units."""
         samples = self._samples(self.source)
         main = samples.is_of_main_sensor
-        rows = samples.where(main)
-        others = self._add_readings(samples.where(~main))
+        rows = samples.chosen(main)
+        others = samples.chosen(~main)
+        of_others = [one for one in self._declared if one.message == others.number and SENSOR_ID in one.match]
+        for one in of_others:
+            messages = others.chosen(one.matches(others.payloads))
+            values = one.values(messages.payloads)
+            if one.column.endswith(OTHER_TIME):
+                values = values + self._to_step_us(messages.at) / 1e6
+            self._updates.setdefault(one.column, []).append((messages, values))
         raw = {one.column for one in TELEMETRY.get(rows.number, []) if one.column.startswith("mag")}
         own = [f"mag_{axis}" for axis in "xyz" if "IMU" in self.source]
         columns = {name: np.full(len(rows.at), np.nan) for name in (*own, *self._units) if name not in raw}
@@ -453,30 +457,17 @@ class TelemetryLog:
                     columns[AGE + name] = age_s
         time = self._fill(rows, columns)
         self._correct(rows, columns)
-        _bring_to_rows(time, columns, others)
+        _bring_to_rows(time, columns, [one.column for one in of_others])
         if "heading" in columns:
             columns["heading"] %= 360.0
         return time, columns, {name: self._units.get(name, "") for name in columns}
 
-    def _to_step_us(self, at: IndexArray) -> IndexArray:
+    def _to_step_us(self, places: IndexArray) -> IndexArray:
         """Return by how much the clock was set after each place (n,), µs."""
-        passed = self._steps_us[np.searchsorted(self._steps_at, at, side="right")]
+        passed = self._steps_us[np.searchsorted(self._steps_at, places, side="right")]
         return np.asarray(self._steps_us[-1] - passed)
 
-    def _add_readings(self, samples: Messages) -> list[str]:
-        """Add the readings of the sensors after the first; return the names of their columns."""
-        of_others = [
-            one for one in self._declared if one.message == samples.number and SENSOR_ID in one.match
-        ]
-        for one in of_others:
-            messages = samples.where(one.matches(samples.payloads))
-            values = one.values(messages.payloads)
-            if one.column.endswith(OTHER_TIME):
-                values = values + self._to_step_us(messages.at) / 1e6
-            self._updates.setdefault(one.column, []).append((messages, values))
-        return [one.column for one in of_others]
-
-    def _fill(self, rows: Messages, columns: dict[str, FloatArray]) -> FloatArray:
+    def _fill(self, rows: LogMessages, columns: dict[str, FloatArray]) -> FloatArray:
         """Set the columns (n,) that the rows' own messages hold, in place; return the times (n,), s."""
         found = source_columns(rows.number, rows.payloads)
         for one in self._declared:
@@ -496,10 +487,10 @@ class TelemetryLog:
                 columns[name] = np.where(np.isnan(values), columns[name], values)
         return found["time"]
 
-    def _correct(self, rows: Messages, columns: dict[str, FloatArray]) -> None:
+    def _correct(self, rows: LogMessages, columns: dict[str, FloatArray]) -> None:
         """Add each ``MAG_FIELD`` to the row before it, that of its reading, unless that has one already."""
-        found = _of(self._kinds, FIELD)
-        found = found.where(found.is_of_main_sensor & ~np.isin(found.at, rows.at))
+        found = _messages_of(self._kinds, FIELD)
+        found = found.chosen(found.is_of_main_sensor & ~np.isin(found.at, rows.at))
         if not len(found.at):
             return
         row = np.searchsorted(rows.at, found.at, side="right") - 1
@@ -514,7 +505,7 @@ class TelemetryLog:
             columns[name][row[order]] = values[name][order]
 
 
-def _carried(rows: Messages, updates: Sequence[Update]) -> tuple[FloatArray, FloatArray]:
+def _carried(rows: LogMessages, updates: Sequence[Update]) -> tuple[FloatArray, FloatArray]:
     """Return the last value of a column at or before each row (n,), and its age, s (n,); NaN once too old."""
     at = np.concatenate([messages.at for messages, _ in updates])
     if not len(at):

@@ -318,7 +318,13 @@ class FileWriter:
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows, and before the first ones the header."""
         if first:
-            headings = ["time", *(_heading(dataset, str(name)) for name in dataset.data_vars)]
+            headings = ["time"]
+            for name in map(str, dataset.data_vars):
+                unit = dataset[name].attrs.get("units", "1")
+                heading = name if name in COLUMNS or unit == "1" else f"{name} [{unit}]"
+                if name == "heading" and dataset.attrs.get("heading_reference") == "magnetic":
+                    heading = f"heading [{unit} magnetic]"
+                headings.append(heading)
             self.metadata = _metadata(dataset, headings)
             self._csv.writerow(headings)
         self._csv.writerows(self.texts(dataset))
@@ -332,13 +338,6 @@ class FileWriter:
     def close(self) -> None:
         """Write everything to the file and close it."""
         self._file.close()
-
-
-def _heading(dataset: xr.Dataset, name: str) -> str:
-    unit = dataset[name].attrs.get("units", "1")
-    if name == "heading" and dataset.attrs.get("heading_reference") == "magnetic":
-        return f"heading [{unit} magnetic]"
-    return name if name in COLUMNS or unit == "1" else f"{name} [{unit}]"
 
 
 def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
