@@ -19,7 +19,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -393,21 +393,6 @@ def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Val
     return found
 
 
-def invalid(
-    rules: Sequence[Validity], columns: Mapping[str, FloatArray]
-) -> Iterator[tuple[str, BoolArray, str]]:
-    """Yield what rules mark as not valid: column ("" for whole rows), values (n,), and the rule's column."""
-    for rule in rules:
-        bad = np.isin(columns[rule.column], list(rule.bad))
-        if bad.any() and not rule.targets:
-            yield "", bad, rule.column
-        for name in rule.targets:
-            if name in columns and (there := bad & np.isfinite(columns[name])).any():
-                yield name, there, rule.column
-
-
-EXPECTED_VALUE = "expected a value, or nothing where it is not known, not "
-
 CODES = np.outer([-1.0, 1.0], [
     9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
     2_147_483_647.0, 69_696_969.0, 999.0, 999.9, 999.99,
@@ -447,46 +432,39 @@ def _is_code(values: FloatArray) -> BoolArray:
     return wrong
 
 
-def mark_invalid(
+def without_invalid(
+    faults: Faults,
+    time: FloatArray,
     columns: dict[str, FloatArray],
+    numbers: Sequence[int],
     rules: Sequence[Validity],
-    note: Callable[[str, BoolArray, str], None],
     *,
-    codes: bool = True,
-) -> BoolArray:
-    """Set missing-value `codes` and what the rules mark to NaN, in place; return the rows (n,) to keep.
+    codes: bool,
+) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
+    """Return times (n,), columns (n,) and numbers of the rows without values that the file states as invalid.
 
-    `note` takes a column ("" for whole rows), its wrong values (n,) and the expectation.
+    These are missing-value `codes`, and values that the rules mark. They are counted in `faults`.
     """
-    for name, wrong in (unknown(columns) if codes else {}).items():
-        note(name, wrong, f"{EXPECTED_VALUE}{float(columns[name][wrong][0])!r}")
-        columns[name][wrong] = np.nan
-    keep = np.ones(len(next(iter(columns.values()), [])), bool)
-    for name, wrong, column in invalid(rules, columns):
-        note(name, wrong, f"not valid by {column!r}")
-        if name:
-            columns[name][wrong] = np.nan
-        else:
-            keep &= ~wrong
-    return keep
-
-
-def known(path: Path, dataset: xr.Dataset, numbers: Sequence[int]) -> tuple[xr.Dataset, Sequence[int]]:
-    """Return a deployment of another program and the numbers of its rows, without invalid values."""
-    columns = {str(name): column.to_numpy().copy() for name, column in dataset.data_vars.items()}
-    lines: list[str] = []
-    dropped = {"values_dropped": 0, "rows_dropped": 0}
 
     def note(name: str, wrong: BoolArray, expected: str) -> None:
-        row = None if expected.startswith(EXPECTED_VALUE) else numbers[int(wrong.argmax())]
-        lines.append(str(FormatError(path, expected, row=row, column=name or None)))
-        dropped["values_dropped"] += int(wrong.sum()) if name else 0
+        counter = "values_dropped" if name else "rows_dropped"
+        faults.note(name, int(wrong.sum()), numbers[int(wrong.argmax())], expected, counter, wrong=False)
 
-    keep = mark_invalid(columns, validity_of([*columns], ()), note)
-    if lines:
-        dataset = dataset.assign({name: dataset[name].copy(data=columns[name]) for name in columns})
-    if columns and not keep.all():
-        dropped["rows_dropped"] = int((~keep).sum())
-        dataset = dataset.isel(time=keep)
-        numbers = [number for number, is_valid in zip(numbers, keep.tolist(), strict=True) if is_valid]
-    return with_losses(dataset, dropped, lines), numbers
+    for name, wrong in (unknown(columns) if codes else {}).items():
+        value = float(columns[name][wrong][0])
+        note(name, wrong, f"expected a value, or nothing where it is not known, not {value!r}")
+        columns[name][wrong] = np.nan
+    keep = np.ones(len(time), bool)
+    for rule in rules:
+        bad = np.isin(columns[rule.column], list(rule.bad))
+        expected = f"not valid by {rule.column!r}"
+        if bad.any() and not rule.targets:
+            note("", bad, expected)
+            keep &= ~bad
+        for name in rule.targets:
+            if name in columns and (there := bad & np.isfinite(columns[name])).any():
+                note(name, there, expected)
+                columns[name][there] = np.nan
+    rows = np.flatnonzero(keep)
+    kept = {name: values[rows] for name, values in columns.items()}
+    return time[rows], kept, [numbers[k] for k in rows.tolist()]

@@ -29,11 +29,6 @@ from magbridge.toml import Table, check_entries, convert, load_toml
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "CELL_NUMBER", "WITH_UNIT", "ColumnMapping", "Options", "aliases", "bare", "declared_by_maker", "is_unit",
-    "renamed", "split",
-]  # fmt: skip
-
 MAKERS_FILE = Path(__file__).with_name("makers.toml")
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
 CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)

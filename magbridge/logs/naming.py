@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from math import hypot
 from pathlib import Path
 
 import numpy as np
@@ -280,7 +279,7 @@ def units_of_angles(layout: Layout, rows: Rows) -> Layout:
     names = [name for name in ANGLES if name in layout.names and name not in layout.units]
     if "heading" not in names:
         return layout
-    values = {name: _numbers(layout, rows, layout.names.index(name)) for name in names}
+    values = {name: _numbers(layout, rows, [layout.names.index(name)]) for name in names}
     heading = values["heading"]
     if len(heading) < 3 or any(np.abs(one).max(initial=0.0) > 2.0 * np.pi + 1e-3 for one in values.values()):
         return layout
@@ -336,19 +335,15 @@ def with_total(layout: Layout, rows: Rows) -> Layout:
     return named.guessing(f"total_field is {layout.headings[k]!r}")
 
 
-def _numbers(layout: Layout, rows: Rows, place: int) -> FloatArray:
-    """Return the numbers (m,) of one column, without other cells."""
-    texts = [layout.number(row[place]) for row in rows if place < len(row)]
-    numbers = np.asarray(pd.to_numeric(pd.Series(texts, dtype="str"), errors="coerce"), np.float64)
-    return numbers[np.isfinite(numbers)]
+def _numbers(layout: Layout, rows: Rows, places: Sequence[int]) -> FloatArray:
+    """Return the numbers (n, k) of the rows that have them in all of k columns."""
+    texts = [[layout.number(row[k]) for k in places] for row in rows if max(places) < len(row)]
+    frame = pd.DataFrame(texts, columns=range(len(places)), dtype="str").apply(pd.to_numeric, errors="coerce")
+    numbers = frame.to_numpy(np.float64)
+    return np.asarray(numbers[np.isfinite(numbers).all(axis=1)])
 
 
 def _length(layout: Layout, rows: Rows, places: Sequence[int]) -> float:
-    """Return the median length of the vector that stands in some columns; 0 without numbers."""
-    lengths = []
-    for row in rows:
-        try:
-            lengths.append(hypot(*(float(layout.number(row[k])) for k in places)))
-        except (ValueError, IndexError):
-            continue
-    return float(np.median(lengths)) if lengths else 0.0
+    """Return the median length of the vector in some columns; 0 without numbers."""
+    numbers = _numbers(layout, rows, places)
+    return float(np.median(np.linalg.norm(numbers, axis=1))) if len(numbers) else 0.0

@@ -38,7 +38,7 @@ from magbridge.columns import COLUMNS, factor
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
 from magbridge.logs import seaglider
-from magbridge.logs.checks import known
+from magbridge.logs.checks import Faults, validity_of, without_invalid
 from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.fields import field_maps
 from magbridge.logs.mapping import aliases
@@ -91,9 +91,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset | tuple[xr.Dataset, Seq
             if seaglider.DIMENSION in file.dimensions:
                 yield from sliced(seaglider.dive(path, _seaglider(path, file)), rows)
             else:
-                ours = any("column" in variable.ncattrs() for variable in file.variables.values())
-                for part, numbers in _trajectory(path, file, rows):
-                    yield (part, numbers) if ours else known(path, part, numbers)
+                yield from _trajectory(path, file, rows)
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None
@@ -130,6 +128,9 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
     stated = [str(heading.getncattr(name)).lower() for name in heading.ncattrs()] if heading else []
     if any("magnetic" in text for text in stated):
         attrs.setdefault("heading_reference", "magnetic")
+    ours = any("column" in variable.ncattrs() for variable in file.variables.values())
+    rules = [] if ours else validity_of([one.name for one in columns], ())
+    faults = Faults(path, strict=False)
     for row in range(0, total, rows):
         part = slice(row, row + rows)
         time = _values(clock, part) * scale + start
@@ -137,8 +138,11 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
         for one in columns:
             if one.flags is not None:
                 values[one.name][_bad(one.flags, part)] = np.nan
+        numbers = range(row + 1, row + 1 + len(time))
+        time, values, kept = without_invalid(faults, time, values, numbers, rules, codes=not ours)
+        counts, lines = faults.since_last()
         piece = deployment(path, time, values, units, attrs, meanings)
-        yield with_losses(piece, {}, () if row else left_out), range(row + 1, row + 1 + len(time))
+        yield with_losses(piece, counts, [*lines, *(() if row else left_out)]), kept
 
 
 def _along(variable: Any) -> str | None:

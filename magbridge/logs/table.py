@@ -14,7 +14,7 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
-from magbridge.logs.checks import Faults, Validity, mark_invalid
+from magbridge.logs.checks import Faults, Validity, without_invalid
 from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, Rows, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
@@ -142,15 +142,8 @@ class TableReader:
             if name in columns and source.valid in columns:
                 rules.append(Validity(source.valid, (name,), frozenset({0.0})))
         rules += self._layout.validity
-
-        def note(name: str, marked: BoolArray, expected: str) -> None:
-            self._note(name, marked, kept, expected, wrong=False)
-
-        keep = mark_invalid(columns, rules, note, codes=self._layout.foreign)
-        if not columns or keep.all():
-            return times, columns, kept
-        kept = [number for number, is_valid in zip(kept, keep.tolist(), strict=True) if is_valid]
-        return times[keep], {name: values[keep] for name, values in columns.items()}, kept
+        codes = self._layout.foreign
+        return without_invalid(self.faults, times, columns, kept, rules, codes=codes)
 
     def _dropping(
         self, wrong: list[bool], lines: list[str], numbers: Sequence[int], text: str
