@@ -14,8 +14,7 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Problem
 
 Columns = Callable[[slice], FloatArray]
-"""A function from a slice of m rows to (m, k): what one unit of each of k coefficients, if the calibration
-lacks it, adds to the residual. Best stored column by column."""
+"""Slice of m rows -> (m, k) change of the residual per unit of each of k coefficients, column by column."""
 AXIS_NAMES = ("x", "y", "z")
 About = Literal["vehicle", "constant", "place", "time"]
 Group = tuple[str, str | None]
@@ -24,11 +23,7 @@ Group = tuple[str, str | None]
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    r"""Columns that are linear combinations of further columns: :math:`\sum_i X_i M_i`.
-
-    Many hypotheses share few parts: one lagged temperature serves all the origins that it is tried with.
-    Sums over a log are therefore taken once for each different ``X_i``.
-    """
+    """Linear combinations ``sum_i X_i M_i`` of columns ``X_i`` that many hypotheses share."""
 
     parts: tuple[tuple[Columns, FloatArray], ...]
     """X_i and M_i."""
@@ -81,7 +76,7 @@ def join_columns(columns: Sequence[Columns]) -> Mixture:
 
 @dataclass(frozen=True)
 class Products:
-    """Products of functions of time and slopes, from which the columns of effects are made."""
+    """Products of functions of time and derivatives, from which the columns of effects are made."""
 
     problem: Problem
     phi: Callable[[slice], FloatArray] | None
@@ -105,8 +100,7 @@ def effect_columns(
 ) -> Mixture:
     """Return the columns of an effect's coefficients, in units of their `widths` (k,).
 
-    Its regressors are `phi` less `origin`; `phi` is (r, n), or a function from m rows to (r, m); by default
-    they are those of the effect's own array form.
+    Its regressors are `phi` less `origin`: (r, n), a function from m rows to (r, m), or the effect's own.
     """
     if phi is None and effect.remembers:
         # Single precision: a search tries dozens of histories, of 5 MB for a month each in double
@@ -171,9 +165,7 @@ class Candidate:
     parts: tuple[Candidate, ...] = ()
     """Those that it was put together from, one after the other."""
     spectra: FloatArray | None = None
-    """(l, k) where its coefficients have one common free size
-    (:mod:`~magbridge.diagnose.joint`): l alternatives for their prior variances, in units of
-    the widths squared and up to a common factor."""
+    """(l, k) alternatives for the prior variances of coefficients of one common free size (:mod:`.joint`)."""
     since: bool = False
     """It is absent from the logs that the calibration was fitted to."""
     regressors: Callable[[slice], FloatArray] | None = None
@@ -236,7 +228,7 @@ class Candidate:
 
 
 def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
-    """Return where the coefficients of each candidate are among those of all, the first's from `first` on."""
+    """Return the places of each candidate's coefficients among those of all, from `first` on."""
     return places((candidate.size for candidate in candidates), first)
 
 
@@ -270,10 +262,9 @@ def of_effect(
     origin: float = 0.0,
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an effect.
+    """Make a candidate of an effect; `phi` and `origin` are those of :func:`effect_columns`.
 
-    Its regressors are those of its array form; or else `phi` (r, n), or a function from rows to those, less
-    `origin`. `unit` is that of all its coefficients, or has one for each of as many equal parts of them.
+    `unit` is that of all its coefficients, or has one for each of as many equal parts of them.
     """
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
     columns = effect_columns(problem, effect, phi, origin, widths)
@@ -295,9 +286,6 @@ def of_reference(
     names: tuple[str, ...],
     kind: About,
 ) -> Candidate:
-    """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT.
-
-    `basis` gives (m, k) of m rows; `width` (k,) is the usual size of each coefficient, nT.
-    """
+    """Make a candidate of an error of the reference, ``sum_k b_k basis_k(t)``, nT; `basis` returns (m, k)."""
     columns = lambda rows: problem.reference_jacobian[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
     return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=kind)

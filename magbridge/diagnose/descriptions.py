@@ -1,10 +1,6 @@
 """Free descriptions: structure of any kind in a residual, without a name.
 
-Notes
------
-Arguments are histories of the log's n samples, (n,) or (n, 3); the result is a block of columns,
-(m, k) of m rows: :mod:`magbridge.diagnose.columns`. Whole histories of a long log fill the
-memory: what can be computed row by row is not kept.
+Arguments are histories of the log's n samples, (n,) or (n, 3); results are :mod:`.columns`, (m, k) of m rows.
 """
 
 from __future__ import annotations
@@ -48,7 +44,7 @@ REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
 ZERO = (500.0, 1000.0, 2000.0)
 """Widths, nT, of errors where an axis reads zero."""
-JACOBIAN = (0.0, 0.1, 0.2)
+SLIDING_TILT_SINES = (0.0, 0.1, 0.2)
 """Sines of the angles at which a loose object in the hull starts to slide."""
 BODY, EARTH = 24, 48
 """Half waves per log of slow curves along the axes of the body, and along the field."""
@@ -80,7 +76,7 @@ def direction(body: Columns) -> Columns:
 def response(reading: FloatArray, jacobian: Columns) -> Columns:
     """Return each axis' error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
 
-    `jacobian` (m, 3) are what one nT in each axis adds to the residual.
+    `jacobian` gives the change (m, 3) of the residual per nT in each axis.
     """
     axes = [_scaled(axis) for axis in reading.T]
 
@@ -102,10 +98,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 
 
 def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Return each axis' error where it passes zero (Hermite's functions); arguments as of :func:`response`.
-
-    There the feedback current changes sign, or a converter's first bit flips.
-    """
+    """Return each axis' error where it passes zero (Hermite's functions); arguments as :func:`response`."""
 
     def columns(rows: slice) -> FloatArray:
         x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
@@ -170,13 +163,10 @@ def repeated(problem: Problem) -> Columns:
 
 
 def lower_end(tilt: FloatArray) -> Columns:
-    """Return the end of the hull at which a loose object lies: the lower one, once tilted by so much.
-
-    `tilt` (n,) is the sine of the tilt; :data:`JACOBIAN` are those at which it starts to slide.
-    """
+    """Return the end of the hull at which a loose object lies; `tilt` (n,) is the sine of the tilt."""
     place = np.arange(len(tilt))
     sides = []
-    for slope in JACOBIAN:
+    for slope in SLIDING_TILT_SINES:
         last = np.maximum.accumulate(np.where(np.abs(tilt) > slope, place, 0))
         sides.append(np.sign(tilt[last]).astype(np.int8))
     return _centred(lambda rows: np.stack([side[rows] for side in sides]).T.astype(float), len(tilt))
@@ -224,11 +214,9 @@ class Description(NamedTuple):
     remembers: bool = False
     """It follows the channel's past (from which side it came), not its value."""
     scales: bool = False
-    """The effect is in proportion to each reading: a change of sensitivity, not of offset. Only for heat are
-    these distinguished: for other channels both describe the effect of a cause with more numbers."""
+    """The effect is in proportion to each reading: a change of sensitivity, not of offset."""
     wider: bool = False
-    """It is much more general than a cause that it holds: a signal found in addition is not a remnant, and it
-    is an alternative to that cause together with another."""
+    """It is much more general than a cause that it holds: what it finds in addition is not a remnant."""
 
     def covers(self, model: Sequence[Candidate]) -> bool:
         """Return True if it contains a cause of `model`, with more coefficients; a wider one, all causes."""
@@ -257,10 +245,10 @@ def _bends(candidate: Candidate) -> bool:
 
 
 def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
-    """List the descriptions with which structure of any kind is searched for in a survey.
+    """List the descriptions of structure of any kind in a survey.
 
-    Passages and packets are searched for in the residual of a `fit` without any cause; `tone` is the
-    strongest, where tones are not among the causes.
+    Passages and packets are those in the residual of a `fit` without any cause; `tone` is the strongest,
+    where tones are not among the causes.
     """
     return [
         *_in_time(problem, fit, tone),
@@ -323,10 +311,7 @@ def _of_reading(problem: Problem) -> list[Description]:
 
 
 def _of_channels(problem: Problem) -> list[Description]:
-    """Return for each channel a curve of its value, functions of its past, and functions that follow it late.
-
-    Late, as heat soaks into a hull: an offset, or a sensitivity.
-    """
+    """Return for each channel functions of its value, of its past, and of its lagged value."""
     masses = {parameter.name for parameter in problem.calibration.parameters}
     survey, listed = problem.survey, []
 

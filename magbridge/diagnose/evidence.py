@@ -1,34 +1,26 @@
 """The evidence for each candidate, its test, and the causes that a log can show or distinguish.
 
-Notes
------
-*Information.* One matrix serves the whole search: the inner products of the whitened columns of *all*
-candidates, summed up in chunks, at a cost linear in samples. From it come scores, Occam factors, which causes
-are confounded, and the distribution of the largest score under no effect.
+Notes ----- *Information.* One matrix serves the whole search: the inner products of the whitened columns of
+all candidates.
 
-*Score.* For a candidate with score b and information S, the calibration projected out,
-``R = b^T S^-1 b`` is its likelihood ratio to second order. The size of an effect is not known beforehand, so
-its k coefficients have Zellner's prior ``N(0, g S^-1)`` with the likeliest g: log evidence
-``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410, sec. 2.4). Every cause
-pays the same price for a coefficient, whatever its unit.
+*Score.* For a candidate with score b and information S, the calibration projected out, ``R = b^T S^-1 b`` is
+its likelihood ratio to second order. Its k coefficients have Zellner's prior ``N(0, g S^-1)`` with the
+likeliest g: log evidence ``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410,
+sec. 2.4).
 
 *Test.* A cause's p-value is that of its likelihood ratio, times the number N of independent hypotheses behind
 the cause, times the number of causes; it is found if that is below 1 %. Under no effect scores are
-``N(0, S)``, and N is ``P(any of its n hypotheses passes) / a`` at the level a at which each is tested: even
-hypotheses that correlate strongly are nearly independent far out in the tail. Plain simulation does not reach
-that far, so each hypothesis in turn is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen,
-Maximov & Chertkov 2019, Electron. J. Statist. 13:231). A size that cannot be negative has one tail
-(:attr:`~magbridge.diagnose.columns.Candidate.tail`).
+``N(0, S)``, and N is ``P(any of its n hypotheses passes) / a`` at the level a at which each is tested. By
+importance sampling, each hypothesis in turn is made to pass, and with m that pass then ``N = n E[1 / m]``
+(Owen, Maximov & Chertkov 2019, Electron. J. Statist. 13:231).
 
 Two kinds of coefficients have a prior of their own. For those of one common size (:mod:`.joint`) the
 ratio contains the prior: the evidence is R / 2, less the log of the number of spectra that were tried. One
 that cannot be negative has half a Gaussian, of twice the density: ``log 2 Phi(sqrt(R))`` is added.
 
-*Isolability.* The information S of a cause's coefficients needs telemetry, attitude and the noise level, but
-no residual. An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k degrees
-of freedom and noncentrality ``a^2`` passes the threshold. Between two causes whose signatures, whitened and
-projected, correlate by rho, the wrong one wins with the chance ``Phi(-a sqrt(1 - rho^2) / 2)`` (two points in
-Gaussian noise).
+*Isolability.* An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k
+degrees of freedom and noncentrality ``a^2`` passes the threshold. Between two causes whose signatures
+correlate by rho, the wrong one wins with the chance ``Phi(-a sqrt(1 - rho^2) / 2)``.
 """
 
 from __future__ import annotations
@@ -45,7 +37,7 @@ from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.columns import Candidate, Columns, Group, join_columns, parts, places, slices
-from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
+from magbridge.diagnose.joint import ALL_PRODUCTS, Joint, Statistic, normal, volume_of
 from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import DERIVATIVE_ROWS, Problem, side_by_side
 
@@ -54,25 +46,20 @@ FALSE_ALARM_RATE = 0.01
 ODDS = float(np.log(20.0))
 """Log evidence by which a cause with an exact regressor must win to be named alone."""
 IDEAL = 0.2
-"""Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that
-competes with it."""
+"""Error of an idealised regressor, as a share of its norm."""
 REMNANT = 0.3
-"""Fraction of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
-not another cause, and is not named."""
+"""Fraction of the strongest cause's signal-to-noise, below which a signal may be that cause's remnant."""
 SMOOTH, MOST_REMAINING = 0.1, 8.0
-"""Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant: a process has
-a flexible shape, but not any shape equally, and the remnant of a map's error is slow in time, too."""
+"""Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant."""
 SIMULATIONS = 400
 PIECE, PIECES = 600, 64
 """Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 CONFOUNDED = 0.85
-"""Correlation beyond which two causes are listed as a pair: at this one they are distinguished in 95 of 100
-cases at signal-to-noise 6."""
+"""Correlation above which two causes are listed as a pair: distinguished in 95 % of cases at S/N 6."""
 MAX_PLAUSIBLE_MULTIPLE = 50.0
 """Multiple of its plausible size from which on a cause is not plausible at all."""
 FREE = 1e-3
-"""Prior precision, in units of a plausible size's, of coefficients that are each free; it is 1 for those of
-one common size."""
+"""Prior precision of free coefficients, in units of a plausible size's; 1 for those of one common size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +89,7 @@ class Information:
         )
 
     def released(self, base: Joint, *places: slice) -> Information:
-        """Remove the coefficients at these places from the model of `base`, and project out its others.
-
-        The model's columns are the last. The scores are those of what `base` leaves and of what the
-        coefficients at these places explain in it.
-        """
+        """Remove the coefficients at these places from the model of `base`, and project out its others."""
         first, own = len(self.score) - base.coefficients.size, np.r_[*places]
         others = np.setdiff1d(np.arange(first, len(self.score)), own)
         S = self.matrix[np.ix_(others, others)] + np.diag(base.prior[len(base.z) + others - first])
@@ -125,8 +108,8 @@ def information(
 ) -> Information:
     """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
 
-    The first `unshared` of them share no parts with any other, and their products with each other are not
-    computed. With a `stride`, only every so many pieces of the log count.
+    The products of the first `unshared` columns with each other are not computed. With a `stride`, only every
+    so many pieces of the log count.
     """
     # Sums are taken over the distinct parts X_i; the candidates are their mixtures X_i M_i
     q, shared = len(problem.centre), join_columns(columns).parts
@@ -150,13 +133,12 @@ def information(
 
 
 class Score(NamedTuple):
-    """Score of a candidate under a noise: likelihood ratio, freedoms, log evidence, estimate, prior."""
+    """Score of a candidate under a noise: likelihood ratio, freedoms, log evidence, estimate."""
 
     ratio: float
     freedom: int
     evidence: float
     estimate: FloatArray
-    prior: FloatArray
 
 
 def score(info: Information, place: slice, candidate: Candidate) -> Score:
@@ -165,14 +147,13 @@ def score(info: Information, place: slice, candidate: Candidate) -> Score:
     b, statistic = info.score[place], Statistic(info.matrix[place, place], candidate.spectra)
     freedom = statistic.freedom
     if not freedom or (candidate.positive and b.min() < 0.0):
-        return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
+        return Score(0.0, freedom, 0.0, np.zeros(len(b)))
     if candidate.spectra is not None:
         best = statistic.best(b)
-        evidence = evidence_of(candidate, best.ratio, freedom)
-        return Score(best.ratio, freedom, evidence, best.estimate, 1.0 / best.variance)
+        return Score(best.ratio, freedom, evidence_of(candidate, best.ratio, freedom), best.estimate)
     ratio, values, V = float(statistic.ratio(b[:, None])[0]), statistic.values, statistic.vectors
-    evidence = evidence_of(candidate, ratio, freedom)
-    return Score(ratio, freedom, evidence, V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT_PRECISION))
+    estimate = V @ ((V.T @ b) / (values + 1.0))
+    return Score(ratio, freedom, evidence_of(candidate, ratio, freedom), estimate)
 
 
 def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
@@ -196,10 +177,7 @@ def one_sided(ratio: float | FloatArray) -> FloatArray:
 
 
 def bayes_factor_threshold(ratio: float) -> float:
-    """Log evidence by which a cause of this likelihood ratio must win to be named alone.
-
-    The error of its regressor is allowed for.
-    """
+    """Return the log evidence by which a cause of this likelihood ratio must win to be named alone."""
     return ODDS + regressor_error(ratio)
 
 
@@ -257,15 +235,11 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
 def log_odds(
     ratio: float, model: Sequence[Candidate], look_elsewhere: Mapping[str, float], shaped: float
 ) -> float:
-    """Log posterior odds of a whole model of this likelihood ratio against no effect.
+    """Return the log posterior odds of a whole model of this likelihood ratio against no effect.
 
-    `shaped` is the part of it that causes of flexible shape do not explain (:func:`.shaped_ratio`).
-    The size of the remaining causes is judged by that part.
-
-    Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the
-    prior odds of a further fault in one log, and for its choice among the causes. How narrowly the data
-    determine nonlinear parameters is not counted here, but only between names: free descriptions are
-    profiled, too, and do not pay for it.
+    `shaped` is the part of the ratio that causes of flexible shape do not explain (:func:`.shaped_ratio`).
+    Every regressor pays for the hypotheses of its cause; each after the first also pays for the prior odds of
+    a further fault, and for its choice among the causes.
     """
     regressors, free = sum(len(c.pieces) for c in model), sum(c.size for c in model if c.spectra is None)
     # Price of each further regressor, of the grids, and of the spectra that were tried
@@ -285,15 +259,11 @@ def certainty(residual: FloatArray, noise: ResidualNoise, columns: Sequence[Colu
 
     Notes
     -----
-    The fitted coefficients a have the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
-    residuals in units of s. A column x has the information ``|w|^2``,
-    ``w_t = x_t - sum_k a_k x_(t-k)``:
+    The fitted coefficients a have the covariance C. A column x has the information ``|w|^2``,
+    ``w_t = x_t - sum_k a_k x_(t-k)``, and the log of a variance with f degrees of freedom the variance 2 / f:
 
     .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
               \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
-
-    The log of a variance estimated with f degrees of freedom has the variance 2 / f. At low frequencies the
-    level is known worst.
     """
     n, p = len(residual), len(noise.ar)
     # Covariance C of the autoregressive coefficients: the inverse of their regression's information
@@ -332,7 +302,7 @@ class Hypothesis:
     evidence: float
     """Log Bayes factor against the model without it."""
     p_value: float
-    """With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes."""
+    """Times the hypotheses behind the cause (look-elsewhere) and the number of causes."""
     fit: Joint
     """Fit of the whole model; this cause's coefficients are the last."""
 
@@ -346,23 +316,18 @@ class Hypothesis:
 
 
 class Best(NamedTuple):
-    """The best candidate of a grid under one noise.
-
-    Its place among all, the price of its nonlinear parameters (log of the grid's average evidence, relative
-    to the best), its score, and the information that gave it.
-    """
+    """The best candidate of a grid under one noise."""
 
     place: int
+    """Place among all candidates."""
     price: float
+    """Log of the grid's average evidence, relative to the best."""
     score: Score
     info: Information
 
 
 def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: bool = False) -> float:
-    """Return likelihood ratio of a model's causes of fixed shape, given its causes of flexible shape.
-
-    `ratio` is the likelihood ratio of the whole model, with `slow` noise if there is any.
-    """
+    """Return the part of a model's likelihood `ratio` that its causes of flexible shape do not explain."""
     free = np.repeat([one.nonparametric for one in model], [one.size for one in model])
     return min(ratio, fit.wald(np.flatnonzero(~free))) if slow or free.any() else ratio
 

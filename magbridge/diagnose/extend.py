@@ -1,22 +1,16 @@
 r"""From findings to a calibration: effects become terms, and all coefficients are refitted.
 
-Notes
------
-*Within a cell of their grid* the likelihood has one peak. The nonlinear parameters s have the derivatives
-``J_s = d(X b)/ds``. M is their information with calibration and effects projected out, and K is by how much
-all other coefficients change for a unit of each (:mod:`.evidence`). With the prior N(0, 1) in units of a
-cell, the covariance of the other coefficients is
+Notes ----- *Within a cell of their grid* the nonlinear parameters s have the derivatives ``J_s = d(X b)/ds``.
+With M their information, calibration and effects projected out, K the change of all other coefficients for a
+unit of each, and the prior N(0, 1) in units of a cell, the covariance of the other coefficients is
 
 .. math:: C + K (M + 1)^{-1} K^T
 
-*Beyond that cell* there may be other peaks: those of an onset may differ by hours, each with a size of its
-own. With d_k the difference of all coefficients at another point of the grid, C_k their covariance there, and
-w_k that point's posterior weight, the mixture of all points has the covariance
+*Beyond that cell* there may be other peaks: those of an onset may differ by hours. With d_k the difference of
+all coefficients at another point of the grid, C_k their covariance there, and w_k that point's posterior
+weight, the mixture of all points has the covariance
 
 .. math:: C + \sum_k w_k \left(d_k d_k^T + C_k - C\right)
-
-A point's weight is its evidence. The estimate was profiled within its cell, so its evidence is reduced by the
-log of the share of the cell that it holds (:attr:`~magbridge.diagnose.columns.GridPoint.narrow`).
 """
 
 from __future__ import annotations
@@ -61,10 +55,9 @@ def loosened(
     fit: Joint,
     grid: Sequence[Candidate] = (),
 ) -> Joint:
-    """Return the fit with the coefficients' covariance for nonlinear parameters that are free as well.
+    """Return the fit with the covariance of its coefficients widened for free nonlinear parameters.
 
-    `columns` are those of the model in this problem, `fit` has its nonlinear parameters held, and `grid` are
-    all candidates of the search.
+    `columns` are those of the model in this problem, and `grid` are all candidates of the search.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if all(piece.point.rebuild is None for piece in pieces):
@@ -160,11 +153,9 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
 
 
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
-    """Return the calibration with the effects of `model` added, at the values of `fit`.
+    """Return the calibration with the effects of `model` added, at the values and covariance of `fit`.
 
-    An error of the reference is not a property of the vehicle: only a constant bias is kept, as the
-    reference's. A filter's attenuation is not kept; the other coefficients are free of it. All
-    covariances are those of the joint posterior.
+    Of errors of the reference only a constant bias is kept, as the reference's.
     """
     calibration, q = problem.calibration, len(problem.centre)
     widths = np.concatenate([np.empty(0), *(candidate.width for candidate in model)])
@@ -203,10 +194,9 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
 
 
 def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list[int]]:
-    """Drop the rates and delays that make the live correction worse; return the calibration and their places.
+    """Return the calibration without the rates and delays that worsen the live correction, and their places.
 
-    In flight the next sample is not known yet, so a rate is a backward difference, which is mostly noise if
-    the vehicle sways from sample to sample.
+    Live, a rate is a backward difference, which is mostly noise if the vehicle sways from sample to sample.
     """
     dropped: list[int] = []
     # Greedy: each rate is dropped if the residual with live differences is smaller without it
@@ -249,9 +239,8 @@ def with_map_error(
     Notes
     -----
     The logs that the calibration was fitted to have the same map as their reference, so the mean of its error
-    may have gone into the calibration's scale. How large it is rests on the map's altitude, which may be half
-    the usual or twice, and half of the error is taken to be uncertain. With s the coefficients that raise the
-    corrected field by 1 nT everywhere, and m the error of the map that was found,
+    may have gone into the calibration's scale. Half of the error is taken to be uncertain. With s the
+    coefficients that raise the corrected field by 1 nT everywhere, and m the error of the map,
 
     .. math:: C \leftarrow C + \overline{(m / 2)^2}\, s s^T
     """
@@ -272,9 +261,8 @@ def relinearised(
 ) -> tuple[Problem, list[Columns], Joint]:
     """Fit again about the extended calibration until the linear model predicts the nonlinear residual.
 
-    Gauss-Newton steps with step halving. Rates of change keep the central differences of the search, because
-    the backward differences of the live effects contain the noise of their own sample. Returned are the
-    problem linearised at the last point, the columns of the model's pieces there, and the fit.
+    Returned are the problem linearised at the last point, the columns of the model's pieces there, and the
+    fit. Rates of change keep the central differences of the search.
     """
     ridge, order, blocks = fit.prior[len(fit.z) :], fit.noise.past.order, fit.noise.uneven
     # The calibration as given is the point that a step which overshoots is halved towards
@@ -320,14 +308,11 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
     Notes
     -----
     A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A
-    regressor that is off by a share :data:`~.evidence.IDEAL` of it leaves a misfit of unknown
-    shape. This is taken for further noise, of the power ``IDEAL^2 W / MODES`` in every direction, where the
-    data's whitened noise has 1. It adds to the variance of the cause's coefficients, and of all others by
-    their correlation with them:
+    regressor that is off by a share :data:`~.evidence.IDEAL` of it leaves a misfit of unknown shape, of the
+    power ``IDEAL^2 W / MODES`` in every direction, where the data's whitened noise has 1:
 
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
-    # C + (IDEAL^2 W / MODES) C_:b C_bb^-1 C_b:, for each cause
     C, q = fit.covariance.copy(), len(fit.z)
     for place in slices(model):
         own = slice(q + place.start, q + place.stop)

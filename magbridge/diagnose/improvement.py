@@ -2,15 +2,13 @@ r"""The improvement of an extended calibration: the corrector's own output on sa
 
 Notes
 -----
-The log is divided into folds of whole dives, runs or eighths. The coefficients of each fold's calibration are
-fitted to the other folds, about the converged fit to all of them, and that calibration corrects its own fold
-with :func:`magbridge.calibration.correct.correct`. No figure of improvement comes from the linear model. The
-calibration as given, refitted in the same way without any cause, is the comparison: what a refit alone gains
-is not credited to a cause.
+The log is divided into folds of whole dives, runs or eighths. A calibration that is fitted to the other folds
+corrects each fold with :func:`magbridge.calibration.correct.correct`. The calibration as given, refitted in
+the same way without any cause, is the comparison.
 
-The linear model is only a check. An extension is refused where its held-out prediction and the corrected
-field differ by more than the noise, where it moves the corrected field beyond what the calibration's
-covariance allows and the log does not determine, and where the held-out field does not improve.
+An extension is refused where the linear model's held-out prediction and the corrected field differ by more
+than the noise, where it moves the corrected field further than the calibration's covariance allows and the
+log determines, and where the held-out field does not improve.
 """
 
 from __future__ import annotations
@@ -51,8 +49,7 @@ if TYPE_CHECKING:
 TIGHTENING = (1.0, 0.3, 0.1)
 """Factors on the prior sigma of the calibration's coefficients that are tried until an extension passes."""
 MAX_DEPARTURE_SIGMA = 4.0
-"""Most that a corrected sample may move, in sigmas of the calibration as given, where the log does not
-determine the move."""
+"""Most that a corrected sample may move where the log does not determine it, in sigmas as given."""
 DETERMINED = 0.25
 """Fraction of a sample's prior variance below which the log determines that sample's corrected field."""
 DOMAIN_TURN_DEG = 10.0
@@ -84,7 +81,7 @@ class Extension:
     error: FloatArray
     """Corrected field less reference (n,), nT, each sample by a calibration that was not fitted to it."""
     reference_error: FloatArray
-    """What the named errors of the reference predict (n,), nT, fitted without the sample."""
+    """Error (n,) of the reference by its named causes, nT, fitted without the sample."""
     sigma: FloatArray
     """Stated sigma (n,) of the corrected field, nT."""
     score: float
@@ -109,15 +106,12 @@ def extension_of(
     counts: BoolArray,
     grid: Sequence[Candidate] = (),
 ) -> Extension:
-    """Extend the calibration by the causes of a model; refuse an extension that its corrected field belies.
+    """Extend the calibration by the causes of a model; without a model, refit its own coefficients.
 
-    The `fit` of the model is linearised about the calibration as given; without a model the calibration's own
-    coefficients are refitted. `counts` (n,) are the samples by which the improvement is measured. All
-    candidates of the search (`grid`) give the uncertainty of nonlinear parameters. Returned is the first
-    attempt, each with a tighter prior than the one before, that passes all checks; or else the first attempt
-    with its reason for refusal.
+    `counts` (n,) are the samples by which the improvement is measured. All candidates of the search (`grid`)
+    give the uncertainty of nonlinear parameters. Returned is the first attempt, each with a tighter prior
+    than the one before, that passes all checks; or else the first attempt with its reason for refusal.
     """
-    # From the prior as given to a tighter one, until the corrected field passes every check
     first = None
     for factor in TIGHTENING:
         tried = attempt(problem, model, fit, counts, grid, factor)
@@ -221,8 +215,8 @@ def _refusal(
 def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
     """Return the limit and the value of the largest undetermined move of the corrected field, nT.
 
-    Probed are the log's own attitudes and those turned by :data:`DOMAIN_TURN_DEG` about each axis, with the
-    calibration's own coefficients alone: the effects of the causes are not limited.
+    It is evaluated at the log's attitudes and at those turned by :data:`DOMAIN_TURN_DEG` about each axis,
+    with the calibration's own coefficients alone: the effects of the causes are not limited.
     """
     calibration = problem.calibration
     own, K = _own_part(calibration, extension.calibration), calibration.coefficients.size
@@ -270,9 +264,8 @@ def check_written(
 ) -> tuple[float, float] | None:
     """Read a written calibration back and correct the logs with it as ``magbridge correct`` does.
 
-    `content` is that of ``calibration.json``; of a long log the first :data:`MAX_CHECKED_ROWS` rows are
-    corrected. Returned are the RMS errors with the calibration as `given` and with the written one, nT, if
-    the latter is larger by more than the noise; None if the file performs as computed.
+    Returned are the RMS errors with the calibration as `given` and with the written one, nT, if the latter is
+    larger by more than the noise; else None. Of a long log :data:`MAX_CHECKED_ROWS` rows are corrected.
     """
     written = decode_calibration(content, "calibration.json")
     errors: dict[bool, list[FloatArray]] = {False: [], True: []}
@@ -291,10 +284,7 @@ def check_written(
 
 
 def tightened(problem: Problem, factor: float) -> Problem:
-    """Return the problem with the prior sigma of the calibration's coefficients multiplied by `factor`.
-
-    The variance that the prior loses is kept as variance of what these data cannot determine.
-    """
+    """Return the problem with the prior sigma of the calibration's coefficients multiplied by `factor`."""
     known = problem.known
     directions, centre = problem.directions.copy(), problem.centre.copy()
     # L -> factor L; what the prior loses, (1 - factor^2) L L^T, is kept as unseen variance
@@ -312,13 +302,11 @@ def _covering(
 
     Notes
     -----
-    The error of a model is not noise, and the covariance of a fit counts noise alone. The excess of the mean
-    square held-out error over the stated variance is added to the covariance, with s the coefficients that
-    raise the corrected field by 1 nT at any attitude:
+    The covariance of a fit counts noise alone, not the error of its model. With s the coefficients that raise
+    the corrected field by 1 nT at any attitude,
 
     .. math:: C \leftarrow C + \max(0, \overline{e^2} - \overline{\sigma^2})\, s s^T
     """
-    # Largest excess of the mean square error over the stated variance, along equal scales
     sigma, s = corrected(problem.survey, calibration).sigma, isotropic(calibration)
     excess = max(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any())
     if excess <= 0.0 or not s.any():
@@ -335,11 +323,9 @@ def _own_part(given: Calibration, extended: Calibration) -> Calibration:
 def with_level_change(problem: Problem, extended: Calibration) -> Calibration:
     r"""Return the extended calibration with the changes of the field's level between logs in its covariance.
 
-    Notes
-    -----
-    Where the calibration's own coefficients move the mean of the corrected field by m, beyond the sigma as
-    given, the level differs from log to log: a reference without the crustal field does that. With the
-    variance ``v = m^2 - sigma^2`` of each log, this log and a later one differ by 2 v,
+    Notes ----- A reference without the crustal field has another level in each log. Where the calibration's
+    own coefficients move the mean of the corrected field by m, beyond the sigma as given, each log has the
+    variance ``v = m^2 - sigma^2``, and two logs differ by 2 v:
 
     .. math:: C \leftarrow C + 2 \max(0, m^2 - \overline{\sigma^2})\, s s^T
     """

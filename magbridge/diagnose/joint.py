@@ -2,35 +2,28 @@ r"""The joint fit of calibration, effects and noise, and its prediction of held-
 
 Notes
 -----
-*The likelihood ratio of one candidate.* With projected information S and score b of k columns in units of
-their widths, coefficients that are each free have the likelihood ratio ``R = b^T S^-1 b``, with as many
-degrees of freedom as the data determine directions.
-
-A smooth function of the place, or a slow curve, has more coefficients than the data can determine. These have
-a Gaussian prior whose variance is a common size g times a spectrum w, the likeliest of each: a Gaussian
-process. With ``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
+*Likelihood ratio of one candidate.* With projected information S and score b of k columns in units of their
+widths, free coefficients have the likelihood ratio ``R = b^T S^-1 b``, with as many degrees of freedom as the
+data determine directions. A smooth function of the place, or a slow curve, has more coefficients than that.
+They have a Gaussian prior of variance g w, with a common size g and a spectrum w, the likeliest of each. With
+``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
 
 .. math:: E = \max_{g, w} \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
 
-half the likelihood ratio of a variance component: under no effect ``R = 2 E`` is at most a chi-square of one
-degree of freedom (Self & Liang 1987), whatever the number of columns.
+Under no effect ``R = 2 E`` is at most a chi-square of one degree of freedom (Self & Liang 1987).
 
-*The joint likelihood.* Noise that is fitted without an effect absorbs it if it is large and slow, so two
-hypotheses are compared only after the noise has been fitted under each.
+*Joint likelihood.* Noise that is fitted without a large and slow effect absorbs it, so two hypotheses are
+compared only after the noise has been fitted under each.
 
-The *score* of a model is the log predictive density of every fold of dives, given the others. With l the log
+*Score of a model*: the log predictive density of every fold of dives, given the others. With l the log
 likelihood of the noise at the fit c to all dives, c_-f the fit without fold f, ``A_f^T A_f`` the information
-of that fold and P that of all folds and the prior, Laplace's approximation (exact for Gaussian noise, by
-Woodbury's identity) is
+of that fold and P that of all folds and the prior, Laplace's approximation is
 
 .. math:: S = l - \tfrac12 |z|^2 - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
               + \log\det P - \log\det (P - A_f^T A_f) \right]
 
-the log likelihood less the price of predicting each fold with coefficients learned from the others. The logs
-that the calibration was fitted to enter by ``|z|``, the distance in sigma between the coefficients and their
-prior: without that, every other dive would predict a constant that the calibration absorbs. The
-difference of two models' scores is the log of the odds that the left-out dives give one against the other:
-the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
+The logs that the calibration was fitted to enter by ``|z|``. The difference of two models' scores is the log
+of the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
 """
 
 from __future__ import annotations
@@ -63,9 +56,8 @@ PRIOR_SIZES = np.logspace(-7, 2, 64)
 VISIBLE = 1e-3
 """Information, as a fraction of the prior's own, below which a direction is ignored."""
 RIDGE = 0.1
-"""Prior precision of an effect, in units of a plausible size's: ten times that size is hardly believed, a
-hundred times not at all. Without it a nonlinearity and the calibration's scales can cancel each other and
-grow until they fit the noise."""
+"""Prior precision of an effect, in units of a plausible size's: without it, a nonlinearity and the
+calibration's scales could cancel each other and fit the noise."""
 FLAT_PRECISION = 1e-6
 """Prior precision of coefficients that are free, or of no known size."""
 FOLDS = 8
@@ -235,8 +227,7 @@ class Joint:
     """A hypothesis at its maximum."""
 
     log_likelihood: float
-    """Log-likelihood of the noise model, with the prior of the calibration and the effects; coefficients of
-    one common size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation)."""
+    """Penalised log-likelihood; coefficients of one common size are integrated out (Laplace)."""
     z: FloatArray
     """(q,)."""
     coefficients: FloatArray
@@ -275,14 +266,13 @@ def fit_joint(
     brief: bool = False,
     stride: int = 1,
 ) -> Joint:
-    """Maximise the joint likelihood of calibration, effects and noise in at most so many `rounds`.
+    """Maximise the joint likelihood of calibration, effects and noise by at most `rounds` steps.
 
-    The best of the `starts` (q + k,) is taken, among them the result of plain least squares if `plain`. The k
-    columns of the effects have the prior precision `ridge`, in units of their widths; those with `spectra`
-    (l, k) have one common size and l alternatives for their variances. The noise is an autoregression of this
-    `order`, begins from that of a fit that it will be `like`, and has the `blocks` and the `brief` memory of
-    :func:`~magbridge.diagnose.noise.fit_noise`. Of the log's pieces, one in `stride` counts in the normal
-    equations; the noise is that of every sample.
+    Start from the best of the `starts` (q + k,), among them plain least squares if `plain`. The k columns of
+    the effects have the prior precision `ridge`, in units of their widths; those with `spectra` (l, k) have
+    one common size and l alternatives for their variances. The autoregression has this `order` and starts
+    from that of the fit `like`; `blocks` and `brief` are those of :func:`.fit_noise`. Of the log's pieces,
+    one in `stride` counts in the normal equations.
     """
     # Coefficients c = (z, b): the calibration's, then the effects'. Prior precision 1 for z, `ridge` for b
     X = JointDesign(problem, precomputed(len(problem), columns))
@@ -339,10 +329,7 @@ def fit_joint(
 
 
 def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
-    """Return ``1/2 ln det(1 + g S)``, the log of how much the data narrow coefficients.
-
-    Their posterior covariance is (k, k), their prior's precision (k,).
-    """
+    """Return ``1/2 ln det(1 + g S)`` of coefficients: posterior covariance (k, k), prior precision (k,)."""
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
 
 
@@ -371,17 +358,16 @@ def _plain(
 
 
 class HeldOut(NamedTuple):
-    """Result of leaving out dives, fold by fold.
-
-    It has the residual (n,) of every sample under the fit without its fold, by the linear model, nT of the
-    sensor; the log predictive density of all folds; the number (n,) of each sample's fold; and the
-    coefficients (f, q + k) of calibration and effects, fitted without each fold.
-    """
+    """Result of leaving out dives, fold by fold."""
 
     residual: FloatArray
+    """(n,) of every sample by the linear fit without its fold, nT of the sensor."""
     score: float
+    """Log predictive density of all folds."""
     fold: IntArray
+    """(n,) number of each sample's fold."""
     coefficients: FloatArray
+    """(f, q + k) of calibration and effects, fitted without each fold."""
 
 
 def held_out(
@@ -392,11 +378,10 @@ def held_out(
     interleaved: bool = False,
     groups: IntArray | None = None,
 ) -> HeldOut:
-    """Leave out dives, fold by fold.
+    """Refit all coefficients without each fold; nonlinear parameters and noise stay those of `fit`.
 
-    Nonlinear parameters and noise are those of the fit to all dives; every coefficient is refitted without
-    the fold. Folds are stretches of dives, so that a slow change is extrapolated; or, `interleaved`, every
-    eighth dive, so that it is only interpolated. `groups` (n,) takes the place of the dives' numbers.
+    Folds are stretches of dives, which extrapolate a slow change, or, `interleaved`, every eighth dive, which
+    interpolates it. `groups` (n,) replaces the dives' numbers.
     """
     X, noise, prior = JointDesign(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
@@ -448,10 +433,7 @@ class Improvement(NamedTuple):
 def paired(
     error_before: FloatArray, error_after: FloatArray, dive: IntArray, counts: BoolArray
 ) -> Improvement:
-    """Compare two errors (n,), nT, on the samples that count.
-
-    The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
-    """
+    """Compare two errors (n,), nT, on the samples that count, by a bootstrap of whole dives."""
     # Sums of squares of each dive: the bootstrap then draws dives, not samples
     number = np.unique(dive[counts], return_inverse=True)[1]
     b, a = np.bincount(number, error_before[counts] ** 2), np.bincount(number, error_after[counts] ** 2)

@@ -1,11 +1,8 @@
 """The part of a signal that no cause of the table accounts for.
 
-Notes
------
-A free description has more coefficients than the data can determine, so they have one common free size
-(:mod:`~.joint`). Noise that was fitted without an effect may have absorbed it. So descriptions
-are scored under the noise of the fit and under that which is left when slow curves are fitted as well; the
-best are then compared by the whole likelihood, with the noise refitted.
+Notes ----- The coefficients of a free description have one common free size (:mod:`.joint`). Descriptions are
+scored under two noises: that of the fit, which may have absorbed an effect, and that which is left when slow
+curves are fitted as well. The best are compared by the whole likelihood, with the noise refitted.
 """
 
 from __future__ import annotations
@@ -30,9 +27,9 @@ from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.estimation.residual import rms, robust_scale
 
 MAX_TESTED_COEFFICIENTS = 6
-"""Coefficients of a cause of which this is asked: with more, it takes almost any shape."""
+"""Most coefficients of a cause whose size is tested for variation: with more, it takes almost any shape."""
 COMPARED_DESCRIPTIONS = 3
-"""Number of the best descriptions under each noise that are then weighed by the full likelihood."""
+"""Best descriptions under each noise that are compared by the full likelihood."""
 TURNS = 6
 """Alternations between fitting a curve and fitting its direction."""
 CALM = 2
@@ -40,9 +37,8 @@ CALM = 2
 LOUD = 2.0
 """Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
 SLOW, SMOOTH, NEGLIGIBLE = 0.4, 5.0, 1e-5
-"""A residual is far from white if so much of its power is left in means over 64 samples, or if its RMS is so
-many times what changes from one sample to the next (autoregressive noise of 0.96); and its RMS, as a share of
-the field, below which that does not matter."""
+"""Limits of a residual that is far from white: fraction of its power in means over 64 samples, ratio of its
+RMS to that of its differences; and the RMS, as a fraction of the field, below which it is negligible."""
 
 
 def varying(
@@ -50,9 +46,8 @@ def varying(
 ) -> Description | None:
     """Describe a named cause whose size follows other telemetry, the attitude, or time.
 
-    A cause of the table has one size in a log: its true name leaves nothing of this kind. A name that stands
-    for something else (a current's, where its leads move, or where a joint closes under pressure) leaves its
-    own regressor times a function of that. None is returned for a cause that takes almost any shape.
+    A true cause has one size in a log; a wrong name may leave its regressor times a function of something
+    else. None is returned for a cause that takes almost any shape.
     """
     if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
         return None
@@ -89,10 +84,7 @@ def _followed(problem: Problem, channel: str | None) -> list[FloatArray]:
 
 
 class Scored(NamedTuple):
-    """A description scored under one noise: the log evidence, its kind, its estimate, the shift of the model.
-
-    The shift (q + k, l) is by how much calibration and model decrease for one unit of each coefficient.
-    """
+    """A description scored under one noise; `shift` is that of :class:`.Information`."""
 
     evidence: float
     kind: str
@@ -145,11 +137,9 @@ class Leftover(NamedTuple):
 def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, free: Ridge) -> Ridge:
     """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
 
-    In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
-    `free` estimate. The two free numbers of the direction pay as in
-    :func:`~.evidence.log_bayes`.
+    The two free numbers of the direction pay as in :func:`~.evidence.log_bayes`.
     """
-    # Start from the first singular vector of the free estimate, then alternate
+    # Start from the first singular vector of the `free` estimate; then fit f given d, and d given f, in turn
     count = len(width) // 3
     direction = np.linalg.svd(free.estimate.reshape(count, 3), full_matrices=False)[2][0]
     for _ in range(TURNS):
@@ -173,10 +163,10 @@ def leftover(
     but: Sequence[Candidate] = (),
     also: Sequence[Description] = (),
 ) -> Leftover | None:
-    """Test whether the fit of `model` leaves anything unexplained; return the best description, or None.
+    """Return the best significant description of what the fit of `model` leaves, or None.
 
-    A description may not only repeat the regressors of the causes in `but`; those in `also` are tried as
-    well, and `tone`, the strongest one, where tones are not among the causes.
+    A description that only repeats the regressors of the causes in `but` is not tried; those in `also` are,
+    and the strongest `tone`, where tones are not among the causes.
     """
     # Descriptions that only repeat an excluded cause's own regressors are no alternatives
     listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
@@ -289,8 +279,7 @@ def unlisted(
 ) -> Leftover | None:
     """Return the part that the `named` causes leave unexplained, or None.
 
-    `wrong` are wrong samples, `error` (n,) is the residual on parts left out, nT, of which `counts` (n,)
-    count.
+    `error` (n,) is the residual on held-out parts, nT, of which the samples `counts` (n,) count.
     """
     return _passing(wrong) or _slow(problem, fit, named) or _loud(problem, error, counts)
 
@@ -298,11 +287,7 @@ def unlisted(
 def switching(
     problem: Problem, fit: Joint, named: Sequence[Hypothesis], wrong: Outliers | None, *, ended: bool
 ) -> Leftover | None:
-    """Describe a switching signal if it is stronger than all `named` causes, or has ended the search.
-
-    Else return None. The noise's memory has absorbed the signal except for its level shifts, and the names
-    describe that rest; after a search that ended, competing names were not tried.
-    """
+    """Describe a switching signal if it is stronger than all `named` causes, or has ended the search."""
     if wrong is None or not wrong.lasting:
         return None
     slow = _slow(problem, fit, named)
@@ -341,11 +326,7 @@ def far_from_white(problem: Problem, found: Memory) -> bool:
 
 
 def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
-    """Describe a residual that is far from white, though no description of the list stands out of it.
-
-    Noise of a long memory can describe any slow signal, but such a signal is not noise of the sensor. Noise
-    that grows towards low frequencies can, too, unless it may be a remnant of the strongest cause.
-    """
+    """Describe a residual that is far from white, or slow noise that is not the strongest cause's remnant."""
     # Slow noise belongs to what is left: no sensor makes it
     slow = problem.slow_noise(fit.z)
     residual = (fit.residual + slow) / problem.reference_jacobian

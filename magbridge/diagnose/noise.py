@@ -55,13 +55,11 @@ ALTERNATIONS = 6
 MIN_GAIN = 0.01
 """Gain in log likelihood below which the fit has converged."""
 LOSS = 0.02
-"""Largest order p as a share of the n samples that have a whole past: fitting p coefficients to them adds
-about p / n to the variance of the prediction."""
+"""Largest order p as a share of the n samples of a whole past: p / n adds to the prediction's variance."""
 MAX_PARTIAL_CORRELATION = 0.9999
 """Largest partial correlation."""
 TIMES = 20.0
-"""Time constants of the noise that a log holds at least. Slower noise would swallow slow effects, and so few
-repetitions cannot show its level."""
+"""Least number of the noise's time constants in a log: slower noise would absorb slow effects."""
 BRIEFEST, SLOWEST = 20.0, 2000.0
 """Limits of the longest time constant in short and in long logs, in samples."""
 
@@ -114,11 +112,7 @@ class ResidualNoise:
         return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
-        """Whiten columns (m, k), rows of the log from `start` on, for least squares.
-
-        The first `skip` rows serve only as the past of the others. The product with a band matrix is computed
-        in blocks; arguments and result are best stored column by column.
-        """
+        """Return whitened columns (m, k) of the rows from `start` on; the first `skip` are only a past."""
         # Band matrix of f (1, -a) in blocks of BAND rows: one dense product for each block
         p, k, own = len(self.ar), values.shape[1], len(values) - skip
         count = -(-own // BAND)
@@ -170,10 +164,9 @@ class ResidualNoise:
 
 
 class Predictors:
-    """Predictors of the samples shortly after a gap.
+    """Predictors of the samples shortly after a gap, for each of l patterns of lags.
 
-    For each of l patterns of lags they have `a` (l, p) and `f` (l,) of the module's notes, and the `weights`
-    (l, p + 1) of a sample, f, and of those before it, ``-f a``.
+    `a` (l, p) and `f` (l,) are those of the module's notes, `weights` (l, p + 1) are f and ``-f a``.
     """
 
     def __init__(self, history: Past, ar: FloatArray) -> None:
@@ -225,21 +218,12 @@ def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
 
 
 def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
-    r"""Choose p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals.
-
-    Whitening with too high an order costs little; with too low a one, noise passes for structure.
-
-    Notes
-    -----
-    Autocovariances c_k of all pairs without a gap (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560),
-    then Levinson's recursion:
-
-    .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
-    """
+    """Return p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals."""
     n = len(residual)
     scale = robust_scale(residual) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
-    # Levinson's recursion on the autocovariances, Akaike's criterion at every order
+    # Autocovariances of all pairs without a gap (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560)
+    # Levinson: kappa_p = (c_p - sum_k a_k c_(p-k)) / v_(p-1), v_p = v_(p-1) (1 - kappa_p^2)
     c = np.array([_product(r, slots, k) for k in range(MAX_NOISE_ORDER + 1)])
     a, v, costs = np.zeros(0), c[0] + 1e-300, {}
     for p in range(1, MAX_NOISE_ORDER + 1):
@@ -267,9 +251,8 @@ def fit_noise(
 ) -> ResidualNoise:
     """Fit the noise model to a residual (n,), nT, with an autoregression of the order of its `history`.
 
-    The level changes from block to block if `blocks` is true; the data decide if it is None. The fit begins
-    from the level and tails of a noise that it will be `like`. `brief` allows no longer time constant than
-    :data:`BRIEFEST`.
+    The level changes from block to block if `blocks` is true; None lets the data decide. The fit starts from
+    the noise `like`. `brief` allows no longer time constant than :data:`BRIEFEST`.
     """
     n, order, whole = len(residual), history.order, history.whole
     # Blocks of equal length, in each of which the level is constant
@@ -360,10 +343,7 @@ def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray
 
 
 def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -> tuple[float, FloatArray]:
-    """Log likelihood and level of each block, from a first guess.
-
-    Each level is shrunk towards that of all blocks, which counts like ten more samples.
-    """
+    """Return the log likelihood and the level of each block, from a first guess."""
     n = len(square)
     power = level**2
     # Expectation maximisation of a Student scale, all blocks at once

@@ -6,17 +6,13 @@ Notes
 
 .. math:: y = c_0 + \sum_i b_i u_i + q\,\bigl(d_0 + \sum_i d_i u_i\bigr)
 
-u the direction of the field in the body: what an offset of one nanotesla along each axis adds to the total
-field. The share of y's power that the terms in q add is what the series explains. Where no series is
-followed, q are slow waves in time, which find the axis of a slow signal. That is a description: a cause is a
-claim about physics, and is tested elsewhere.
+u the direction of the field in the body. The series explains the share of y's power that the terms in q add.
+Where no series is followed, q are slow waves in time, which find the axis of a slow signal.
 
-*A track.* A function of the place is the same on every pass. Of slow changes with time, a trend and a bend
-``f = (x, x^2)``, x the time over the log, it can imitate the means of f over the cells of the track. With T
-the covariance of f and W that within the cells, the smallest eigenvalue of ``T^-1 W`` is the least share of
-the power of such a change that no function of the place imitates: one less the largest squared canonical
-correlation (Hotelling 1936, Biometrika 28:321). It is 0 for a track that never returns, and for one that
-goes there and back: a change that bends about the turning point is the same on both ways.
+*A track.* A function of the place is the same on every pass. It can imitate the cell means of a trend and a
+bend in time, ``f = (x, x^2)``. With T the covariance of f and W that within the cells, the smallest
+eigenvalue of ``T^-1 W`` is the least share of the power of such a change that no function of the place
+imitates (one less the largest squared canonical correlation: Hotelling 1936, Biometrika 28:321).
 """
 
 from __future__ import annotations
@@ -46,14 +42,13 @@ MIN_LAG_GAIN = 0.02
 CLEARLY = 0.1
 """Least fraction of the unexplained part by which an axis must beat the next to be reported."""
 WAVES, SLOW = 48, 0.5
-"""Half waves per log by which the axis of a slow signal that follows no series is found, and the share of its
-power, constants aside, that they must explain."""
+"""Half waves per log that describe a slow signal, and the fraction of its power that they must explain."""
 WHITE = 0.9
-"""Share of a residual's RMS that changes from one sample to the next, from which on it lasts no time."""
+"""Ratio of the RMS of sample-to-sample changes to the RMS, from which on a residual counts as white."""
 EVERY = slice(None)
 FIELD_AND_AXES = ("field", "x", "y", "z")
 CORRELATION_ROWS = 20_000
-"""Rows that are looked at."""
+"""Most rows that are correlated."""
 RETURN_CELL_M = 250.0
 """Side of the cells, m: crustal sources are seldom nearer, and a map's own grid is seldom finer."""
 MIN_RETURN_TIME_S = 900.0
@@ -66,13 +61,11 @@ class Seen(NamedTuple):
     """What a signal follows."""
 
     channel: str | None
-    """Series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``. None if no
-    series explains a tenth, or a slow signal might be correlated by chance."""
+    """Series that explains most: telemetry, ``time``, ``roll``, ``pitch``, ``heading``; None if none does."""
     lag: float
     """Lag of the signal behind the series, s."""
     axis: str | None
-    """``x y z`` of the body, ``field`` along the field; None where several take part, or the signal neither
-    follows a series nor is slow."""
+    """``x y z`` of the body, ``field`` along the field; None where several take part."""
     size: float
     """RMS of the signal in the total field."""
     share: float
@@ -80,19 +73,19 @@ class Seen(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """How far from white a residual is.
-
-    It has its RMS, and what of that changes from one sample to the next (`white`); the time after which its
-    autocorrelation has fallen to 1/e, s; and the share of its power that is left (`slow`) in so many `means`
-    over `samples` samples.
-    """
+    """How far from white a residual is."""
 
     rms: float
     white: float
+    """RMS of the changes from one sample to the next, divided by the root of two."""
     correlation_time: float
+    """Time after which the autocorrelation has fallen to 1/e, s."""
     slow: float
+    """Fraction of the power that is left in means."""
     samples: int
+    """Samples of each mean."""
     means: int
+    """Number of means."""
 
     @property
     def lasts(self) -> bool:
@@ -101,10 +94,7 @@ class Memory(NamedTuple):
 
 
 def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = None) -> Seen:
-    """Return the series that a signal (n,), nT of the total field, follows.
-
-    If only its part `component` (n,) is of interest, this part must follow the series, too.
-    """
+    """Return the series that a signal (n,), nT of the total field, and its part `component` (n,) follow."""
     part = slice(None, None, -(-len(signal) // CORRELATION_ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
     axes = np.column_stack([np.ones(len(u)), u])
@@ -113,7 +103,7 @@ def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = No
     size = rms(signal)
     if not total:
         return Seen(None, 0.0, None, size, 0.0)
-    # A constant along each axis is not asked for: project it out of signal and series
+    # Project a constant along each axis out of signal and series
     base = np.linalg.qr(axes)[0]
     y, own = (x - base @ (base.T @ x) for x in (y, signal[part] if component is None else component[part]))
 
@@ -150,10 +140,9 @@ def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = No
 
 
 def _by_chance(share: float, terms: int, residual: FloatArray) -> float:
-    """Return the chance that a series explains such a share of something that has nothing to do with it.
+    """Return the p-value (Fisher's F) of a share that a series of `terms` functions explains.
 
-    Fisher's F; of a `residual` (n, 4), seen along each axis, only so many samples are independent as its
-    memory allows (Bartlett 1946).
+    The correlation time of the `residual` (n, 4) gives the number of independent samples (Bartlett 1946).
     """
     n = len(residual)
     freedom = max(n / (1.0 + 2.0 * max(map(_remembered, residual.T))) - terms - len(FIELD_AND_AXES), 1.0)

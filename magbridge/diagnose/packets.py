@@ -2,9 +2,7 @@ r"""Transient signals: oscillations that ring, surge or burst, and the passage o
 
 Notes
 -----
-*What lasts for a while: oscillations that ring, surge or burst, and the passage of a distant source.*
-A packet is a wave along the field under a Gaussian, with an amplitude and a phase of its own (Gabor 1946,
-J. IEE 93:429):
+A packet is a wave along the field under a Gaussian (Gabor 1946, J. IEE 93:429):
 
 .. math:: e^{-(t - t_0)^2 / 2 L^2} \left(a \cos 2 \pi f (t - t_0) + b \sin 2 \pi f (t - t_0)\right)
 
@@ -15,9 +13,8 @@ g the score of each single sample and h its information at that frequency, the l
 .. math:: B = \sum_t g_t e^{-(t - t_0)^2 / 2 L^2 + 2 \pi i f (t - t_0)}, \qquad
           S = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / L^2}
 
-which is a short-time Fourier transform for each length; intervals without a sample have g = h = 0. A place is
-a length, a frequency and a moment. A packet is accepted if its Bayes factor, averaged over all places that it
-could have had, is above one.
+which is a short-time Fourier transform for each length. A place is a length, a frequency and a moment. A
+packet is accepted if its Bayes factor, averaged over all places, is above one.
 """
 
 from __future__ import annotations
@@ -59,15 +56,14 @@ QUARTERS = np.arange(-12, 13)
 
 
 class Packets(NamedTuple):
-    """The accepted packets.
-
-    Their columns, two for each; how many sets of as many packets they were chosen from; and the period of the
-    loudest, s.
-    """
+    """The accepted packets."""
 
     columns: Columns
+    """Two for each packet."""
     look_elsewhere: float
+    """Number of sets of as many packets that they were chosen from."""
     period: float
+    """Period of the strongest, s."""
 
 
 def packets(problem: Problem, fit: Joint) -> Packets | None:
@@ -114,10 +110,7 @@ def _columns(
 
 
 def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
-    """Return (5, m) length, frequency, moment, ratio and log prior of places above :data:`LEAST_RATIO`.
-
-    Times are in intervals; the prior is one among the places of this length.
-    """
+    """Return (5, m) length, frequency, moment (intervals), ratio and log prior of places that are tried."""
     noise, slots, slope = fit.noise, problem.survey.slots, problem.reference_jacobian
     wide, every = WINDOW * length, length // 2
     window = np.exp(-0.5 * ((np.arange(wide) - wide // 2) / length) ** 2)
@@ -155,12 +148,11 @@ def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
 
 
 def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
-    r"""Find the most likely passage of a distant source, over all durations T, in steps of half a duration.
+    r"""Return three columns of the likeliest passage of a distant source, and the number of passages tried.
 
-    Returned are three columns, and the number of moments tried at this duration, times the durations. Along a
-    straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s the time
-    from its nearest point in units of T, distance over speed (Anderson's functions: Ginzburg, Frumkis &
-    Kaplan 2002, Sens. Actuators A 102:67).
+    Along a straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s
+    the time from its nearest point in units of the duration (Ginzburg, Frumkis & Kaplan 2002, Sens. Actuators
+    A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
     # Score and information of each quarter of a duration, then matched filters at all moments

@@ -1,42 +1,25 @@
 r"""The comparison of the measured field with a calibration, as a linear problem.
 
-Notes
------
-*Slow noise.*
-The autoregression of :mod:`~magbridge.diagnose.noise` sees few samples and ends long before: it
-leaves the lowest frequencies of 5,000 such samples five to nine times too much power, which passes for a slow
-cause. So the noise of axis i may also have a slow part (Keshner 1982, Proc. IEEE 70:212),
-
-.. math:: o_i(t) = \sum_k c_{ki} \cos(\pi k t / T), \qquad \operatorname{var} c_{ki} = g / k
-
-of one common size g (:mod:`~magbridge.diagnose.joint`). It is that of many frequencies, of
-which no slow cause has all. A random walk has 1/k^2 (:mod:`~magbridge.diagnose.run`).
-
-*The prior of the coefficients.* It is the calibration's posterior without the information of samples that are
-compared here again, and with a drift between days, which every instrument has.
-
-*The residuals of a calibration, and what each coefficient leaves in them.*
-With the scalar residual e of :mod:`magbridge.estimation.residual` and its derivative g by the nine
-coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves it by
+Notes ----- *Forward model.* With the scalar residual e of :mod:`magbridge.estimation.residual` and its
+derivative g by the nine coefficients, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves e
+by
 
 .. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
 
-and a coefficient that the vehicle has but the calibration lacks adds minus that to the residual. Every cause
-passes through the forward model by this one rule. The calibration's coefficients stay free, with its
-posterior as prior: ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L spans only the directions that
-these data can determine.
+A coefficient that the vehicle has and the calibration lacks adds minus that to the residual. Derivatives are
+taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes. At the reading itself they
+would correlate with its noise (errors in variables).
 
-Three delays are free, too: the sensor's axes may have been sampled late, and then interpolated to their rows
-(:func:`interpolation_error`). That is a fault of the log, not of the vehicle, so the delays change no
-coefficient; without them, a pair of large causes that cancel each other could mimic them. They have one
-common size (:mod:`~magbridge.diagnose.joint`), because many logs have no such delays, and three independent
-numbers absorb up to a tenth of a skew's power.
+*Unknowns.* The calibration's coefficients are free, ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L spans the
+directions that these data determine. The prior is the calibration's posterior, without the information of
+samples that are compared again, and with a drift between days. Three delays of the sensor's axes are free as
+well (:func:`interpolation_error`): they are a fault of the log, and change no coefficient.
 
-Slow noise is free if the data need it (:func:`with_slow_noise`).
+*Slow noise* is free if the data need it (:func:`with_slow_noise`). The autoregression of :mod:`.noise` ends
+after few samples, and underestimates the power of 1/f noise at the lowest frequencies by a factor of five to
+nine. So the noise of axis i may have a slow part (Keshner 1982, Proc. IEEE 70:212), of one common size g:
 
-Derivatives are taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes: at the reading
-itself they would correlate with its noise, and scales could grow against offsets until they fit the noise
-(errors in variables).
+.. math:: o_i(t) = \sum_k c_{ki} \cos(\pi k t / T), \qquad \operatorname{var} c_{ki} = g / k
 """
 
 from __future__ import annotations
@@ -103,19 +86,11 @@ def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
 
 
 def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
-    r"""Return the first or second derivative (k, n) of H (k, n), of a cubic spline through each leg.
+    """Return the first or second derivative (k, n) of H (k, n), of a cubic spline through each leg.
 
-    A leg is a run of samples in which no gap is longer than :data:`MAX_MISSING_SAMPLES` samples.
-
-    Notes
-    -----
-    Of an oscillation of angular frequency w, sampled every h, a central difference returns only
-    ``sin(wh)/wh = 1 - (wh)^2/6 + ...`` of the rate, so a coefficient fitted to it would be too large by as
-    much. The spline returns ``3 sin(wh)/(wh (2 + cos(wh))) = 1 - (wh)^4/180 + ...``.
-
-    The rates ``D e`` of noise e, of covariance Sigma, correlate with the noise:
-    :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D`, whatever Sigma is. A one-sided difference has a trace,
-    which would pass for an effect; the spline treats both directions of time equally and has none.
+    A leg is a run of samples without a gap of more than :data:`MAX_MISSING_SAMPLES`. The derivative matrix of
+    a spline has no trace, so the rates of noise do not correlate with the noise itself; those of a one-sided
+    difference do. A central difference would underestimate the rate of an oscillation.
     """
     t, out = survey.time, np.zeros_like(H)
     # One spline for each leg, so that none reaches across a gap
@@ -128,20 +103,11 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
 
 
 def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""Return (3, n) error of axes H (3, n) sampled late and interpolated to their row, nT per s of delay.
+    """Return (3, n) error of axes H (3, n) sampled late and interpolated to their row, nT per s of delay.
 
-    Linear interpolation is in error when the vehicle sways from sample to sample. `H` must be free of the
-    readings' noise: the difference is one-sided and would correlate with it.
-
-    Notes
-    -----
-    An axis sampled tau after its row, and interpolated linearly from there and from the sample before it
-    (H_-, an interval h earlier), reads at its row (H_0)
-
-    .. math:: H(t + \tau) - \frac{\tau}{h} \left(H(t + \tau) - H(t - h + \tau)\right)
-              \approx H + \tau \left(\dot H - \frac{H_0 - H_-}{h}\right)
+    `H` must be free of the readings' noise: the difference is one-sided and would correlate with it.
     """
-    # tau (dH/dt - (H_0 - H_-) / h), per unit of tau
+    # Linear interpolation between t - h + tau and t + tau: H + tau (dH/dt - (H_0 - H_-) / h), per unit of tau
     rate, follows = rates(survey, H), survey.follows()
     at = np.flatnonzero(follows & rate.any(axis=0))
     out = np.zeros_like(H)
@@ -180,12 +146,8 @@ def noise_sigma(calibration: Calibration, e: FloatArray) -> float:
 
 
 def floor(calibration: Calibration) -> FloatArray:
-    """Return (K, K) covariance, nT², of how much the nine constants may have changed since the calibration.
-
-    The posterior counts only the noise of its samples, and a few thousand samples average that down to a
-    hundredth. The filters' lag in the turns of the calibration runs, and the drift between days, are larger.
-    """
-    # 20 ppm of the field on each of the nine constants
+    """Return (K, K) covariance, nT², of the drift of the nine constants since the calibration."""
+    # 20 ppm of the field on each: the posterior counts only noise, which thousands of samples average down
     spread = np.zeros(calibration.coefficients.size)
     for constants in _constants(calibration):
         spread[constants] = STABLE * calibration.reference.field
@@ -235,10 +197,8 @@ def _without_repeats(
 ) -> tuple[FloatArray, FloatArray]:
     """Return L and m of the posterior without the information of samples that are compared here again.
 
-    The information of the calibration's samples that are in the survey again (`survey.fitted`) is subtracted
-    from its posterior: it would count twice. In the posterior's own units the precision left is
-    ``P_0 = 1 - H`` with H the information of those samples, and since the gradient of the whole fit vanished
-    at c_0, ``P_0 m = L^T J^T W e``, the sum over those samples.
+    It would count twice. In the posterior's own units the remaining precision is ``P_0 = 1 - H`` with H the
+    information of those samples (`survey.fitted`), and ``P_0 m = L^T J^T W e``, the sum over them.
     """
     L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
@@ -254,9 +214,8 @@ def _without_repeats(
     # P_0 = 1 - H, and P_0 m = A^T y with the directions that only these samples determined left out
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
-    held = (
-        values > MIN_PRECISION
-    )  # other directions were learned from the repeated samples alone, which count anyway
+    # other directions were learned from the repeated samples alone, which count anyway
+    held = values > MIN_PRECISION
     pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
     # Those directions keep the physical bound as their prior
     bound = L / _physical(calibration)[:, None]
@@ -268,9 +227,7 @@ def _without_repeats(
 def _physical(calibration: Calibration) -> FloatArray:
     """Return the plausible 1-sigma (K,), nT, of each coefficient on any vehicle; infinite if unknown.
 
-    Soft iron is percents of the field, hard iron thousands of nanotesla, and both fall with the order. The
-    bound is needed because, at a glider's few attitudes, scale and offset can cancel each other: without it
-    they grow without end and fit the noise.
+    Without this bound, scale and offset can cancel each other at a glider's few attitudes and fit the noise.
     """
     width, k = np.full(calibration.coefficients.size, np.inf), 0
     for term in calibration.terms:
@@ -290,15 +247,13 @@ class Problem:
     survey: Survey
     calibration: Calibration
     reading: FloatArray
-    """(n, 3) nT, ``H_r - e w / |w|^2``: for effects that depend on the reading, which must not contain its
-    noise."""
+    """(n, 3) nT, ``H_r - e w / |w|^2``: the reading without noise, for effects that depend on it."""
     residual: FloatArray
     """(n,) e, in the sensor's nanotesla."""
     jacobian: FloatArray
     """(n, 9) g."""
     reference_jacobian: FloatArray
-    """(n,) 1/s of :mod:`magbridge.estimation.residual`: e per nT by which the true field exceeds the
-    reference."""
+    """(n,) change of e per nT by which the true field exceeds the reference."""
     delay_jacobian: FloatArray
     """(n, 3) ``-de/dz`` of the delays, in units of :data:`AXIS_DELAY_SIGMA_S`."""
     directions: FloatArray
@@ -308,8 +263,7 @@ class Problem:
     unseen: FloatArray
     """(K, K) nT², covariance in the directions that these data cannot see."""
     waves: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(k,) of each coefficient of slow noise, what its variance falls with: the number of half waves per log,
-    or a power of it. There are none where the noise has no such part."""
+    """(k,) half waves per log, or a power, by which slow noise's variances fall; empty without such noise."""
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -344,21 +298,15 @@ class Problem:
 
     @cached_property
     def coefficient_jacobian(self) -> FloatArray:
-        """(n, k) ``-de/dz`` of the calibration's own coefficients, :attr:`known` of z.
-
-        Single precision: an entry is rarely above 1e4 nT, so its rounding is below 1e-3 nT, and a month's
-        array takes 50 MB in place of 100.
-        """
+        """(n, k) ``-de/dz`` of the calibration's own coefficients (:attr:`known`), single precision."""
         samples, _ = samples_of(self.survey, self.calibration)
         L = -self.directions[:, self.known]
         return derivatives(self.calibration, samples, self.jacobian, L, np.float32)
 
     def calibration_rows(self, rows: slice) -> FloatArray:
-        """Return rows (m, q) of ``-de/dz``: coefficients, slow noise (nT), delays of the axes.
-
-        Slow noise is computed where it is needed: for a month its columns would fill 500 MB.
-        """
+        """Return rows (m, q) of ``-de/dz``: coefficients, slow noise (nT), delays of the axes."""
         blocks = [self.coefficient_jacobian[rows]]
+        # Computed for each block: for a month, all columns of slow noise would fill 500 MB
         if self.waves.size:
             blocks.append(slow_columns(self.jacobian[:, 6:], rows))
         return side_by_side([*blocks, self.delay_jacobian[rows]])
@@ -405,11 +353,10 @@ def samples_of(survey: Survey, calibration: Calibration) -> tuple[ResidualSample
 def linearised(
     samples: ResidualSamples, coefficients: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Compute the residual and its derivatives at readings that are moved until the residual vanishes.
+    """Return the residual (n,), nT, its derivatives (n, 9) and (n,), and the moved readings (n, 3), nT.
 
-    Returned are the residual (n,), in the sensor's nT, its derivatives by the nine coefficients (n, 9) and by
-    the true field (n,), and the moved readings (n, 3), nT. The `coefficients` (9 m,) are those of all m
-    regressors.
+    The derivatives are those by the nine coefficients and by the true field, at readings that are moved until
+    the residual vanishes. The `coefficients` (9 m,) are those of all m regressors.
     """
     n = len(samples.field)
     e, g, reference_jacobian, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
@@ -452,10 +399,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
 
 
 def with_slow_noise(problem: Problem, power: int = 1) -> Problem:
-    """Return the problem with slow noise, its power 1/f or that to a higher `power`.
-
-    Its coefficients are places of z that move no calibration.
-    """
+    """Return the problem with slow noise, its power 1/f or that to a higher `power`."""
     if problem.waves.size:
         made = replace(problem, waves=waves() ** power)
     else:

@@ -54,8 +54,8 @@ if TYPE_CHECKING:
 __all__ = ["accept", "diagnose", "odds_over_random_walk", "settle"]
 
 AGAINST = 2.0
-"""Log odds of the held-out dives against the names from which on names are rejected. These odds are noisy: of
-14 right names of S/N 8 one had 1.9, of ten wrong ones of unlisted effects four had more."""
+"""Log odds of the held-out dives against the names above which names are rejected: of 14 right names of S/N 8
+one had 1.9, of ten wrong ones four had more."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 MIN_SLOW_FRACTION = 0.5
@@ -65,12 +65,9 @@ MIN_SLOW_FRACTION = 0.5
 def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
 
-    Names and free descriptions both pay for the number of alternatives they were chosen from. The evidence of
-    a description of the remaining signal is added to the names' evidence; unless it is a remnant of one of
-    the named causes, the names pay for it as for a further cause. A cause that the table lacks competes like
-    any other: names are asserted if they are likelier than every description of the whole signal, and predict
-    every eighth dive as well. They remain possible unless one beats them 20:1, allowing for the error of
-    their regressors.
+    Names and free descriptions pay for the number of alternatives they were chosen from. Names are asserted
+    if, with a description of the remaining signal, they are likelier than every description of the whole
+    signal, and predict every eighth dive as well. They remain possible unless a description beats them 20:1.
     """
     model = outcome.model
     # Names: their likelihood ratio with all prices
@@ -109,8 +106,8 @@ def settle(
 ) -> tuple[SearchOutcome, bool, Leftover | None]:
     """Search, and return the selected outcome with the result of :func:`accept`.
 
-    Slow noise absorbs part of the signal that descriptions represent, and so makes names look better. So if
-    the names found without slow noise are not asserted, or something switches, no search with it is made.
+    Slow noise absorbs part of what descriptions represent. So if the names found without it are not asserted,
+    or something switches, no search with it is made.
     """
 
     def rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> float | None:
@@ -126,10 +123,7 @@ def settle(
 
 
 def _foretold(problem: Problem, model: Sequence[Candidate], fit: Joint, best: Leftover | None) -> float:
-    """Return the log odds by which a model with the best description, if any, predicts every eighth dive.
-
-    Descriptions that were picked from many places or periods pay for that, as in the fit.
-    """
+    """Return the log odds by which a model with the best description, if any, predicts every eighth dive."""
     columns = [candidate.columns for candidate in model]
     scores = [held_out(problem, columns, fit, interleaved=True).score]
     for one in best.fitted if best else ():
@@ -147,11 +141,7 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
 
 
 def _possible_names(outcome: SearchOutcome, deficit: float) -> tuple[CompetingHypothesis, ...]:
-    """Return the names, and their competing hypotheses, the likeliest first.
-
-    A description beats the names by `deficit`; those that it does not beat by their threshold stay. Its
-    shape follows the data, whereas the regressors of all causes are idealised.
-    """
+    """Return the names and competing hypotheses that a description, better by `deficit`, does not exclude."""
     found: dict[Group, CompetingHypothesis] = {}
     for hypothesis, competing in zip(outcome.chosen, outcome.competing, strict=True):
         limit = bayes_factor_threshold(hypothesis.ratio)
@@ -168,9 +158,7 @@ def odds_over_random_walk(outcome: SearchOutcome, hypothesis: Hypothesis) -> flo
     Notes
     -----
     A random walk has a power of 1/f^2: half waves of variance ``g / k^2`` in place of the ``g / k`` of
-    :mod:`~magbridge.diagnose.problem`. Most of that is of the lowest frequencies, of which a step
-    or a drift of a low signal-to-noise is, too, so a log may not distinguish them. Both are compared by their
-    evidence, each autoregression at Akaike's price: with a walk it is shorter.
+    :mod:`.problem`. Both are compared by their evidence, each autoregression at Akaike's price.
     """
     slots, noise = outcome.problem.survey.slots, outcome.null.noise
     others = [one.candidate for one in outcome.chosen if one is not hypothesis]

@@ -2,22 +2,15 @@
 
 Notes
 -----
-Candidates are scored (:mod:`.evidence`) under two noises: that of the model so far, and that which is left
-when the best candidate of every cause is fitted, because the former may have absorbed an effect. The best of
-each cause are then fitted jointly with noise and calibration. The best that passes the test is added, and so
-on while one does. A cause that is found again needs more than one regressor: these become one candidate. Then
-causes are exchanged for competing hypotheses. Last, causes that later findings have
-made needless are dropped.
+1. Score all candidates (:mod:`.evidence`) under two noises: that of the model so far, and that which is left
+   when the best candidate of every cause is fitted. The former may have absorbed an effect.
+2. Fit the best of each cause jointly with noise and calibration. Add the best that passes the test, and
+   repeat. The regressors of a cause that is found again become one candidate.
+3. Exchange causes for competing hypotheses, and drop those that later findings have made redundant.
 
-Slow noise may have absorbed the joint effect of several causes: then none is significant on its own.
-So a second start finds causes under noise of a short correlation, and compares them under noise of any. A
-switching signal uses regressor after regressor, and none describes it: if the level still shifts at many
-places that the first few do not explain (:func:`~.search.switches`), the search ends.
-
-Asserted causes are then searched for again under noise that grows towards low frequencies, if that gains
-anything (:mod:`~.problem`), and the likelier result is kept: a cause that only represents such
-noise is not found. The competing hypotheses are read off one matrix at the end: the information of all
-candidates under the noise that is left, the other causes projected out.
+A second start finds causes under noise of a short correlation, because other noise may have absorbed the
+joint effect of several causes. The search ends where a signal switches (:func:`switches`). Asserted causes
+are then searched for again with slow noise (:mod:`.problem`), and the likelier result is kept.
 """
 
 from __future__ import annotations
@@ -63,18 +56,13 @@ from magbridge.diagnose.state import (
 from magbridge.estimation.residual import robust_scale
 
 Rival = Callable[[Problem, Sequence[Candidate], Joint, Candidate], float | None]
-"""Problem, model, fit, further cause -> held-out score of the model with the best free description in place
-of the further cause; None where no description is significant."""
+"""Problem, model, fit, further cause -> held-out score of the best free description in its place, or None."""
 LOST, PLACES = 2, 6
-"""Regressors of a model, and shifts of the level from which on the table has no cause for the signal."""
+"""Regressors of a model, and shifts of the level, from which on a signal is called switching."""
 AFTERWARDS = 16
 """Samples beyond the noise's order in which a shift of the level is looked for."""
 MAX_REGRESSORS = 6
 """Regressors found one by one in a log, at most."""
-
-
-def no_rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> None:
-    """Return None: no free description is compared."""
 
 
 class Outliers(NamedTuple):
@@ -97,11 +85,7 @@ class Outliers(NamedTuple):
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
-    """Test for wrong samples: a few innovations from a wide distribution of their own.
-
-    Heavy tails alone are not outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the
-    best ``t_nu``.
-    """
+    """Test for wrong samples: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the best ``t_nu``."""
     v = fit.noise.innovations
     n = len(v)
     if np.abs(v).max() < 5.0:
@@ -128,17 +112,9 @@ def switches(fit: Joint, model: Sequence[Candidate], causes: int) -> bool:
 
 
 def _lasting(fit: Joint, rows: IndexArray) -> bool:
-    r"""Return True if shifts of the level at `rows` (k,) are likelier than impulses there.
-
-    Notes
-    -----
-    Noise of a long memory absorbs switching signals, except for the switching itself. Whitened by the filter
-    ``h = (1, -a)`` an impulse is h and a shift its running sum s; of either, x, with the innovations v from
-    the row on (Chen & Liu 1993, J. Am. Stat. Assoc. 88:284),
-
-    .. math:: \lambda_x = \left(\sum_l x_l v_{i+l}\right)^2 \Big/ \sum_l x_l^2
-    """
-    # Whitened impulse h and shift s, then lambda of both at every row
+    """Return True if shifts of the level at `rows` (k,) are likelier than impulses there."""
+    # Whitened impulse h = (1, -a) and shift, its running sum; of either, x, at each row i the statistic
+    # (sum_l x_l v_(i+l))^2 / sum_l x_l^2 (Chen & Liu 1993, J. Am. Stat. Assoc. 88:284)
     impulse = np.concatenate([[1.0], -fit.noise.ar, np.zeros(AFTERWARDS)])
     both = np.stack([impulse, np.cumsum(impulse)])
     v = np.append(fit.noise.innovations, np.zeros(impulse.size))[rows[:, None] + np.arange(impulse.size)]
@@ -147,19 +123,18 @@ def _lasting(fit: Joint, rows: IndexArray) -> bool:
 
 
 def _neighbours(fit: Joint, rows: IndexArray) -> float:
-    r"""Return chance that the samples before and after `rows` (k,) are good: 1 where gaps leave none to ask.
+    r"""Return the p-value of good samples before and after `rows` (k,): 1 where gaps leave none to test.
 
     Notes
     -----
-    A wrong sample i is an additive outlier, or one of the innovations, which the noise's correlation carries
-    on (Fox 1972, JRSS B 34:350). In the first case three impulses c are fitted, at i - 1, i and i + 1. With h
-    the whitening filter ``(1, -a)`` and v the innovations in units of the noise's scale,
+    A wrong sample i is an additive outlier, or one of the innovations (Fox 1972, JRSS B 34:350). In the first
+    case three impulses c are fitted, at i - 1, i and i + 1; with the whitening filter ``h = (1, -a)`` and the
+    innovations v in units of the noise's scale,
 
     .. math:: G c = b, \qquad G_{jk} = \sum_l h_l h_{l+|j-k|}, \qquad b_j = \sum_l h_l v_{j+l}
 
-    Then the outer c are noise if the neighbours are good; in the second case the innovations next to i are.
-    In both cases each neighbour has as its p-value its rank among those of all samples, whatever the noise's
-    tails; Fisher's method combines them, and each sample counts as the kind that has the better neighbours.
+    The outer c, or else the innovations next to i, are noise if the neighbours are good. Their p-values are
+    ranks among those of all samples, combined by Fisher's method for the better of the two cases.
     """
     # Whitening filter h, and b: the filter's transpose applied to the innovations
     noise, p = fit.noise, len(fit.noise.ar)
@@ -214,11 +189,11 @@ class SearchOutcome:
     chosen: tuple[Hypothesis, ...]
     """In the order found; each against the model without it; none where names are not asserted."""
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
-    """For each chosen one, all others that it does not beat by
-    :func:`~.evidence.bayes_factor_threshold`, the best first."""
+    """For each chosen one, the others within :func:`.bayes_factor_threshold`, the best first."""
     null: Joint
+    """Fit without any cause."""
     fit: Joint
-    """`null`, `fit`: fits without any cause, and with the chosen ones."""
+    """Fit with the chosen ones."""
     p_value: float
     """The smallest of the first round."""
     info: Information
@@ -245,13 +220,13 @@ def search(
     problem: Problem,
     candidates: Sequence[Candidate],
     causes: int,
-    rival: Rival = no_rival,
+    rival: Rival | None = None,
     plain: Joint | None = None,
 ) -> SearchOutcome:
     """Find the causes, of so many `causes`, that the data support under one noise model.
 
-    Each further cause must beat a free description, the `rival`, on held-out dives. `plain` is the null
-    without slow noise, where the problem has such.
+    Each further cause must predict held-out dives better than the `rival`, a free description. `plain` is the
+    null without slow noise, where the problem has such noise.
     """
     # Order of the noise, forward selection with exchanges, backward elimination, competing hypotheses
     rough = fit_joint(problem, [], 1, rounds=2)
@@ -276,7 +251,7 @@ def search(
 
 
 def beside_slow_noise(
-    found: SearchOutcome, candidates: Sequence[Candidate], causes: int, rival: Rival = no_rival
+    found: SearchOutcome, candidates: Sequence[Candidate], causes: int, rival: Rival | None = None
 ) -> SearchOutcome:
     """Repeat the search of the causes found, with slow noise; return the likelier outcome."""
     noisy, null = with_slow_noise(found.problem), found.null
@@ -345,11 +320,10 @@ def _remnant(found: Hypothesis) -> float:
 
 
 def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
-    """Pick the best that passes, unless it is so weak that other causes' idealised regressors may leave it.
+    """Return the best that passes the test and exceeds the remnants of the causes in the model, or None.
 
-    `strengths` holds what the causes that are in the model may leave, `ratio` is the likelihood ratio of
-    those that have a shape. Among candidates whose evidence differs by less than the regressors' errors
-    may account for, the one with the fewest coefficients is preferred.
+    `strengths` holds the remnants by cause, `ratio` is the likelihood ratio of the causes of fixed shape.
+    Candidates within the error of their regressors count as equal: the one of fewest coefficients is taken.
     """
 
     def remnant(cause: str) -> float:
@@ -377,12 +351,11 @@ def _added(state: SearchState, model: list[Candidate], best: Hypothesis) -> tupl
 
 
 def _backward_elimination(
-    state: SearchState, model: list[Candidate], base: Joint, rival: Rival = no_rival
+    state: SearchState, model: list[Candidate], base: Joint, rival: Rival | None
 ) -> tuple[list[Hypothesis], Joint]:
-    """Drop causes without which the model is likelier, or which fail their test given the others.
+    """Drop causes that fail their test given the others, or without which the model is likelier.
 
-    Then drop the remnants of a Gaussian process, and further causes that the held-out dives contradict or
-    that a free description predicts better.
+    Then drop further causes that are remnants (:func:`_surplus`).
     """
     # Each cause in turn against the model without it; a drop starts the pass again
     chosen: list[Hypothesis] = []
@@ -409,14 +382,12 @@ def _backward_elimination(
 
 
 def _surplus(
-    state: SearchState, chosen: Sequence[Hypothesis], base: Joint, rival: Rival = no_rival
+    state: SearchState, chosen: Sequence[Hypothesis], base: Joint, rival: Rival | None
 ) -> int | None:
-    """Return the place of the weakest cause if it is redundant given the others.
+    """Return the place of the weakest cause if it is redundant given the others, else None.
 
-    A process represents part of every slow shape, and its remnant of a map's error passes for a second cause.
-    Two correlated causes share a signal; if the second gains nothing on held-out dives, it is redundant. Any
-    further cause may be what the regressors of the others leave: its name must predict the held-out dives
-    better than the best free description does in its place.
+    It is redundant if it is the remnant of a Gaussian process, if it correlates with another cause and does
+    not improve held-out dives, or if a free description predicts these better.
     """
     smooth = max((_remnant(h) for h in chosen if h.candidate.nonparametric), default=0.0)
     k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
@@ -434,7 +405,7 @@ def _surplus(
         ]
         if power[0] < power[1]:
             return k
-    described = rival(problem, others, without, model[k])
+    described = rival and rival(problem, others, without, model[k])
     if described is None:
         return None
     named = held_out(problem, [c.columns for c in model], base, interleaved=True).score

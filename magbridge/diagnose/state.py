@@ -1,10 +1,6 @@
 """The steps of a search: score every cause given a model, fit the likeliest, profile it, exchange it.
 
-Notes
------
-The model is not part of the state: every step of a search takes one and returns another. A round adds data of
-the log, not of the model, which are the same whenever they are computed: the look-elsewhere factors and the
-certainty of the noise's level, in the first; and the last information, which several steps ask for.
+The model is not part of the state: every step takes one and returns another.
 """
 
 from __future__ import annotations
@@ -42,22 +38,19 @@ from magbridge.diagnose.problem import Problem
 MAX_SCREENED_SAMPLES = 65_536
 """Samples of a long log, in pieces spread evenly over it, by which a round chooses what it fits to all."""
 JOINTLY_FITTED_CAUSES, WORTH_FITTING = 9, 0.3
-"""Causes that are fitted jointly in a round, at most, and the least score of one, as a fraction of the best's
-log evidence."""
+"""Most causes that are fitted jointly in a round, and their least score as a fraction of the best's."""
 MAX_EXCHANGES, TRIED = 6, 3
 """Exchanges at most, and replacements tried in each."""
 COLUMNS, STAGES = 144, 2
-"""Number of columns that all values tried within a nonlinear parameter's bracket may have, and number of
-stages: after each the bracket is narrowed to the neighbours of the best value."""
+"""Columns of all values tried within a nonlinear parameter's bracket, and stages of narrowing it."""
 
 
 class SearchState:
     """The problem of one search, its candidates, and quantities of the log.
 
     `null` is the fit without any cause, `look_elsewhere` the number of hypotheses behind each cause,
-    `certain` the degrees of freedom of the noise's level for each group, and `groups` has the places of the
-    candidates of each cause and channel. One piece of a long log in `stride` chooses what is fitted to all
-    samples. If `brief`, noise is correlated for a short time only.
+    `certain` the degrees of freedom of the noise's level for each group. One piece of a long log in `stride`
+    screens the candidates. If `brief`, noise is correlated for a short time only.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
@@ -102,10 +95,7 @@ class SearchState:
         return 2.0 * (fit.log_likelihood - (null or self.null).log_likelihood)
 
     def value(self, model: Sequence[Candidate], fit: Joint, null: Joint | None = None) -> float:
-        """Log evidence of a model; each cause must also outweigh what idealised regressors may leave.
-
-        It is relative to this search's null, or to one without slow noise.
-        """
+        """Return the log evidence of a model relative to `null`, less what idealised regressors may gain."""
         ratio = self.ratio(fit, null)
         if not model:
             return 0.5 * ratio
@@ -223,10 +213,7 @@ class SearchState:
         return max(found, key=lambda h: h.evidence)
 
     def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
-        """Return P-value of a likelihood ratio, times the hypotheses behind its cause, times the causes.
-
-        The noise's level is estimated, too, so the distribution is Fisher's F.
-        """
+        """Return the p-value of a likelihood ratio, times the hypotheses of its cause, times the causes."""
         hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.point.likelier))
         tests = candidate.tail * hypotheses * self.causes
         # Fisher's F, with as many degrees of freedom in the denominator as the level of the noise has
@@ -250,8 +237,7 @@ def _ridge(model: Sequence[Candidate]) -> FloatArray:
 def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
     """Profile the nonlinear parameters of a cause given `model`, whose fit is `base`, one after the other.
 
-    Many values are scored at once under the present noise, because the likelihood of an onset has several
-    peaks. The evidence pays for the choice: the average over the bracket counts, not the peak.
+    Many values are scored at once, because the likelihood of an onset has several peaks.
     """
     best, narrow = hypothesis, 0.0
     if best.candidate.point.rebuild is None:

@@ -1,10 +1,4 @@
-"""Deployments as the arrays that a diagnosis compares: columns, channels and their kinds, dives, gaps.
-
-Notes
------
-*Kinds.* A cause that contradicts the kind is never proposed: a throttle that the field follows is not a
-temperature. Only a series without a meaningful unit or name may be of every kind.
-"""
+"""Deployments as the arrays that a diagnosis compares: columns, channels and their kinds, dives, gaps."""
 
 from __future__ import annotations
 
@@ -63,13 +57,11 @@ MIN_SAMPLES_A_DAY = 100
 Table = dict[str, FloatArray]
 """Columns (n,) in order of time, each with a value somewhere; ``learned`` is 1 where it was learned from."""
 MAX_LAG = 1000
-"""Lag, in sampling intervals, from which on a sample says nothing about the noise; longer ones are cut
-to it."""
+"""Largest lag, in sampling intervals; a sample that long ago does not predict this one's noise."""
 MIN_SURVEY_SAMPLES = 60
 """Samples below which noise and effect cannot both be estimated."""
 SHORT = 0.25
-"""Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near
-the surface."""
+"""Quantile of the time steps that is the sampling interval: some gliders sample faster near the surface."""
 INTERNAL_PREFIXES = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of another magnetometer, which follows everything that this one does and so explains nothing."""
@@ -79,11 +71,9 @@ NOT_TELEMETRY = {
     "power_cycle",
 }  # fmt: skip
 TRUSTED = 0.5
-"""Largest cubic term in the interpolation of an axis to the time of its row, as a multiple of the noise;
-where it is exceeded the sample is not used."""
+"""Largest cubic term in the interpolation of an axis to its row's time, as a multiple of the noise."""
 MAX_HALF_RANGES = 10.0
-"""Distance from the middle of the calibrated range, in half ranges, beyond which a parameter's value is
-not the position of a mass but a code for "not known"."""
+"""Distance from the middle of the calibrated range, in half ranges, beyond which a value is a code."""
 
 
 def kinds_of(name: str, unit: str) -> tuple[str, ...]:
@@ -111,10 +101,7 @@ def _is_among(part: str, words: str) -> bool:
 
 
 def dives_of(table: Table) -> IntArray:
-    """Return the dive number (n,) of each sample: the log's, else from surface to surface, else eighths.
-
-    Of two logs, that which was learned from and that which is diagnosed, one may count its dives alone.
-    """
+    """Return the dive number (n,) of each sample: the log's, else from surface to surface, else eighths."""
     # As the log counts; a log that lacks the count has its dives found by itself
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
@@ -134,11 +121,10 @@ def dives_of(table: Table) -> IntArray:
 
 
 def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
-    """Return the number (n,) of each sample's day, or None where the diagnosed log is of fewer than two days.
+    """Return the number (n,) of each sample's day, -1 for `learned` samples; None for fewer than two days.
 
     A day begins with the first sample, after :data:`DAY_S`, and after a gap of :data:`NIGHT_S`. Days of fewer
-    than :data:`MIN_SAMPLES_A_DAY` samples count to the day before. Samples that serve only as a comparison
-    (`learned`) have the number -1.
+    than :data:`MIN_SAMPLES_A_DAY` samples count to the day before.
     """
     day, number, start, last = np.full(len(time), -1), -1, -np.inf, -np.inf
     fresh = np.flatnonzero(~learned)
@@ -175,10 +161,9 @@ def _part(table: Table, rows: BoolArray) -> Table:
 class Past:
     """The p samples before each sample (`order` p), and their lags.
 
-    `steps` (n,) are the intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none. A
-    sample is `whole` (n,) if the p samples before it have the lags 1 to p. The other `rows` (m,), after a
-    gap, share patterns of `lags` (l, p), :data:`MAX_LAG` where a sample is too long ago; `pattern` (m,) says
-    which.
+    `steps` (n,) are the intervals since the previous sample. A sample is `whole` (n,) if the p samples before
+    it have the lags 1 to p. The other `rows` (m,), after a gap, have the `lags` (l, p) of their `pattern`
+    (m,).
     """
 
     def __init__(self, steps: IntArray, order: int) -> None:
@@ -198,7 +183,7 @@ class Past:
 
 
 class TelemetryChannel(NamedTuple):
-    """A telemetry series, as a channel is throughout a diagnosis: values (n,), unit, kinds that it may be."""
+    """A telemetry series: values (n,), unit, kinds of quantity that it may be."""
 
     values: FloatArray
     unit: str
@@ -225,8 +210,7 @@ class Survey:
     still: tuple[str, ...]
     """Telemetry that never changes."""
     steps: IntArray
-    """(n,) intervals since the previous sample; :data:`~.survey.MAX_LAG` if it is too long ago to predict
-    this one's noise."""
+    """(n,) intervals since the previous sample, at most :data:`MAX_LAG`."""
     dive: IntArray
     """(n,) number of the dive, the unit of cross-validation."""
     place: FloatArray | None
@@ -292,8 +276,7 @@ def assemble(
 ) -> Survey:
     """Make a survey from complete columns (n,) in order of time: find channels, dives and gaps.
 
-    Columns ``fitted`` and ``learned`` are 1 where the survey's are true; the `needed` channels are kept even
-    if they never change.
+    The `needed` channels are kept even if they never change.
     """
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
@@ -362,11 +345,10 @@ def load_survey(
     training_logs: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
 ) -> Survey:
-    """Gather the deployments to be diagnosed, and the logs that the calibration was fitted to.
+    """Read the deployments to be diagnosed, and the logs that the calibration was fitted to.
 
-    A log that is among both is diagnosed. The calibration decides which channels a deployment must have; the
-    `grid` is added to the main field where a log has no reference of its own. DataError: a column is missing,
-    too few samples are complete, or a parameter is out of all range; one line says which.
+    A log that is among both is diagnosed. The `grid` is added to the main field where a log has no reference
+    of its own. DataError: a column is missing, too few samples are complete, or a parameter is out of range.
     """
     # A training log that is diagnosed as well is read once, as diagnosed
     own = [any(ds is one for one in training_logs) for ds in datasets]

@@ -37,10 +37,9 @@ class Cause(ABC):
 
     @abstractmethod
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the hypotheses: columns of the problem over a grid of nonlinear parameters.
+        """Return the hypotheses over a grid of nonlinear parameters; none if the log cannot show the cause.
 
-        Their widths are plausible sizes (1-sigma of a Gaussian prior). They set Occam's factor, not what can
-        be found. The list is empty for a log that cannot show the cause.
+        Their widths are plausible sizes (1-sigma of a Gaussian prior), which set Occam's factor.
         """
 
     @property
@@ -51,10 +50,9 @@ class Cause(ABC):
     def jacobian_error(self, problem: Problem, candidate: Candidate) -> float:
         """Return the largest error of a candidate's columns, as a fraction of their largest number.
 
-        The columns are compared with differences of the residual of the calibration extended by the
-        candidate's effects, at the readings of :attr:`.Problem.reading`, whose residual is zero. 0 is
-        returned for an error of the reference, and for an effect whose regressors the search computes
-        differently from the live correction.
+        The columns are compared with numerical derivatives of the extended calibration's residual, at the
+        readings of :attr:`.Problem.reading`. 0 is returned for an error of the reference, and for an effect
+        whose regressors the search computes differently from the live correction.
         """
         if not candidate.effects or candidate.regressors is not None or candidate.since:
             return 0.0

@@ -19,8 +19,7 @@ ONSETS = 40
 TONES = 5
 """Peaks of the spectrum that are tried."""
 MAX_BEND_NT = 50.0
-"""Most that a response may plausibly bend (RMS of its coefficients), nT: a thousandth of the field, as
-magnetoresistive sensors do. Fluxgates are ten times better."""
+"""Most that a response may plausibly bend (RMS of its coefficients), nT: that of magnetoresistive sensors."""
 
 
 class OffsetStep(Cause):
@@ -84,10 +83,8 @@ class OffsetDrift(Cause):
 class InterferenceTone(Cause):
     """Machinery at a fixed frequency, seen through the sampling: ``T += b cos + c sin (2 pi t / period)``.
 
-    Frequencies are those where the differenced residual, seen through each axis' projection, has its
-    highest peaks. The highest of m (in steps of one period in the log), taken between them, too, exceeds
-    a high u by chance as often as the highest of ``m sqrt(pi u / 6)`` independent ones (Davies 1987,
-    Biometrika 74:33). At the test's level that is 5 m, and there are five peaks to count.
+    Frequencies are the highest peaks of the differenced residual. The highest of m frequencies exceeds a high
+    u by chance as often as that of ``m sqrt(pi u / 6)`` independent ones (Davies 1987, Biometrika 74:33).
     """
 
     name = "interference_tone"
@@ -141,10 +138,7 @@ def _loudest_periods(problem: Problem) -> list[float]:
 
 
 def _top(power: FloatArray, peak: int) -> float:
-    """Return where, in bins, a parabola through a peak and its neighbours is highest.
-
-    A line between two bins loses up to a fifth of its power in either.
-    """
+    """Return where, in bins, a parabola through a peak and its neighbours is highest."""
     low, top, high = power[[peak - 1, peak, peak + 1 if peak + 1 < len(power) else peak - 1]]
     return peak + (0.5 * (low - high) / (low - 2.0 * top + high) if top > max(low, high) else 0.0)
 
@@ -152,12 +146,9 @@ def _top(power: FloatArray, peak: int) -> float:
 class Nonlinearity(Cause):
     """The response bends: ``T_i += b_i (H_i / H_0)^p``, p = 2 (a leak), 3 (a saturating core), or 1 to 3.
 
-    The leak is that of an even harmonic. A feedback of finite gain leaves the core the field that its output
-    takes, and that is the inverse of its magnetisation curve: steeper the farther out, but not flat at zero
-    either. So a core that shows through also changes the sensitivity, and p = 1 belongs to the bend. All nine
-    coefficients have one common size, because the three axes have the same design, up to
-    :data:`MAX_BEND_NT`: nine free numbers could otherwise take a wrong reference and a mass' error for one
-    bend.
+    With a feedback of finite gain the response is the inverse of the core's magnetisation curve, which also
+    changes the sensitivity (p = 1). All nine coefficients have one common size, because the three axes have
+    the same design: nine free numbers could take a wrong reference and a mass' error for one bend.
     """
 
     name = "nonlinearity"

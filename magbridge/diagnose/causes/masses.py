@@ -70,8 +70,7 @@ class ActuatorOrder(Cause):
         """Return each missing term, all orders of each mass together, and a row of sources along its path.
 
         Missing terms up to the next order (paper, eq. 8) are Legendre polynomials, since the calibration has
-        absorbed the lower orders. All orders of one mass serve where its field has changed since. A mass
-        that passes close to iron makes a field that no polynomial of a low order follows.
+        absorbed the lower orders. Sources describe a mass that passes close to iron.
         """
         calibration = problem.calibration
         if not calibration.parameters:
@@ -130,10 +129,7 @@ class Hysteresis(Cause):
     disambiguation = "approach one position from both sides"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return drives and steel for each mass of the model.
-
-        The difference between any other channel and its wide play is that channel.
-        """
+        """Return drives and steel for each mass of the model."""
         made = []
         for parameter in problem.calibration.parameters:
             low, high = problem.survey.channels[parameter.name].extent

@@ -19,11 +19,9 @@ MAX_MAP_ERROR_CELLS = 300
 FINEST = 125.0
 """Side of the smallest cell, m."""
 SCALES = np.array([1.0, 2.0, 4.0, 8.0, 32.0])
-"""Depths of the crustal sources below the deepest place of the track, and half the correlation lengths of the
-part that is the same at every depth, in cells."""
+"""Depths of sources below the deepest place of the track, and half the correlation lengths, in cells."""
 ALTITUDE = 100.0
-"""m above the sea at which a map holds: aircraft survey at 60 to 150 m. For a map from 300 m a third of the
-mean error is still found."""
+"""Altitude of a map, m above the sea: aircraft survey at 60 to 150 m."""
 FAINT = 1e-6
 """Share of a map's mean square error below which one of the functions that describe it is left out."""
 ERROR = 20.0
@@ -38,9 +36,8 @@ class MapError(Cause):
 
     .. math:: e(x, z) = T(x, z) - T(x, -a)
 
-    The error is the same on every pass at one depth, and changes with depth as Laplace's equation demands. So
-    dives distinguish it from an offset: even its mean is known. Sources at a depth d give T the covariance
-    (Moritz 1980, the reciprocal distance)
+    The error is the same on every pass at one depth. Sources at a depth d give T the covariance (Moritz 1980,
+    the reciprocal distance)
 
     .. math:: C(z, z') = (s^2 + r^2)^{-1/2}, \quad s = 2 d - z - z'
 
@@ -86,16 +83,10 @@ class MapError(Cause):
 def _expanded(
     covariances: Sequence[Callable[[FloatArray, FloatArray], FloatArray]], Z: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Expand Gaussian processes in Karhunen-Loeve functions, at places x (m, 3), by visited cells Z (c, 3).
+    """Return Karhunen-Loeve functions (m, k) at places x (m, 3), variances (k,), relative ones (l, k).
 
-    With K the mean of all covariances these are ``K(x, Z) V / lambda`` where ``K(Z, Z) = V lambda V^T``: no
-    more of them than cells, however large the box. One covariance K_l enters by the functions' prior
-    variances alone, ``diag(V^T K_l V)``.
-
-    Returns
-    -------
-    (m, k), (k,), (l, k) array
-        The functions, of unit variance; their prior variances; those by each covariance, relative to these.
+    With K the mean of all covariances and ``K(Z, Z) = V lambda V^T`` at the visited cells Z (c, 3), these are
+    ``K(x, Z) V / lambda``. The l-th covariance gives them the prior variances ``diag(V^T K_l V)``.
     """
     # Mean of all covariances, each scaled to unit mean variance, in its eigenfunctions
     each = np.array([K(Z, Z) for K in covariances])

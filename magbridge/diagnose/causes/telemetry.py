@@ -18,8 +18,7 @@ from magbridge.diagnose.problem import Problem, cached_per_problem
 TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """Spaced so closely that any lag between two of them is matched to within a fifth (RMS), s."""
 STAGES = 2
-"""Equal lags in series, because conducted heat passes the hull before it reaches the core. One lag misses 10
-to 30 % of the temperature in the centre of a slab, two in series miss 4 to 9 %."""
+"""Equal lags in series, hull and core: one lag misses 10 to 30 % of a slab's temperature, two 4 to 9 %."""
 MAX_JOINT_CURRENTS = 12
 """Most currents that are also tried together."""
 
@@ -137,11 +136,7 @@ class CurrentField(_Proportional):
     kind, largest = "current", 100.0
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return each current by itself, and all together.
-
-        Motors that are driven as one (throttle, speed controllers, battery) leave the field of currents at
-        several places, which have one common size.
-        """
+        """Return each current by itself, and all together, of one common size: motors driven as one."""
         alone = super().candidates(problem)
         if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
             return alone

@@ -31,10 +31,8 @@ def field_rates(problem: Problem) -> FloatArray:
 def mass_rates(problem: Problem) -> FloatArray:
     """Return (9, n) rates of change, per s, of the nine coefficients while masses move.
 
-    A drive starts and stops between samples and runs evenly meanwhile. So a mass is in motion at a sample if
-    it moves the same way in the intervals before and after it, and its speed is the larger of the two: that
-    of an interval in which it moves all the time. One-sided differences do no harm here, because telemetry
-    does not contain the residual's noise.
+    A drive runs evenly, and starts and stops between samples. So a mass is in motion at a sample if it moves
+    the same way in the intervals before and after, and its speed is the larger of the two.
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
@@ -101,16 +99,10 @@ def _legs(problem: Problem) -> tuple[FloatArray, IntArray]:
 
 
 def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
-    r"""Return the mean rates of change of the nine coefficients over a shift of the telemetry.
+    """Return the mean rates of change of the nine coefficients theta over a shift d of the telemetry.
 
-    Notes
-    -----
-    With theta(p) the nine coefficients and d the shift,
-
-    .. math:: \phi(t) = \frac{\theta(p(t + d)) - \theta(p(t))}{d}
-
-    A mass that moves within one sampling interval has no rate at any sample, but it has moved after a shift.
-    Positions between samples are interpolated, and none across a gap.
+    They are ``(theta(p(t + d)) - theta(p(t))) / d``, with positions p interpolated between samples, and none
+    across a gap. A mass that moves within one sampling interval has no rate at any sample, but a shift.
     """
     kernel, t = problem.calibration.kernel, problem.survey.time
     p, leg = _legs(problem)
@@ -176,13 +168,10 @@ class ClockOffset(_Delay):
 class FilterLag(_Delay):
     """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2``.
 
-    It holds the field back, not the telemetry. In a uniform field ``|H|`` shows the delay only where masses
-    move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, theta the nine coefficients. That is the signature of a
-    clock offset of the opposite sign, and the same correction removes it. The only difference is that a
-    filter's delay cannot be negative.
-
-    It also shortens a field that turns. From turning calibration runs that has gone into the calibration, so
-    it shows where these are compared with a survey that turns less.
+    In a uniform field ``|H|`` shows the delay only where masses move: ``u^T A dH_r/dt = -dF/dtheta
+    dtheta/dt``, theta the nine coefficients, the signature of a clock offset of the opposite sign. A filter's
+    delay cannot be negative. It also shortens a field that turns, which shows if the calibration runs turned
+    faster.
     """
 
     name = "filter_lag"
@@ -198,18 +187,11 @@ class FilterLag(_Delay):
 
 
 def _shortened(problem: Problem) -> Candidate:
-    r"""Return the attenuation of a field that turns.
+    """Return the attenuation of a field that turns.
 
-    Notes
-    -----
-    A filter whose impulse response has the variance sigma^2 about its mean, the delay, passes on
-
-    .. math:: H + \tfrac12 \sigma^2 \ddot H + \dots
-
-    For an RC filter sigma is its time constant. A field that turns with omega is shortened by
-    ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-cutoff``, the calibration is
-    fitted without it, and nothing is added to a field that turns live. The second derivative is that of
-    :attr:`.Problem.reading`, because it would correlate with the noise of its own sample.
+    A filter whose impulse response has the variance ``sigma^2`` about its mean passes on
+    ``H + sigma^2 / 2 d^2H/dt^2``. The calibration is fitted without it (``calibrate --filter-cutoff``), and
+    nothing is added live. The readings are free of noise, with which a second derivative would correlate.
     """
     bend = rates(problem.survey, problem.reading.T, 2).T
     columns = -0.5 * np.einsum("ij,ij->i", problem.jacobian[:, 6:], bend)[:, None]
