@@ -46,24 +46,11 @@ class PendingReading(NamedTuple):
 
 
 class ScalarCorrection:
-    """Corrects reading after reading of a scalar magnetometer.
+    """Correct reading after reading of a scalar magnetometer.
 
-    Parameters
-    ----------
-    sensor : ScalarSensor or None
-        The compensation; without it, a reading is published as it is.
-    settings : Align
-        With the filter delay of this sensor.
-    sigma : float or None
-        nT, 1-sigma of a reading that needs no compensation. Without `sensor` and `sigma`, samples are flagged
-        ``uncalibrated``.
-
-    Attributes
-    ----------
-    aligner : Aligner
-        Of the readings and of the compensation's channels.
-    notices : list of str
-        Messages about flagged samples since the caller last emptied the list, each once.
+    Without the compensation `sensor` a reading is published as it is; `sigma` is then its 1-sigma, nT, and
+    without both, samples are flagged ``uncalibrated``. `settings` hold the filter delay of this sensor.
+    `notices` collects the messages about flagged samples, each once, until the caller empties it.
     """
 
     def __init__(self, sensor: ScalarSensor | None, settings: Align, sigma: float | None = None) -> None:

@@ -87,10 +87,15 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
 
 def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatArray]:
     """Return a function that continues values (ny, nx), nT, on a grid's nodes to another altitude, m."""
+    gain = _growth(_wavenumber(grid), grid.altitude - altitude, SURE)
+    return lambda values: _filtered(values, gain)
+
+
+def _filtered(values: FloatArray, gain: FloatArray) -> FloatArray:
+    """Return values (ny, nx), holes filled, with the terms of their cosine transform times a `gain`."""
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 
-    gain = _growth(_wavenumber(grid), grid.altitude - altitude, SURE)
-    return lambda values: np.asarray(idctn(dctn(filled(values), norm="ortho") * gain, norm="ortho"))
+    return np.asarray(idctn(dctn(filled(values), norm="ortho") * gain, norm="ortho"))
 
 
 SIGN_WAVELENGTH_FRACTION = 0.25
@@ -107,11 +112,8 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The sigma added is the RMS
     of the removed part, over the map: around a node it is that of a wave or two, and chance.
     """
-    from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
-
     gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
-    hole = np.isnan(grid.anomaly)
-    anomaly = np.where(hole, np.nan, idctn(dctn(filled(grid.anomaly), norm="ortho") * gain, norm="ortho"))
+    anomaly = np.where(np.isnan(grid.anomaly), np.nan, _filtered(grid.anomaly, gain))
     # The removed part is an error of the smoothed map, correlated over a fraction of the wavelength.
     removed = np.sqrt(np.nanmean((grid.anomaly - anomaly) ** 2))
     sigma = np.hypot(np.nan_to_num(grid.sigma), removed)
@@ -158,24 +160,13 @@ def prepare(
 ) -> tuple[AnomalyGrid, list[PreparationStep]]:
     """Return one map from several surveys, and each intermediate step.
 
-    Parameters
-    ----------
-    grids : sequence of AnomalyGrid
-        At least one.
-    altitude : float, optional
-        m, to which every grid is continued upward; default the highest of the grids'.
-    smooth : float, optional
-        km, wavelength of which half the amplitude stays (:func:`~.continuation.smoothed`); 0: none.
-    mask : array_like, (k, 2), optional
-        Longitude and latitude (deg) of a polygon; nodes outside become holes.
-    spacing : float, optional
-        deg, of the map; default the finest of the grids'.
+    Every grid is continued upward to `altitude`, m, by default the highest of the grids'. `smooth` (km) is
+    the wavelength of which half the amplitude stays (:func:`smoothed`), 0 for none. Nodes outside the polygon
+    `mask` (k, 2), longitude and latitude in deg, become holes. `spacing` is that of the map, deg, by default
+    the finest of the grids'.
 
-    Raises
-    ------
-    OutOfRange
-        An altitude below a grid's; a grid of unknown altitude that is to be continued, or merged with one of
-        known altitude; more than :data:`MAX_MERGED_NODES` nodes.
+    OutOfRange: an altitude below a grid's; a grid of unknown altitude that is to be continued, or merged with
+    one of known altitude; more than :data:`MAX_MERGED_NODES` nodes.
     """
     steps = [PreparationStep(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]

@@ -129,17 +129,10 @@ def sphere_radius(points: FloatArray) -> float:
 def earth_field(
     deployment: xr.Dataset, grid: AnomalyGrid | None = None
 ) -> tuple[FloatArray, FloatArray | None, str]:
-    """Return the reference that a calibration is fitted to.
+    """Return the reference that a calibration is fitted to: total field, vector, and the name of both.
 
-    Returns
-    -------
-    total : (n,) array
-        nT, :func:`reference_field`.
-    vector : (n, 3) array or None
-        nT, north-east-down: the IGRF's direction with the length of `total`; None without positions, or
-        without a date.
-    name : str
-        Name of both.
+    The total field (n,), nT, is :func:`reference_field`. The vector (n, 3), nT, north-east-down, is the
+    IGRF's direction with that length; it is None without positions, or without a date.
     """
     if not {"latitude", "longitude"} <= set(deployment.variables) or counts_from_boot(deployment):
         return reference_field(deployment, grid), None, "reference_field"

@@ -38,28 +38,15 @@ SEARCH_SPREADS = (2.0, 4.0, 2.0, 8.0)
 class Estimate:
     """Position around a dead-reckoned track, from blocks of samples and fixes given in order of time.
 
-    Attributes
-    ----------
-    options : NavigationOptions
-        As given, but with a wider constant error of the field once the filter was lost.
-    time_us : int
-        µs, of the last start, fix or measurement.
-    x, P : ndarray, (6,), (6, 6)
-        Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
-    valid : bool
-        The position can be used: the map has described the field at odds of ``options.alarm_odds``; the
-        filter began as wide as competing filters do, or they have since come to the same place; and no test
-        rejects it now.
-    moved : tuple of ndarray
-        F and Q of the last prediction, for a smoother.
-    jumps : list of Jump
-        Restarts of the estimate, across which a smoother must not look.
-    alone : ndarray, (4, 4)
-        Covariance of position and current by dead reckoning alone, since the start or the last fix.
-    travelled, motion
-        Distance through the water, m, and uncertainty of the dead-reckoned motion, until `time_us`.
-    step : Step
-        Motion between the last two measurements on the map.
+    `x` (6,) and `P` (6, 6) are estimate and covariance of :mod:`~magbridge.navigate.model`'s states at
+    `time_us` (µs), that of the last start, fix or measurement; `travelled` (m) and `motion` are distance and
+    uncertainty of the dead-reckoned motion until then, `step` the motion between the last two measurements on
+    the map. `valid` is True if the map has described the field at odds of ``options.alarm_odds``, the filter
+    began as wide as competing filters do, or they have since come to the same place, and no test rejects it
+    now. For a smoother, `moved` holds F and Q of the last prediction, and `jumps` the restarts, which it must
+    not cross. `alone` (4, 4) is the covariance of position and current by dead reckoning alone, since the
+    start or the last fix. `options` are those given, with a wider constant error of the field once the filter
+    was lost.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:

@@ -103,25 +103,14 @@ def localise(
     *,
     start: tuple[float, float] | None = None,
 ) -> xr.Dataset:
-    """Return the track that the field along it gives, without a map.
+    """Return the track that the field along it gives, without a map: arguments as :func:`~.batch.navigate`.
 
-    Parameters
-    ----------
-    deployment, options, start
-        As for :func:`~.batch.navigate`.
+    It is on ``time`` of the blocks: position with covariance, ``north east`` from the dead-reckoned one,
+    ``unaided_sigma`` of dead reckoning alone, anomaly and that of the field found; where the log has a better
+    position, ``error_*`` and ``bound_sigma``, the smallest (:func:`own_bound`). Attributes: ``findings``,
+    ``motion``, ``reference_track``.
 
-    Returns
-    -------
-    Dataset
-        On ``time`` of the blocks: position with covariance, ``north east`` from the dead-reckoned one,
-        ``unaided_sigma`` of dead reckoning alone, anomaly and that of the field found; where the log has a
-        better position, ``error_*`` and ``bound_sigma``, the smallest (:func:`own_bound`).
-        Attributes: ``findings``, ``motion``, ``reference_track``.
-
-    Raises
-    ------
-    FormatError
-        No total field, no motion, no start, or no usable sample.
+    FormatError: no total field, no motion, no start, or no usable sample.
     """
     source = str(deployment.attrs.get("source", "deployment"))
     options = options or NavigationOptions()

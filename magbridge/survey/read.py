@@ -72,12 +72,8 @@ def read_table(path: Path) -> Samples:
     """
     table = _table(path)
     value = _numbers(path, table, _first(path, table, ANOMALY_COLUMNS))
-    longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
-    heights = [name for name in HEIGHT if name in table]
-    if "depth" in table:
-        depth = _numbers(path, table, "depth")
-    else:
-        depth = -_numbers(path, table, heights[0]) if heights else np.zeros(len(value))
+    longitude, latitude, depth = _places(path, table)
+    depth = np.zeros(len(value)) if depth is None else depth
     lines = next((name for name in ("line", "line_number", "line_no") if name in table), None)
     line = np.zeros(len(value), int)
     if lines:  # an empty cell is a line of its own
@@ -90,10 +86,9 @@ def read_table(path: Path) -> Samples:
             path, f"only {counted(int(known.sum()), 'row')} with longitude, latitude and anomaly"
         )
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
-    north, east = separation(*origin, latitude, longitude)
-    return Samples(
-        np.stack([north, east], axis=1), depth, np.full(len(value), np.nan), value, line.ravel(), tie, origin
-    ).part(known)
+    place = np.stack(separation(*origin, latitude, longitude), axis=1)
+    no_time = np.full(len(value), np.nan)
+    return Samples(place, depth, no_time, value, line.ravel(), tie, origin).part(known)
 
 
 def read_points(
@@ -104,13 +99,9 @@ def read_points(
     FormatError: a column is missing or holds something else than numbers, or a place is not known.
     """
     table = _table(path)
-    longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
+    longitude, latitude, depth = _places(path, table)
     if wrong := int((~np.isfinite(longitude + latitude)).sum()):
         raise FormatError(path, f"expected longitude and latitude in every row, {wrong} lack one")
-    heights = [name for name in HEIGHT if name in table]
-    depth = -_numbers(path, table, heights[0]) if heights else None
-    if "depth" in table:
-        depth = _numbers(path, table, "depth")
     return longitude, latitude, depth, np.stack(separation(*origin, latitude, longitude), axis=1)
 
 
@@ -160,21 +151,8 @@ def located(
 ) -> tuple[Samples, BoolArray]:
     """Return all rows of a log with anomalies (n,), nT, and which of them can be used, (n,).
 
-    Parameters
-    ----------
-    ds : Dataset
-        The log.
-    value : (n,) array
-        nT; NaN where it is not known.
-    name : str
-        Name of the value in the error.
-    by_line : bool
-        Whether the log's ``line`` and ``line_type`` divide it into lines.
-
-    Raises
-    ------
-    FormatError
-        Fewer than ten rows have a value and a position.
+    `value` is NaN where it is not known; `name` is its name in the error. With `by_line` the log's ``line``
+    and ``line_type`` divide it into lines. FormatError: fewer than ten rows have a value and a position.
     """
     longitude, latitude, depth = positions(ds)
     known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
@@ -277,6 +255,15 @@ def _table(path: Path, rows: int | None = None) -> pd.DataFrame:
     except (OSError, ValueError, EOFError) as error:
         raise FormatError(path, f"expected a table with a header row: {error}") from error
     return table.rename(columns=lambda name: str(name).partition("[")[0].strip().lower())
+
+
+def _places(path: Path, table: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return longitude and latitude (n,), deg, and the depth (n,), m; None without depth or height."""
+    longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
+    if "depth" in table:
+        return longitude, latitude, _numbers(path, table, "depth")
+    height = next((name for name in HEIGHT if name in table), None)
+    return longitude, latitude, None if height is None else -_numbers(path, table, height)
 
 
 def _first(path: Path, table: pd.DataFrame, names: Sequence[str]) -> str:

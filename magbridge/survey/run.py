@@ -127,32 +127,15 @@ def scalar_survey(
     lag: float | None = None,
     lever: tuple[float, float, float] | None = None,
 ) -> Result:
-    """Align, level and grid the samples of a scalar magnetometer.
+    """Align, level and grid the samples of a scalar magnetometer, the `column` (nT) of logs with positions.
 
-    Parameters
-    ----------
-    logs : sequence of Dataset
-        Each with `column`, nT, and positions.
-    column : str
-        The scalar's reading.
-    names : sequence of str
-        Telemetry channels whose effect is fitted, where no calibration has the sensor.
-    calibrations : sequence of Calibration
-        None, one for all logs, or one for each. One whose ``sensors`` hold `column` compensates it.
-    lag : float, optional
-        Time of the reading after the position, s; estimated if not given.
-    lever : tuple of 3 float, optional
-        Position of the sensor relative to the logged positions, m forward, starboard and down; its
-        horizontal part is estimated if not given.
+    The effect of the telemetry channels `names` is fitted where no calibration has the sensor. There are no
+    `calibrations`, one for all logs, or one for each; one whose ``sensors`` hold `column` compensates it.
+    `lag` is the time of the reading after the position, s, and `lever` the sensor's place relative to the
+    logged positions, m forward, starboard and down; lag and horizontal lever are estimated if not given.
 
-    Raises
-    ------
-    FormatError
-        A column is missing.
-    DataError
-        The reading is not nT, or the number of calibrations does not fit.
-    CalibrationError
-        The samples cannot be aligned or gridded.
+    FormatError: a column is missing. DataError: the reading is not nT, or the number of calibrations does not
+    fit. CalibrationError: the samples cannot be aligned or gridded.
     """
     rows = scalar_rows(logs, column, names, calibrations, lever)
     samples, terms = align(rows, lag=lag, lever_known=lever is not None)

@@ -8,7 +8,8 @@ the field's amplitude is made proportional to their root mean square.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -59,10 +60,10 @@ class Samples:
 
     def part(self, rows: BoolArray | IndexArray) -> Samples:
         """Pick samples: an (n,) mask, or places."""
-        return Samples(
-            self.place[rows], self.depth[rows], self.time[rows], self.value[rows], self.line[rows],
-            self.tie[rows], self.origin, self.weight[rows], self.rho, self.modes[rows], self.level_sigma,
-        )  # fmt: skip
+        arrays: dict[str, Any] = {
+            name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        return replace(self, **arrays)
 
 
 LAG, REACH = 0.5, 2.0
@@ -226,15 +227,7 @@ class Crossovers:
 
 
 def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
-    """Find where the lines cross.
-
-    Parameters
-    ----------
-    place : (n, 2) array
-        m north and east.
-    line : (n,) array
-        Label of each sample's line.
-    """
+    """Return where lines cross, by the samples' `place` (n, 2), m north and east, and label `line` (n,)."""
     # Segments of several samples: their number bounds the work.
     step = max(len(place) // SEGMENTS, 1)
     start = np.arange(0, len(place) - step, step)

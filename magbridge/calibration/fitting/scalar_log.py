@@ -81,35 +81,15 @@ def calibrate_scalar(
     lag: float | None = None,
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> ScalarFit:
-    """Fit the compensation of a log's scalar magnetometer.
+    """Fit the compensation of a log's scalar magnetometer, `column` (nT), by the telemetry channels `names`.
 
-    Parameters
-    ----------
-    ds : Dataset
-        With the vector sensor's channels and `column`, nT, and a reference or positions.
-    calibration : Calibration
-        Of the vector sensor, which gives the directions.
-    column : str
-        The scalar magnetometer's reading.
-    names : sequence of str
-        Telemetry channels.
-    grid : AnomalyGrid, optional
-        Added to the main field.
-    map_known : bool
-        The reference includes the crustal field.
-    lag : float, optional
-        s, of the scalar behind the vector; estimated if not given.
-    lever : tuple of 3 float
-        m, forward, starboard and down from the positions to the scalar sensor.
+    `calibration` is that of the vector sensor, which gives the directions. The reference is the log's, or the
+    main field plus `grid`; with `map_known` it includes the crustal field. `lag` is that of the scalar behind
+    the vector, s, estimated if not given; `lever` is the scalar's place relative to the positions, m forward,
+    starboard and down.
 
-    Raises
-    ------
-    FormatError
-        A column is missing, or there is neither a reference nor a position.
-    DataError
-        The reading is not nT.
-    CalibrationError
-        Too few samples.
+    FormatError: a column is missing, or there is neither a reference nor a position. DataError: the reading
+    is not nT. CalibrationError: too few samples.
     """
     require(ds, (*CHANNELS, column, *names))
     reading = scalar_reading(ds, column)
