@@ -1,10 +1,10 @@
 """The other end of every line: a simulated world, and emulated devices with real protocols.
 
 A :mod:`.scenario` describes the simulation. In its :mod:`.world` a vehicle (:mod:`.platform`) with an
-:mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`; the :mod:`.twin` is all of them
-together, and its log a :mod:`.dataset`. :mod:`.like` flies the way of a real log instead, and :mod:`.inject`
-hides effects. :mod:`.fluxgate` emulates the sensors' protocols, and :mod:`.replay` plays deployments to the
-bridge. :mod:`.demo` does the main job.
+:mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`, or the way of a real log; the
+:mod:`.twin` is all of them together, and its log a :mod:`.dataset`. :mod:`.inject` hides effects.
+:mod:`.fluxgate` emulates the sensors' protocols, and :mod:`.replay` plays deployments to the bridge.
+:mod:`.demo` does the main job.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sitl.dataset import segments
-    from sitl.like import simulate_like
     from sitl.scenario import Scenario, load
-    from sitl.twin import Twin, simulate
+    from sitl.twin import Twin, simulate, simulate_like
 
 __all__ = ["Scenario", "Twin", "load", "segments", "simulate", "simulate_like"]
 
@@ -27,7 +26,7 @@ _HOMES = {
     "load": "sitl.scenario",
     "segments": "sitl.dataset",
     "simulate": "sitl.twin",
-    "simulate_like": "sitl.like",
+    "simulate_like": "sitl.twin",
 }
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sitl.inject.scene import Array, Effect, Generator, Scene, direction, relays
+from sitl.inject import Array, Effect, Generator, Scene, direction, relays
 from sitl.instrument import rotation
 from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field

@@ -185,7 +185,7 @@ def replay(
     cli.logs_to_read(files, None, config)
 
     from sitl.replay.run import replay as played
-    from sitl.replay.summary import summary
+    from sitl.replay.run import summary
 
     with new_folder(log) if log else nullcontext():
         result = played(files, config, speed_of(speed), log, reading.options)

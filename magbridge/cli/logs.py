@@ -226,9 +226,8 @@ def simulate(
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     """
     from magbridge.logs import write
-    from sitl.like import placed_at, simulate_like
     from sitl.scenario import load
-    from sitl.twin import Twin
+    from sitl.twin import Twin, placed_at, simulate_like
     from sitl.twin import simulate as simulate_scenario
 
     cli.check_inputs((scenario, *trajectory_from), output)

@@ -22,8 +22,8 @@ from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.logs import Options, read
 from magbridge.logs.telemetry_writer import short_name
-from sitl.like import simulate_like
 from sitl.scenario import load
+from sitl.twin import simulate_like
 
 FULL_SCALE = 100_000.0
 """nT that the emulated fluxgate can read."""

@@ -25,8 +25,7 @@ from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality
 from sitl.replay.own_log import Recorded, is_own_log, runs
-from sitl.replay.run import agreement
-from sitl.replay.summary import summary
+from sitl.replay.run import agreement, summary
 
 BOOT = START - 77_000_000
 

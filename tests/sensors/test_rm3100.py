@@ -14,7 +14,7 @@ from magbridge.config import load
 from magbridge.errors import ConfigError, PortError
 from magbridge.records import Reading
 from magbridge.sensors.rm3100 import Rm3100, Rm3100Options, nt_per_count
-from sitl.fluxgate.rm3100 import Rm3100Registers
+from sitl.fluxgate import Rm3100Registers
 
 
 def driver(**options: object) -> Rm3100:

@@ -25,14 +25,12 @@ from magbridge.mavlink import Codec, LogReader
 from magbridge.records import Channel
 from sitl import Twin, load, segments, simulate
 from sitl.demo import demo
-from sitl.replay.autopilot import Autopilot
-from sitl.replay.emulation import with_motion
+from sitl.replay.emulation import Autopilot, with_motion
 from sitl.replay.listener import Listener
 from sitl.replay.own_log import Recorded, is_own_log
-from sitl.replay.run import replay
+from sitl.replay.run import replay, summary
 from sitl.replay.setup import bridge_toml, short_names
 from sitl.replay.stage import Stage
-from sitl.replay.summary import summary
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,137 @@
-"""What goes wrong in an instrument, in a vehicle and around it; each effect is one function of the scene."""
+"""Hide an effect in a simulated deployment, with finer physics than anyone would fit to it.
+
+It shares nothing with the detector: heat soaks through a slab where the detector has two lags in series,
+steel has a Preisach distribution where it has one play operator, currents flow in wires with a shape, filters
+and converters are the instrument's own, the ionosphere has a spectrum. Each effect is one function of the
+:class:`Scene`, a size, and a random generator that draws its direction, place and time. An effect is
+proportional to its size as far as physics allows. Properties of the vehicle or its instrument are drawn from
+the seed of :class:`HiddenEffect` alone, so they are the same on every deployment.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from dataclasses import field as attribute
+
 import msgspec
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
-from sitl.inject.scene import Array, Effect, Generator, Scene, direction, relays, soaked
-from sitl.instrument import rotation
-from sitl.signals import first_order
+from sitl.instrument import Instrument, Samples, rotation
+from sitl.signals import autoregressive, first_order
+from sitl.trajectory import Track
+from sitl.twin import Twin
 from sitl.world import MU_0_OVER_4_PI, dipole_field
+
+__all__ = ["EFFECTS", "HiddenEffect", "disturb"]
+
+Array = NDArray[np.float64]
+Generator = np.random.Generator
+
+
+@dataclass
+class Scene:
+    """What an effect may change, on the simulation's fine grid of n points; m rows are logged."""
+
+    track: Track
+    when: Array
+    """(m,), s after the start, of the rows."""
+    field: Array
+    """(n, 3), nT at the sensor, body axes."""
+    earth: Array
+    """(n, 3), nT north-east-down, added to the Earth's field but not to the reference."""
+    water: Array
+    """(n,), degC."""
+    instrument: Instrument
+    reference: Array
+    """(m,), nT by which the reference is too small."""
+    late: float = 0.0
+    """s by which the telemetry's timestamps are behind."""
+    logged: dict[str, tuple[Array, str]] = attribute(default_factory=dict)
+    """(n,) each: Further telemetry."""
+    bend: list[Callable[[Array], Array]] = attribute(default_factory=list)
+    """Functions applied to the channels (m, 3) after the analogue chain."""
+    truth: dict[str, float] = attribute(default_factory=dict)
+    """Numbers that a perfect diagnosis would print, by the name it would print them under."""
+
+    @property
+    def t(self) -> Array:
+        """(n,) s after the start."""
+        return self.track.elapsed
+
+    def add(self, shape: Array, vector: Array) -> None:
+        """Add ``shape(t) vector``, (n,) times (3,) nT in body axes, to the field at the sensor."""
+        self.field = self.field + shape[:, None] * vector
+
+    def record_truth(self, vector: Array) -> None:
+        """Note as the truth what the channels read of a `vector` (3,) in body axes."""
+        self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
+
+
+Effect = Callable[[Scene, float, Generator], None]
+
+
+class HiddenEffect(msgspec.Struct, frozen=True):
+    """One hidden effect: its name, as in :data:`EFFECTS`, size, seed."""
+
+    name: str
+    size: float
+    seed: int
+
+
+def direction(rng: Generator) -> Array:
+    """Draw a unit vector (3,)."""
+    d = rng.normal(size=3)
+    return np.asarray(d / np.linalg.norm(d))
+
+
+def relays(x: Array, centres: Array, widths: Array) -> Array:
+    """Mean state of relays along a history x (n,) (Preisach 1935), less that without hysteresis."""
+    total = np.zeros(len(x))
+    for c, w in zip(centres, widths, strict=True):
+        up, down = x >= c + w / 2, x <= c - w / 2
+        last = np.maximum.accumulate(np.where(up | down, np.arange(len(x)), 0))
+        total += np.where(up[last], 1.0, -1.0) - np.where(x >= c, 1.0, -1.0)
+    return total / len(centres)
+
+
+def soaked(surface: Array, step: float, lag: float) -> Array:
+    """Return the temperature (n,) in the middle of a slab whose faces follow `surface` (n,), every `step` s.
+
+    `lag` is the slowest mode's time constant, s (Carslaw & Jaeger 1959, sec. 3.4).
+    """
+    modes = range(40)
+    weights = np.array([4.0 * (-1) ** k / (np.pi * (2 * k + 1)) for k in modes])
+    parts = [first_order(surface, step, lag / (2 * k + 1) ** 2) for k in modes]
+    return np.asarray((weights / weights.sum()) @ np.array(parts))
+
+
+def furnish(scene: Scene, rng: Generator) -> None:
+    """Log what any vehicle logs, related to an effect or not: motor currents, a fin, temperatures."""
+    n, t, step = len(scene.t), scene.t, scene.track.step
+    moving = np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0
+    duty = (autoregressive(rng, (n,), 1.0, 400.0 / step) > 0.8) & ~moving
+    pump = 2.5 * first_order(moving.astype(float), step, 3.0) + 0.02 * rng.normal(size=n)
+    motor = 0.8 * first_order(duty.astype(float), step, 8.0) * (1.0 + 0.1 * np.sin(t / 700.0))
+    scene.logged["amps_a"] = (pump, "A")
+    scene.logged["amps_b"] = (motor + 0.005 * rng.normal(size=n), "A")
+    fin = np.round(first_order(autoregressive(rng, (n,), 12.0, 240.0 / step), step, 5.0), 1)
+    scene.logged["p17"] = (fin, "deg")
+    day = 0.8 * np.sin(2 * np.pi * t / 86400.0 + rng.uniform(0, 6.28)) + autoregressive(
+        rng, (n,), 0.25, 4000.0 / step
+    )
+    scene.water = scene.water + day
+    scene.logged["sensor_temperature"] = (first_order(scene.water, step, 300.0), "degC")
+    scene.logged["water_temperature"] = (scene.water, "degC")
+    bay = first_order(scene.water, step, 20_000.0) + first_order(0.6 * pump, step, 5000.0)
+    scene.logged["bay_temperature"] = (bay, "degC")
+
+
+# ---- the effects -------------------------------------------------------------------------------------------
+
 
 CALIBRATED_AT = 4.5
 """Instrument's temperature during the calibration, to about half a degree, degC."""
@@ -18,7 +141,7 @@ FIN = np.radians(12.0)
 """A usual deflection of the fin."""
 
 
-# ---- the instrument: heat, shocks, age; its converter, filter, clock and range ------------------------
+# ---- the instrument: heat, shocks, age; its converter, filter, clock and range ----------------------
 
 
 def _warmer(scene: Scene, rng: Generator) -> Array:
@@ -113,7 +236,7 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
     scene.bend.append(bend)
 
 
-# ---- the surroundings: the Earth's field, the map of it, machines -------------------------------------
+# ---- the surroundings: the Earth's field, the map of it, machines -----------------------------------
 
 
 def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
@@ -154,7 +277,7 @@ def hum(scene: Scene, size: float, rng: Generator) -> None:
     scene.field = scene.field + size * (np.outer(np.cos(phase), a) + np.outer(np.sin(phase + 0.3), 0.5 * b))
 
 
-# ---- the vehicle: currents, iron that moves, remembers or is strained, conductors ---------------------
+# ---- the vehicle: currents, iron that moves, remembers or is strained, conductors -------------------
 
 
 def wires(scene: Scene, size: float, rng: Generator) -> None:
@@ -255,3 +378,85 @@ EFFECTS: dict[str, Effect] = {
     "outliers": bit_flips,
 }
 """Cause, by its public name -> the effect that is hidden."""
+
+
+# ---- a deployment with effects -----------------------------------------------------------------------------
+
+
+FINER = 5
+"""Factor by which the simulation's grid is refined if the instrument has a filter or channel delays."""
+
+
+def _interpolate(scene: Scene) -> tuple[Array, Array, float]:
+    """Return field, water temperature and step on a finer grid.
+
+    The Earth's part of the field turns with the vehicle and is interpolated by a spline, because a delayed
+    channel would see the error of a straight line. The rest is interpolated linearly: masses start and stop
+    abruptly.
+    """
+    track, t = scene.track, scene.t
+    turn = rotation(track.roll, track.pitch, track.heading)
+    earth = turn.apply(turn.apply(scene.field).mean(axis=0), inverse=True)
+    fine = np.linspace(0.0, t[-1], FINER * (len(t) - 1) + 1)
+    rest = [np.interp(fine, t, values) for values in (scene.field - earth).T]
+    field = np.column_stack(rest) + CubicSpline(t, earth)(fine)
+    return field, np.interp(fine, t, scene.water), track.step / FINER
+
+
+def _samples(scene: Scene, rng: np.random.Generator) -> Samples:
+    """Return what the scene's instrument gives, the effects on the channels after it included."""
+    track = scene.track
+    if scene.earth.any():
+        turn = rotation(track.roll, track.pitch, track.heading)
+        scene.field = scene.field + turn.apply(scene.earth, inverse=True)
+    field, water, step = scene.field, scene.water, track.step
+    if scene.instrument.corner or any(scene.instrument.channel_delay):
+        field, water, step = _interpolate(scene)
+    samples = scene.instrument.measure(field, water, step, scene.when, rng)
+    for bend in scene.bend:
+        samples = replace(samples, channels=bend(samples.channels))
+    return samples
+
+
+def disturb(
+    twin: Twin,
+    hidden: tuple[HiddenEffect, ...],
+    track: Track,
+    time: Array,
+    seed: int = 0,
+    effects: Mapping[str, Effect] = EFFECTS,
+) -> xr.Dataset:
+    """Measure along `track` with `hidden` effects, by their names in `effects`.
+
+    Without any, the furnished deployment alone is returned. The triples are taken at `time` (m,), s after the
+    track's start, up to a few seconds before its end. `seed` is that of the telemetry that has nothing to do
+    with the effects. The deployment has more telemetry than that of :meth:`~sitl.twin.Twin.measure`;
+    ``attrs["truth"]`` (JSON) holds what a perfect diagnosis would print of a single effect, where physics has
+    such numbers.
+    """
+    ambient = twin.ambient(track)
+    scene = Scene(
+        track,
+        time,
+        field=ambient.field,
+        earth=np.zeros_like(ambient.field),
+        water=ambient.water,
+        instrument=twin.scenario.instrument,
+        reference=np.zeros(len(time)),
+    )
+    furnish(scene, np.random.default_rng([seed, 77]))
+    for one in hidden:
+        effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
+    out = twin.log(track, time, ambient.earth, _samples(scene, twin.instrument_rng()))
+    if "reference_field" in out:  # `reference` is by how much the true field exceeds it
+        known = out["reference_field"]
+        out["reference_field"] = "time", known.to_numpy() - scene.reference, known.attrs
+    seen = np.clip(time - scene.late, 0.0, None)
+    logged = dict(scene.logged)
+    if scene.late:
+        logged |= {name: (values, out[name].attrs["units"]) for name, values in track.parameters.items()}
+    for name, (values, unit) in logged.items():
+        attrs = {"units": unit, "long_name": name.replace("_", " ")}
+        out[name] = ("time", np.interp(seen, track.elapsed, values), attrs)
+    out.attrs["truth"] = msgspec.json.encode(scene.truth).decode()
+    return out

@@ -1,0 +1,437 @@
+"""Emulated instruments: the inverse of each driver, in the instrument's own bytes.
+
+An encoder quantises and saturates as the instrument does, counts its readings, and answers what the driver
+sends, so that a program behind a pty cannot distinguish it from the real one. Other packages add theirs by
+an entry point in the group ``magbridge.encoders``: the driver's name, and a class like :class:`Encoder`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from fractions import Fraction
+from math import inf, isnan
+from pathlib import Path
+from struct import pack
+from typing import Any, ClassVar
+from zlib import crc32
+
+from magbridge.columns import NT_PER_UNIT
+from magbridge.errors import ConfigError
+from magbridge.plugins import load, plugins
+from magbridge.records import Reading
+from magbridge.sensors import ascii as ascii_wire
+from magbridge.sensors import digitizer as wire
+from magbridge.sensors import hmr2300, rm3100
+from magbridge.sensors import twinleaf as tio
+from magbridge.sensors.digitizer import FULL_SCALE, DigitizerOptions
+from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_encode
+from magbridge.toml import convert
+
+__all__ = ["ENCODERS", "Encoder", "Rm3100Registers", "open_encoder"]
+
+
+class Encoder(ABC):
+    """An instrument, switched on, with the options of the driver that reads it.
+
+    `rate` is that of the readings, Hz, for an instrument that gives a reading's number in place of its time.
+    It is `streaming` while it sends readings; some wait for a command. `power_cycle` is how many times it was
+    switched on.
+    """
+
+    Options: ClassVar[Any]
+    streaming = True
+
+    def __init__(self, options: Any, rate: float = 1.0) -> None:
+        self.options = options
+        self.rate = rate
+        self.power_cycle = 0
+        self.power_on()
+
+    def power_on(self) -> None:
+        """Switch off and on again: add a power cycle, and count readings from 0."""
+        self.power_cycle += 1
+        self.sequence = 0
+
+    @abstractmethod
+    def encode(self, reading: Reading) -> bytes:
+        """Return the bytes sent for one reading; none while it is not streaming.
+
+        It uses the reading's field (nT, finite), `device_time` (s on its own clock, which begins at
+        power-on), `channel_delay`, `temperature` and `supply`, where the instrument sends them; counters
+        are its own.
+        """
+
+    def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most do not listen
+        """Receive bytes that were sent to the instrument; return its answers."""
+        return b""
+
+
+def clip(value: float, limit: float) -> float:
+    """Return `value`, at most `limit` either side of zero."""
+    return max(-limit, min(value, limit))
+
+
+# ---- a line protocol, as the configuration describes it ----------------------------------------------------
+
+
+class AsciiEncoder(Encoder):
+    """Sends a line with every reading."""
+
+    Options = ascii_wire.AsciiOptions
+
+    def encode(self, reading: Reading) -> bytes:
+        """Return one line; the end of another before the first: a listener cannot tell half a line."""
+        options = self.options
+        end = b"\r\n" if options.terminator == "\n" else b"\r"
+        before = b"" if self.sequence else end
+        time = reading.device_time % options.time_modulo if options.time_modulo else reading.device_time
+        values = {
+            "time": time / ascii_wire.SECONDS[options.time_unit],
+            "temperature": reading.temperature,
+            "supply": reading.supply,
+            "sequence": self.sequence % (options.sequence_modulo or inf),
+            "power_cycle": self.power_cycle,
+            "-": 0,
+        }
+        for axis, value in zip("xyz", reading.field, strict=True):
+            scaled = clip(value, options.range or inf) / (options.scale * NT_PER_UNIT.get(options.unit, 1.0))
+            values[axis] = round(scaled) if options.unit == "counts" else scaled
+        self.sequence += 1
+        cells = [f"{values[name]:.13g}" for name in options.columns if name != "*"]
+        if options.keys:
+            pairs = zip(options.keys, cells, strict=True)
+            line = "{" + ", ".join(f'"{key}": {cell}' for key, cell in pairs) + "}"
+        else:
+            line = (options.separator or " ").join(cells)
+        text: bytes = (options.prefix + line).encode(ascii_wire.ENCODING)
+        if options.checksum:
+            digits, function = ascii_wire.CHECKSUMS[options.checksum]
+            text += f"*{function(text):0{digits}X}".encode()
+        return before + text + end
+
+
+# ---- the digitizer: its frames as its driver describes them ------------------------------------------------
+
+
+WRAP = 1 << 16
+
+
+class DigitizerEncoder(Encoder):
+    """Three channels, one converter."""
+
+    Options = DigitizerOptions
+
+    def encode(self, reading: Reading) -> bytes:
+        """Return one frame."""
+        top, limit = FULL_SCALE - 1, self.options.full_scale or inf
+        flags, counts = 0, []
+        for channel, value in enumerate(reading.field):
+            ideal = round(clip(value, limit) / self.options.nt_per_count)
+            count = max(-top - 1, min(ideal, top))
+            flags |= (count != ideal) << channel
+            counts += [count & 0xFFFF, count >> 16]
+        temperature, supply = reading.temperature, reading.supply
+        message = wire.BODY.pack(
+            wire.READING,
+            wire.LENGTH,
+            self.sequence % WRAP,
+            self.power_cycle % WRAP,
+            *(round((reading.device_time + delay) * 1e6) % wire.WRAP_US for delay in reading.channel_delay),
+            wire.NO_TEMPERATURE if isnan(temperature) else round(clip(temperature, 327.0) * 100),
+            wire.NO_SUPPLY if isnan(supply) else round(clip(supply, 65.0) * 1000),
+            flags,
+            *counts,
+        )
+        self.sequence += 1
+        return cobs_encode(message + crc32(message).to_bytes(4, "little")) + b"\0"
+
+
+# ---- the HMR2300: as delivered it sends ASCII, and only when asked -----------------------------------------
+
+
+STOP = b"\x1b"
+
+
+class Hmr2300Encoder(Encoder):
+    """Three magnetoresistive channels, commands, two outputs."""
+
+    Options = hmr2300.Hmr2300Options
+
+    def power_on(self) -> None:
+        """Wait for commands."""
+        super().power_on()
+        self.streaming = self.binary = self._enabled = False
+        self._latest = (0, 0, 0)
+        self._lines = Framer(b"\r", 64)
+
+    def encode(self, reading: Reading) -> bytes:
+        """Return one frame or line, where it streams."""
+        x, y, z = (round(clip(value / hmr2300.NT_PER_COUNT, hmr2300.MAX_COUNTS)) for value in reading.field)
+        self._latest = x, y, z
+        return self._sample() if self.streaming else b""
+
+    def _sample(self) -> bytes:
+        if self.binary:
+            return hmr2300.COUNTS_LAYOUT.pack(*self._latest) + b"\r"
+        return ("  ".join(map(_comma, self._latest)) + "  \r").encode()
+
+    def feed(self, data: bytes) -> bytes:
+        """Obey commands and answer them."""
+        if STOP in data:
+            self.streaming = False
+            data = data.replace(STOP, b"")
+        return b"".join(self._obey(line.decode("latin-1").upper()) for line in self._lines.split(data))
+
+    def _obey(self, line: str) -> bytes:
+        own, command = f"*{self.options.device:02d}", line[3:]
+        if line[:3] not in (own, "*99"):
+            return b"Re-enter\r"
+        if command == "C":
+            self.streaming = True
+            return b""
+        if command == "P":
+            return self._sample()
+        return self._set(command)
+
+    def _set(self, command: str) -> bytes:
+        """Obey a command that is accepted only after a write enable."""
+        enabled, self._enabled = self._enabled, command == "WE"
+        if command in ("A", "B") and enabled:
+            self.binary = command == "B"
+            return b"BINARY ON\r" if self.binary else b"ASCII ON\r"
+        if command == "WE" or (command.startswith("R=") and enabled):
+            return b"OK\r"
+        known = command in ("A", "B") or command.startswith("R=")
+        return b"WE_OFF\r" if known else b"Re-enter\r"
+
+
+def _comma(count: int) -> str:
+    """Write a count as the instrument does: sign, two digits, comma, three digits, leading zeros blank."""
+    return ("-" if count < 0 else " ") + f"{abs(count):,}".rjust(6)
+
+
+# ---- the RM3100: its registers behind the bus interface, and the lines of its readings ---------------------
+
+
+class Rm3100Encoder(Encoder):
+    """An RM3100 with the program that polls it."""
+
+    Options = rm3100.Rm3100Options
+
+    def encode(self, reading: Reading) -> bytes:
+        """Return the line of one reading."""
+        return rm3100.encode_line(results(reading, self.options.cycle_count), reading.device_time)
+
+
+def results(reading: Reading, cycle_count: int) -> bytes:
+    """Return the nine bytes of the result registers for a reading's field."""
+    step = rm3100.nt_per_count(cycle_count)
+    counts = (round(clip(value / step, rm3100.MAX_COUNT)) for value in reading.field)
+    return b"".join(count.to_bytes(3, "big", signed=True) for count in counts)
+
+
+class Rm3100Registers:
+    """The part's register map, which answers as the part does in a `field` (nT) at its coils.
+
+    If it `is_frozen`, no measurement completes until the registers are written again. If it `has_failed`, the
+    bus does not answer; if it `is_absent`, an SPI bus reads zeros. `broken_axes` (bits 4 to 6) are the coils
+    that fail the self-test.
+    """
+
+    def __init__(self) -> None:
+        self.field = (20_000.0, -1_000.0, 45_000.0)
+        self.is_frozen = self.has_failed = self.is_absent = False
+        self.broken_axes = 0
+        self.configured = 0
+        self._registers = bytearray(0x37)
+        self._registers[0x36] = rm3100.REVISION
+        self._ready = False
+
+    def read(self, register: int, count: int) -> bytes:
+        """Return `count` bytes from `register` on."""
+        self._fail()
+        if self.is_absent:
+            return bytes(count)
+        if register == rm3100.STATUS:
+            is_measuring = self._registers[rm3100.CMM] & 1 or self._ready
+            self._registers[rm3100.STATUS] = 0x80 if is_measuring and not self.is_frozen else 0
+        if register == rm3100.RESULTS:
+            cycles = int.from_bytes(self._registers[4:6], "big")
+            self._registers[0x24:0x2D] = results(Reading(self.field), cycles)
+            self._ready = False
+        return bytes(self._registers[register : register + count])
+
+    def write(self, register: int, data: bytes) -> None:
+        """Write bytes from `register` on, and do as the part does."""
+        self._fail()
+        self._registers[register : register + len(data)] = data
+        if register == rm3100.POLL:
+            self._ready = True
+            if self._registers[rm3100.BIST] & 0x80:
+                self._registers[rm3100.BIST] = 0x80 | (0x70 & ~self.broken_axes)
+        elif register == rm3100.CYCLE_COUNTS:
+            self.is_frozen = False
+            self.configured += 1
+
+    def close(self) -> None:
+        """Release the bus."""
+
+    def _fail(self) -> None:
+        if self.has_failed:
+            raise OSError(121, "Remote I/O error")
+
+
+# ---- a TIO device of either generation, its samples 32-bit floats as those of the VMR ----------------------
+
+
+FLOAT32 = 0x42
+STREAM = {1: 0, 2: 1}
+"""The stream that holds the field, in each generation."""
+
+
+class TwinleafEncoder(Encoder):
+    """A TIO device; set `generation` before its first reading to have the older one."""
+
+    Options = tio.TwinleafOptions
+    generation = 2
+
+    def power_on(self) -> None:
+        """Begin a new session; describe it before its first reading."""
+        super().power_on()
+        options = self.options
+        self._rate = Fraction(self.rate).limit_denominator(1000)
+        self._routing = bytes(reversed(options.hops()))
+        self._columns = [*options.columns, *([options.temperature] if options.temperature else [])]
+        self._unit = options.unit or "nT"
+        self._frames = Framer(tio.END, tio.MAX_FRAME_BYTES)
+        self._described = False
+
+    def encode(self, reading: Reading) -> bytes:
+        """Return one packet of one sample, its number the time times the rate."""
+        number = round(reading.device_time * self._rate)
+        limit = self.options.range
+        values = [clip(value, limit) / NT_PER_UNIT[self._unit] for value in reading.field]
+        if self.options.temperature:
+            values.append(reading.temperature)
+        if self.generation == 1:
+            header = (number % tio.WRAP_1).to_bytes(4, "little")
+        else:
+            header = (number % tio.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
+        samples = header + b"".join(pack("<f", value) for value in values)
+        packet = self._slip(tio.STREAM_TYPE + STREAM[self.generation], samples)
+        if self._described:
+            return packet
+        self._described = True
+        heartbeat = self._slip(tio.HEARTBEAT, self.power_cycle.to_bytes(4, "little"))
+        return tio.END + heartbeat + self._describe() + packet
+
+    def feed(self, data: bytes) -> bytes:
+        """Answer requests."""
+        answers = b""
+        for frame in self._frames.split(data):
+            packet = tio.unslip(frame)
+            if crc32(packet) != CRC32_RESIDUE:
+                continue
+            kind, _, length = tio.TIO_HEADER.unpack_from(packet)
+            if kind != tio.RPC_REQUEST or packet[4 + length : -4] != self._routing:
+                continue
+            number, size = tio.RPC_HEADER.unpack_from(packet, 4)
+            method = packet[8 : 8 + size % 0x8000]
+            reply = number.to_bytes(2, "little")
+            if method == b"dev.metadata" and self.generation == 2:
+                records = b"".join(bytes([kind, len(record)]) + record for kind, record in self._records())
+                answers += self._slip(tio.RPC_REPLY, reply + records)
+            elif method == b"data.send_all" and self.generation == 1:
+                answers += self._describe() + self._slip(tio.RPC_REPLY, reply)
+            else:
+                not_found = (2).to_bytes(2, "little")
+                answers += self._slip(tio.RPC_ERROR, reply + not_found)
+        return answers
+
+    def _slip(self, kind: int, payload: bytes) -> bytes:
+        return tio.slip(tio.pack(kind, payload, self._routing))
+
+    def _describe(self) -> bytes:
+        """Return the packets that describe the contents of a sample."""
+        if self.generation == 2:
+            return b"".join(
+                self._slip(tio.METADATA, bytes([kind, 0]) + record) for kind, record in self._records()
+            )
+        numerator, denominator = self._rate.denominator * 1_000_000, self._rate.numerator
+        name = self._columns[0].partition(".")[0]
+        axes = ",".join(column.rpartition(".")[2] for column in self._columns[:3])
+        sources = [(f"{name}\t{axes}\t{name}\t{self._unit}", 3)]
+        sources += [(f"{column}\t\t{column}\tC", 1) for column in self._columns[3:]]
+        packets = self._slip(
+            tio.TIMEBASE, tio.TIMEBASE_HEADER.pack(0, 1, 1, 0, numerator, denominator, 1, 0.0) + bytes(16)
+        )
+        components = b""
+        for number, (text, channels) in enumerate(sources):
+            header = tio.SOURCE_HEADER.pack(number, 0, 1, 0, 0, 0, channels, FLOAT32)
+            packets += self._slip(tio.SOURCE, header + text.encode())
+            components += tio.COMPONENT.pack(number, 0, 1, 0)
+        return packets + self._slip(
+            tio.STREAM, tio.STREAM_HEADER.pack(0, 0, 1, 0, 0, len(sources), 0) + components
+        )
+
+    def _records(self) -> list[tuple[int, bytes]]:
+        """Return the records of generation 2, each with its type."""
+        session, stream = self.power_cycle, STREAM[2]
+        size, active = 4 * len(self._columns), 3
+        records = [
+            (tio.DEVICE_RECORD, tio.DEVICE_HEADER.pack(tio.DEVICE_HEADER.size, 0, session, 0, 0, 1)),
+            (
+                tio.STREAM_RECORD,
+                tio.STREAM_RECORD_HEADER.pack(
+                    tio.STREAM_RECORD_HEADER.size, stream, len(self._columns), 1, size, 0, 0
+                ),
+            ),
+            (
+                tio.SEGMENT_RECORD,
+                tio.SEGMENT_HEADER.pack(
+                    tio.SEGMENT_HEADER.size, stream, session % 256, active, 1, 0, session, 0,
+                    self._rate.numerator, self._rate.denominator, 0.0, 0,
+                ),
+            ),
+        ]  # fmt: skip
+        for index, name in enumerate(self._columns):
+            unit = self._unit if index < 3 else "C"
+            header = tio.COLUMN_HEADER.pack(
+                tio.COLUMN_HEADER.size, stream, index, FLOAT32, len(name), len(unit), 0
+            )
+            records.append((tio.COLUMN_RECORD, header + name.encode() + unit.encode()))
+        return records
+
+
+# ---- all instruments ---------------------------------------------------------------------------------------
+
+
+ENCODERS: dict[str, type[Encoder]] = {
+    "ascii": AsciiEncoder,
+    "digitizer": DigitizerEncoder,
+    "hmr2300": Hmr2300Encoder,
+    "rm3100": Rm3100Encoder,
+    "twinleaf": TwinleafEncoder,
+}
+"""Driver's name: the emulated instrument."""
+
+
+def open_encoder(
+    name: str, options: Mapping[str, Any], rate: float = 1.0, source: str | Path = "bridge.toml"
+) -> Encoder:
+    """Return the emulated instrument that the driver called `name` reads.
+
+    Arguments are those of :func:`magbridge.sensors.open_driver`; `rate` is that of the readings, Hz, for an
+    instrument that gives a reading's number in place of its time.
+
+    Raises
+    ------
+    ConfigError
+        No such instrument, or a wrong option.
+    """
+    others = {} if name in ENCODERS else plugins("magbridge.encoders")
+    if name not in ENCODERS and name not in others:
+        raise ConfigError(source, "sensor.driver", f"can emulate {', '.join(sorted({*ENCODERS, *others}))}")
+    encoder: type[Encoder] = ENCODERS[name] if name in ENCODERS else load(others[name])
+    return encoder(convert(dict(options), encoder.Options, source, "sensor.options."), rate)
