@@ -16,9 +16,12 @@ the difference, until it is less than :data:`NEAR_SIGMA`.
 from __future__ import annotations
 
 from math import inf, isnan, log, nan, pi, sqrt
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from magbridge.records import Vector
+
+if TYPE_CHECKING:
+    from magbridge.health.scatter import Scatter  # which needs the messages of this module
 
 __all__ = ["LevelCheck", "Messages", "RepetitionCheck"]
 
@@ -93,15 +96,15 @@ class RepetitionCheck:
         """Return True if the last reading repeats the previous one on all axes."""
         return self._common.run > 0
 
-    def is_stuck(self, raw: Vector, white_sigma: float) -> bool:
+    def is_stuck(self, raw: Vector, scatter: Scatter) -> bool:
         """Return True if channels repeat their reading, or read a limit at which they were once stuck.
 
-        `raw` is the reading, `white_sigma` the 1-sigma of the white noise, nT.
+        `raw` is the reading, nT; `scatter` has measured the white noise.
         """
         x_axis, y_axis, z_axis = self._axes
         x, y, z = raw
         if x == x_axis.last and y == y_axis.last and z == z_axis.last:
-            return self._repeat_all(white_sigma)
+            return self._repeat_all(scatter.white_sigma)
         self._common.change()
         stuck = False
         for number, axis in enumerate(self._axes):

@@ -35,6 +35,7 @@ from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.sequential import SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
 from magbridge.health.checks import Messages
+from magbridge.health.trend import TrendCheck
 from magbridge.records import Vector
 
 __all__ = ["MASS_FRACTION", "ConsistencyCheck", "TestedSample"]
@@ -148,12 +149,20 @@ class ConsistencyCheck:
         self.restart()
         self._log_roughness, self._straight_samples = 0.0, 0
 
-    def is_due(self, time_us: int, speed: float) -> bool:
-        """Return True if it is time to test a sample of a vehicle that moves at a speed, m/s."""
-        interval = MAX_INTERVAL_S
+    @property
+    def is_waiting(self) -> bool:
+        """Return True if a sample waits for newer telemetry."""
+        return bool(self._pending)
+
+    def is_due(self, time_us: int, trend: TrendCheck) -> bool:
+        """Return True if it is time to test a sample of a vehicle whose speed follows from the trend."""
+        elapsed_us = time_us - self._due_us
+        if 0 <= elapsed_us < 0.99e6 * MIN_INTERVAL_S:  # at any speed
+            return False
+        interval, speed = MAX_INTERVAL_S, trend.crossing_speed
         if speed > 0.0:
             interval = min(max(INTERVAL_M / speed, MIN_INTERVAL_S), MAX_INTERVAL_S)
-        return not 0 <= time_us - self._due_us < 0.99e6 * interval
+        return not 0 <= elapsed_us < 0.99e6 * interval
 
     def add(self, sample: TestedSample) -> None:
         """Add a sample; it is tested once newer telemetry has come."""

@@ -109,7 +109,7 @@ class HealthMonitor:
         total, sigma = total_field
         reference, reference_sigma = main_field
         level, trend = self._level, self._trend
-        stuck = self._axes.is_stuck(raw, self._scatter.white_sigma)
+        stuck = self._axes.is_stuck(raw, self._scatter)
         if not 0.0 < total < inf:
             if total == 0.0:
                 level.check(time_us, total, sigma, reference, reference_sigma, steady=True)
@@ -135,14 +135,14 @@ class HealthMonitor:
         if self.is_fault or trend.is_away:
             self.flags = IMPLAUSIBLE
         consistency = self._consistency
-        speed = trend.crossing_speed
         # consistency: samples at rest that no other check has flagged
-        if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
+        if steady and not self.flags and trend.is_established and consistency.is_due(time_us, trend):
             anomaly = total - reference + self._reference_steps.total if isfinite(reference) else total
-            changes, course = tuple(mass_changes()), self._course.angle
+            changes, course, speed = tuple(mass_changes()), self._course.angle, trend.crossing_speed
             new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, changes, speed, course)
             consistency.add(new)
-        consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
+        if consistency.is_waiting:
+            consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
         return variance + self._scatter.excess() + consistency.variance()
 
     def explain(self, difference: float, *, jumps: bool) -> None:
