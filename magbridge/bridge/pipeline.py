@@ -34,7 +34,7 @@ from magbridge.link.publish import MASK, check_publish
 from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, Sources, TelemetryMap, is_possible, needed_rates
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Message, Signing, Spec, load_key, spec
-from magbridge.mavlink.enums import MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver
@@ -146,6 +146,7 @@ class Pipeline:
             version=__version__,
             kept=start.parameters,
             status=self._status,
+            speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
             streams=streams,
         )
 
@@ -400,11 +401,10 @@ class Pipeline:
         """Return the fields of MAG_STATUS about sensor, samples and log."""
         now_us, main = self.component.codec.now_us, self.streams[0]
         tracks = self._correction.aligner.by_name
-        stale = sum(
-            1 << bit
-            for bit, name in enumerate(self._config.telemetry)
-            if bit < 32 and name in tracks and tracks[name].stale(now_us)
-        )
+        stale = 0
+        for bit, name in enumerate(self._config.telemetry):
+            if bit < 32 and name in tracks and tracks[name].stale(now_us):
+                stale |= 1 << bit
         # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
         records = self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0
         return {

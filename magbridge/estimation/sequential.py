@@ -56,6 +56,9 @@ MAX_SQUARED_INNOVATION: Final = 9.0
 """Normalised squared innovation that counts for that ratio, at most."""
 
 
+UNIT_MATRIX = np.eye(3)
+
+
 class SequentialTest:
     """Test several kinds of change, each with several onsets.
 
@@ -138,7 +141,7 @@ class SequentialTest:
         S, v = estimator.variance, estimator.innovation
         regressor, effect = regressors[self.kind], effects[self.kind]
         # response of the innovation to a unit change: the signature less what the filter has absorbed
-        absorbed = np.tensordot(estimator.row, self.absorbed, axes=1)
+        absorbed = np.dot(estimator.row[None], self.absorbed.reshape(self._states, -1)).reshape(-1, 3)
         phi = (regressor - self.start)[:, None] * effect + absorbed
         residual = v - np.sum(phi * self.amplitude, axis=1)
         self.squared_residual = float(residual[self.log_ratio.argmax()]) ** 2 / S
@@ -169,7 +172,7 @@ class SequentialTest:
         if null is not None:
             # what the model allows of one kind may look like a change of another kind
             allowed = self._mixture(null[self.kind] ** 2)[1].reshape(len(null), -1).max(axis=0)
-            self.statistic = self.log_ratio - np.tile(allowed, len(null))
+            self.statistic = (self.log_ratio.reshape(len(null), -1) - allowed).ravel()
         return float(self.statistic.max())
 
     def _begin(self, time: float, residual: FloatArray) -> BoolArray:
@@ -192,7 +195,7 @@ class SequentialTest:
 
     def _mixture(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return amplitudes (rows, 3) and L (rows,) for amplitudes of variance `prior` (rows,)."""
-        W = prior[:, None, None] * self._M + np.eye(3)
+        W = prior[:, None, None] * self._M + UNIT_MATRIX
         amplitude = prior[:, None] * np.linalg.solve(W, self._y[:, :, None])[:, :, 0]
         explained = np.sum(self._y * amplitude, axis=1)
         if self._dof:

@@ -197,7 +197,7 @@ class ConsistencyCheck:
         F, Q = self._process.transition(metres, seconds, turn if isfinite(turn) else 0.0)
         self._filter.predict(F, Q)
         absorbed = self._test.absorbed
-        absorbed[:] = np.tensordot(F, absorbed, axes=1)
+        absorbed[:] = np.dot(F, absorbed.reshape(len(F), -1)).reshape(absorbed.shape)
         v = self._filter.innovate(total - self._level, self._process.row(1.0), self._process.white_variance)
         normalised = v / self._filter.sigma
         self._outliers = self._outliers + 1 if abs(normalised) > MAX_CONSISTENT_SIGMA else 0

@@ -20,7 +20,6 @@ from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message,
 from magbridge.mavlink.codec import NOT_SIGNED
 from magbridge.mavlink.enums import (
     FIRMWARE_VERSION_TYPE,
-    MAG_PORT_STATE,
     MAV_AUTOPILOT,
     MAV_CMD,
     MAV_PROTOCOL_CAPABILITY,
@@ -183,22 +182,27 @@ class Reports:
 
     `version`: of the program, ``"0.1.0"``.
     `condition`: returns the fields of MAG_STATUS that the link cannot know itself.
+    `speaking`: returns True if readings come from the sensor.
     `calibration_id`: CRC-32 of the calibration's file; 0 is none.
     `more`: functions that send the messages with the rate of MAG_STATUS.
     """
 
     def __init__(
-        self, component: Component, version: str, calibration_id: int, condition: Callable[[], dict[str, Any]]
+        self,
+        component: Component,
+        version: str,
+        calibration_id: int,
+        condition: Callable[[], dict[str, Any]],
+        speaking: Callable[[], bool],
     ) -> None:
-        self._component, self._outbox = component, component.outbox
+        self._component, self._outbox, self._speaking = component, component.outbox, speaking
         self._version, self.calibration_id, self._condition = version, calibration_id, condition
         self._start_us = component.codec.now_us
         self.more: list[Callable[[], object]] = []
 
     def heartbeat(self) -> bool:
         """Send HEARTBEAT: active while readings come from the sensor, else critical; return True."""
-        speaks = self._condition().get("sensor_state") == MAG_PORT_STATE.OK
-        self._outbox.put(HEARTBEAT, ALIVE if speaks else CRITICAL)
+        self._outbox.put(HEARTBEAT, ALIVE if self._speaking() else CRITICAL)
         return True
 
     def status(self) -> bool:
@@ -289,6 +293,7 @@ class Component:
     `version`: of the program, ``"0.1.0"``.
     `kept`: parameters that a station changed in an earlier run.
     `status`: returns the fields of MAG_STATUS that the component cannot know itself (samples, log, sensor).
+    `speaking`: returns True if readings come from the sensor; else the heartbeat's state is critical.
     `outbox`: messages to send.
     `received`: everything that came, as frames for the log; the bridge empties it.
     `genuine`: the signed frames of the last :meth:`receive` that were accepted.
@@ -310,6 +315,7 @@ class Component:
         version: str = "0.0.0",
         kept: Mapping[str, float] | None = None,
         status: Callable[[], dict[str, Any]] = dict,
+        speaking: Callable[[], bool] = bool,
         streams: Mapping[Stream, tuple[float, float]] | None = None,
     ) -> None:
         self._link = link
@@ -340,7 +346,7 @@ class Component:
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
         self.metadata = metadata_files(self.parameters.table.values(), link.component)
         self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
-        self.reports = Reports(self, version, calibration_id, status)
+        self.reports = Reports(self, version, calibration_id, status, speaking)
         self.authority = Authority(link.system, link.autopilot)
         self.parameter_service = ParameterService(
             self.parameters, self.outbox, self.timers, self.announcer, self.authority

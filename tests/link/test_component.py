@@ -55,6 +55,7 @@ def test_status(make_link: MakeLine) -> None:
     link = make_link(
         calibration_id=7,
         status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": 3},
+        speaking=lambda: True,
     )
     link.to(0)
     link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
