@@ -3,17 +3,14 @@
 A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
 magnetometer sample; every other column holds the values known at that time:
 
-- logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN
-  before the first and when it is older than 30 s. This is what the bridge itself would have known, so a
-  calibration is fitted to the same kind of data as it will correct live;
+- logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN once
+  it is older than 30 s. The bridge itself would have known this, so a calibration is fitted to the same kind
+  of data as it will correct live;
 - logs that were assembled ashore (Slocum, Seaglider): interpolated linearly, headings on the circle, NaN
   across gaps.
 
-:mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.access`
-reads and writes all of them; :mod:`.mapping` is what a user can say about a log. The formats share
-:mod:`.fields` (telemetry brought to the rows; :mod:`.compasses` does so for autopilots and robots),
-:mod:`.deployment` (what they return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one
-stream of several. :mod:`.tlog` is separate: it writes the bridge's log.
+:mod:`.registry` is the table of formats, :mod:`.access` reads and writes all of them, and :mod:`.mapping` has
+the user's declarations. :mod:`.tlog` is separate: it writes the bridge's log.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Read and write deployments in files of any format, whole or in pieces.
 
-Bad rows and values are dropped, counted and named in attributes
-(:func:`magbridge.logs.deployment.with_losses`), and the rest is read: rows and values by
-:mod:`magbridge.logs.checks`, a whole file of several here.
+Bad rows and values are dropped by :mod:`magbridge.logs.checks`, a whole file of several here; both are
+counted and named in attributes.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from magbridge.columns import CHANNEL_TIMES, counts_from_boot, decoded, in_seconds, require
+from magbridge.columns import counts_from_boot, decoded, in_seconds, require
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
@@ -250,10 +249,9 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
     """Return a deployment whose times count from the boot, with the boot at `date` (s) if that is given."""
     if date is None or not counts_from_boot(part):
         return part
-    moved = part.assign_coords(time=part["time"].copy(data=part["time"].values + date))
-    for name in CHANNEL_TIMES:
-        if name in moved:
-            moved[name] = moved[name] + date
+    from magbridge.logs.deployment import shifted  # noqa: PLC0415 - xarray is for ashore
+
+    moved = shifted(part, date)
     moved.attrs.pop("time_reference", None)
     return moved
 

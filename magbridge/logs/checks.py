@@ -1,17 +1,14 @@
-"""Drop and count data that cannot be, and values that a file states not to be valid.
+"""Drop and count impossible data, and values that a file states not to be valid.
 
-One damaged record costs only itself. The longest increasing series of times is kept: a clock
-that was set back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time
-become one. A value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units,
-or in another order, and is refused. Each kind of fault is counted, and the first of each column is named.
+One damaged record costs only itself. The longest increasing series of times is kept: a clock that was set
+back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time become one. A
+value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units, or in another
+order, and is refused.
 
 A column ``Valid`` is 0 in rows that are not valid, ``MagValid`` where the field is not. A column ``X_QC`` has
-the quality flags of column ``X``, of which 3, 4 and 9 are bad or missing. A column ``Flag`` with the values 0
-and 1 marks the rarer of the two. Programs without NaN write codes such as -999 for "not known".
-
-References
-----------
-Argo Quality Control Manual, reference table 2, https://doi.org/10.13155/33951
+the quality flags of column ``X``, of which 3, 4 and 9 are bad or missing (Argo Quality Control Manual,
+reference table 2, https://doi.org/10.13155/33951). A column ``Flag`` with the values 0 and 1 marks the rarer
+of the two. Programs without NaN write codes such as -999 for "not known".
 """
 
 from __future__ import annotations
@@ -88,7 +85,14 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
         if piece is None:  # only the last is
             break
         next_times = following[0]["time"].values if following else np.empty(0)
-        part = _sound(faults, *piece, previous, next_times)
+        part, rows = piece
+        index, duplicates = _times(faults, part["time"].values, rows, previous, next_times)
+        dropped = part.sizes["time"] - len(index)
+        if dropped:
+            part, rows = part.isel(time=index), [rows[k] for k in index.tolist()]
+        part, values = _plausible(faults, part, rows)
+        faults.lost(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
+        part = merged(part) if duplicates else part
         if part.sizes["time"]:
             previous = float(part["time"].values[-1])
             if last is not None:
@@ -108,19 +112,6 @@ def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator
         yield from pieces
     except FormatError as error:
         broken.append(error)
-
-
-def _sound(
-    faults: Faults, dataset: xr.Dataset, rows: Sequence[int], previous: float, next_times: FloatArray
-) -> xr.Dataset:
-    """Return a piece without impossible data, between the last time before it and the times after it."""
-    index, duplicates = _times(faults, dataset["time"].values, rows, previous, next_times)
-    dropped = dataset.sizes["time"] - len(index)
-    if dropped:
-        dataset, rows = dataset.isel(time=index), [rows[k] for k in index.tolist()]
-    dataset, values = _plausible(faults, dataset, rows)
-    faults.lost(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
-    return merged(dataset) if duplicates else dataset
 
 
 def _times(

@@ -2,13 +2,11 @@
 
 A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date. Where the heading
 does not state the kind, the size decides: an Excel serial of today is 46,000, a Julian date 2.46 million, a
-Unix time 1.8e9. GPS time and Unix time have the same size: GPS time must be named. It has no leap seconds
-and is ahead of UTC by :func:`leap_seconds`. Where several columns are the time (date and time of day, GPS
-week and second), they come joined by blanks.
+Unix time 1.8e9. GPS time, which is ahead of UTC by :func:`leap_seconds`, has the size of Unix time and must
+be named. Where several columns are the time, they come joined by blanks.
 
-The pattern of a date is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. A
-second's fraction is not part of it: behind the seconds, after a point, a comma or a colon, it is read
-whatever the pattern.
+The pattern of a date is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. The
+fraction of a second, behind a point, a comma or a colon, is read whatever the pattern.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Logs with several magnetometers: their compasses, the choice of one, and rows at its samples.
 
-A log tells which compass was in use by the vehicle's settings and by its state: the one that the estimator
-names, that is enabled and healthy. Unless the user asks for another, this one becomes ``mag_x``, ``mag_y``,
-``mag_z``; the others keep their number, as in ``mag2_x`` of the second.
+Unless the user asks for another, ``mag_x``, ``mag_y``, ``mag_z`` are those of the compass that the estimator
+names, that is enabled and healthy; the others keep their number, as in ``mag2_x`` of the second.
 
 In the logs of ArduPilot, PX4 and ROS, a row is a sample of that magnetometer; every other column is the last
 value before it. A log that does not tell UTC counts from the boot, and has the attribute

@@ -1,16 +1,13 @@
 """ArduPilot's log as columns: binary by numpy, or as text, from the log's own format (``FMT``) records.
 
-A record is the bytes A3 95, the number of its kind, and that kind's fields, as an ``FMT`` record of the
-log describes them: there is neither a length nor a checksum. So a record is believed where it joins another:
-where it begins right after one that is believed, or another header follows right after its end. What joins
-nothing is damage, and its bytes are counted. A record whose end lies beyond the beginning of a chain was cut
-short, and is damage too: its last fields are the next record's bytes.
+A record is the bytes A3 95, the number of its kind, and that kind's fields, as an ``FMT`` record describes
+them: there is neither a length nor a checksum. So a record is believed where it joins another: where it
+begins right after one that is believed, or another header follows right after its end. Bytes that join
+nothing are damage, and are counted. A record whose end lies beyond the beginning of a chain was cut short,
+and is damage too. Records are found in a few passes over all bytes at once.
 
-Only the kinds that are asked for are decoded. Which records there are is found in a few passes over all bytes
-at once; Python steps only from one place to the next where the chain does not go on with the next header.
-
-The text form (``.log``, as Mission Planner and ``mavlogdump.py`` write it) has a record in each line. Its
-values are already in the unit of the field. Lines without a record are counted.
+The text form (``.log``, as Mission Planner and ``mavlogdump.py`` write it) has a record in each line, with
+values in the unit of the field. Lines without a record are counted.
 
 References
 ----------
@@ -84,7 +81,12 @@ class _Kind(NamedTuple):
 def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
     """Return the records of the `wanted` kinds, and of each the wanted fields."""
     data = np.memmap(path, dtype=np.uint8, mode="r")
-    headers = _headers(data)
+    found = []
+    for start in range(0, data.size - 2, PASS):
+        stop = min(start + PASS, data.size - 2)
+        is_header = (data[start:stop] == 0xA3) & (data[start + 1 : stop + 1] == 0x95)
+        found.append(start + np.flatnonzero(is_header))
+    headers = np.concatenate(found) if found else np.empty(0, dtype=np.intp)
     kinds = _kinds(data, headers)
     lengths = _lengths(data, headers, kinds)
     headers, lengths = headers[lengths > 0], lengths[lengths > 0]
@@ -101,20 +103,10 @@ def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
         if len(here):
             fields = zip(kind.columns, kind.letters, strict=False)
             letters |= {(kind.name, name): letter for name, letter in fields}
-            found = _decoded(data, kind, here, wanted[kind.name])
+            decoded = _decoded(data, kind, here, wanted[kind.name])
             before = records.get(kind.name)
-            records[kind.name] = found if before is None else _joined(before, found)
+            records[kind.name] = decoded if before is None else _joined(before, decoded)
     return Flash(records, letters, int(data.size - lengths[believed].sum()))
-
-
-def _headers(data: Bytes) -> IndexArray:
-    """Return the offsets of the bytes A3 95 that at least one byte follows."""
-    found = [
-        start + np.flatnonzero((data[start:stop] == 0xA3) & (data[start + 1 : stop + 1] == 0x95))
-        for start in range(0, data.size - 2, PASS)
-        for stop in [min(start + PASS, data.size - 2)]
-    ]
-    return np.concatenate(found) if found else np.empty(0, dtype=np.intp)
 
 
 def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:

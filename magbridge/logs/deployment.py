@@ -11,7 +11,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from magbridge.columns import COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, in_seconds, usual
+from magbridge.columns import CHANNEL_TIMES, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, in_seconds, usual
 from magbridge.errors import FormatError
 from magbridge.logs.mapping import split
 from magbridge.records import Quality
@@ -117,6 +117,13 @@ def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
     for start in range(0, dataset.sizes["time"], rows):
         part = dataset.isel(time=slice(start, start + rows))
         yield uncounted(part) if start else part
+
+
+def shifted(dataset: xr.Dataset, seconds: float) -> xr.Dataset:
+    """Return a deployment with later times, also those of the channels."""
+    moved = dataset.assign_coords(time=dataset["time"].copy(data=dataset["time"].values + seconds))
+    channels = [name for name in CHANNEL_TIMES if name in moved]
+    return moved.assign({name: moved[name].copy(data=moved[name].values + seconds) for name in channels})
 
 
 def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:

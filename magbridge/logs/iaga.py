@@ -1,11 +1,8 @@
 """IAGA-2002: an observatory's or a base station's field, minute by minute or second by second.
 
 The elements become ``observatory_x`` (or ``_h``, ``_d`` ...), nT or minutes of arc, and the total field is
-``total_field``: F where it is there, else from the vector. The place is the observatory's.
-
-References
-----------
-IAGA-2002 Data Exchange Format, https://www.ncei.noaa.gov/services/world-data-system/v-dat-working-group/iaga-2002-data-exchange-format
+``total_field``: F where it is there, else from the vector. The place is the observatory's. Source:
+https://www.ncei.noaa.gov/services/world-data-system/v-dat-working-group/iaga-2002-data-exchange-format
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
-"""The layout of a text file: from its first lines, or guessed from them.
+"""The layout of a text file, from its first lines.
 
 Comments (``#``, ``%``, ``//``) and lines of a preamble come first, then the headings, perhaps a row of units,
 then the rows. A heading may itself be a comment. A file without headings is read where its columns are
 declared by their numbers: ``column_1`` is the first. The separator is the one by which headings and rows have
-the same number of fields; decimal commas are known by cells like ``-12,5``. Assumptions are kept for the
-user.
-
-:class:`Layout` is a frozen record: each step of :mod:`.naming` returns a new one.
+the same number of fields; decimal commas are known by cells like ``-12,5``.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """MCAP, as Foxglove and Lichtblick open it: JSON messages, each topic with its schema.
 
-A row becomes a message in each topic that knows something of it: ``/magnetometer`` (raw), ``/field``
+A row becomes a message in each topic that has a known value of it: ``/magnetometer`` (raw), ``/field``
 (corrected), ``/quality`` (the flags, each also as a truth value), ``/vehicle`` (attitude, place, speed) and
-``/telemetry`` (everything else). ``/position`` repeats the place as a ``foxglove.LocationFix``, which a map
-panel draws. What a row does not know is not in its message. Only files written by this module are read; the
-MCAP of robots is read as :mod:`.rosbag`.
+``/telemetry`` (everything else). ``/position`` repeats the place as a ``foxglove.LocationFix``. Only files
+written by this module are read; the MCAP of robots is read as :mod:`.rosbag`.
 
 References
 ----------

@@ -1,12 +1,9 @@
 """Bring several logs together: a stream sorted in time, and a vehicle's telemetry at a sensor's times.
 
 A fluxgate with a logger of its own records the field, but neither attitude nor position; the vehicle's logs
-have these, on another time base. The sensor's rows stay as they are. Each column of the vehicle is brought to
-them by the rule for its kind:
-
-- a column on a circle (heading, roll, longitude) is interpolated along the shorter arc;
-- a column with few integer values (a switch, a mode, a counter of dives) is held until its next value;
-- any other column is interpolated linearly.
+have these, on another time base. The sensor's rows stay as they are. A column of the vehicle on a circle
+(heading, roll, longitude) is interpolated along the shorter arc; one with few integer values (a switch, a
+mode, a counter of dives) is held until its next value; any other is interpolated linearly.
 
 A column has no value in a gap: an interval longer than `MIN_GAP_S` and than `GAP_INTERVALS` of its usual
 intervals. Rows outside the vehicle's logs, and rows in gaps of these logs, stay and are counted.
@@ -32,6 +29,7 @@ from magbridge.logs.deployment import (
     join_attrs,
     noted,
     same_columns,
+    shifted,
     sliced,
     uncounted,
     with_losses,
@@ -204,9 +202,7 @@ def _on_clock_of(vehicle: xr.Dataset, sensor: xr.Dataset, offset_s: float) -> xr
     """Return a sensor's log on the vehicle's clock, that is `offset_s` later."""
     from_boot, vehicle_from_boot = counts_from_boot(sensor), counts_from_boot(vehicle)
     if offset_s:
-        sensor = sensor.assign_coords(time=sensor["time"].copy(data=sensor["time"] + offset_s))
-        for name in set(CHANNEL_TIMES) & set(sensor.data_vars):
-            sensor[name] = sensor[name].copy(data=sensor[name] + offset_s)
+        sensor = shifted(sensor, offset_s)
         if from_boot and not vehicle_from_boot:
             sensor.attrs.pop("time_reference", None)
     elif from_boot != vehicle_from_boot:

@@ -72,7 +72,11 @@ def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[st
         low if low in COLUMNS and lower.count(low) == 1 else name
         for name, low in zip(names, lower, strict=True)
     ]
-    layout = replace(layout, rate=_declared_rate(path, layout))
+    source = layout.declared.columns.get("time")
+    if match := ROW_COUNT.fullmatch(source.heading or "time") if source else None:
+        if not float(match[1]):
+            raise FormatError(path, "expected a rate other than 0 Hz", column="time")
+        layout = replace(layout, rate=float(match[1]))
     taken = _declared(path, layout, names)
     # a simulation's truth is not a reading: a log that lacks a channel must not take it from there
     open_to_all = ["" if k in taken or name.startswith("truth_") else name for k, name in enumerate(names)]
@@ -110,15 +114,6 @@ def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
     elif source is not None and source.heading and source.heading.strip() != heading.strip():
         unit = split(source.heading)[1] or unit
     return layout.with_units({name: unit}) if name and unit else layout
-
-
-def _declared_rate(path: Path, layout: Layout) -> float | None:
-    """Return the rows a second that the user declares in place of a column of times."""
-    source = layout.declared.columns.get("time")
-    match = ROW_COUNT.fullmatch(source.heading or "time") if source else None
-    if match and not float(match[1]):
-        raise FormatError(path, "expected a rate other than 0 Hz", column="time")
-    return float(match[1]) if match else None
 
 
 def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str]:
@@ -231,8 +226,9 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
         text = [layout.number(cell) for cell in values]
         if any(CELL_NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
             continue
-        if layout.foreign and (unit := _unit_behind(text)):
-            units.setdefault(name, unit)
+        behind = {match[2] if (match := WITH_UNIT.fullmatch(cell)) else "" for cell in text}
+        if layout.foreign and len(behind) == 1 and is_unit(*behind) and behind != {""}:
+            units.setdefault(name, *behind)
             continue
         names[k] = ""
         side = [one for one, letters in HEMISPHERES.items() if {v.upper() for v in values} <= {*letters}]
@@ -242,13 +238,6 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
             left.append(name)
     layout = replace(layout, names=tuple(names), units=units, hemispheres=hemispheres)
     return layout.guessing(f"left out, no numbers: {', '.join(left)}") if left else layout
-
-
-def _unit_behind(cells: Sequence[str]) -> str:
-    """Return the common unit behind all numbers, as in ``5.8m``; "" without one."""
-    units = {match[2] if (match := WITH_UNIT.fullmatch(cell)) else "" for cell in cells}
-    unit = units.pop()
-    return unit if not units and unit and is_unit(unit) else ""
 
 
 def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:

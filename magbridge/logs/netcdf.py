@@ -1,18 +1,16 @@
 """Read and write netCDF: one trajectory.
 
-A file is written along the dimension ``time`` with the documented names of the columns, so that
-``xarray.open_dataset`` gives the same names as :func:`magbridge.logs.read`. With the vocabulary of
-OceanGliders OG1.0 it is written along ``N_MEASUREMENTS`` in capitals instead: ``TIME LATITUDE LONGITUDE DEPTH
-ROLL PITCH HEADING TEMP PRES`` are names of OG1.0, the others the documented names in capitals (``MAG_X``).
-The attribute ``column`` keeps the documented name in both.
+A file is written along the dimension ``time`` with the documented names of the columns. With the vocabulary
+of OceanGliders OG1.0 it is written along ``N_MEASUREMENTS`` in capitals instead: ``TIME LATITUDE LONGITUDE
+DEPTH ROLL PITCH HEADING TEMP PRES`` are names of OG1.0, the others the documented names in capitals
+(``MAG_X``). The attribute ``column`` keeps the documented name in both.
 
-Any trajectory is read. pyglider, the IOOS Glider DAC, EGO, OG1.0, seagliderOG1, VOTO and Argo differ in the
-names of dimensions and variables; `standard_name`, units and flags are common to them. The time is the
-variable with the standard name ``time`` (or in a unit ``... since ...``) along which most variables lie; a
-dimension of length 1, as of a file with one trajectory, does not count. Every numeric variable along that
-time becomes a column: by the attribute ``column`` (ours), by its standard name, by a name that is known to
-mean the same, else under its own name in small letters. A value that a flag of its own calls bad or missing
-is not known. A basestation's Seaglider file is recognised by its dimensions (:mod:`.seaglider`).
+Any trajectory is read, as of pyglider, the IOOS Glider DAC, EGO, OG1.0, seagliderOG1, VOTO and Argo. The time
+is the variable with the standard name ``time`` (or in a unit ``... since ...``) along which most variables
+lie; a dimension of length 1 does not count. Every numeric variable along that time becomes a column: by the
+attribute ``column`` (ours), by its standard name, by a name that is known to mean the same, else under its
+own name in small letters. A value that a flag of its own calls bad or missing is not known. A basestation's
+Seaglider file is recognised by its dimensions (:mod:`.seaglider`).
 
 References
 ----------
@@ -160,7 +158,11 @@ def _clock(path: Path, file: Any) -> Any:
     """Return the variable that is the time of the trajectory."""
     numbers = [one for one in file.variables.values() if _is_number(one) and _along(one) is not None]
     lying = Counter(_along(one) for one in numbers)
-    candidates = [one for one in numbers if _is_time(one)]
+    candidates = []
+    for one in numbers:
+        standard, units = (str(getattr(one, name, "")) for name in ("standard_name", "units"))
+        if standard == "time" or " since " in units or one.name.lower() == "time":
+            candidates.append(one)
     if not candidates:
         there = ", ".join(file.variables) or "none"
         raise FormatError(path, f"expected a variable with the standard_name time; there are: {there}"[:300])
@@ -171,11 +173,6 @@ def _clock(path: Path, file: Any) -> Any:
         return lying[_along(variable)], named, standard, variable.size
 
     return max(candidates, key=rank)
-
-
-def _is_time(variable: Any) -> bool:
-    standard, units = (str(getattr(variable, name, "")) for name in ("standard_name", "units"))
-    return standard == "time" or " since " in units or variable.name.lower() == "time"
 
 
 def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[list[CfColumn], list[str]]:

@@ -1,11 +1,8 @@
 """OceanGliders OG1.0: the metadata of a glider's file.
 
-A ``metadata.toml`` says of people, platform and sensor the facts that no log has. Positions of GPS fixes are
-those of ``gps_latitude`` and ``gps_longitude``, where a log has them.
-
-References
-----------
-OceanGliders format 1.0.0, https://oceangliderscommunity.github.io/OG-format-user-manual/OG_Format.html
+A ``metadata.toml`` has the facts of people, platform and sensor that are in no log. Positions of GPS fixes
+are those of ``gps_latitude`` and ``gps_longitude``, where a log has them. Source: OceanGliders format 1.0.0,
+https://oceangliderscommunity.github.io/OG-format-user-manual/OG_Format.html
 """
 
 from __future__ import annotations

@@ -172,7 +172,10 @@ def format_of(path: Path, *, write: bool = False) -> Format:
     signed = [one for one in FORMATS.values() if one.signature is not None]
     found = next((one for one in signed if re.match(one.signature or b"", start, re.DOTALL)), None)
     found = FORMATS["ros"] if is_bag(path) else found
-    packed = not write and path.is_file() and is_packed(path)
+    packed = False
+    if not write and path.is_file():
+        with path.open("rb") as file:
+            packed = file.read(6).startswith(tuple(PACKERS))
     if found is None and (
         other := next((text for mark, text in UNREADABLE.items() if re.match(mark, start)), None)
     ):
@@ -214,12 +217,6 @@ PACKERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zX
 """First bytes -> how it is unpacked."""
 DECOMPRESSION_ERRORS = EOFError, zlib.error, lzma.LZMAError
 """Errors of damaged ones, in addition to OSError."""
-
-
-def is_packed(path: Path) -> bool:
-    """Return True if a file is compressed, by its first bytes."""
-    with path.open("rb") as file:
-        return file.read(6).startswith(tuple(PACKERS))
 
 
 def opened(path: Path) -> IO[bytes]:

@@ -100,18 +100,14 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
 def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetometer:
     tesla = np.stack([stream.values[axis] for axis in "xyz"])
     length = float(np.nanmedian(np.linalg.norm(tesla, axis=0)))
-    unit = _unit(length)
+    unit = "T"
+    if not TESLA[0] <= length <= TESLA[1]:
+        fitting = (one for one in FIELD_UNITS if EARTH[0] <= NT_PER_UNIT[one] * length < EARTH[1])
+        unit = next(fitting, "T")
     if unit != "T":
         notes.append(f"{stream.topic}: {length:.3g} T is not a field on Earth: read as {length:.3g} {unit}")
     x, y, z = NT_PER_UNIT[unit] * tesla
     return sampled(number, stream.time, np.stack([x, -y, -z]), id=stream.topic)
-
-
-def _unit(length: float) -> str:
-    """Return the unit in which a median length is that of the Earth's field; T if none fits."""
-    if TESLA[0] <= length <= TESLA[1]:
-        return "T"
-    return next((unit for unit in FIELD_UNITS if EARTH[0] <= NT_PER_UNIT[unit] * length < EARTH[1]), "T")
 
 
 def _telemetry(streams: Sequence[_Stream]) -> Iterator[Series]:

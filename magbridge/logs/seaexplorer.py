@@ -1,18 +1,14 @@
 """SeaExplorer gliders: ``.gli`` (navigation) and ``.pld1`` (payload), raw or sub-sampled, also gzipped.
 
-Text with semicolons; positions are degrees and minutes written together, 9999 is a code for "not known". In
-the navigation, ``LinPos`` (mm) and ``AngPos`` (deg) are where the battery is, ``BallastPos`` (cc) is the
-ballast: moving masses, as ``battpos``, ``battery_roll`` and ``ballast``. A payload's columns keep their names
-in small letters, except the CTD's and a vector magnetometer's. Its rows get attitude and masses from the
-navigation file of the same dive, where that is in the same folder.
+Text with semicolons, names and units as pyglider reads them; positions are degrees and minutes written
+together, 9999 is a code for "not known". ``LinPos`` (mm) and ``AngPos`` (deg) are where the battery is,
+``BallastPos`` (cc) is the ballast. A payload's columns keep their names in small letters, except the CTD's
+and a vector magnetometer's. Its rows get attitude and masses from the navigation file of the same dive, where
+that is in the same folder.
 
 The file does not say whether ``Heading`` is true or magnetic. The reader uses it as true and adds a note. On
 SEA063 it differed by 14 deg (quartiles 12 and 16) from the compass of an acoustic profiler, at a declination
 of 6 deg.
-
-References
-----------
-Names and units as pyglider reads them, https://pyglider.readthedocs.io
 """
 
 from __future__ import annotations

@@ -116,19 +116,15 @@ def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[
     kind = int(device) // 16
     if kind in COMPASS_NT_PER_COUNT:
         return COMPASS_NT_PER_COUNT[kind], []
-    estimated = _by_length(known.time, columns)
-    unknown = f"{path}: {name} {int(device)} is not known: counts of unknown size"
-    return estimated, [f"{unknown}, taken as {estimated:.3g} nT, with which they are as long as the field"]
-
-
-def _by_length(time: FloatArray, columns: Mapping[str, FloatArray]) -> float:
-    """Return the IGRF over the radius of the sphere through the counts, nT."""
+    # the IGRF over the radius of the sphere through the counts
+    estimated = COMPASS_NT_PER_COUNT[2]
     counts = np.column_stack([columns[f"mag_{axis}"] for axis in "xyz"])
     counts = counts[np.isfinite(counts).all(axis=1)]
     place = [columns[name][np.isfinite(columns[name])][:1] for name in PLACE if name in columns]
-    if len(counts) < 4 or sum(map(len, place)) < 2:
-        return COMPASS_NT_PER_COUNT[2]
-    return float(total_field(place[0], place[1], 0.0, time[0])[0]) / sphere_radius(counts)
+    if len(counts) >= 4 and sum(map(len, place)) == 2:
+        estimated = float(total_field(place[0], place[1], 0.0, known.time[0])[0]) / sphere_radius(counts)
+    unknown = f"{path}: {name} {int(device)} is not known: counts of unknown size"
+    return estimated, [f"{unknown}, taken as {estimated:.3g} nT, with which they are as long as the field"]
 
 
 def _position(known: Dive, column: str) -> FloatArray | None:

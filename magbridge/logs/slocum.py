@@ -1,16 +1,13 @@
 """Slocum: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ..., as text ``.dba``.
 
 A row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
-The science file of the same name as a flight file is joined to it, and the other way round: either name, or
-both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` in the folder of the
-file, or in a folder ``cac`` or ``cache`` there or above. A science file begins with the sensors' start
-values, 0 degC at 0 bar, which are not measured: they are left out.
+The flight and the science file of one name are read together. The list of sensors is read from the file
+``<crc>.cac`` in the folder of the file, or in a folder ``cac`` or ``cache`` there or above. A science file
+begins with the sensors' start values, 0 degC at 0 bar, which are not measured: they are left out.
 
 Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
-of its own, so there is no ``mag_x``: the log can drive a simulated one. To correct the log of an instrument
-that was carried along, give both; to calibrate it, interpolate this log's columns to the instrument's times.
-
-Header and list of sensors are checked first: dbdreader never ends on a header that is cut off.
+of its own, so there is no ``mag_x``. Header and list of sensors are checked first: dbdreader never ends on a
+header that is cut off.
 """
 
 from __future__ import annotations
@@ -76,7 +73,12 @@ dbdreader = _import()
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the flight file, with its science file where there is one, in pieces."""
-    flight, science = _pair(path)
+    flight: Path | None = path
+    science = None
+    if other := (SCIENCE | FLIGHT).get(path.suffix.lower()):
+        partner = path.with_suffix(other.upper() if path.suffix.isupper() else other)
+        there = partner if partner.is_file() else None
+        flight, science = (path, there) if path.suffix.lower() in SCIENCE else (there, path)
     tracks = {**_read(flight), **_measured(_read(science))}
     base = "m_present_time" if "m_present_time" in tracks else "sci_m_present_time"
     if base not in tracks or not len(tracks[base][0]):
@@ -87,16 +89,6 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     columns, units = interpolated(SLOCUM_FIELDS, tracks, time, MAX_SENSOR_GAP_S)
     dataset = deployment(path, time, columns, units, {"heading_reference": "magnetic"})
     yield from sliced(dataset, rows)
-
-
-def _pair(path: Path) -> tuple[Path | None, Path | None]:
-    """Return the flight and the science file of the same name; None for one that does not exist."""
-    suffix = path.suffix
-    if (other := (SCIENCE | FLIGHT).get(suffix.lower())) is None:
-        return path, None
-    partner = path.with_suffix(other.upper() if suffix.isupper() else other)
-    both = path, (partner if partner.is_file() else None)
-    return both if suffix.lower() in SCIENCE else both[::-1]
 
 
 def _measured(tracks: Tracks) -> Tracks:

@@ -2,11 +2,9 @@
 
 A row becomes these messages, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg,
 mm), a ``NAMED_VALUE_FLOAT`` (float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the
-deployment is corrected, ``MAG_FIELD``. So a column comes back to 6e-8 of its value, time to 1 µs; a column of
-integers (counts times 100, say) comes back exactly.
-
-A name of more than ten letters is cut and made unique; a ``MAG_COLUMN`` at the start of the log gives it in
-full. Units, and attributes that change what values mean, are declared in the same way.
+deployment is corrected, ``MAG_FIELD``. So a column comes back to 6e-8 of its value, time to 1 µs. A
+``MAG_COLUMN`` at the start of the log has each name of more than ten letters in full, and units and
+attributes that change the meaning of values.
 """
 
 from __future__ import annotations
