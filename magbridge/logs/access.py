@@ -171,7 +171,7 @@ def without_companions(paths: Sequence[Path]) -> list[Path]:
 
 
 def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:
-    """Return the contents of the small files that need a child process, by their places: one for all."""
+    """Read the small files that need a child process in one child; return their contents by place."""
     small = [
         k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < MAX_SHARED_BYTES
     ]

@@ -117,7 +117,7 @@ def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator
 def _times(
     faults: Faults, time: FloatArray, rows: Sequence[int], previous: float, next_times: FloatArray
 ) -> tuple[IndexArray, int]:
-    """Return the indices of the rows to keep, and how many of these have the time of the one before."""
+    """Return the indices of the rows to keep, and the number of these that repeat the time before."""
     faults.count("time", len(time))
     time = np.where(np.isfinite(time), time, np.nan)  # an infinite time has no difference from another
     whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
@@ -220,7 +220,7 @@ MAX_WRONG_FRACTION = 0.5
 
 
 class Faults:
-    """The faults of a file so far; `rows` counts all rows seen."""
+    """Counts of the faults found in a file so far; `rows` counts all its rows."""
 
     def __init__(self, file: str | Path, *, strict: bool) -> None:
         self._file, self._strict = file, strict
@@ -269,7 +269,7 @@ class Faults:
         return last
 
     def finish(self) -> None:
-        """FormatError: half of the rows, or of a column's values, are wrong."""
+        """Raise FormatError if half of the rows, or of a column's values, are wrong."""
         for column, error in self._first.items():
             if self._wrong[column] >= MAX_WRONG_FRACTION * (self._known[column] or self.rows):
                 raise error
@@ -337,7 +337,7 @@ MAX_FLAGGED = 0.2
 
 
 class Validity(NamedTuple):
-    """Statement of a column about other columns."""
+    """Rule by which one column states which values of others are valid."""
 
     column: str
     targets: tuple[str, ...]
@@ -347,7 +347,7 @@ class Validity(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The rule, for the user."""
+        """Return the rule in words, for the user."""
         what = " ".join(self.targets) or "rows"
         bad = " or ".join(f"{value:g}" for value in sorted(self.bad))
         return f"{what} not valid where {self.column} is {bad}"

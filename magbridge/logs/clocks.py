@@ -90,7 +90,7 @@ OF_A_DAY = "times of day, of a day that the file does not tell"
 
 
 class TimeFormat(NamedTuple):
-    """How a column's times are read."""
+    """Format of the times in a column."""
 
     kind: str
     """A key of :data:`EPOCHS`, ``iso``, or a pattern of :meth:`datetime.strptime`."""
@@ -106,7 +106,7 @@ class TimeFormat(NamedTuple):
 
     @property
     def expected(self) -> str:
-        """What a cell should have been, for an error."""
+        """Return the expected content of a cell, for an error."""
         if self.kind == "s":
             return "seconds since 1970"
         return f"a time as {self.kind}" if self.is_text and self.kind != "iso" else "a time"
@@ -208,9 +208,9 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, integers: bool) ->
 
 
 def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, str]:
-    """Return the kind of a count, and why it is thought to be that; seconds may be `declared`.
+    """Return the kind of a count, and the reason; seconds may be `declared`.
 
-    Under our own name, ``time``, it is in seconds, unless these would be of another age of the Earth.
+    Under our own name, ``time``, it is in seconds, unless it is too large for seconds since 1970.
     """
     ours = declared or heading == "time"
     for kind, words in HEADING_WORDS.items():

@@ -70,7 +70,7 @@ class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def words(self) -> str:
-        """Short description of the compass."""
+        """Return a short description of the compass."""
         facts = [f"id {self.id}"] if self.id else []
         facts.append(f"{self.rate:.3g} Hz, {counted(self.samples, 'sample')}")
         facts += ["disabled"] if self.enabled is False else []

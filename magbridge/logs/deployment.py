@@ -234,7 +234,7 @@ def noted(*pieces: Mapping[str, Any]) -> list[str]:
 
 
 def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
-    """Return the attributes of several deployments as those of one; only headed parts say what headings mean.
+    """Return the attributes of several deployments as one; parts without headings do not say what these mean.
 
     FormatError: two parts disagree on an attribute that changes what values mean.
     """

@@ -128,7 +128,7 @@ def _of_device(table: Table | None, device: float) -> Table | None:
 
 
 def _most(tables: Mapping[int, Table]) -> float:
-    """Return the device id that most samples of the first instance that has one carry; 0 where none has."""
+    """Return the most frequent device id of the first instance that has device ids; 0 without one."""
     for _, table in sorted(tables.items()):
         if "device_id" in table:
             devices, counts = np.unique(table["device_id"], return_counts=True)

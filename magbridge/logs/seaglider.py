@@ -105,8 +105,7 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
 def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[float, list[str]]:
     """Return the nT per count of the compass in use, and a note if that was estimated.
 
-    For an unknown type: what gives the sphere through the counts the radius of the Earth's field. The
-    calibration's scales are free to differ from it.
+    For an unknown type, the sphere through the counts gets the radius of the Earth's field.
     """
     use = known.settings.get("COMPASS_USE", 0.0)
     name = "COMPASS2_DEVICE" if np.isfinite(use) and int(use) & SECOND_COMPASS_BIT else "COMPASS_DEVICE"
@@ -167,7 +166,7 @@ GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the dive that a glider sent in pieces; it is held whole."""
+    """Yield in pieces the dive of the files that a glider sends; it is held whole."""
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():
         raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")

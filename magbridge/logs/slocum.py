@@ -92,10 +92,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _measured(tracks: Tracks) -> Tracks:
-    """Return the tracks of a science file without CTD samples in which all values are 0.
-
-    As pyglider does: the sensors' values before their first sample are 0.
-    """
+    """Return the tracks of a science file without the CTD's zeros, which stand before its first sample."""
     ctd = {name: tracks[name] for name in CTD_SENSORS if name in tracks}
     unset = [when[value == 0.0] for when, value in ctd.values()]
     if not unset:
@@ -139,7 +136,7 @@ def _read(path: Path | None) -> Tracks:
 
 
 def _read_ascii(path: Path) -> Tracks:
-    """Return the same of what ``dbd2asc`` wrote (``.dba``): NaN stands for no update."""
+    """Return the tracks of a text that ``dbd2asc`` wrote (``.dba``); NaN stands for no update."""
     lines = path.read_bytes().splitlines()
     start = next((k for k, line in enumerate(lines) if not ASCII_HEADER.fullmatch(line)), len(lines))
     try:

@@ -122,7 +122,7 @@ class TableReader:
     def read(
         self, frame: pd.DataFrame, kept: list[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-        """Return the same of the cells, in columns by position, of rows with these numbers."""
+        """Return times (n,), values (n,) and numbers of rows whose cells are in columns by position."""
         times, wrong = self._times(frame, kept)
         if wrong.any():
             frame, times = frame[~wrong], times[~wrong]
@@ -191,7 +191,7 @@ class TableReader:
         return frame
 
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
-        """Return the times, and the rows with another cell than a time."""
+        """Return the times (n,), and which rows (n,) hold a cell that is no time."""
         if self._layout.rate:  # a row that was left out keeps its time
             lines = np.asarray(numbers, np.float64) - 1.0 - self._layout.first
             return lines / self._layout.rate, np.zeros(len(lines), bool)

@@ -167,7 +167,7 @@ def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
 
 
 class LogMessages(NamedTuple):
-    """LogMessages of one kind in the order of the log; the arrays are (n,)."""
+    """Messages of one kind in the order of the log; the arrays are (n,)."""
 
     number: int
     at: IndexArray
@@ -204,9 +204,9 @@ class LogMessages(NamedTuple):
 
 
 Kinds = dict[int, LogMessages]
-"""LogMessages by their id."""
+"""Messages by their id."""
 Update = tuple[LogMessages, FloatArray]
-"""LogMessages (n), and the values (n,) of a column in them."""
+"""Messages (n), and the values (n,) of a column in them."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:

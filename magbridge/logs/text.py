@@ -353,7 +353,7 @@ def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
 
 
 def _attributes(path: Path) -> dict[str, str | float]:
-    """Return the attributes in the file next to it."""
+    """Return the attributes in the metadata next to a table."""
     sidecar = metadata_path(path)
     if not sidecar.is_file():
         return {}
