@@ -1,13 +1,13 @@
-"""Puts the three channels and the telemetry on one time base, causally.
+"""Put the three channels and the telemetry on one time base, from past data alone.
 
 A multiplexed converter samples one channel after the other: all are brought to the time of the earliest
 (:mod:`magbridge.one_time`). The anti-alias filter delays the field by ``filter_delay``; the sample's time is
 corrected for that, and the telemetry is looked up at the corrected time.
 
-While the process was held up, readings and telemetry waited. Inputs with a time of their own (the
-instrument's clock, the autopilot's by TIMESYNC) keep it; inputs without one may be of any time of the stall.
-A sample for which either is guessed is flagged ``late_join``, its parameters anywhere between their values
-meanwhile.
+If the process stalls, readings and telemetry wait in buffers. An input with its own time stamp (of the
+instrument, or of the autopilot by TIMESYNC) keeps it; any other input may have been measured at any time of
+the stall. A sample with such an input is flagged ``late_join``, and its sigma covers all values that the
+parameters had during the stall.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ class Track:
         self.moved_us = NEVER
 
     def update(self, time_us: int, value: float, moving_rate: float, since_us: int = 0) -> None:
-        """Take a telemetry value; NaN means unknown from now on. One older than the last is ignored.
+        """Add a value measured at `time_us`, µs; NaN: unknown from now on. Values out of order are ignored.
 
-        One that was true at an unknown time since `since_us` (µs, if not 0) is taken as of `time_us`.
+        If `since_us` is not 0, the value was measured at an unknown time between `since_us` and `time_us`.
         """
         self.lacking = not isfinite(value)
         if self.lacking:
@@ -167,13 +167,12 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
 
 
 class Aligner:
-    """Joins readings and telemetry into samples.
+    """Join readings and telemetry into samples.
 
-    `inputs` are the parameters that the calibration needs, in its order; `tracks` has their telemetry,
-    `by_name` that of these and of all else that is watched. `power_cycle` is the instrument's power-on
-    counter at the time of its calibration, None where unknown. During a stall, inputs may have waited since
-    `late_since_us` (µs, 0: no stall). `motion_since_us` is the time of the last report before the motion of
-    the last sample.
+    `inputs` are the parameters of the calibration in its order; `tracks` holds their telemetry and `by_name`
+    also all other telemetry that is watched. `power_cycle` is the instrument's power-on counter at its
+    calibration (None: unknown). `late_since_us` is the time when a stall began, µs (0: no stall), and
+    `motion_since_us` the time of the last report before the motion of the last sample.
     """
 
     def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
@@ -203,10 +202,9 @@ class Aligner:
             track.max_age = ages.get(name, track.max_age)
 
     def telemetry(self, name: str, time_us: int, value: float, *, guessed: bool = False) -> None:
-        """Take a telemetry value; a name that the calibration does not need is ignored.
+        """Add a telemetry value of `time_us` (µs); NaN: unknown. A name that is not an input is ignored.
 
-        The value was true at `time_us` (µs) and is NaN where it is not known. If `guessed`, that is the time
-        of its arrival, but it had waited.
+        If `guessed`, `time_us` is the time of arrival after a stall.
         """
         track = self.by_name.get(name)
         if track is not None:
@@ -255,7 +253,7 @@ class Aligner:
     ) -> tuple[tuple[float, ...], tuple[tuple[int, float, float], ...], float, int, float]:
         """Return values, spans, age, flags and variance (nT²) of the parameters at `sample_us` (µs).
 
-        An `undated` sample waited, and it is not known since when.
+        An `undated` sample has no time stamp of its own and arrived after a stall.
         """
         late_us, settings = self.late_since_us, self.settings
         settle_us = settings.settle_time * 1e6

@@ -104,16 +104,8 @@ _FACTORS = {
 }
 _SPELLINGS = {
     "deg": (
-        *(
-            "degrees",
-            "degree",
-            "Decimal Degrees",
-            "decimal degrees",
-            "angular_degree",
-            "arc_degree",
-            "°",
-            "WGS84",
-        ),
+        *("degrees", "degree", "Decimal Degrees", "decimal degrees", "angular_degree", "arc_degree"),
+        *("°", "WGS84"),
         # CF Conventions, sections 4.1 and 4.2
         *(f"degree{s}{sep}{to}" for s in ("", "s") for sep in ("_", "") for to in "NE"),
         *(f"degree{s}_{to}" for s in ("", "s") for to in ("north", "east", "true")),
@@ -166,20 +158,21 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
     if "time" not in deployment.variables:
         source = deployment.attrs.get("source", "the deployment")
         raise FormatError(source, absent("time", map(str, deployment.variables)), column="time")
-    times = {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
-    for name, time in times.items():
+    for name, time in _times(deployment).items():
         if time.dtype.kind == "M":
-            unknown = time.isnull()
             seconds = (time.values - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
-            described = {**time.attrs, **COLUMNS[name]._asdict()}
-            values = (time.dims, np.where(unknown, np.nan, seconds), described)
-            deployment = deployment.assign({name: values})
+            values = np.where(time.isnull(), np.nan, seconds)
+            deployment = deployment.assign({name: (time.dims, values, time.attrs | COLUMNS[name]._asdict())})
         elif time.dtype.kind not in "iuf":
             source = deployment.attrs.get("source", "the deployment")
-            raise FormatError(
-                source, f"expected times as numbers or datetime64, got {time.dtype}", column=name
-            )
+            expected = f"expected times as numbers or datetime64, got {time.dtype}"
+            raise FormatError(source, expected, column=name)
     return deployment
+
+
+def _times(deployment: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the columns of a deployment that hold times."""
+    return {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
 
 
 def decoded(deployment: xr.Dataset) -> xr.Dataset:
@@ -189,17 +182,16 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
     """
     import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
 
-    for name in ("time", *CHANNEL_TIMES):
-        if name in deployment.variables and deployment[name].dtype.kind != "M":
-            time = deployment[name]
-            seconds = np.where(np.isfinite(time.values), time.values, 0.0)
-            whole = np.floor(seconds)
-            moments = whole.astype("datetime64[s]").astype("datetime64[ns]")
-            moments = moments + np.rint((seconds - whole) * 1e9).astype("timedelta64[ns]")
-            moments[~np.isfinite(time.values)] = np.datetime64("NaT")
-            described = {key: value for key, value in time.attrs.items() if key != "units"}
-            values = (time.dims, moments, described)
-            deployment = deployment.assign({name: values})
+    for name, time in _times(deployment).items():
+        if time.dtype.kind == "M":
+            continue
+        seconds = np.where(np.isfinite(time.values), time.values, 0.0)
+        whole = np.floor(seconds)
+        moments = whole.astype("datetime64[s]").astype("datetime64[ns]")
+        moments = moments + np.rint((seconds - whole) * 1e9).astype("timedelta64[ns]")
+        moments[~np.isfinite(time.values)] = np.datetime64("NaT")
+        described = {key: value for key, value in time.attrs.items() if key != "units"}
+        deployment = deployment.assign({name: (time.dims, moments, described)})
     return deployment
 
 

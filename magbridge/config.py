@@ -41,10 +41,9 @@ class Sensor(Table, frozen=True):
     driver: str
     """A name from the driver table (:data:`magbridge.sensors.DRIVERS`)."""
     port: Name
-    """A device, a pattern (``/dev/ttyUSB*``: the first on which a reading comes within `timeout`, so that a
-    sensor that comes back under another name is found again; one that sends NMEA 0183 and no readings gets no
-    start-up commands) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``),
-    or an RM3100 on a bus: ``i2c:1:0x20`` or ``spi:0.0``."""
+    """A device, a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``), an RM3100 on a bus
+    (``i2c:1:0x20``, ``spi:0.0``), or a pattern such as ``/dev/ttyUSB*``: the first device that sends a
+    reading within `timeout`. A device that sends NMEA 0183 instead gets no start-up commands."""
     baudrate: Baudrate = 9600
     """bit/s."""
     timeout: Positive = 10.0
@@ -137,8 +136,7 @@ class Telemetry(Table, frozen=True):
     delay: float = 0.0
     """Time by which the telemetry is late, s: a value stamped t was true at t - delay."""
     component: SystemId | None = None
-    """Only what this component sends counts; without it, the autopilot's, else what the first sends that is
-    heard."""
+    """Component whose messages count; by default the autopilot, or else the first component that sends."""
 
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.scale) < inf:
@@ -221,13 +219,11 @@ class Learning(Table, frozen=True):
     """What the corrected field is compared with: ``igrf``, or an anomaly grid's file, above the IGRF."""
     map_sigma: NotNegative = 20.0
     position_sigma: NotNegative = 100.0
-    """`map_sigma`, `position_sigma`: nT and m: how well that grid is known, and the vehicle's position on it.
-    """
+    """`map_sigma`, `position_sigma`: 1-sigma of that grid, nT, and of the vehicle's position on it, m."""
     prior: Name | None = None
     """Without ``[calibration]``: a calibration file with the prior of a vehicle of this class."""
     ranges: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
-    """Without both: the parameters of moving masses, each with the least and the greatest value. The prior is
-    then that of any vehicle."""
+    """Without both: lowest and highest value of each moving mass; the prior is that of any vehicle."""
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
     """Largest rate of the samples that are learned from, Hz."""
     directory: Name | None = None

@@ -38,7 +38,7 @@ MAX_AGE = 30.0
 
 
 class Correction:
-    """Corrects reading after reading.
+    """Correct readings one after the other.
 
     Parameters
     ----------

@@ -39,8 +39,8 @@ MAX_INTERVAL_RATIO: Final = 10.0
 class LagCorrection:
     """Undo the lag of a first-order filter of the cutoff frequency `cutoff_hz`.
 
-    `time_constant` is that of the filter, s; `variance` that of each component of the last vector from what
-    is not known of the lag, nT².
+    `time_constant` is that of the filter, s; `variance` (nT²) is the part of the variance of each component
+    of the last vector that comes from the uncertainty of the lag.
     """
 
     def __init__(self, cutoff_hz: float) -> None:

@@ -1,8 +1,8 @@
-"""A damaged file read where it can be ended: in a child process with limits on time and memory.
+"""Read files that may be damaged in a child process with limits on time and memory.
 
-A library that was written for whole files may never end on a damaged one, ask for all memory or crash, and
-take the process with it. In a child, each of these is an error that names the file. The result comes back
-through a pipe, piece by piece; for a whole file that costs the fork and one copy.
+On a damaged file, a library may loop forever, allocate all memory or crash. In a child process, each of these
+becomes an error that names the file. The pieces of the file come back through a pipe, which costs one fork
+and one copy.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ WAIT = 10.0
 
 
 class Raised(NamedTuple):
-    """An error on its way to the parent: what builds it again, from what."""
+    """An error that the child sends to the parent: the function that builds it, and its arguments."""
 
     rebuild: Callable[..., BaseException]
     arguments: tuple[Any, ...]
@@ -60,7 +60,7 @@ class Raised(NamedTuple):
 
 
 class GuardedJob(NamedTuple):
-    """A file, and what returns an iterable of objects read from it, which can be pickled."""
+    """A file, and the function that returns an iterable of picklable objects read from it."""
 
     path: Path
     read: Callable[[], Iterable[Any]]
@@ -76,9 +76,8 @@ class GuardedJob(NamedTuple):
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     """Yield what ``read()`` yields, run in a child process that ends where the file lets it run away.
 
-    The objects must be such as can be pickled. The size of the file `path` sets the limits. Without fork
-    (Windows), or where a process may not have children (a worker of a pool), this process reads the file:
-    then a crash ends the process, and nothing limits the time.
+    The objects must be picklable; the size of the file `path` sets the limits. Without fork (Windows), and
+    in a process that may not have children (a worker of a pool), this process reads the file without limits.
 
     FormatError: the file makes its reader fail in an unexpected way, crash, need more than 8 s of processor
     time and 0.2 s a MB, or more than 500 MB of memory and 50 times its size. MagbridgeError, OSError: as
@@ -92,9 +91,9 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
 
 
 class Guarded:
-    """Small files that are read one after the other as :func:`guarded` reads one, all in one child.
+    """Read several small files in one child process, as :func:`guarded` reads one.
 
-    The child of a file that ends it is followed by another, for the files after that.
+    If a file ends the child, another child reads the files after it.
     """
 
     def __init__(self, jobs: Sequence[GuardedJob]) -> None:

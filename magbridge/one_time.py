@@ -1,16 +1,15 @@
-r"""Channels that are sampled in turn, at one time: that of the earliest.
+r"""Interpolate channels that are sampled in turn to the time of the earliest channel.
 
 Channel i of reading k is sampled :math:`d` later than that. With its slope r since the reading before, h ago,
 it was, by the parabola through that one and the next, h' later (in Newton's form),
 
 .. math:: f_k - r_k\,d - \frac{d\,(h - d)}{h + h'} (r_{k+1} - r_k), \qquad r_k = \frac{f_k - f_{k-1}}{h}
 
-Ashore, the reading before the last is known as well, and :func:`interpolate_to_rows` adds the cubic term.
+With a whole log, :func:`interpolate_to_rows` adds the cubic term.
 
-Live, the next reading is not known. The last term, by which the slope lags behind a vehicle that turns ever
-faster or slower, is left out then; its value for the previous slope counts in the sigma, and the next
-reading corrects it. That matters: the lag depends on the attitude, so for learning it is not a noise but a
-bias.
+A live bridge does not know the next reading. :class:`OneTime` leaves the last term out and counts its value
+for the previous slope in the sigma; the next reading corrects the sample. Learning uses the corrected sample,
+because the error depends on the attitude and would bias it.
 """
 
 from __future__ import annotations
@@ -93,10 +92,10 @@ def interpolate_to_rows(
 
 
 class OneTime:
-    """Brings reading after reading to one time.
+    """Bring the channels of each reading to one time.
 
-    `variance` is the variance (nT²) of the last reading's total field from the lag of its slopes; `settled`
-    is the last but one reading without that lag (nT), None if it is unchanged.
+    `variance` (nT²) is the variance of the last reading's total field due to the missing last term;
+    `settled` is the reading before it with that term (nT), None if it is unchanged.
     """
 
     def __init__(self) -> None:

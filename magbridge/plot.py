@@ -17,6 +17,7 @@ import numpy as np
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
+from magbridge.columns import in_seconds
 from magbridge.errors import MissingExtra, WrongUse
 from magbridge.estimation.residual import rms
 from magbridge.field.grid import AnomalyGrid
@@ -56,7 +57,7 @@ def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = No
     if column not in log:
         raise WrongUse(f"expected a column {column!r}, got a log without it; correct the log first")
     axes = _axes(ax)
-    corrected_panel(axes, log, column)
+    corrected_panel(axes, in_seconds(log), column)
     axes.legend(frameon=False, fontsize="small")
     return axes
 

@@ -28,9 +28,9 @@ __all__ = ["correct_rows"]
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """Correct the rows of a deployment, or of its pieces in order, as the live bridge would.
 
-    One flag is added that live cannot be known yet: ``moving`` of the last sample before telemetry tells of
-    a motion, where that sample's own telemetry is older than it. A motion that begins with a piece's first
-    row does not reach back into the piece before.
+    One flag is added that a live bridge cannot know yet: ``moving`` for the last sample before the telemetry
+    reports a motion, if the telemetry of that sample is older than the sample. A motion that begins with the
+    first row of a piece does not flag the piece before.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:
 
 
 def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
-    """Flag again what a bridge flagged as late, with its sigma: rows do not tell how long they waited."""
+    """Flag the samples that a bridge flagged as late, and keep its sigma: rows do not hold their delay."""
     if not {"quality", "total_field_sigma"} <= set(deployment):
         return
     recorded = np.nan_to_num(deployment["quality"].to_numpy().astype(float)).astype(int)

@@ -83,7 +83,7 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
 
 
 def _valid_keys(kind: Any, keys: str) -> list[str]:
-    """Return the keys of the table at the dotted path `keys` in `kind`; empty if it is no struct."""
+    """Return the keys of the table at the dotted path `keys` in `kind`; empty if it is not a struct."""
     tables = [inspect.type_info(kind)]
     for key in [*filter(None, re.split(r"\.|(?=\[)", keys)), None]:
         tables = [

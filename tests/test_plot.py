@@ -55,6 +55,9 @@ def test_a_corrected_log(found: tuple[mb.Calibration, Observations]) -> None:
     good = np.isfinite(line)
     np.testing.assert_array_equal(line[good], corrected["total_field"].to_numpy()[good])
     assert "nT" in mb.plot.corrected(corrected, "total_field_sigma").get_ylabel()
+    decoded = corrected.assign_coords(time=corrected["time"].to_numpy().astype("datetime64[s]"))
+    shown = mb.plot.corrected(decoded).lines[0].get_xdata()
+    np.testing.assert_array_equal(np.asarray(shown), np.asarray(axes.lines[0].get_xdata()))
     with pytest.raises(mb.MagbridgeError, match=r"expected a column 'total_field'.*correct the log first"):
         mb.plot.corrected(log)
 

@@ -287,7 +287,7 @@ MAX_NAMED_LOSSES = 5
 
 @contextmanager
 def naming(deployment: xr.Dataset) -> Iterator[None]:
-    """Name the logs in the error messages of what is done with them: raise these as :class:`DataError`."""
+    """Raise errors of the block as :class:`DataError` whose message begins with the names of the logs."""
     try:
         yield
     except (CalibrationError, OutOfRange) as error:

@@ -1,8 +1,8 @@
 """The catalogue: tables to which rows are only ever added, in a folder or on a server.
 
-A row's key is the SHA-256 of its content, so a row is there once, by any writer, however often. No row
-holds the time at which it was written: a catalogue made in one go, and one whose making was killed and begun
-again, are the same. :class:`FolderCatalogue` keeps the tables in a folder, :mod:`.postgres` in a database.
+A row's key is the SHA-256 of its content, so that a row is stored once, whoever adds it and however often. No
+row holds the time of writing: an interrupted and repeated run gives the same catalogue.
+:class:`FolderCatalogue` keeps the tables in a folder, :mod:`.postgres` in a database.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ CATALOGUE_FORMAT = 1
 SERVERS = ("postgresql://", "postgres://")
 MARK = "catalogue.json"
 """File that makes a folder a catalogue."""
-MANY, SMALL = 64, 1000
-"""Files of a table, of fewer rows than that, from which on they are made one."""
+MAX_SMALL_FILES, SMALL_FILE_ROWS = 64, 1000
+"""Number of files with fewer rows than the second number at which :meth:`Catalogue.compact` merges them."""
 TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
     pl.String(), pl.Float64(), pl.Int64(), pl.List(pl.String()), pl.List(pl.Float64()), pl.Binary(),
 )  # fmt: skip
@@ -85,7 +85,7 @@ class Catalogue(ABC):
     """A catalogue, wherever it is."""
 
     name: str
-    """As people know it."""
+    """Location of the catalogue, for messages."""
     results: Path
     """Folder of corrected logs and maps."""
 
@@ -119,7 +119,7 @@ class Catalogue(ABC):
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0
 
     def compact(self) -> None:  # noqa: B027  most need not
-        """Rearrange what many additions have left behind, where that makes reading quicker."""
+        """Merge small files, where a catalogue consists of files."""
 
     @abstractmethod
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
@@ -166,14 +166,11 @@ class FolderCatalogue(Catalogue):
         return self._read(table, columns).drop("key").to_dicts()
 
     def compact(self) -> None:
-        """Make one file of each table's many small ones.
-
-        The removed rows are in the file just written, so rows are never lost, even if others do so.
-        """
+        """Merge the small files of each table; the new file is complete before the old ones are removed."""
         for table, columns in CATALOGUE_TABLES.items():
             with suppress(FileNotFoundError):  # another writer does the same
-                files = [path for path in self._files(table) if len(self._keys(path)) < SMALL]
-                if len(files) < MANY:
+                files = [path for path in self._files(table) if len(self._keys(path)) < SMALL_FILE_ROWS]
+                if len(files) < MAX_SMALL_FILES:
                     continue
                 written = self._write(table, self._joined(table, files, tuple(columns)))
                 for path in files:

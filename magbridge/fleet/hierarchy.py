@@ -51,7 +51,7 @@ VARIATION_FRACTIONS = (1.0, 0.1, 0.02)
 """Fractions of the physical widths by which they are expected to vary with each, before any fleet is seen."""
 PRIOR_DIFFERENCES = 2.0
 """Differences that this expectation is worth."""
-MAX_ITERATIONS = 60
+MAX_EM_ITERATIONS = 60
 """Iterations of expectation-maximisation at most."""
 MAX_LOG_CHANGE = 0.02
 """Change of every log variance below which the iterations end."""
@@ -213,7 +213,7 @@ def learn(
     refits move coefficients together. If `variances` are given, they are taken instead of learned.
     """
     found, sums = _pass_messages(variances or Variances.expected(len(groups), shapes), observed, shapes)
-    for _ in range(0 if variances else MAX_ITERATIONS):
+    for _ in range(0 if variances else MAX_EM_ITERATIONS):
         old, new = found.variances, sums.maximised(groups, shapes)
         found, sums = _pass_messages(new, observed, shapes)
         change = np.log(np.append(new.own, new.shaped) / np.append(old.own, old.shaped))

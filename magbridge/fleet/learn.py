@@ -1,4 +1,4 @@
-"""From calibrations of single deployments to what their fleet expects of the next.
+"""Learn from the calibrations of a fleet's deployments, and predict the next one.
 
 All deployments are brought to one scale of the positions and one F_0 (:func:`.rescaling`), and to units of
 the coefficients' physical widths (:mod:`magbridge.estimation.priors`). Coefficients that share a
@@ -74,18 +74,18 @@ def shape_groups(masses: int) -> IndexArray:
     return np.repeat(np.arange(SHAPE_KINDS * masses), 3)
 
 
-REST = 0.01
-"""Share of the physical widths that a refit of a mounted mass moves besides what a dipole does."""
-NOWHERE: Mapping[str, Mapping[str, Mounting]] = {}
+UNEXPLAINED_FRACTION = 0.01
+"""Variation between refits that the dipole of a mounted mass does not explain, in physical widths."""
+NO_MOUNTINGS: Mapping[str, Mapping[str, Mounting]] = {}
 REFERENCE_FIELD_NT = 50_000.0
 """F_0 that a fleet's coefficients refer to, nT."""
 
 
 class Lesson(NamedTuple):
-    """One deployment's calibration as its own data determine it, without any prior.
+    """Information about the coefficients of one deployment from its own data, without a prior.
 
-    `time` is when it began, s since 1970; `noise` that of a sample, nT; the others as in :class:`.Known` and
-    :class:`.GaussianInformation`.
+    `time` is the start of the deployment, s since 1970; `noise` the 1-sigma of a sample, nT; the others are
+    as in :class:`.Known`.
     """
 
     vehicle: str
@@ -124,7 +124,7 @@ def unpacked(row: Mapping[str, bytes]) -> GaussianInformation:
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """What a fleet of vehicles with the same moving masses has taught."""
+    """Model of a fleet of vehicles with the same moving masses."""
 
     parameters: tuple[Parameter, ...]
     """The scale that all are brought to: the whole range seen."""
@@ -158,7 +158,7 @@ class Fleet:
 
 def learn_fleet(
     lessons: Sequence[Lesson],
-    mounted: Mapping[str, Mapping[str, Mounting]] = NOWHERE,
+    mounted: Mapping[str, Mapping[str, Mounting]] = NO_MOUNTINGS,
     variances: Variances | None = None,
 ) -> Fleet:
     """Learn from deployments of vehicles whose masses have the same names, fitted to the same order.
@@ -208,7 +208,7 @@ def _shapes(
         D = shapes_of(where, exponents, parameters, REFERENCE_FIELD_NT, basis @ mean, basis @ P @ basis.T)
         found[vehicle] = np.asarray(np.linalg.solve(basis, D))
     moves = np.repeat([sum(powers) > 0 for powers in exponents], 9)
-    return Shapes(found, shape_groups(len(parameters)), np.where(moves, REST, NO_SHAPES.rest))
+    return Shapes(found, shape_groups(len(parameters)), np.where(moves, UNEXPLAINED_FRACTION, NO_SHAPES.rest))
 
 
 def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:
@@ -234,8 +234,8 @@ def _groups(exponents: Sequence[Exponents]) -> IndexArray:
 
 
 FIXED = "hard iron"
-ALARM = 1e-3
-"""Chance of a false alarm in a deployment, over all its coefficients."""
+FALSE_ALARM_PROBABILITY = 1e-3
+"""Probability of a false alarm in a deployment, over all its coefficients."""
 
 
 class Change(NamedTuple):
@@ -277,7 +277,8 @@ def history(fleet: Fleet, vehicle: str) -> History:
     A deployment is predicted as N(m, S), wider where the vehicle was refitted. With its own data the
     coefficients move to N(m', P), and under the model the move has the covariance ``Cov(m' - m) = S - P``. So
     each coefficient's move over its own sigma is a standard normal number, whatever the runs determine. A
-    change is reported where one exceeds :data:`ALARM` for as many coefficients as are looked at.
+    change is reported where the probability of a move as large is below :data:`FALSE_ALARM_PROBABILITY` over
+    all monitored coefficients.
     """
     mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
     names, places = _looked_at(fleet)
@@ -331,7 +332,7 @@ def _significant_changes(
     for name, move, sigma in zip(names, moves, sigmas, strict=True):
         z = abs(move) / max(sigma, 1e-12)
         chance = min(2.0 * float(norm.sf(z)) * len(names), 1.0)
-        if chance < ALARM:
+        if chance < FALSE_ALARM_PROBABILITY:
             found.append(Change(name, float(move), float(z), chance, _cause(name, refitted)))
     return sorted(found, key=lambda one: -one.sigmas)
 
@@ -348,7 +349,7 @@ def _cause(name: str, refitted: bool) -> str:
 
 
 def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
-    """Return names and places among the coefficients of those that a technician can do something about."""
+    """Return names and indices of the monitored coefficients: hard iron, and each mass's linear terms."""
     names, places = [], []
     for m, powers in enumerate(fleet.exponents):
         if sum(powers) > 1:

@@ -1,4 +1,4 @@
-"""What a catalogue's deployments have taught, and its prediction of the next."""
+"""Predict the next deployment of a vehicle from the calibrations in a catalogue."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class _Taught(NamedTuple):
-    """A lesson, what its logs' SHA-256 are, the sensor it flew, and whether it was made elsewhere."""
+    """A deployment's calibration, the SHA-256 of its logs, its sensor, and if it was made elsewhere."""
 
     lesson: Lesson
     inputs: frozenset[str]
@@ -114,7 +114,7 @@ def fleets(catalogue: Catalogue, names: Iterable[str]) -> dict[str, Fleet | Data
 
 
 def remember(catalogue: Catalogue) -> None:
-    """Put on record how the coefficients of the catalogue's fleets vary, so that it is estimated once."""
+    """Store the estimated variances of each fleet in the catalogue, so that they are estimated once."""
     for fleet in fleets(catalogue, vehicles(catalogue)).values():
         if isinstance(fleet, Fleet):
             own, shaped = (one.ravel().tolist() for one in fleet.population.variances)
@@ -171,7 +171,7 @@ def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
 
 
 def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting]]) -> str:
-    """Return the name of the estimates: from other lessons, another name."""
+    """Return a hash of the deployments and positions of masses from which variances are estimated."""
     each = sorted(
         (one.vehicle, one.refit, one.deployment, one.time, one.information.vector.tolist()) for one in lessons
     )
@@ -191,10 +191,10 @@ def _taught(row: Row) -> _Taught:
     return _Taught(lesson, frozenset(calibration.inputs.values()), row["sensor"], row["job"] == GIVEN)
 
 
-DETERMINED = 0.25
-"""Share of the prior's variance that is left, below which the data have determined a direction."""
-UNLIKE = 3.0
-"""Times as wide as expected, from which on a deployment is not as its vehicle's past predicts."""
+MAX_VARIANCE_FRACTION = 0.25
+"""Largest remaining fraction of the prior's variance in a direction that the data have determined."""
+MAX_DEPARTURE_RATIO = 3.0
+"""Departure from the vehicle's past over the expected departure, above which a warning is printed."""
 
 
 def add_calibration(
@@ -248,8 +248,8 @@ def _information(calibration: Calibration, order: int) -> GaussianInformation | 
     """Return the information of its data; None unless it is a polynomial of that order alone.
 
     A cal.json holds a posterior N(c, P). Its prior is taken to have been the physical one, N(0, W). With
-    ``W^-1/2 P W^-1/2 = sum lambda_k v_k v_k^T``, the directions with lambda_k below :data:`DETERMINED` count,
-    with the precision ``1 / lambda_k - 1``.
+    ``W^-1/2 P W^-1/2 = sum lambda_k v_k v_k^T``, the directions with lambda_k below
+    :data:`MAX_VARIANCE_FRACTION` count, with the precision ``1 / lambda_k - 1``.
     """
     term, *others = calibration.terms
     if others or not isinstance(term, Polynomial) or max(map(sum, term.exponents)) != order:
@@ -261,7 +261,7 @@ def _information(calibration: Calibration, order: int) -> GaussianInformation | 
     to_z = np.linalg.inv(family.E * family.widths(family.centre))
     left, v = np.linalg.eigh(to_z @ calibration.covariance[:size, :size] @ to_z.T)
     left = np.maximum(left, 1e-12)
-    known = left < DETERMINED
+    known = left < MAX_VARIANCE_FRACTION
     J = (v[:, known] * (1.0 / left[known] - 1.0)) @ v[:, known].T
     h = (v[:, known] / left[known]) @ (v[:, known].T @ to_z @ calibration.coefficients[:size])
     return GaussianInformation(to_z.T @ J @ to_z, to_z.T @ h)
@@ -284,7 +284,7 @@ def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
 
 
 class FleetPrediction(NamedTuple):
-    """The prior; of how many deployments of the vehicle itself, and of other vehicles."""
+    """The prior, and the numbers of deployments behind it: of the vehicle, and of other vehicles."""
 
     known: Known
     vehicle: str
@@ -331,7 +331,7 @@ def gained(found: Fit, single: Fit | None, began: FleetPrediction) -> tuple[dict
     otherwise = f"instead of {without:.1f}" if without is not None else "where these runs alone allow no fit"
     past = f"{counted(began.own, 'deployment')} of {began.vehicle} and {began.others} of its fleet"
     lines = [f"{past}: expect {with_it:.1f} nT of error {otherwise}"]
-    if departure > UNLIKE:
+    if departure > MAX_DEPARTURE_RATIO:
         lines.append(
             f"{began.vehicle} differs from its past by {departure:.1f} times the expected: another "
             "vehicle, or something on it has changed"

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from magbridge.errors import MagbridgeError, WriteError
 from magbridge.field.read import read_grid
 from magbridge.files import atomic_path, new_folder
-from magbridge.fleet.learn import ALARM, History, facts
+from magbridge.fleet.learn import FALSE_ALARM_PROBABILITY, History, facts
 from magbridge.fleet.register import is_file_name
 from magbridge.pictures import literal
 from magbridge.plot import grid
@@ -82,8 +82,8 @@ def _write(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )
     text = engine.get_template("page.html").render(
-        title=title, vehicles=listed, detailed=detailed, alarm=ALARM, is_overview=bool(listed),
-        heading="h2" if listed else "h1",
+        title=title, vehicles=listed, detailed=detailed, alarm=FALSE_ALARM_PROBABILITY,
+        is_overview=bool(listed), heading="h2" if listed else "h1",
     )  # fmt: skip
     with atomic_path(path) as temporary:
         temporary.write_text(f"{text}\n", encoding="utf-8")

@@ -1,7 +1,7 @@
-"""A catalogue in a PostgreSQL database, for those who share one.
+"""A catalogue in a PostgreSQL database, for a team that shares one.
 
-The tables are those of :data:`.CATALOGUE_TABLES`, in a schema of their own. The rows' keys are the primary
-key of each: a row that two people add at once is there once.
+The tables are those of :data:`.CATALOGUE_TABLES`, in a schema of their own. The key of a row is the primary
+key, so that a row is stored once even if two processes add it at the same time.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, Catalo
 SCHEMA = sql.Identifier("magbridge_fleet")
 CONNECT_TIMEOUT_S = 10
 """s until a server that does not answer is given up."""
-MAKING = 0x6D616762
-"""Number of the lock that one holds who makes the tables."""
+CREATION_LOCK = 0x6D616762
+"""Key of the advisory lock under which a process creates the tables."""
 TYPES: dict[pl.DataType, str] = {
     pl.String(): "text",
     pl.Float64(): "double precision",
@@ -95,8 +95,8 @@ class PostgresCatalogue(Catalogue):
             raise PortError(self.name, " ".join(str(error).split())) from error
 
     def _make(self, connection: psycopg.Connection) -> None:
-        """Make the tables that are not there; one at a time does so."""
-        connection.execute("select pg_advisory_xact_lock(%s)", (MAKING,))
+        """Create the missing tables, under a lock."""
+        connection.execute("select pg_advisory_xact_lock(%s)", (CREATION_LOCK,))
         connection.execute(sql.SQL("create schema if not exists {}").format(SCHEMA))
         connection.execute(
             sql.SQL("create table if not exists {}.catalogue (format bigint primary key)").format(SCHEMA)

@@ -1,9 +1,8 @@
 """Process deployments of a catalogue, each a task, on dask.distributed.
 
-A worker (:func:`work`) writes corrected logs and maps, nothing else; the rows of the catalogue are written by
-the process that asked. A fault of a log is a failure on record, and the deployment's others go on. A fault of
-the moment (a file that is gone or has changed, a full disk) is reported, not recorded, and the deployment is
-tried again.
+A worker (:func:`work`) writes only corrected logs and maps; the calling process writes the rows of the
+catalogue. A fault of a log is recorded as a failure, and the deployment's other logs are processed. A
+temporary fault (a missing or changed file, a full disk) is reported, not recorded; the next call tries again.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ PIECE_ROWS = 20_000
 
 
 class Done(NamedTuple):
-    """Rows for each table, and what stood in the way at the moment (empty: nothing)."""
+    """Result rows of a job by table, and the temporary fault that prevented them (empty: none)."""
 
     tables: dict[str, list[Row]]
     hindrance: str = ""
@@ -71,7 +70,7 @@ def work(job: Job, results: Path) -> Done:
 
 
 def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
-    """Fill `tables`, one after the other, until something is in the way."""
+    """Process a job step by step; `tables` receives the rows of each completed step."""
     logs: dict[str, xr.Dataset] = {}
     for row in {row["sha256"]: row for row in job.files}.values():
         path = Path(row["path"])
@@ -211,12 +210,12 @@ def _named(job: Job) -> str:
     return f"{job.vehicle['vehicle']} {job.deployment}"
 
 
-START = "120s"
-"""Until processes of this machine are up: they import much, and it may be busy."""
-PACE = 64
-"""Deployments after which the catalogue is rearranged."""
+WORKER_START_TIMEOUT = "120s"
+"""Longest time until the worker processes of this machine run: they import much, and it may be busy."""
+COMPACT_INTERVAL = 64
+"""Number of deployments after which the catalogue merges its small files."""
 SCHEDULER_TIMEOUT = "20s"
-"""Until a scheduler that does not answer is given up."""
+"""Longest time to wait for the answer of a scheduler."""
 
 
 @contextmanager
@@ -236,7 +235,12 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
             yield client
         return
     with (
-        dask.config.set({"distributed.comm.timeouts.connect": START, "distributed.comm.timeouts.tcp": START}),
+        dask.config.set(
+            {
+                "distributed.comm.timeouts.connect": WORKER_START_TIMEOUT,
+                "distributed.comm.timeouts.tcp": WORKER_START_TIMEOUT,
+            }
+        ),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -279,5 +283,5 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[l
         else:  # that it is done comes last
             catalogue.add("done", [{**job.mark, "diagnosed": job.diagnose, "mapped": job.map}])
         yield lines
-        if number % PACE == 0 or number == len(futures):
+        if number % COMPACT_INTERVAL == 0 or number == len(futures):
             catalogue.compact()

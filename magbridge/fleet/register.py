@@ -40,7 +40,7 @@ from magbridge.toml import Table, check_entries, convert, load_toml
 from magbridge.wording import one_of
 
 FIXED_KEYS = "serial", "parameters"
-"""What a vehicle keeps; all else about it may be corrected, and the newest counts."""
+"""Properties of a vehicle that never change; of all others the newest row counts."""
 
 
 class Deployment(Table, frozen=True):
@@ -204,7 +204,7 @@ def is_file_name(name: str) -> bool:
 
 
 def _check_name(name: str, kind: str) -> None:
-    """Refuse names that cannot be a folder's: results are kept by them."""
+    """Check that a name can be a folder's, because results are stored in a folder of that name."""
     if not is_file_name(name):
         raise WrongUse(f"{name!r}: expected {kind}'s name without slashes, not beginning with a dot")
 
@@ -215,7 +215,7 @@ def _described(row: Row) -> str:
 
 
 GIVEN = "given"
-"""In the place of a job's name: the result was made elsewhere."""
+"""Value of the column `job` in the row of a calibration that was made elsewhere."""
 STATUS_COLUMNS = (
     "deployments", "logs", "calibrated", "unsupported", "failed", "new", "given", "diagnosed", "mapped"
 )  # fmt: skip
@@ -236,17 +236,17 @@ class Job:
 
     @property
     def sensor(self) -> str:
-        """The sensor it flew with; empty: whichever."""
+        """Name of the deployment's sensor; empty: any sensor."""
         return str(next((row["sensor"] for row in self.files if row["sensor"]), self.vehicle["sensor"]))
 
     @property
     def mark(self) -> Row:
-        """What each of its results begins with."""
+        """Columns that identify the job in each row of its results."""
         return {"job": self.name, "attempt": self.attempt}
 
     @cached_property
     def name(self) -> str:
-        """What its results are made of, as 32 hexadecimal digits: other logs or parameters, another name."""
+        """Hash of the job's inputs, 32 hexadecimal digits; other logs or parameters give another name."""
         made_of = (
             self.vehicle["vehicle"], self.deployment, self.refit, self.sensor,
             self.vehicle["parameters"], self.vehicle["order"], sorted({row["sha256"] for row in self.files}),

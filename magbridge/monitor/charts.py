@@ -9,7 +9,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from importlib.resources import files
 from io import BytesIO
-from math import atan2, ceil, cos, floor, isfinite, log10, nan, pi, sin, sqrt
+from math import ceil, cos, floor, isfinite, log10, nan, pi, sin, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ day and by night. An axis has no labels at its ends, where they would cover the 
 BREAK = 10.0
 """s without a sample that interrupt the curve, unless the interval before was at least a third as long."""
 ROOM, TAIL = 3.0, 0.02
-"""The axis holds all but the share `TAIL` of the points at either end, and `ROOM` times their range beyond. A
-step of the field is more than that share within seconds; a spike never is."""
+"""The axis covers the points without the fraction `TAIL` at either end, extended by `ROOM` times their range.
+A step of the field soon has more points than that fraction; a spike never has."""
 MIN_AXIS_RANGE = 1e-5
 """Smallest range of the value: an axis is not shorter."""
 ASPECT = 4.0 / 3.0
@@ -148,23 +148,20 @@ def read_background(path: Path) -> Background:
 def ellipse(place: TrackPoint) -> list[tuple[float, float]]:
     """Return the 2-sigma ellipse of a place as a polygon of (longitude, latitude), deg; empty if not known.
 
-    Notes
-    -----
-    With the eigenvalues ``a², b²`` of the covariance and the angle θ of the longer axis from north,
-    ``tan 2θ = 2 P_ne / (P_nn - P_ee)``.
+    Its points are ``2 L (cos t, sin t)`` with Cholesky's factor L of the covariance, ``P = L L^T``.
     """
     nn, ne, ee = place.covariance
-    middle, half = 0.5 * (nn + ee), 0.5 * (nn - ee)
-    radius = sqrt(half * half + ne * ne)
-    if not (isfinite(middle + radius) and 0.0 < middle + radius < 1e12 and abs(place.latitude) < 89.0):
+    largest = nn + ee
+    if not (isfinite(largest + ne) and 0.0 < largest < 1e12 and abs(place.latitude) < 89.0):
         return []
-    a, b, angle = 2 * sqrt(middle + radius), 2 * sqrt(max(middle - radius, 0.0)), 0.5 * atan2(ne, half)
+    north_sigma = sqrt(max(nn, 1e-12 * largest))
+    shared = ne / north_sigma
+    east_sigma = sqrt(max(ee - shared * shared, 0.0))
     per_latitude, per_longitude = metres_per_degree(place.latitude)
     polygon = []
     for k in range(SIDES + 1):
-        along, across = a * cos(2 * pi * k / SIDES), b * sin(2 * pi * k / SIDES)
-        north = along * cos(angle) - across * sin(angle)
-        east = along * sin(angle) + across * cos(angle)
+        cosine, sine = 2.0 * cos(2.0 * pi * k / SIDES), 2.0 * sin(2.0 * pi * k / SIDES)
+        north, east = north_sigma * cosine, shared * cosine + east_sigma * sine
         polygon.append((place.longitude + east / per_longitude, place.latitude + north / per_latitude))
     return polygon
 

@@ -39,7 +39,7 @@ class Point:
         return self.sum / self.count
 
     def add(self, value: float, two_sigma: float) -> None:
-        """Take one more sample in."""
+        """Add a sample with its 2-sigma."""
         self.sum, self.count = self.sum + value, self.count + 1
         self.least, self.most = min(self.least, value), max(self.most, value)
         self.low, self.high = min(self.low, value - two_sigma), max(self.high, value + two_sigma)
@@ -151,9 +151,9 @@ class Alarm:
     """`key`, `text`: Identifier, and text for a reader."""
     since: float
     last: float
-    """`since`, `last`: When it last began, and when it was last so."""
+    """`since`, `last`: When the condition last began, and when it last held."""
     active: bool = True
-    """It is so at present."""
+    """The condition holds at present."""
     count: int = 1
     """How often it has begun."""
     acknowledged: bool = False
@@ -174,13 +174,13 @@ class AlarmGroup:
 
     @property
     def text(self) -> str:
-        """The texts, those that are so at present first."""
+        """Texts of the alarms, those of active alarms first."""
         ordered = sorted(self.alarms, key=lambda alarm: not alarm.active)
         return "; ".join(dict.fromkeys(alarm.text for alarm in ordered))
 
     @property
     def active(self) -> bool:
-        """At least one of them is so at present."""
+        """At least one of them is active."""
         return any(alarm.active for alarm in self.alarms)
 
     @property

@@ -17,10 +17,10 @@ from magbridge.monitor.words import conditions
 
 BRIDGES = {spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")}
 """A component that sends one of these is a bridge."""
-MOST, AWAY = 8, 30.0
-"""Bridges that are kept at most, and s of silence after which one makes room for another."""
-CHECK = 0.5
-"""s between checks for faults."""
+MAX_BRIDGES, BRIDGE_TIMEOUT_S = 8, 30.0
+"""Largest number of bridges, and time without a message after which a new bridge replaces one, s."""
+CHECK_INTERVAL_S = 0.5
+"""Time between two checks for faults, s."""
 
 
 class ReceivedBridges:
@@ -46,10 +46,10 @@ class ReceivedBridges:
 
     def _room(self, now_s: float) -> bool:
         """Make room for one more bridge; False where all known ones still send."""
-        if len(self.states) < MOST:
+        if len(self.states) < MAX_BRIDGES:
             return True
         silent, state = min(self.states.items(), key=lambda item: item[1].received_at)
-        if now_s - state.received_at <= AWAY:
+        if now_s - state.received_at <= BRIDGE_TIMEOUT_S:
             return False
         del self.states[silent]
         return True
@@ -61,7 +61,7 @@ class ReceivedBridges:
             self._beat = now_s
             kind = {"type": MAV_TYPE.GCS, "autopilot": MAV_AUTOPILOT.INVALID, "mavlink_version": 3}
             requests.append(("HEARTBEAT", {**kind, "system_status": MAV_STATE.ACTIVE}))
-        if now_s - self._checked >= CHECK:
+        if now_s - self._checked >= CHECK_INTERVAL_S:
             self._checked = now_s
             for state in self.states.values():
                 state.alarms.update(conditions(state, now_s), now_s)
@@ -69,7 +69,7 @@ class ReceivedBridges:
 
 
 ASLEEP = getattr(time, "CLOCK_BOOTTIME", None)
-"""A clock that goes on while the computer sleeps, where there is one."""
+"""Clock that also counts while the computer sleeps; None if the system has none."""
 
 
 def monotonic_s() -> float:

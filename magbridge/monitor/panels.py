@@ -407,31 +407,33 @@ def rose_picture(field: dict[str, Any]) -> str:
     """
     parts = [f'<circle r="{RADIUS}" fill="none" stroke="{GREY}" stroke-width="1.5"/>']
     for bearing in range(0, 360, 30):
-        (x, y), (u, v) = _point(bearing, RADIUS), _point(bearing, RADIUS - (10 if bearing % 90 == 0 else 5))
-        parts.append(f'<line x1="{x}" y1="{y}" x2="{u}" y2="{v}" stroke="{GREY}"/>')
+        inner = RADIUS - (10 if bearing % 90 == 0 else 5)
+        parts.append(_line(bearing, inner, RADIUS, f'stroke="{GREY}"'))
     for letter, bearing in zip("NESW", range(0, 360, 90), strict=True):
         x, y = _point(bearing, RADIUS + 12.0)
-        parts.append(
-            f'<text x="{x}" y="{y}" fill="{GREY}" font-size="15" text-anchor="middle" '
-            f'dominant-baseline="central">{letter}</text>'
-        )
+        style = f'fill="{GREY}" font-size="15" text-anchor="middle" dominant-baseline="central"'
+        parts.append(f'<text x="{x}" y="{y}" {style}>{letter}</text>')
     if found := current_heading(field):
         heading, sigma, _ = found
-        x, y = _point(heading, RADIUS - 12.0)
         parts.append(_band(heading, min(2.0 * sigma, MAX_BAND_DEG)))
-        parts.append(f'<line x1="0" y1="0" x2="{x}" y2="{y}" stroke="{BLUE}" stroke-width="3"/>')
+        parts.append(_line(heading, 0.0, RADIUS - 12.0, f'stroke="{BLUE}" stroke-width="3"'))
     label = f'role="img" aria-label="Compass rose. {heading_text(field)}"'
     return f'<svg viewBox="-100 -100 200 200" {label} style="max-width: 14rem">{"".join(parts)}</svg>'
 
 
+def _line(bearing: float, inner: float, outer: float, style: str) -> str:
+    """Return a radial line between two radii at a bearing, deg."""
+    (x, y), (u, v) = _point(bearing, inner), _point(bearing, outer)
+    return f'<line x1="{x}" y1="{y}" x2="{u}" y2="{v}" {style}/>'
+
+
 def _band(heading: float, half: float) -> str:
     """Return the sector `half` deg either side of the heading."""
+    style = f'fill="{BLUE}" fill-opacity="0.25"'
     if half >= MAX_BAND_DEG:
-        return f'<circle r="{RADIUS}" fill="{BLUE}" fill-opacity="0.25"/>'
+        return f'<circle r="{RADIUS}" {style}/>'
     (x, y), (u, v) = _point(heading - half, RADIUS), _point(heading + half, RADIUS)
-    is_large = int(half > 90.0)
-    path = f"M 0 0 L {x} {y} A {RADIUS} {RADIUS} 0 {is_large} 1 {u} {v} Z"
-    return f'<path d="{path}" fill="{BLUE}" fill-opacity="0.25"/>'
+    return f'<path d="M 0 0 L {x} {y} A {RADIUS} {RADIUS} 0 {int(half > 90.0)} 1 {u} {v} Z" {style}/>'
 
 
 def _point(bearing: float, radius: float) -> tuple[float, float]:

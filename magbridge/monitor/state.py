@@ -13,15 +13,15 @@ from magbridge.mavlink.enums import MAG_NAVIGATION_STATE, MAV_PARAM_TYPE, MAV_SE
 from magbridge.monitor.history import Alarms, Series, TrackPoint, Trail
 from magbridge.records import Quality
 
-HOLD = 3.0
-"""s for which a flag is still shown after it was last set."""
+FLAG_HOLD_TIME_S = 3.0
+"""Time for which a flag is shown after it was last set, s."""
 REQUEST_RETRY_S = 1.5
 """s after which a request without an answer is repeated."""
 WAITING = "no answer yet"
 MAX_SENSORS = 8
 """Sensors of a bridge that are kept at most."""
 MIN_COMPARISON_TIME_S = 1.0
-"""Samples of two sensors are compared where they are no further from each other, s, or than two intervals."""
+"""Largest time between two compared samples of two sensors, s, unless two sample intervals are longer."""
 SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 """Largest numbers of samples, parameters and series of telemetry that are kept."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
@@ -187,7 +187,9 @@ class BridgeState:
         self.field, self.sampled = message.fields, now_s
         for name in Quality(self.field["flags"]).names().split():
             self.flags[name] = self.flags.get(name, (now_s, now_s))[0], now_s
-        self.flags = {name: times for name, times in self.flags.items() if now_s - times[1] <= HOLD}
+        self.flags = {
+            name: times for name, times in self.flags.items() if now_s - times[1] <= FLAG_HOLD_TIME_S
+        }
         self.samples.append(self.field)
         self.total.add(
             self.field["time_usec"] * 1e-6, self.field["total_field"], 2 * self.field["total_field_sigma"]

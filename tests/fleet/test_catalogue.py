@@ -69,7 +69,7 @@ def test_two_writers_of_the_same_rows_write_one_file(
 
 
 def test_many_files_become_one_and_say_the_same(empty: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "MANY", 5)
+    monkeypatch.setattr(room, "MAX_SMALL_FILES", 5)
     for n in range(7):
         empty.add("failures", [line(n)])
     before = empty.rows("failures")

@@ -18,7 +18,7 @@ from magbridge.mavlink import Codec, spec
 from magbridge.monitor.charts import drawn
 from magbridge.monitor.charts import series as track_series
 from magbridge.monitor.history import TIERS
-from magbridge.monitor.link import MOST, ReceivedBridges
+from magbridge.monitor.link import MAX_BRIDGES, ReceivedBridges
 from magbridge.monitor.page import bundle
 from magbridge.monitor.panels import heading_text, rose_picture
 from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
@@ -201,7 +201,7 @@ def test_each_vehicle_has_a_state_of_its_own(air: Air) -> None:
 def test_vehicles_are_bounded_and_one_that_is_silent_makes_room(air: Air) -> None:
     for system in range(1, 100):
         air.give(Codec(system, 191).pack("MAG_FIELD", total_field=1.0), NOW)
-    assert list(air.fleet.states) == [(system, 191) for system in range(1, 1 + MOST)]
+    assert list(air.fleet.states) == [(system, 191) for system in range(1, 1 + MAX_BRIDGES)]
     air.give(Codec(3, 191).pack("MAG_FIELD", total_field=1.0), NOW + 20.0)
     air.give(Codec(100, 191).pack("MAG_FIELD", total_field=1.0), NOW + 31.0)
     assert (1, 191) not in air.fleet.states
