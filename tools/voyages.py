@@ -20,7 +20,6 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.correction import Correction
 from magbridge.estimation.residual import rms
-from magbridge.field.continuation import smoothed
 from magbridge.field.geodesy import metres_per_degree, offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
@@ -304,10 +303,6 @@ def drawn_track(
     return track_over(over or grid, options, first + seed, speed=speed, jump=jump), grid, options
 
 
-LEVEL = 60.0
-"""nT by which the field is measured too large."""
-
-
 def carried(kind: Map, seed: int) -> tuple[float, float]:
     """Displace a tracking vehicle by 1.5 correlation lengths at 2 h; return as :meth:`Run.silence`."""
     length = 1.5 * synthetic(kind, seed % 10).correlation_length
@@ -320,19 +315,6 @@ def misled(kind: Map, seed: int) -> tuple[float, float]:
     """Claim a tenth of the true 1-sigma of the start, one length; return as :meth:`Run.silence`."""
     ds, grid, options = drawn_track(kind, seed, 1.0, first=7000)
     return sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)).silence()
-
-
-def level(kind: Map, seed: int) -> tuple[float, float]:
-    """Measure 60 nT too much all along, where 0.5 nT is claimed; return as :meth:`Run.standing`."""
-    ds, grid, options = drawn_track(kind, seed, 0.2, first=9000)
-    return sail(ds.assign(total_field=ds["total_field"] + LEVEL), grid, options).standing()
-
-
-def half(kind: Map, seed: int) -> tuple[float, float]:
-    """Sail on a field of which the map holds half the variance; return as :meth:`Run.standing`."""
-    grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
-    field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
-    return sail(*drawn_track(kind, seed, 0.2, first=9000, over=field)).standing()
 
 
 def dived(seed: int) -> Iterator[dict[str, float]]:
@@ -357,20 +339,8 @@ def track_score(track: xr.Dataset) -> dict[str, float]:
     return {"error": rms(np.hypot(north, east)), "nees": float(nees.mean()) / 2, "valid": valid}
 
 
-ROUGH = Map(40, 1000, rough=True)
-WAVELENGTHS = (0.0, 1_000.0, 2_000.0)
-"""m, of which half the amplitude stays; 0: all of it."""
-
-
-def on_smoothed(seed: int) -> Iterator[dict[str, float]]:
-    """Yield one flight's score on the map of every wavelength."""
-    ds, raw, options = drawn_track(ROUGH, seed, 0.2)
-    for length in WAVELENGTHS:
-        yield sail(ds, smoothed(raw, length) if length else raw, options).score()
-
-
-def calibrated(kinds: tuple[Map, ...], seed: int) -> Iterator[dict[str, object]]:
-    """Yield how a glider navigates on each map with each calibration, all else the same.
+def calibrated(kinds: tuple[Map, ...], seed: int) -> list[dict[str, object]]:
+    """Return how a glider navigates on each map with each calibration, all else the same.
 
     *error* is the RMS error (nT) of the corrected field on the survey, *claimed* the median claimed sigma.
     """
@@ -379,6 +349,7 @@ def calibrated(kinds: tuple[Map, ...], seed: int) -> Iterator[dict[str, object]]
     places = separation(*PLACE, *(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")))
     every = float(survey["time"][1] - survey["time"][0])
     velocity = np.gradient(np.column_stack(places), every, axis=0)
+    rows = []
     for method, options in METHODS.items():
         fitted = fit(observations(runs, () if method == "nominal" else MASSES), method, **options).calibration
         corrected = correct_rows(Correction(fitted), survey)
@@ -391,7 +362,8 @@ def calibrated(kinds: tuple[Map, ...], seed: int) -> Iterator[dict[str, object]]
             known = informed(known, fitted, claimed)
             ds = adrift(grid, known, np.random.default_rng(seed), velocity, error, sigma, every=every)
             row = {"map": str(kind), "calibration": method, "error": rms(error), "claimed": claimed}
-            yield row | sail(ds, grid, known).score()
+            rows.append(row | sail(ds, grid, known).score())
+    return rows
 
 
 # ---- without a map -----------------------------------------------------------------------------------------
