@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from passages import AIRCRAFT, PLACE, flight, steep_map
 from referee import ArduPilot
-from referee.loop import Run, sail
-from referee.receiver import Receiver, carried_off, frozen, honest, jammed, jumped
+from referee.loop import Receiver, Run, carried_off, frozen, honest, jammed, jumped, sail
 from small import small_bridge
 from vehicle import Bench
 

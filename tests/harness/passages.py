@@ -5,8 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from referee.loop import Passage
-from referee.receiver import Receiver, honest
+from referee.loop import Passage, Receiver, honest
 from voyages import Map, synthetic
 
 from magbridge.field.geodesy import metres_per_degree, offset

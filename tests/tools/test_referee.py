@@ -11,7 +11,7 @@ import pytest
 from passages import BACK, LAST, LOST, OPTIONS, PLACE, hills, passage
 from referee import ArduPilot, Autopilot, Px4, Truth
 from referee.ardupilot import COPTER_RATES_HZ, PLANE_RATES_HZ
-from referee.filter import PositionFilter
+from referee.autopilot import PositionFilter
 from referee.loop import Run, sail
 from referee.px4 import PX4_RATES_HZ
 
