@@ -29,8 +29,6 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.records import MAX_MEASURED_NT
 
-__all__ = ["CorrectedArrays", "correct", "forward", "regressors", "vector_covariance"]
-
 CORRECTED_AT_ONCE = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
 

@@ -18,8 +18,6 @@ from magbridge.calibration.terms import Step
 from magbridge.errors import CalibrationError
 from magbridge.records import MAX_MEASURED_NT, Corrected, Quality
 
-__all__ = ["EXTRAPOLATED", "GAP", "STALE_TELEMETRY", "Corrector", "base_flags", "begun", "omega", "ranges"]
-
 Span = tuple[int, float, float]
 GAP: Final = int(Quality.GAP)
 STALE_TELEMETRY: Final = int(Quality.STALE_TELEMETRY)

@@ -29,8 +29,6 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
 from magbridge.wording import one_of
 
-__all__ = ["SERIES_ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
-
 Vector = tuple[float, float, float]
 
 SERIES_ORDER = 8

@@ -25,12 +25,6 @@ from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import MAX_ORDER, Effect, Exponents, LogSeries, Power, Step, Width
 from magbridge.errors import CalibrationError
 
-__all__ = [
-    "ChannelEffect", "ClockEffect", "LegendreEffect", "PathEffect", "PlayEffect", "PowersEffect",
-    "RateEffect", "ResponseEffect", "SourcesEffect", "TimeEffect", "held", "lagged", "offsets", "play",
-    "powers",
-]  # fmt: skip
-
 MAX_INTERVAL = 60_000_000
 """Longest gap over which a rate of change is computed, µs."""
 

@@ -17,8 +17,6 @@ from magbridge.calibration.model import Calibration
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
 
-__all__ = ["c_header", "c_source", "c_template", "hexadecimal", "reals", "rows"]
-
 
 def c_header(calibration: Calibration) -> str:
     """Return ``magbridge_calibration.h``."""

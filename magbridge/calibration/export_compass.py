@@ -6,16 +6,16 @@ The autopilots correct by a symmetric matrix and an offset, and by a vector time
     PX4        b = M (h + COMP I - OFF)                     G, G/kA
 
 Ours is ``b = R A(x) (h - T(x))``. So ``M = A``, ``OFS = -T``; a parameter in ampere whose field is linear
-gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects, and the boresight R; the
+gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects and the boresight R; the
 export reports the resulting error.
 
-A Seaglider corrects counts of its compass by an offset and a matrix, in axes with y and z reversed, and
-levels the result with roll and pitch::
+A Seaglider corrects counts of its compass in axes with y and z reversed, and levels the result with roll and
+pitch::
 
     m = (x, -y, -z),    p = soft (m - hard),    psi = atan2(p_y', p_x')
 
 With ``S = diag(1, -1, -1)`` and c nT in a count, the same heading follows from ``hard = S T / c`` and ``soft
-= S R A S``, both at the middle of each parameter's range: :func:`heading_cost` computes what that costs.
+= S R A S``, at the middle of each parameter's range; :func:`heading_cost` computes the error of that.
 
 References
 ----------
@@ -36,17 +36,12 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import CalibrationError
 
-__all__ = [
-    "Compass", "HeadingCost", "ardupilot", "compass_of", "heading_cost", "matrix_and_offset",
-    "position_table", "px4", "seaglider",
-]  # fmt: skip
-
 AUTOPILOT_AXES = "X", "Y", "Z"
 OFF = (0, 1), (0, 2), (1, 2)
 FLOAT, INTEGER = 9, 6
 """MAV_PARAM_TYPE of a QGroundControl parameter file."""
 MAX_OFFSET_MG = 1_800.0
-"""mG: ArduPilot refuses to arm with longer offsets (COMPASS_OFFS_MAX)."""
+"""Longest offset with which ArduPilot arms (COMPASS_OFFS_MAX), mG."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +49,13 @@ class Compass:
     """The part of a calibration that an autopilot's compass model can represent."""
 
     matrix: FloatArray
-    """(3, 3): Symmetric."""
+    """(3, 3), symmetric."""
     offset: FloatArray
-    """(3,), nT, T at the middle of each parameter's range, at no current."""
+    """(3,): T at the middle of each parameter's range, at no current, nT."""
     current: FloatArray | None
-    """(3,), nT/A, dT/dI."""
+    """(3,): dT/dI, nT/A."""
     lost: tuple[str, ...]
-    """Parts of the calibration that the format cannot represent, with the resulting error."""
+    """What the format cannot represent, with the resulting error."""
 
 
 def compass_of(calibration: Calibration) -> Compass:
@@ -173,7 +168,7 @@ class HeadingCost:
 
 
 def rotation(calibration: Calibration) -> FloatArray:
-    """Return the boresight (3, 3); CalibrationError: there is none, and a heading needs one."""
+    """Return the boresight (3, 3); CalibrationError: there is none."""
     if calibration.boresight is None:
         raise CalibrationError(
             "no boresight: the matrix of a compass needs one; calibrate with roll and pitch in the log, at "
@@ -183,10 +178,7 @@ def rotation(calibration: Calibration) -> FloatArray:
 
 
 def seaglider(calibration: Calibration, nT_per_count: float) -> str:
-    """Return the text of a ``tcm2mat.cal``.
-
-    CalibrationError: the calibration has no boresight.
-    """
+    """Return the text of a ``tcm2mat.cal``; CalibrationError: the calibration has no boresight."""
     S = TO_SEAGLIDER_AXES
     A, T = matrix_and_offset(calibration, _middle(calibration))
     hard = S @ T / nT_per_count
@@ -197,11 +189,10 @@ def seaglider(calibration: Calibration, nT_per_count: float) -> str:
 
 
 def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
-    """Return the heading error due to the moving masses if only one offset and one matrix are used.
+    """Return the heading error of one offset and one matrix where masses move.
 
-    `calibration`: with a boresight. `dip_deg`: deg, inclination of the Earth's field: the error is inversely
-    proportional to its horizontal part. Returns: With all parameters at the ends of their ranges; then with
-    one at its ends, each.
+    The first entry has all parameters at the ends of their ranges, each further one a single parameter.
+    `dip_deg`: inclination of the Earth's field; the error is inversely proportional to its horizontal part.
     """
     ends = [(one.low, one.high) for one in calibration.parameters]
     centre = _middle(calibration)
@@ -251,9 +242,7 @@ def _errors(calibration: Calibration, R: FloatArray, positions: FloatArray, dip_
 def position_table(calibration: Calibration, parameter: str) -> str:
     """Return a CSV of offset (nT) and matrix at positions of one mass, the others at the middle.
 
-    ``b = M (h - offset)``, in body axes, x forward, y starboard, z down.
-
-    CalibrationError: the calibration has no such parameter, or no boresight.
+    ``b = M (h - offset)`` in body axes. CalibrationError: no such parameter, or no boresight.
     """
     names = [one.name for one in calibration.parameters]
     if parameter not in names:

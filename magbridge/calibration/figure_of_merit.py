@@ -2,10 +2,10 @@
 
 Notes
 -----
-On a box, four headings are flown, and on each of them rolls, pitches and yaws with periods of 4 to 5 s. The
-figure of merit is the sum of the twelve peak-to-peak values that these manoeuvres leave in the field. The
-improvement ratio is the standard deviation before compensation over that after it. Both refer to the field
-between 0.1 and 0.6 Hz (Noriega 2011, The Leading Edge 30:1122).
+A box has four headings, and on each of them rolls, pitches and yaws with periods of 4 to 5 s. The figure of
+merit is the sum of the twelve peak-to-peak values that these manoeuvres leave in the field. The improvement
+ratio is the standard deviation before compensation over that after it. Both refer to the field between 0.1
+and 0.6 Hz (Noriega 2011, The Leading Edge 30:1122).
 """
 
 from __future__ import annotations
@@ -19,17 +19,15 @@ from scipy.signal import butter, sosfiltfilt
 
 from magbridge.arrays import BoolArray, FloatArray
 
-__all__ = ["MANOEUVRE_AXES", "BoxFlight", "Manoeuvre", "box_flight", "figure_of_merit", "merit_text"]
-
 MANOEUVRE_AXES = ("roll", "pitch", "yaw")
 BAND_HZ = (0.1, 0.6)
 """Band of the manoeuvres, Hz."""
 USUAL_AMPLITUDE_DEG = (10.0, 5.0, 5.0)
-"""Amplitude, deg, of rolls, pitches and yaws of a box."""
+"""Amplitude of the rolls, pitches and yaws of a box, deg."""
 MIN_AMPLITUDE_FRACTION = 0.35
 """Fraction of the usual amplitude from which on an oscillation is a manoeuvre."""
 WINDOW_S, MIN_DURATION_S = 6.0, 8.0
-"""Time, s, over which an oscillation's amplitude is taken, and shortest manoeuvre."""
+"""Window of an oscillation's amplitude, and duration of the shortest manoeuvre, s."""
 MIN_RATE_HZ = 1.5
 """Lowest rate, Hz, of a log in which manoeuvres can be seen."""
 MIN_MANOEUVRES = 8
@@ -56,7 +54,7 @@ class BoxFlight(NamedTuple):
     """Time between samples, s."""
 
     def rows(self, n: int) -> BoolArray:
-        """Return the samples (n,) that belong to a manoeuvre."""
+        """Return True for samples (n,) that belong to a manoeuvre."""
         inside = np.zeros(n, bool)
         for one in self.manoeuvres:
             inside[one.rows] = True
@@ -66,10 +64,9 @@ class BoxFlight(NamedTuple):
 def box_flight(
     time: FloatArray, roll: FloatArray, pitch: FloatArray, heading: FloatArray
 ) -> BoxFlight | None:
-    """Find the manoeuvres of a box flight.
+    """Return the manoeuvres of a box flight, or None if too few were flown or the log is too slow.
 
-    `time` (n,): s, ascending. `roll`, `pitch`, `heading` (n,): deg; NaN where unknown. Returns: None if
-    fewer than :data:`MIN_MANOEUVRES` of the twelve were flown, or the log is too slow.
+    `time` (n,): s, ascending. `roll`, `pitch`, `heading` (n,): deg; NaN where unknown.
     """
     if len(time) < 100:
         return None
@@ -99,9 +96,9 @@ def box_flight(
 
 
 def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
-    """Return the longest manoeuvre of each axis and of each of four headings, a quarter turn from each other.
+    """Return the longest manoeuvre of each axis and of each of four headings.
 
-    The box's own orientation is the mean of the headings modulo a quarter turn.
+    The orientation of the box is the mean of the headings modulo a quarter turn.
     """
     if not found:
         return ()
@@ -119,11 +116,9 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
 
 
 def figure_of_merit(box: BoxFlight, measured: FloatArray, compensated: FloatArray) -> dict[str, Any]:
-    """Return figure of merit and improvement ratio.
+    """Return figure of merit and improvement ratio as plain values, with those of each manoeuvre.
 
-    `box`: the manoeuvres. `measured`, `compensated` (n,): nT, field before and after compensation; NaN where
-    unknown. Returns: ``before_nT`` and ``after_nT`` (sums), ``improvement_ratio``, ``manoeuvres`` (number),
-    and ``peak_to_peak``: a list with axis, heading (deg), before and after (nT) of each.
+    `measured`, `compensated` (n,): field before and after compensation, nT; NaN where unknown.
     """
     # Peak to peak of each manoeuvre in the band; their sum is the figure of merit.
     seen = [_band(_filled(values), box.interval) for values in (measured, compensated)]

@@ -37,10 +37,6 @@ from magbridge.arrays import FloatArray
 Components = Sequence[Any]
 """Components of one sample, or arrays (n,) of them."""
 
-__all__ = [
-    "DEFAULT_TILT_SIGMA_DEG", "Heading", "heading", "heading_of_sample", "level_vector",
-    "model_declination_sigma", "published_covariance",
-]  # fmt: skip
 
 DEFAULT_TILT_SIGMA_DEG = 0.3
 """1-sigma of roll and of pitch where the log does not state one, deg."""

@@ -34,8 +34,6 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.residual import PAIRS
 
-__all__ = ["TABLE_SUMS", "Kernel", "Linear", "Numbers", "Prepared", "apply", "linear", "prepare", "variances"]
-
 TABLE_SUMS = 81
 """Sums that the table gives: A' and T (12), then the 69 combinations of their covariance."""
 MAX_REGRESSOR = 1e100

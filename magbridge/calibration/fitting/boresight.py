@@ -48,11 +48,6 @@ from magbridge.calibration.model import Boresight, Calibration
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 
-__all__ = [
-    "TiltBoresight", "boresight_from_tilt", "choose_boresight", "down_in_body", "field_body",
-    "find_boresight", "magnetic_headings",
-]  # fmt: skip
-
 # ---- From roll and pitch alone ----
 
 INCLINATION_SIGMA_DEG = 0.2

@@ -14,11 +14,6 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.diagnostics import Diagnostic
 from magbridge.wording import counted
 
-__all__ = [
-    "PLACE_LENGTH_FRACTION", "courses", "crossed", "far_off", "jumped", "jumps", "left_open",
-    "left_open_by", "rough_rock", "tells_rock", "too_rough",
-]  # fmt: skip
-
 MIN_CROSSING_DEG = 30.0
 """deg between two courses that cross."""
 REVERSED_COURSE_DEG = 150.0

@@ -26,12 +26,6 @@ from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.nodes import Nodes, nodes_near
 from magbridge.estimation.priors import PriorFamily
 
-__all__ = [
-    "BENDS", "DECISIVE_LOG_RATIO", "MAX_FIELD_NODES", "MAX_UNCERTAIN_NODES", "SMOOTH", "Choice", "Weighed",
-    "about_the_middle", "choose", "climb", "fine_enough", "first_guess", "ladder", "nodes_for", "plausible",
-    "refined",
-]  # fmt: skip
-
 # ---- Lengths and nodes ----
 
 RUNGS = 7

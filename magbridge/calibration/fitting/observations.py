@@ -18,8 +18,6 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
 
-__all__ = ["Observations", "monomials", "polynomial_samples", "unfiltered"]
-
 RARE = 0.001
 """Share of the samples at either end that does not count for the range of a condition: it may be wrong."""
 COMMON, FAR = 0.005, 10.0

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["at_one_time", "observations"]
 
 MAP_ERROR = 20.0
 """1-sigma of a map that does not state its own, nT."""

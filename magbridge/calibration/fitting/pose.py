@@ -45,11 +45,6 @@ from magbridge.estimation.priors import FACTOR_MASS, PriorFamily, gain_rotation,
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.toml import check_entries, convert, load_toml
 
-__all__ = [
-    "DEPARTURE", "LATENT", "Known", "Mounting", "Posed", "Vehicle", "mass_columns", "mounted_prior", "pose",
-    "read_vehicle", "rescaling",
-]  # fmt: skip
-
 # ---- Dipoles at measured places ----
 
 Vector = tuple[float, float, float]

@@ -21,8 +21,6 @@ from magbridge.estimation.residual import ResidualSamples, rms, scales_and_offse
 from magbridge.version import __version__
 from magbridge.wording import counted
 
-__all__ = ["Creep", "Fit", "assemble"]
-
 
 @dataclass(frozen=True, eq=False)
 class Creep:

@@ -24,12 +24,6 @@ from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Noise, Re
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
 
-__all__ = [
-    "Mission", "apart_from_level", "contradicts", "expected_error", "expected_heading_sigma",
-    "in_sensor_units", "level_of", "nearby_mission", "sizes", "with_level",
-]  # fmt: skip
-
-
 CONTRADICTS = 2.0
 """Largest departure of an estimated level from the reference's, in its 1-sigma, that is accepted."""
 LEVEL_ROWS = 5_000

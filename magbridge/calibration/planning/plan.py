@@ -1,15 +1,15 @@
-"""Which calibration runs to fly next: those after which the mission's worst error is smallest.
+"""Which calibration runs to fly next: those after which the mission's largest error is smallest.
 
 Notes
 -----
-A run at one pitch, roll and position with all headings adds the information ``phi phi^T (x) G``, with ``G``
-the sum of ``g g^T / sigma^2`` over its samples. That follows from the geometry alone, before the run is
-flown. With the calibration's covariance C and ``F = phi (x) G^(1/2)``::
+A run at one pitch, roll and position, on all headings, adds the information ``phi phi^T (x) G``, with ``G``
+the sum of ``g g^T / sigma^2`` over its samples. With the calibration's covariance C and ``F = phi (x)
+G^(1/2)``::
 
     C' = C - C F (I + F^T C F)^-1 F^T C
 
-Runs are chosen one by one, then exchanged for better ones (Fedorov's exchange), to make the largest error
-over the mission small (G-optimality, approximated by the eighth power mean, which is smooth).
+:func:`plan` chooses runs one by one, then exchanges them (Fedorov), to minimise the largest error over the
+mission (G-optimality, approximated by the eighth power mean, which is smooth).
 """
 
 from __future__ import annotations
@@ -39,29 +39,25 @@ from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "Design", "Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "facts",
-    "flight_plan", "mission_samples", "plan", "settled", "summary", "trim_of",
-]  # fmt: skip
 
 SLACK = 3.0
-"""Change of the pitch by another trim of the vehicle, at the same positions, deg."""
+"""Change of pitch by another trim of the vehicle at the same positions, deg."""
 MAX_REST_FRACTION = 0.01
-"""Share of half a position's range, from one sample to the next: a mass at rest."""
+"""Motion between samples, as a fraction of half a position's range, of a mass at rest."""
 MAX_POSITION_DIFFERENCE = 0.35
-"""Share of half a position's range, by which a run may differ from positions that were flown."""
+"""Distance of a run from flown positions, at most, as a fraction of half a position's range."""
 PLANNED_HEADINGS = 24
 PLANNED_RUN_SAMPLES = 225
 """Samples of a run: a quarter of an hour at the paper's 0.25 Hz."""
 POSITION_LEVELS = 7
 """Values of each position that are tried."""
 VARIANCE_POWER = 4
-"""Power of the variance that is averaged over the mission, the eighth of sigma: the worst counts most."""
+"""Power of the variance that is averaged over the mission: the eighth of sigma."""
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One spiral: pitch and roll in deg, positions in their units."""
+    """One spiral: pitch and roll (deg), positions in their units."""
 
     pitch: float
     roll: float
@@ -70,21 +66,18 @@ class PlannedRun:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the vehicle can do."""
+    """Attitudes and positions that the vehicle can fly."""
 
     roll: tuple[float, float] = (-10.0, 10.0)
-    """Banks that it can hold in a spiral, deg."""
+    """Smallest and largest bank in a spiral, deg."""
     pitch: tuple[float, float] = (14.0, 30.0)
     """Smallest and largest pitch of dives and climbs, deg."""
     parameters: tuple[tuple[float, float], ...] = ()
     """Ends of each position."""
     pitch_at: Callable[[FloatArray], float] | None = None
-    """Positions (k,) -> pitch that they trim the vehicle to (deg), see :func:`trim_of`; without it pitch is
-    free."""
+    """Pitch (deg) that positions (k,) trim the vehicle to; None: pitch is free."""
     flown: FloatArray | None = None
-    """(m, k): Positions that the vehicle is known to fly with: a run keeps within
-    :data:`MAX_POSITION_DIFFERENCE` of some of
-    them. (No glider dives with its ballast out.)."""
+    """(m, k): positions that the vehicle has flown; a run stays near one of them."""
 
 
 def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
@@ -104,7 +97,7 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
 
 
 def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray:
-    """Return the (m, k) positions at which the masses of `data` are at rest; `parameters` give the scales."""
+    """Return the (m, k) positions of `data` at which all masses are at rest."""
     scale = [parameter.scale for parameter in parameters]
     # A sample is at rest if no mass moved before or after it.
     moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > MAX_REST_FRACTION).any(axis=1)
@@ -139,19 +132,19 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
 
 
 def _is_near_flown(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
-    """Return True if some flown positions differ by no more than REACH in any parameter."""
+    """Return True if a flown position (m, k) is near in all parameters."""
     off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
     return bool((off.max(axis=1) <= MAX_POSITION_DIFFERENCE).any())
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Runs to fly, in order of worth, and what they are expected to bring."""
+    """Runs to fly, the most useful first, and the error that is expected after each."""
 
     runs: tuple[PlannedRun, ...]
     rms: tuple[float, ...]
     worst: tuple[float, ...]
-    """`rms`, `worst`: nT, expected error over the mission before any run, after the first, after two ..."""
+    """`rms`, `worst`: expected error over the mission before any run, after the first ..., nT."""
 
 
 def expected_calibration(
@@ -159,8 +152,7 @@ def expected_calibration(
 ) -> Calibration:
     """Return the prior of a vehicle before its first run: the physical widths of its coefficients.
 
-    `parameters`: parameters that vary, with their ranges. `field`, `noise`: nT, the field where runs are
-    flown, and a sample's noise. `order`: highest total degree.
+    `field`, `noise`: field where the runs are flown, and noise of a sample, nT.
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(p.name for p in parameters), field)
@@ -198,7 +190,10 @@ class Design:
         self.points = jacobian(phi, g)
 
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return monomials (n, m) and the residual's derivative (n, 9) at fields (n, 3), nT, body axes."""
+        """Return monomials (n, m) and derivatives of the residual by the nine coefficients (n, 9).
+
+        `truth` (n, 3): true field in body axes, nT.
+        """
         calibration = self.calibration
         # Derivative of the residual at noise-free readings of the true field.
         phi = monomials(positions, calibration.parameters, self.exponents)
@@ -208,7 +203,7 @@ class Design:
         return phi, residuals(samples, calibration.coefficients)[1]
 
     def factor(self, run: PlannedRun) -> FloatArray:
-        """Return F (K, 9) of a run through all headings."""
+        """Return F (K, 9) of a run on all headings."""
         # One spiral at fixed pitch and roll: its information is phi phi^T (x) G (see the module's notes).
         turn = np.linspace(0.0, 2.0 * np.pi, PLANNED_HEADINGS, endpoint=False)
         attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * PLANNED_HEADINGS), turn])
@@ -223,17 +218,17 @@ class Design:
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 
     def variances(self, C: FloatArray) -> FloatArray:
-        """Return the variance (n,), nT², at the mission's points."""
+        """Return the variance at the mission's points (n,), nT²."""
         return np.asarray(np.einsum("ij,jk,ik->i", self.points, C, self.points))
 
     def covariance_after(self, C: FloatArray, F: FloatArray) -> FloatArray:
-        """Return C' (K, K), the covariance after one more run."""
+        """Return the covariance (K, K) after one more run."""
         # Woodbury: C' = C - C F (I + F^T C F)^-1 F^T C.
         CF = C @ F
         return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
 
     def scores(self, C: FloatArray, factors: Sequence[FloatArray]) -> FloatArray:
-        """Return the mean power of the variance over the mission after each of the candidates: (m,)."""
+        """Return the mean power of the variance over the mission after each candidate: (m,)."""
         PC, before = self.points @ C, self.variances(C)
         found = []
         for F in factors:
@@ -266,11 +261,10 @@ def plan(
 ) -> Plan:
     """Choose the runs to fly next.
 
-    `calibration`: calibration so far; :func:`expected_calibration` before the first run. `mission`: where
-    the error is to be small. `field_ned` (3,): nT, where the runs will be flown. `limits`: Pitch, bank and
-    positions that the vehicle can fly. `runs`: how many spirals.
+    `mission`: where the error is to be small. `field_ned` (3,): field where the runs will be flown, nT.
+    `runs`: number of spirals.
 
-    CalibrationError: the limits leave nothing to fly.
+    CalibrationError: no run lies within the limits.
     """
     with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
         design = Design(calibration, mission, field_ned)
@@ -305,9 +299,8 @@ def plan(
 def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
     """Choose runs for a mission.
 
-    `calibration`: calibration so far. `mission`: Attitude, position and masses as the mission will have
-    them; magnetometer columns are not needed. `runs`: how many to choose. `roll`: deg, the largest bank
-    either way.
+    `mission`: attitude, position and masses as the mission will have them, without magnetometer. `roll`:
+    largest bank either way, deg.
 
     CalibrationError: the mission has no attitude or position. FormatError: it lacks a parameter of the
     calibration, or has it in another unit.
@@ -331,7 +324,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
 
 
 def mission_samples(mission: xr.Dataset, names: tuple[str, ...]) -> Observations:
-    """Return a mission's samples; what the magnetometer will read is of no account."""
+    """Return a mission's samples, with placeholders for the magnetometer's readings."""
     some = ("time", np.ones(mission.sizes["time"]))  # zeros would count as missing
     return observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
 
@@ -350,7 +343,7 @@ def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
 
 
 def summary(found: Plan, calibration: Calibration) -> str:
-    """Return a plan as a table: the runs in order of worth, and the error expected after each."""
+    """Return a plan as a table: the runs, and the error expected after each."""
     names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
     header = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
     lines = [

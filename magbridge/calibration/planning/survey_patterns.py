@@ -1,8 +1,8 @@
-"""Which survey to fly so that it calibrates itself: what each pattern of legs would leave open.
+"""Which survey to fly so that it calibrates itself: the error that each pattern of legs would leave.
 
 The vehicle trims, rolls and moves its masses as in the mission; a pattern gives each leg its course, and may
-bank every other leg. With the jacobians of the samples it would take and a Gaussian field in place
-(:mod:`~magbridge.estimation.elimination`), the coefficients' covariance follows before it is flown.
+bank every other leg. The Jacobian of the samples and a Gaussian field in place
+(:mod:`~magbridge.estimation.elimination`) give the coefficients' covariance before the survey is flown.
 """
 
 from __future__ import annotations
@@ -33,26 +33,25 @@ from magbridge.estimation.residual import jacobian
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Proposal", "facts", "propose", "summary", "survey_plan"]
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
-"""Amplitude (nT), length (m) and power of the expected crustal field, as the place is unmapped."""
+"""Amplitude (nT), length (m) and power of the crustal field of an unmapped place."""
 LEVEL_SIGMA_NT = 145.0
 """1-sigma of the main field's level, nT."""
 PATTERN_SAMPLES = 1_500
-"""Largest number of samples of a pattern: more are averaged."""
+"""Largest number of samples of a pattern; of more, averages are used."""
 SPIRAL = 1_800.0
-"""s of a spiral at the end."""
+"""Duration of a spiral at the end, s."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A pattern, the expected accuracy, and the questions that it leaves open."""
+    """A pattern, its expected accuracy, and what it leaves undetermined."""
 
     name: str
     rms: float
     worst: float
-    """`rms`, `worst`: nT, 1-sigma of the corrected field over the mission, about its mean."""
+    """`rms`, `worst`: 1-sigma of the corrected field over the mission, about its mean, nT."""
     crossings: int
     """Places met again on another course."""
     open: tuple[str, ...]
@@ -66,11 +65,9 @@ def survey_plan(
     hours: float,
     roll: float = 10.0,
 ) -> list[Proposal]:
-    """Propose self-calibrating surveys of `hours`; arguments as for :func:`flight_plan`.
+    """Propose self-calibrating surveys of `hours`; arguments and errors as for :func:`.plan.flight_plan`.
 
     Without a calibration they are for an unknown vehicle, whose masses' positions are `parameters`.
-
-    CalibrationError, FormatError: as :func:`flight_plan`.
     """
     if calibration is not None:
         require_units(mission, calibration.units)
@@ -85,11 +82,10 @@ def survey_plan(
 def propose(
     calibration: Calibration, data: Observations, *, hours: float, roll: float = 10.0
 ) -> list[Proposal]:
-    """Return patterns of a survey of a given duration, the best first.
+    """Return patterns of a survey of `hours`, the best first.
 
-    `calibration`: where to linearise, with the noise of a sample: the calibration so far, or the prior of
-    any vehicle. `data`: the mission: attitude, position and masses as they will be. `hours`: how long it may
-    take. `roll`: deg, by which the vehicle can bank either way.
+    `calibration`: where to linearise, and the noise of a sample. `data`: attitude, position and masses as in
+    the mission. `roll`: largest bank either way, deg.
 
     CalibrationError: the mission has no attitude or position, or does not move.
     """
@@ -127,7 +123,7 @@ def propose(
 def _patterns(
     n: int, interval: float, speed: float, roll: float
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield name, course and bank (n,), rad, of every pattern of n samples, at `interval` s."""
+    """Yield name, course and bank (n,), rad, of every pattern of n samples at `interval` s."""
     # Fraction of the survey at each sample; `level` flight has no bank.
     share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
     bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
@@ -149,7 +145,7 @@ def _patterns(
 
 
 def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
-    """Return the course (n,), rad, over `count` parallel lines of `length` m, at shares (n,) of the way."""
+    """Return courses (n,), rad, over `count` lines of `length` m, at fractions (n,) of the way."""
     aside = min(0.1, 0.5 * LENGTH * count / max(length, 1.0))  # of a line's part, from each to the next
     part = share * count
     line, within = part.astype(int), part % 1.0
@@ -159,7 +155,7 @@ def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
 def _expected(
     design: Design, attitude: FloatArray, place: FloatArray, positions: FloatArray, noise: float
 ) -> tuple[float, float]:
-    """Return RMS and worst 1-sigma over the mission, about its mean, nT, after a survey's samples."""
+    """Return RMS and largest 1-sigma over the mission, about its mean, nT, after a survey."""
     calibration = design.calibration
     truth = field_body(attitude, np.tile(design.field_ned, (len(attitude), 1)))
     phi, g = design.derivative(truth, positions)
