@@ -44,7 +44,7 @@ TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge import plot
     from magbridge.api import calibrate, correct, navigate, survey
-    from magbridge.calibration.corrector import Corrector
+    from magbridge.calibration.correct import Corrector
     from magbridge.calibration.file import load, save
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.observe import observations
@@ -74,7 +74,7 @@ _HOMES = {
     **dict.fromkeys(["read", "write"], "logs"),
     "Calibration": "calibration.model",
     "Correction": "correction",
-    "Corrector": "calibration.corrector",
+    "Corrector": "calibration.correct",
     "MagbridgeError": "errors",
     "__version__": "version",
     "correct_rows": "rows",

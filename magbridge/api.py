@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, cast, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magbridge.calibration.correct import CorrectedArrays
+from magbridge.calibration.correct import CorrectedArrays, Corrector
 from magbridge.calibration.correct import correct as correct_arrays
-from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.fitting.observe import observations
 from magbridge.columns import in_seconds
 from magbridge.errors import CalibrationError, WrongUse

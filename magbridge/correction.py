@@ -12,7 +12,7 @@ from math import inf, isfinite, nan, sqrt
 from typing import TYPE_CHECKING, Any
 
 from magbridge.align import Aligner, Input, Sample
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
 from magbridge.columns import TEMPERATURE
 from magbridge.config import Align

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from magbridge.align import Sample
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector
 from magbridge.calibration.heading import heading_of_sample, model_declination_sigma
 from magbridge.calibration.model import Calibration
 from magbridge.config import HeadingOutput

@@ -14,5 +14,5 @@ A calibration is a list of :mod:`.terms` with their coefficients and covariance:
 of the masses, a :mod:`.dipole` that is expanded into one, and effects, which depend on anything else
 (:mod:`.effects`). Fits minimise the :mod:`~magbridge.estimation.residual`; :func:`.model.to_paper` gives
 the result in the paper's terms, and :mod:`.planning` says which runs to fly next. The live path needs
-:mod:`.corrector` and :mod:`.file` only; neither imports scipy or xarray.
+:mod:`.correct` and :mod:`.file` only; neither imports scipy or xarray.
 """

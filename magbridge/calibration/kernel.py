@@ -16,9 +16,9 @@ of the corrected vector::
     V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA', dT and the sensor's noise carried through)
     sigma_F^2 = u^T V u,  sigma_i^2 = V_ii + ([b] Omega [b]^T)_ii
 
-:func:`prepare` and :func:`apply` accept floats (one sample, :mod:`.corrector`) and arrays (a log,
-:mod:`.correct`). The two differ only in the order in which the product with the table is summed: by less
-than 1e-12 of the field. The table is made by :mod:`.model`.
+:func:`prepare` and :func:`apply` accept floats (one sample, :class:`.correct.Corrector`) and arrays (a log,
+:func:`.correct.correct`). The two differ only in the order in which the product with the table is summed: by
+less than 1e-12 of the field. The table is made by :mod:`.model`.
 """
 
 from __future__ import annotations

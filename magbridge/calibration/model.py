@@ -25,10 +25,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import permutations
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
@@ -169,7 +170,7 @@ class CalibratedSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str = ""
     power_cycle: int | None = None
-    filter_cutoff: float = 0.0
+    filter_cutoff: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
     """Cutoff frequency of the anti-alias filter that correcting undoes, Hz; 0: none."""
 
     def may_be(self, name: str) -> bool:
@@ -187,11 +188,11 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `autocorrelation`: AR(1), of the memory ``-interval / log(autocorrelation)`` s.
     """
 
-    sensor: float
+    sensor: Annotated[float, Meta(ge=0.0, le=1e15)]
     reference: float = 0.0
     autocorrelation: float = 0.0
     interval: float = 0.0
-    white: float = 0.0
+    white: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
 
 
 class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -201,7 +202,7 @@ class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     field is: the part of its sigma that is common to all samples.
     """
 
-    field: float
+    field: Annotated[float, Meta(gt=0.0)]
     model: str = ""
     bias: float = 0.0
     bias_sigma: float = 0.0

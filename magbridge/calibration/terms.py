@@ -38,6 +38,8 @@ MAX_ORDER = 30
 Power = Annotated[int, Meta(ge=1, le=MAX_ORDER)]
 Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
 """A divisor, in any unit."""
+Position = Annotated[float, Meta(ge=-1e12, le=1e12)]
+"""Position of a mass, or value of another parameter, in any unit."""
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
 """The nine coefficients: six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
@@ -64,11 +66,11 @@ class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     unit: str
     """`name`, `unit`: As in the deployment's columns."""
-    low: float
-    high: float
+    low: Position
+    high: Position
     """`low`, `high`: The range that the calibration has seen."""
-    centre: float
-    scale: float
+    centre: Position
+    scale: Annotated[float, Meta(gt=0.0, le=1e12)]
     """`centre`, `scale`: ``x = (p - centre) / scale``."""
 
 

@@ -18,7 +18,7 @@ from magbridge.estimation.priors import PriorFamily
 
 __all__ = [
     "BLOCK_ROWS", "NO_COEFFICIENTS", "BlockColumns", "OffsetBlock", "ParameterBlock", "SlowFunctions",
-    "in_chunks", "slow_functions", "with_blocks",
+    "in_chunks", "with_blocks",
 ]  # fmt: skip
 
 MAX_PAUSE_S = 3.0 * 3600.0
@@ -64,14 +64,18 @@ class OffsetBlock(ParameterBlock):
 
 
 class SlowFunctions:
-    """Functions of time that change slowly, (n, r) as an array; made for the rows that are asked for.
+    """Functions of time that change slowly, as an array (n, r); computed for the rows that are indexed.
 
-    `first` (m,) is the first sample of each stretch without a gap, `span` (m,) how long that is, s, and
-    `count` (m,) how many waves it has.
+    `time` (n,): s. `fastest`: half the period of the fastest function, s.
+
+    Notes
+    -----
+    A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
+    as 1/k (Karhunen-Loeve), and of its start. After a gap of :data:`MAX_PAUSE_S` it restarts.
     """
 
-    def __init__(self, time: FloatArray, fastest: float) -> None:
-        self.time, self.stretch = time, stretches(time)
+    def __init__(self, time: FloatArray, fastest: float = SHORTEST_CHANGE_HALF_PERIOD_S) -> None:
+        self.time, self.stretch = time, np.cumsum(np.diff(time, prepend=time[:1]) > MAX_PAUSE_S)
         _, first, size = np.unique(self.stretch, return_index=True, return_counts=True)
         self.start = time[first]
         self.span = np.maximum(time[first + size - 1] - self.start, 1e-9)
@@ -123,30 +127,11 @@ class BlockColumns:
         return np.asarray(sum(part @ mine for part, mine in pieces))
 
 
-def slow_functions(
-    time: FloatArray, fastest: float = SHORTEST_CHANGE_HALF_PERIOD_S
-) -> tuple[SlowFunctions, FloatArray]:
-    """Return functions of time that change slowly (n, r), and their widths (r,) as those of a random walk.
-
-    Notes
-    -----
-    A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
-    as 1/k (Karhunen-Loeve), and of its start. After a gap of :data:`MAX_PAUSE_S` it restarts.
-    """
-    waves = SlowFunctions(time, fastest)
-    return waves, waves.shape
-
-
 def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
     """Return the result (n, ...) of `made` for n rows, computed in chunks of bounded memory."""
     return np.concatenate(
         [made(slice(start, start + BLOCK_ROWS)) for start in range(0, max(n, 1), BLOCK_ROWS)]
     )
-
-
-def stretches(time: FloatArray) -> IndexArray:
-    """Return the number of the stretch without a gap that each sample (n,) belongs to."""
-    return np.cumsum(np.diff(time, prepend=time[:1]) > MAX_PAUSE_S)
 
 
 def with_blocks(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> PriorFamily:

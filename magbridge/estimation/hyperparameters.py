@@ -24,13 +24,11 @@ from magbridge.arrays import FloatArray
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.priors import PriorFamily
 
-__all__ = ["Hyperparameters", "is_maximum", "log_evidence", "maximise_evidence"]
+__all__ = ["Hyperparameters", "log_evidence", "maximise_evidence"]
 
 MAX_PRIOR_SIGMA = 10.0
 """Sigmas of the prior of eta, and of log sigma from where it starts: nothing physical lies beyond, and exp
 must not overflow."""
-MIN_EVIDENCE_GAIN = 0.01
-"""Log evidence: two answers that differ by less count as the same."""
 LOG_SIGMA_SCALE = 0.1
 """Scales log sigma as a prior's sigma scales eta."""
 
@@ -102,18 +100,3 @@ def maximise_evidence(
     x = middle + scale * minimize(downhill, start, jac=True, method="BFGS", options={"gtol": 1e-2}).x
     value, _, determined = log_evidence(information, family, x[:-1], x[-1])
     return Hyperparameters(x[:-1], float(np.exp(x[-1])), value, determined)
-
-
-def is_maximum(information: GaussianInformation, family: PriorFamily, widths: Hyperparameters) -> bool:
-    """Return whether the evidence curves down in every direction and a Newton step would gain nothing."""
-    x = np.append(widths.eta, np.log(widths.sigma))
-    scale = np.append(family.spread, LOG_SIGMA_SCALE)
-
-    def slope(point: FloatArray) -> FloatArray:
-        return np.asarray(log_evidence(information, family, point[:-1], point[-1])[1] * scale)
-
-    # Hessian by central differences of the analytic gradient; all eigenvalues must show a maximum.
-    bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
-    values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))
-    rise = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))
-    return bool(values[0] > 0.0 and rise < MIN_EVIDENCE_GAIN)

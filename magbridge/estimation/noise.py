@@ -207,7 +207,6 @@ def estimate_noise(
     e: FloatArray,
     steps: FloatArray,
     free: float,
-    absorbed: tuple[float, float] = (0.0, 0.0),
     shape: tuple[float, float] | None = None,
 ) -> NoiseModel:
     """Estimate the noise model from the residuals of a fit.
@@ -220,15 +219,11 @@ def estimate_noise(
         Sampling intervals since the previous sample.
     free : float
         Number of parameters that the data determined.
-    absorbed : tuple of 2 float
-        Variance of the fitted model at a sample, nT², and its covariance with the next sample. A fit absorbs
-        that much of the noise, mostly of its slow part: ``Cov e = R - J P J^T`` (R: covariance of the noise,
-        P: posterior covariance of the coefficients).
     shape : tuple of 2 float, optional
         Autocorrelation and white fraction, if they are known: see :func:`fit_slow_and_white`.
     """
     if shape is None:
-        shape = (_autocorrelation(_clipped(e), steps == 1, absorbed), 0.0)
+        shape = (_autocorrelation(_clipped(e), steps == 1), 0.0)
     white = whiten(e, steps, *shape)
     weight = (np.abs(white) <= OUTLIER_SIGMA * _scale(white)).astype(float)
     kept = weight.sum()
@@ -287,13 +282,10 @@ def _scale(e: FloatArray) -> float:
     return robust_scale(e) or float(np.abs(e).mean()) or 1e-9
 
 
-def _autocorrelation(e: FloatArray, follows: BoolArray, absorbed: tuple[float, float]) -> float:
+def _autocorrelation(e: FloatArray, follows: BoolArray) -> float:
     """Return the autocorrelation of successive residuals; 0 if it is below three of its standard errors."""
     late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
     if len(late) < MIN_PAIRS:
         return 0.0
-    # the noise's moments are those of the residuals plus what the fit absorbed
-    n, (variance, covariance) = len(late), absorbed
-    squares = np.sqrt((late @ late + n * variance) * (early @ early + n * variance))
-    rho = float((late @ early + n * covariance) / (squares + 1e-300))
+    rho = float((late @ early) / (np.sqrt((late @ late) * (early @ early)) + 1e-300))
     return min(rho, MAX_AUTOCORRELATION) if rho > 3.0 / np.sqrt(len(late)) else 0.0

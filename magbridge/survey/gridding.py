@@ -33,8 +33,8 @@ from magbridge.calibration.fitting.field_search import (
 from magbridge.estimation.blocks import (
     NO_COEFFICIENTS,
     ParameterBlock,
+    SlowFunctions,
     in_chunks,
-    slow_functions,
     with_blocks,
 )
 from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
@@ -305,10 +305,10 @@ def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
         groups = [ParameterBlock("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
         # Slow changes are offered: the evidence decides whether they are needed.
-        waves, shape = slow_functions(samples.time)
-        if len(shape):
+        waves = SlowFunctions(samples.time)
+        if len(waves.shape):
             groups.append(
-                ParameterBlock("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True)
+                ParameterBlock("slow change with time", waves, waves.shape, SLOW, SLOW_SPREAD, offered=True)
             )
     return tuple(groups)
 

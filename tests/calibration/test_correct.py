@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magbridge.calibration.correct import correct, forward
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector, correct, forward
 from magbridge.calibration.dipole import Dipole
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.kernel import TABLE_SUMS

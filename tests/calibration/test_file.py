@@ -161,7 +161,7 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
         lambda c: c["coefficients"].pop(), CalibrationError, "covariance: expected 38 x 38"),
     "a row less": (_drop_row, CalibrationError, "covariance: expected 39"),
     "a noise of 1e308 nT": (
-        lambda c: c["noise"].update(sensor=1e308), CalibrationError, "noise: sensor: expected nT, 0 to"),
+        lambda c: c["noise"].update(sensor=1e308), FormatError, "noise.sensor: Expected `float` <= 1"),
     "a variance of 1e308": (
         lambda c: c["covariance"][0].__setitem__(0, 1e308), CalibrationError, "standard deviations up to"),
     "negative variance": (
@@ -169,8 +169,8 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "not symmetric": (
         lambda c: c["covariance"][0].__setitem__(1, c["covariance"][0][1] + 0.5), CalibrationError,
         "symmetric"),
-    "no field": (lambda c: c["reference"].update(field=0.0), CalibrationError, "reference: field"),
-    "no scale": (lambda c: c["parameters"][0].update(scale=0.0), CalibrationError, "scale > 0"),
+    "no field": (lambda c: c["reference"].update(field=0.0), FormatError, "reference.field"),
+    "no scale": (lambda c: c["parameters"][0].update(scale=0.0), FormatError, "scale: Expected"),
     "another parameter": (
         lambda c: c["parameters"][0].update(name="fin"), CalibrationError, "expected one of fin"),
     "exponents": (
@@ -185,7 +185,7 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
         lambda c: c.update(boresight={"rotation": [0.0, 0.0, 1e308], "covariance": np.eye(3).tolist()}),
         CalibrationError, "boresight: rotation: expected a rotation vector"),
     "a position of 1e150": (
-        lambda c: c["parameters"][0].update(high=1e150), CalibrationError, "expected positions up to"),
+        lambda c: c["parameters"][0].update(high=1e150), FormatError, "high: Expected"),
     "an effect among terms": (
         lambda c: c["terms"].append(c["effects"].pop()), CalibrationError, "terms and effects"),
 }  # fmt: skip

@@ -11,8 +11,8 @@ from gliders import Glider, Gliders, codes
 from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.auto import ellipsoid
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, METHODS, fit
+from magbridge.calibration.fitting.methods import ellipsoid
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
@@ -363,3 +363,9 @@ def test_a_long_log_is_fitted_with_a_part_of_its_samples() -> None:
     found = fit(data, "nominal")
     assert len(found.residual) == n // 2
     np.testing.assert_allclose(found.calibration.coefficients[6:9], offset, atol=0.1)
+
+
+def test_runs_are_fitted_where_the_noise_is_small(glider: Gliders) -> None:
+    """Directions that no run determines keep a wide prior, however precise the others are."""
+    found = fit(glider(3, noise=0.2).runs, "runs")
+    assert np.median(np.abs(found.residual)) < 0.3  # where the masses are at rest

@@ -16,9 +16,9 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting import in_place
-from magbridge.calibration.fitting.auto import fit_auto
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit, fit
+from magbridge.calibration.fitting.methods import fit_auto
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.fitting.uncertainty import apart_from_level, level_of, with_level

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from posed import FIELD, T0, calibrated, regressors_of, surveyed, walk
 
-from magbridge.calibration.correct import correct
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector, correct
 from magbridge.calibration.effects import (
     ChannelEffect,
     ClockEffect,

@@ -88,21 +88,6 @@ def test_every_number_that_was_fitted_counts() -> None:
     assert estimate_noise(drawn(0.0)[few], STEPS[few], 500.0).sigma > fitted, "more numbers than samples"
 
 
-def test_what_a_fit_has_absorbed_of_slow_noise_is_given_back() -> None:
-    """Return the residuals of a straight line in many short runs, and the noise that was drawn."""
-    e, runs = drawn(0.9), np.arange(N) // 40
-    X = np.column_stack([np.ones(40), np.linspace(-1.0, 1.0, 40)])
-    H = X @ np.linalg.inv(X.T @ X) @ X.T
-    left = np.concatenate([part - H @ part for part in e.reshape(-1, 40)])
-    steps = np.where(np.diff(runs, prepend=-1) > 0, np.inf, 1.0)
-    C = 16.0 * 0.9 ** np.abs(np.subtract.outer(np.arange(40), np.arange(40)))
-    missing = C - (np.eye(40) - H) @ C @ (np.eye(40) - H).T
-    doubt = float(np.mean(np.diag(missing))), float(np.mean(np.diag(missing, 1)))
-    without, given = (estimate_noise(left, steps, 0.0, d).autocorrelation for d in ((0.0, 0.0), doubt))
-    assert without < 0.85
-    assert given == pytest.approx(0.9, abs=0.02)
-
-
 def test_a_slow_part_is_believed_only_where_it_is_likelier() -> None:
     alone = estimate_noise(drawn(0.5), STEPS, 0.0)
     assert fit_slow_and_white(drawn(0.5), STEPS, alone) is alone

@@ -8,7 +8,7 @@ from math import nan
 import numpy as np
 from small import polynomial
 
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, Parameter
 from magbridge.calibration.terms import full_order
 from magbridge.field.grid import AnomalyGrid

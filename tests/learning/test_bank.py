@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds import FIELD, World, calibration
 
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration, Noise
 from magbridge.learning.alarms import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from worlds import FIELD, MASS, World, calibration, error_of, learn
 
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration
 from magbridge.learning import Learner
 from magbridge.learning.estimator import FIRST_FIT_SAMPLES, class_prior

@@ -11,8 +11,7 @@ from benchmarks.row import Row, in_own_process, processor_time
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from magbridge.calibration.correct import CORRECTED_AT_ONCE, correct
-from magbridge.calibration.corrector import Corrector
+from magbridge.calibration.correct import CORRECTED_AT_ONCE, Corrector, correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.observe import observations

@@ -25,12 +25,12 @@ from magbridge.wording import one_of
 __all__ = ["MAIN_FIELD_SIGMA_NT", "METHODS", "Fit", "fit"]
 
 METHODS: dict[str, str] = {
-    "auto": "magbridge.calibration.fitting.auto:fit_auto",
+    "auto": "magbridge.calibration.fitting.methods:fit_auto",
     "survey": "magbridge.calibration.fitting.in_place:fit_in_place",
-    "nominal": "magbridge.calibration.fitting.auto:fit_nominal",
-    "cubic": "magbridge.calibration.fitting.paper_methods:fit_cubic",
-    "runs": "magbridge.calibration.fitting.paper_methods:fit_per_run",
-    "horizontal": "magbridge.calibration.fitting.paper_methods:fit_horizontal",
+    "nominal": "magbridge.calibration.fitting.methods:fit_nominal",
+    "cubic": "magbridge.calibration.fitting.methods:fit_cubic",
+    "runs": "magbridge.calibration.fitting.methods:fit_per_run",
+    "horizontal": "magbridge.calibration.fitting.methods:fit_horizontal",
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 
@@ -75,7 +75,7 @@ def fit(
         the map, and of a main-field model alone :data:`MAIN_FIELD_SIGMA_NT`.
     **options
         Further arguments of the method's own function, as ``vehicle`` of
-        :func:`~magbridge.calibration.fitting.auto.fit_auto`.
+        :func:`~magbridge.calibration.fitting.methods.fit_auto`.
 
     Raises
     ------

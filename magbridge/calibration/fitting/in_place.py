@@ -48,7 +48,6 @@ from magbridge.calibration.fitting.rounds import (
     SEARCHED,
     WIDE,
     Answer,
-    Drift,
     Rounds,
     SurveySamples,
 )
@@ -58,7 +57,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import TEMPERATURE
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, NoSolutionError
-from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, slow_functions
+from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, SlowFunctions
 from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import rms
@@ -84,8 +83,8 @@ def fit_in_place(
 
     `data`: with places, none of them far from all others. `order`: highest total degree of the polynomials
     in the masses' positions. `level`: nT, 1-sigma of the reference's error that is the same everywhere.
-    `vehicle`, `known`: as for :func:`~.auto.fit_auto`. `position_sigma`: m, by which dead-reckoned positions
-    slowly drift; the fit then corrects the track to the field.
+    `vehicle`, `known`: as for :func:`~.methods.fit_auto`. `position_sigma`: m, by which dead-reckoned
+    positions slowly drift; the fit then corrects the track to the field.
 
     CalibrationError: the data have no positions. NoSolutionError: the fit collapsed or did not converge.
     """
@@ -142,9 +141,11 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
     level = max(level, 1e-3)
     groups = [ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)]
     groups.append(ParameterBlock("gradient", away, np.ones(3), level))
-    waves, shape = slow_functions(data.time)
-    if len(shape):
-        groups.append(ParameterBlock("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
+    waves = SlowFunctions(data.time)
+    if len(waves.shape):
+        groups.append(
+            ParameterBlock("slow change with time", waves, waves.shape, SLOW, SLOW_SPREAD, offered=True)
+        )
     return tuple(groups)
 
 
@@ -178,10 +179,10 @@ def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, Survey
     return best.settle(), survey
 
 
-def _drift(data: Observations, sigma: float) -> Drift | None:
-    """Return the drift of positions, north and east, as a random walk of `sigma` m."""
-    waves, shape = slow_functions(data.time, DRIFTING)
-    return Drift(waves, shape, sigma) if sigma and len(shape) else None
+def _drift(data: Observations, sigma: float) -> ParameterBlock | None:
+    """Return the drift of positions, north or east, as a random walk of `sigma` m."""
+    waves = SlowFunctions(data.time, DRIFTING)
+    return ParameterBlock("drift", waves, waves.shape, sigma) if sigma and len(waves.shape) else None
 
 
 def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:
@@ -232,11 +233,10 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
                     OffsetBlock(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag)
                 )
     # a random walk of the offset, by slow functions of time on each axis
-    waves, shape = slow_functions(data.time, SHORTEST_DRIFT_HALF_PERIOD_S)
-    if len(shape):
-        groups.append(
-            OffsetBlock("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD, offered=True)
-        )
+    waves = SlowFunctions(data.time, SHORTEST_DRIFT_HALF_PERIOD_S)
+    if len(waves.shape):
+        shape = np.tile(waves.shape, 3)
+        groups.append(OffsetBlock("creep of the offset", waves, shape, CREEPS, SPREAD, offered=True))
     return tuple(groups)
 
 

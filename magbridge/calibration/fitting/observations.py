@@ -102,14 +102,17 @@ class Observations:
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
         _enough(n, whole, field, parameters, self.names, reference)
         _plausible(self.names, parameters[whole])
-        put(self, "field", field[whole])
-        put(self, "reference", reference[whole])
-        put(self, "parameters", parameters[whole])
-        put(self, "runs", runs[whole])
-        put(self, "time", time[whole])
-        for name in ("attitude", "reference_ned", "place", "unmapped", "temperature", "depth"):
-            if getattr(self, name) is not None:
-                put(self, name, np.asarray(getattr(self, name), float)[whole])
+        values = {
+            "field": field,
+            "reference": reference,
+            "parameters": parameters,
+            "runs": runs,
+            "time": time,
+        }
+        optional = {name: getattr(self, name) for name in _PER_SAMPLE if name not in values}
+        values |= {name: np.asarray(v, float) for name, v in optional.items() if v is not None}
+        for name, value in values.items():
+            put(self, name, value[whole])
 
     def __len__(self) -> int:
         return len(self.field)

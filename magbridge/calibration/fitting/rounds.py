@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -34,7 +34,6 @@ from magbridge.estimation.blocks import (
     BlockColumns,
     OffsetBlock,
     ParameterBlock,
-    SlowFunctions,
     in_chunks,
     with_blocks,
 )
@@ -338,14 +337,6 @@ class Rounds:
         return residuals_of(known, self.family.E @ z + self.family.offset)
 
 
-class Drift(NamedTuple):
-    """How positions drift with time: functions (n, r), their widths (r,) over `sigma`, and that, m."""
-
-    waves: FloatArray | SlowFunctions
-    shape: FloatArray
-    sigma: float
-
-
 def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
     """Return True for samples (n,) next to a motion of a mass, as defined in :mod:`magbridge.align`.
 
@@ -382,7 +373,7 @@ class SurveySamples:
         data: Observations,
         samples: ResidualSamples,
         groups: tuple[ParameterBlock, ...],
-        drift: Drift | None = None,
+        drift: ParameterBlock | None = None,
     ) -> None:
         assert data.place is not None
         assert data.unmapped is not None
@@ -395,10 +386,8 @@ class SurveySamples:
         self.kept = self.at_rest.copy()
         if drift is not None:
             nothing = np.zeros((len(samples.field), 0))
-            groups = (
-                *groups,
-                *(ParameterBlock(f"position {way}", nothing, drift.shape, drift.sigma) for way in ("n", "e")),
-            )  # fmt: skip
+            ways = (replace(drift, name=f"position {way}", functions=nothing) for way in ("north", "east"))
+            groups = (*groups, *ways)
         self.keep(groups)
 
     def thinned(self, step: int) -> SurveySamples:
@@ -409,7 +398,7 @@ class SurveySamples:
         # intervals are counted in units of `step`, so that the noise has one autocorrelation per row
         few.samples = replace(self.samples.part(rows), steps=np.append(np.inf, self._intervals(rows)) / step)
         if self.drift is not None:
-            few.drift = self.drift._replace(waves=self.drift.waves[rows])
+            few.drift = replace(self.drift, functions=self.drift.functions[rows])
         few.keep(tuple(replace(group, functions=group.functions[rows]) for group in self.groups))
         return few
 
@@ -460,7 +449,7 @@ class SurveySamples:
             return
         # f(x + dx) = f(x) + grad f . dx, dx = waves @ (north, east): the slope is taken at the new place
         north, east = latent[self.bent :].reshape(2, -1)
-        waves = self.drift.waves[:]
+        waves = self.drift.functions[:]
         self.place = self.as_logged + np.stack([waves @ north, waves @ east], axis=1)
         slopes = [(slope @ w * self.unmapped)[:, None] * waves for slope in field.slopes(self.place)]
         self.slopes = np.hstack(slopes)

@@ -20,7 +20,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.errors import NoSolutionError
-from magbridge.estimation.hyperparameters import Hyperparameters, is_maximum, maximise_evidence
+from magbridge.estimation.hyperparameters import Hyperparameters, maximise_evidence
 from magbridge.estimation.information import GaussianInformation, covariance_of
 from magbridge.estimation.noise import (
     CLIP_SIGMA,
@@ -35,7 +35,6 @@ from magbridge.estimation.optimise import Solution, gauss_newton
 from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import (
     ResidualSamples,
-    jacobian,
     residuals,
     residuals_of,
     robust_scale,
@@ -215,9 +214,8 @@ def climb(
         if step < MAX_START_ITERATIONS - 4:
             prior = family.prior(eta)
             e = residuals_of(samples, prior.coefficients(z))
-            absorbed = (0.0, 0.0) if white or shape else _absorbed(samples, prior, solution, noise)
             steps = np.where(white, np.inf, samples.steps)
-            found = estimate_noise(e, steps, widths.determined, absorbed, shape)
+            found = estimate_noise(e, steps, widths.determined, shape)
             noise = replace(found, sigma=widths.sigma)
     prior = family.prior(eta)
     spread = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
@@ -225,19 +223,6 @@ def climb(
     return Climbed(
         samples, prior, z, spread, noise, noise, solution.settled, objective, family, widths, quadratic, score
     )
-
-
-def _absorbed(
-    samples: ResidualSamples, prior: Prior, solution: Solution, noise: NoiseModel
-) -> tuple[float, float]:
-    """Return variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
-    few = thinned(samples)
-    _, g = residuals(few, prior.coefficients(solution.z))
-    J = jacobian(few.phi, g)
-    P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
-    JP = J @ (prior.E @ P @ prior.E.T)
-    next_one = few.steps[1:] == 1
-    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
 
 
 def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
@@ -251,7 +236,7 @@ def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples)
 def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
     """Return the answer with the largest evidence among several starts.
 
-    NoSolutionError: no start reached a maximum.
+    NoSolutionError: no start converged.
     """
     # climb from each start with a part of the samples, at narrow and at wide priors; then the best with all
     few = thinned(samples)
@@ -264,9 +249,9 @@ def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
         if few is not samples:
             noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation, answer.noise.white)
             last = climb(samples, answer.family, answer.z, answer.widths.eta, noise)
-        if last.settled and is_maximum(last.quadratic, last.family, last.widths):
+        if last.settled:
             return last
-    raise NoSolutionError("auto: no start reached a maximum of the evidence; the data contradict themselves")
+    raise NoSolutionError("auto: no start converged; the data contradict themselves")
 
 
 def with_slow_noise(answer: Climbed) -> Climbed:

@@ -1,25 +1,46 @@
-"""The default fit, and the fit of one ellipsoid: two configurations of one loop (:mod:`.solve`).
+r"""The methods of a fit: configurations of one loop (:mod:`.solve`).
 
 Notes
 -----
-``auto`` has physical priors whose widths the evidence chooses. The start with the largest evidence wins. It
-must be a maximum of the evidence, and its scales must not have collapsed. Choosing the widths by leaving out
+``auto`` has physical priors whose widths the evidence chooses. The start with the largest evidence wins; its
+scales must not have collapsed. Choosing the widths by leaving out
 one run at a time is not better (survey error 1.045 times the noise floor, against 1.036; median of 8 gliders)
-and takes hundreds of fits where the evidence needs a few. Leaving out is used to check: sigmas grow to what
-the parts left out show (:mod:`.left_out`), and where one ellipsoid predicts those better, it is taken.
+and takes hundreds of fits. Held-out parts check the fit: sigmas grow to what they show (:mod:`.left_out`),
+and where one ellipsoid predicts them better, it is taken.
 
-``nominal`` (paper, section 2.1) is one block of nine numbers whose prior is given, and the error of its model
-lasts. On a glider's narrow range of attitudes a free ellipsoid can collapse: ``A -> 0`` with ``T ->
-infinity`` makes every residual zero. So scale and soft iron have a prior of physical width, residuals are in
-the sensor's own nT, and a fit that collapsed all the same is refused.
+``nominal`` (section 2.1 of the paper, see :mod:`magbridge.calibration.model`) is one block of nine numbers
+whose prior is given, and the error of its model lasts. On a glider's narrow range of attitudes a free
+ellipsoid can collapse: ``A -> 0`` with ``T -> infinity`` makes every residual zero. So scale and soft iron
+have a prior of physical width, and a fit that collapsed all the same is refused.
+
+``cubic`` (section 2.2): every coefficient is a free polynomial, from a nominal start. Out of sample it is
+wrong in every direction that the runs do not determine; such combinations of coefficients keep the width
+:data:`FREE_SIGMA_NT`.
+
+``runs`` (the first stage of section 2.2): an ellipsoid for each run, with a prior about the nominal ellipsoid
+of all runs, then polynomials through them, each run weighted by its precision::
+
+    c = argmin sum_r (Phi_r c - c_r)^T Lambda_r (Phi_r c - c_r),   Lambda_r = H_r / sigma_r^2 + P
+
+``horizontal`` (Isezaki 1986, Korenaga 1995) uses the sizes of the horizontal and the vertical part of the
+field, which roll and pitch separate at any heading::
+
+    l = R_y(pitch) R_x(roll) B (H_r - T),   |l_xy| = H_h,   l_z = Z
+
+with a full matrix ``B = R A``, A symmetric (polar decomposition). A tilt of half a degree puts 0.9 % of Z
+into H_h, 400 nT of 46,000 nT.
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.linalg import polar
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.left_out import LeftOut, error_between, error_forward, leave_out
@@ -39,9 +60,11 @@ from magbridge.calibration.fitting.solve import (
     with_slow_noise,
 )
 from magbridge.errors import CalibrationError, NoSolutionError
-from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel
+from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, estimate_noise
+from magbridge.estimation.optimise import Solution
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
-from magbridge.estimation.residual import ResidualSamples
+from magbridge.estimation.residual import ResidualSamples, residuals_of
+from magbridge.wording import counted
 
 # ---- Polynomials with physical priors ----
 
@@ -59,7 +82,7 @@ def fit_auto(
     `order`: highest total degree. `vehicle`: where the masses sit, by parameter: their coefficients' prior is
     then that of dipoles there. `known`: what the coefficients are expected to be, instead of physical widths.
 
-    CalibrationError: no start reached a maximum, or the best one collapsed.
+    CalibrationError: no start converged, or the best one collapsed.
     """
     # 1. coefficients, widths and noise that maximise the evidence, from several starts
     posed = pose(data, order, vehicle, known)
@@ -255,3 +278,161 @@ def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArr
     covariance = np.diag(np.array([scale_sigma] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += gain_sigma**2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
+
+
+# ---- The paper's cubic polynomials ----
+
+REFERENCE_NOISE_RATIO = 1e4
+"""kappa at which all noise counts as the reference's: the residual is the paper's ``|A(H_r - T)| - H_e``."""
+FREE_SIGMA_NT = 1e4
+"""Prior 1-sigma of a free coefficient, nT: so wide that it only keeps steps finite."""
+
+
+def fit_cubic(data: Observations, order: int = 3) -> Fit:
+    """Fit all coefficients by damped least squares on the scalar residual; the paper's order is 3."""
+    # eq. 8: each of the nine coefficients is a polynomial in the positions; start with the nominal ones
+    posed = pose(data, order)
+    samples = replace(posed.samples, kappa=REFERENCE_NOISE_RATIO)
+    size = 9 * len(posed.exponents)
+    start = np.zeros(size)
+    with suppress(CalibrationError):  # without a nominal fit the start is a sensor without error
+        start[:9] = ellipsoid(data, axes_fixed=True, equal_xz=True)[1].coefficients
+    # white noise: its samples have no steps; they cannot have determined more numbers than half of them
+    alone = replace(samples, steps=np.full(len(data), np.inf))
+    noise_of = partial(_noise_of, alone, min(float(size), len(data) / 2))
+    wide = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
+    prior = Prior(np.eye(size) / FREE_SIGMA_NT**2, np.eye(size))
+    found = settle(samples, prior, start, noise_of, wide, rounds=2, steps=200)
+    check_scales(samples, found.z)
+    # report residuals in the sensor's units; A is near I, so the sensor's noise is the magnitude's
+    as_magnitude = NoiseModel(found.noise.sigma * REFERENCE_NOISE_RATIO)
+    return assemble(data, posed, replace(found, samples=posed.samples, noise=as_magnitude), "cubic")
+
+
+def _noise_of(
+    samples: ResidualSamples, free: float, prior: Prior, found: Solution, _: NoiseModel
+) -> tuple[NoiseModel, NoiseModel]:
+    """Return the noise of the residuals of a fit with `free` parameters, to state and to weigh with."""
+    noise = estimate_noise(residuals_of(samples, prior.coefficients(found.z)), samples.steps, free)
+    return noise, noise
+
+
+# ---- An ellipsoid for each run, then polynomials through them ----
+
+MIN_RUN_SAMPLES = 20
+"""Samples of a run that is fitted."""
+MAX_MONOMIAL_DIFFERENCE = 0.05
+"""Largest difference of a monomial from the run's median in a sample with the masses at rest."""
+RUN_SIGMA_FRACTIONS = np.array([0.005] * 6 + [0.02] * 3)
+"""1-sigma of a run's nine coefficients about the nominal ellipsoid, as fractions of the field."""
+
+
+def fit_per_run(data: Observations, order: int = 3) -> Fit:
+    """Fit every run on its own, then polynomials through the runs.
+
+    CalibrationError: fewer runs than the order plus one.
+    """
+    posed = pose(data, order)
+    samples = posed.samples
+    single, one, _ = ellipsoid(data)
+    prior = Prior(np.diag((RUN_SIGMA_FRACTIONS * samples.F_0) ** -2.0), np.eye(9), one.coefficients)
+    size = 9 * len(posed.exponents)
+    # A run at monomials m says C m = c_run. In units of its errors, with Lambda = L L^T, these are the rows
+    # (m x L)^T c = L^T c_run. The first rows are the prior of the coefficients.
+    rows_of_runs, values = [np.eye(size) / FREE_SIGMA_NT], [np.zeros(size)]
+    for label in np.unique(data.runs):
+        rows = data.runs == label
+        typical = np.median(samples.phi[rows], axis=0)
+        # only samples with the masses at rest: one run is one position
+        rows &= np.abs(samples.phi - typical).max(axis=1) < MAX_MONOMIAL_DIFFERENCE
+        if rows.sum() < MIN_RUN_SAMPLES:
+            continue
+        part = single.samples.part(rows)
+        found = settle(
+            part, prior, np.zeros(9), partial(_noise_of, part, 5.0), NoiseModel(one.noise.sigma), rounds=3
+        )
+        L = np.linalg.cholesky(np.linalg.inv(found.spread))
+        rows_of_runs.append(np.kron(typical, L.T))
+        values.append(L.T @ found.coefficients)
+    if (runs := len(values) - 1) <= order:
+        raise CalibrationError(
+            f"method runs: {runs} runs with {MIN_RUN_SAMPLES} samples or more at one position of the masses; "
+            f"order {order} needs {order + 1}: fly runs with the masses at rest"
+        )
+    # least squares by singular values: the normal equations would lose the directions that no run determines
+    U, singular, Vt = np.linalg.svd(np.vstack(rows_of_runs), full_matrices=False)
+    coefficients = (Vt.T / singular) @ (U.T @ np.concatenate(values))
+    return _assembled(data, posed, coefficients, (Vt.T / singular**2) @ Vt, "runs")
+
+
+def _assembled(
+    data: Observations, posed: Posed, coefficients: FloatArray, covariance: FloatArray, method: str
+) -> Fit:
+    """Return a fit whose coefficients were found without a common posterior."""
+    samples, free = posed.samples, 0.0 if method == "runs" else 9.0
+    check_scales(samples, coefficients)
+    noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, free)
+    none = Prior(np.zeros_like(covariance), np.eye(len(coefficients)))
+    found = CoefficientPosterior(
+        samples, none, coefficients, covariance, noise, noise, settled=True, objective=0.0
+    )
+    return assemble(data, posed, found, method)
+
+
+# ---- The horizontal fit ----
+
+MIN_LEVELLED_SAMPLES = 30
+"""Samples that an ellipsoid's twelve unknowns need."""
+DIFFERENCE_STEP = 1e-6
+"""Step of B, and of T over the field: the symmetric difference over it is good to 1e-9."""
+FIRST_NOISE_FRACTION = 1e-3
+"""Noise that attitude errors make, before it is estimated, as a fraction of the field."""
+
+
+def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
+    """Fit one ellipsoid by levelled components.
+
+    CalibrationError: roll and pitch, or the reference's direction, are lacking.
+    """
+    if data.attitude is None or data.reference_ned is None:
+        raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")
+    known = np.isfinite(data.attitude[:, :2]).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
+    if known.sum() < MIN_LEVELLED_SAMPLES:
+        raise CalibrationError(
+            f"horizontal: only {counted(int(known.sum()), 'sample')} with roll, pitch and position"
+        )
+    data = data.part(np.asarray(known))
+    assert data.attitude is not None
+    assert data.reference_ned is not None
+    posed = pose(data.without_parameters(), 0)
+    F_0 = posed.samples.F_0
+    # Turn the reading by pitch and roll alone: its horizontal and vertical parts are then those of the Earth.
+    level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
+    horizontal, vertical = np.hypot(*data.reference_ned[:, :2].T), data.reference_ned[:, 2]
+    widths = np.array([SOFT_IRON_SIGMA] * 9 + [WIDE_HARD_IRON_SIGMA] * 3)
+
+    def misfit(x: FloatArray, sigma: float) -> FloatArray:
+        B, T = np.eye(3) + x[:9].reshape(3, 3), F_0 * x[9:]
+        l = level.apply((data.field - T) @ B.T)  # noqa: E741  (the notes' letter)
+        parts = np.concatenate([np.hypot(l[:, 0], l[:, 1]) - horizontal, l[:, 2] - vertical])
+        return np.concatenate([parts / sigma, x / widths])
+
+    # robust least squares, each time with the noise that the last one left
+    sigma, x = FIRST_NOISE_FRACTION * F_0, np.zeros(12)
+    for _ in range(3):
+        found = least_squares(misfit, x, args=(sigma,), loss="soft_l1", f_scale=3.0)
+        x = found.x
+        sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
+    # covariance of (A, T) from that of (B, T), by symmetric differences
+    steps = DIFFERENCE_STEP * np.eye(12)
+    J = np.array([_ellipsoid_of(x + h, F_0) - _ellipsoid_of(x - h, F_0) for h in steps]).T
+    J /= 2.0 * DIFFERENCE_STEP
+    covariance = J @ np.linalg.inv(found.jac.T @ found.jac) @ J.T
+    return _assembled(data, posed, _ellipsoid_of(x, F_0), covariance, "horizontal")
+
+
+def _ellipsoid_of(x: FloatArray, F_0: float) -> FloatArray:
+    """Return the nine coefficients (nT) for B and T: A of ``B = R A``, and T."""
+    _, A = polar(np.eye(3) + x[:9].reshape(3, 3))
+    a = F_0 * (A - np.eye(3))
+    return np.concatenate([a[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], F_0 * x[9:]])
