@@ -158,9 +158,9 @@ def to_integer(value: float) -> int:
     return int(value) if isfinite(value) else -1
 
 
-HEARTBEAT = spec("HEARTBEAT")
+HEARTBEAT_SPEC = spec("HEARTBEAT")
 ALIVE, CRITICAL = (
-    HEARTBEAT.payload(
+    HEARTBEAT_SPEC.payload(
         type=MAV_TYPE.ONBOARD_CONTROLLER,
         autopilot=MAV_AUTOPILOT.INVALID,
         system_status=state,
@@ -202,7 +202,7 @@ class Reports:
 
     def heartbeat(self) -> bool:
         """Send HEARTBEAT: active while readings come from the sensor, else critical; return True."""
-        self._outbox.put(HEARTBEAT, ALIVE if self._speaking() else CRITICAL)
+        self._outbox.put(HEARTBEAT_SPEC, ALIVE if self._speaking() else CRITICAL)
         return True
 
     def status(self) -> bool:

@@ -184,7 +184,7 @@ LIMITS = {
 DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 
 
-MAX_INTERVAL_US = 0x7FFFFFFF
+MAX_MESSAGE_INTERVAL_US = 0x7FFFFFFF
 """Longest interval that a MESSAGE_INTERVAL holds, µs (36 min)."""
 
 
@@ -233,7 +233,7 @@ class MessageRates:
         if rate is None or rate.hertz < 0:
             return 0 if rate is None else -1
         hertz = rate.hertz or sample_rate
-        return min(period_us(hertz), MAX_INTERVAL_US) if hertz > 0 else 0
+        return min(period_us(hertz), MAX_MESSAGE_INTERVAL_US) if hertz > 0 else 0
 
     def set(self, number: int, hertz: float | None) -> str:
         """Set a message's rate (None: the default); return the parameter's name, empty if impossible."""
