@@ -277,6 +277,8 @@ class LiveHeading:
             published if published < inf else inf, tilt_sigma_deg=degrees(tilt_sigma),
             declination_sigma_deg=self._declination_sigma,
         )  # fmt: skip
+        if isnan(magnetic):
+            return NO_ATTITUDE
         return Attitude(magnetic, true, sigma, self._declination, roll, pitch, self._rates, tilt_sigma)
 
     def _tilt(self, elapsed: float, stated: float) -> tuple[float, float, float]:
@@ -309,7 +311,7 @@ class LiveHeading:
 
     def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
         """Send the heading of a sample if it is due and accurate; `time_us` is the sample's time."""
-        if not attitude.is_known or quality & NO_HEADING_FLAGS or attitude.sigma > MAX_SENT_SIGMA_DEG:
+        if quality & NO_HEADING_FLAGS or attitude.sigma > MAX_SENT_SIGMA_DEG:
             return
         utc_us = time_us + self._component.codec.utc_offset_us
         is_true = isfinite(attitude.heading)

@@ -50,16 +50,6 @@ class Attitude(NamedTuple):
     tilt_sigma: float
     """Standard deviation of roll and of pitch, rad."""
 
-    @property
-    def is_known(self) -> bool:
-        """Return True if there is a magnetic heading."""
-        return isfinite(self.magnetic) and isfinite(self.sigma)
-
-    @property
-    def heading_fields(self) -> tuple[float, float, float]:
-        """The three heading fields of MAG_FIELD, deg."""
-        return self.magnetic, self.heading, self.sigma
-
 
 NO_ATTITUDE: Final = Attitude(nan, nan, inf, nan, nan, nan, (nan, nan, nan), inf)
 """The attitude where the heading is unknown."""

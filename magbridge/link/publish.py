@@ -130,7 +130,7 @@ class Publisher:
             self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
             x, y, z, x_sigma, y_sigma, z_sigma, anomaly, sample.age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, self._sensor_id,
-            *(attitude.heading_fields if attitude.is_known else NO_HEADING),
+            *(NO_HEADING if attitude is NO_ATTITUDE else attitude[:3]),
         )  # fmt: skip
         self._outbox.put(FIELD_MESSAGE, payload)
 
