@@ -119,7 +119,11 @@ class OneTime:
         self.variance, self.settled = 0.0, None
         x, y, z = field
         if self._us and step > 0.0 and (x_late or y_late or z_late):
-            slope = x_slope, y_slope, z_slope = self._slopes(field, delay, step)
+            (x_then, y_then, z_then), (x_was, y_was, z_was), before = self._field, self._delay, self._slope
+            x_slope = _slope(x - x_then, step + delay[0] - x_was, before[0])
+            y_slope = _slope(y - y_then, step + delay[1] - y_was, before[1])
+            z_slope = _slope(z - z_then, step + delay[2] - z_was, before[2])
+            slope = x_slope, y_slope, z_slope
             out = x - x_slope * x_late, y - y_slope * y_late, z - z_slope * z_late
             lever = x_late * (step - x_late), y_late * (step - y_late), z_late * (step - z_late)
             self._judge(field, slope, lever, 1.0 / (step + self._step))
@@ -127,19 +131,6 @@ class OneTime:
             self._us, self._step, self._field, self._delay = time_us, step, field, delay
             self._out, self._slope, self._lever = out, slope, lever
         return out, earliest
-
-    def _slopes(self, field: Vector, delay: Vector, step: float) -> Vector:
-        """Return the rate of change of each channel since the previous reading, nT/s."""
-        x, y, z = field
-        x_then, y_then, z_then = self._field
-        x_late, y_late, z_late = delay
-        x_was, y_was, z_was = self._delay
-        x_slope, y_slope, z_slope = self._slope
-        return (
-            _slope(x - x_then, step + x_late - x_was, x_slope),
-            _slope(y - y_then, step + y_late - y_was, y_slope),
-            _slope(z - z_then, step + z_late - z_was, z_slope),
-        )
 
     def _judge(self, field: Vector, slope: Vector, lever: Vector, share: float) -> None:
         """Set the variance by the expected lag, and the previous reading without its lag."""

@@ -160,11 +160,18 @@ class TrendCheck:
         e = total - level
         scatter.follow(time_us, total)
         # the jumps so far stay as they are; _replace would take twice as long
-        predicted = TrendState(time_us, level, now.slope, p_level, p_cross, p_slope, *now[6:])
         if e * e <= GATE * S:
             # accepted only because of a turn or a motion: it may yet be an outlier
             self._before = level if e * e > GATE * (p_still + noise) else nan
-            return self._accept(predicted, e, S, sigma, noise)
+            # Kalman gain and update of level and slope
+            k_level, k_slope = p_level / S, p_cross / S
+            kept = 1.0 - k_level
+            p_slope = max(p_slope - k_slope * p_cross, 0.0)
+            self._now = TrendState(
+                time_us, level + k_level * e, now.slope + k_slope * e, p_level * kept, p_cross * kept,
+                p_slope, *now[6:],
+            )  # fmt: skip
+            return self._accept(self._now, e * e / S, sigma, noise)
         if self._accepted < AGREEING:
             # which of the first samples is the outlier is not known
             if self.has_moved and learn:
@@ -172,7 +179,7 @@ class TrendCheck:
             self._begin(time_us, total, sigma, noise)
             self._accepted = 0
             return 0.0
-        self._now = predicted
+        self._now = TrendState(time_us, level, now.slope, p_level, p_cross, p_slope, *now[6:])
         self._adapt(MAX_TREND_SQUARE)
         self._unrest = min(e * e, 16.0 * GATE * S)
         self._decay = BURST_DECAY if self._quiet < BURST_SAMPLES else SPIKE_DECAY
@@ -182,27 +189,19 @@ class TrendCheck:
             self._agree(time_us, total, sigma, S, noise)
         return e * e
 
-    def _accept(self, predicted: TrendState, e: float, S: float, sigma: float, noise: float) -> float:
-        """Update the filter; return what past outliers add, nT²."""
+    def _accept(self, state: TrendState, square: float, sigma: float, noise: float) -> float:
+        """Record a sample that the filter was updated with; return what past outliers add, nT².
+
+        `square` is the normalised square of its innovation.
+        """
         self._accepted += 1
         self._agreed = 0
-        # Kalman gain and update of level and slope
-        k_level, k_slope = predicted.p_level / S, predicted.p_cross / S
-        self._now = TrendState(
-            predicted.time_us,
-            predicted.level + k_level * e,
-            predicted.slope + k_slope * e,
-            predicted.p_level * (1.0 - k_level),
-            predicted.p_cross * (1.0 - k_level),
-            max(predicted.p_slope - k_slope * predicted.p_cross, 0.0),
-            *predicted[6:],
-        )
         self._sigma, self.has_moved = sigma, False
-        self._adapt(min(e * e / S, MAX_TREND_SQUARE))
+        self._adapt(min(square, MAX_TREND_SQUARE))
         # states to return to when a motion is reported late
         checkpoints = self._checkpoints
-        if not checkpoints or not 0 <= predicted.time_us - checkpoints[-1].time_us < CHECKPOINT_US:
-            checkpoints.append(self._now)
+        if not checkpoints or not 0 <= state.time_us - checkpoints[-1].time_us < CHECKPOINT_US:
+            checkpoints.append(state)
         self._unrest = self._unrest * self._decay if self._unrest > noise else 0.0
         self._quiet += 1
         return self._unrest

@@ -119,9 +119,8 @@ class Digitizer(FramedDriver):
         message = cobs_decode(frame)
         if len(message) < LENGTH or message[1] != len(message) or crc32(message) != CRC32_RESIDUE:
             raise ValueError
-        return self._reading(message) if message[0] == READING else None
-
-    def _reading(self, message: bytes) -> Reading:
+        if message[0] != READING:
+            return None
         (
             _, _, sequence, cycle, time_x, time_y, time_z, temperature, supply, flags,
             x_low, x_high, y_low, y_high, z_low, z_high,
