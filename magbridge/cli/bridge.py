@@ -163,10 +163,9 @@ def replay(
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
 
-    A bridge's own log is published again bit for bit. For a log that was restarted in the middle of a run
-    (the file was deleted, or the disk was full) it reports in how many samples the field is the same. Any
-    other log is played through an emulated fluxgate and an emulated autopilot, and the corrected field is
-    compared with the reference field.
+    A bridge's own log is published again bit for bit; if it was restarted in the middle of a run, the command
+    reports in how many samples the field is the same. Any other log is played through an emulated fluxgate
+    and autopilot, and the corrected field is compared with the reference field.
 
     Parameters
     ----------
@@ -314,7 +313,7 @@ def init(
     from magbridge.bridge.init import PLACEHOLDER, Answers, bridge_toml
     from magbridge.files import atomic_path
 
-    known = _loaded(calibration)
+    known = mb.load(calibration) if calibration else None
     asks = not json and sys.stdin.isatty() and sys.stdout.isatty()
     driver = driver or _ask("1. Which sensor?", _drivers_help(), "digitizer", asks, "--driver")
     port = port or _ask("2. On which port?", _ports_listed(), "/dev/ttyUSB*", asks, "--port")
@@ -339,11 +338,6 @@ def init(
         cli.complain(finding)
     sentence = f"{output}: written; next: magbridge run --check --config {output}"
     cli.print_result({"file": str(output), "findings": found}, sentence, json)
-
-
-def _loaded(calibration: Path | None) -> mb.Calibration | None:
-
-    return mb.load(calibration) if calibration else None
 
 
 def _relative(file: Path | None, output: Path) -> str | None:
@@ -422,8 +416,8 @@ def ports(
 ) -> None:
     """Listen on serial ports, and show which device sends on each.
 
-    It is a sensor, an autopilot, a GPS, or a line that cannot be parsed, which is then shown. Nothing is
-    sent: a sensor that waits for a command stays silent here. The exit code is 1 if a port that is named here
+    The command recognises sensors, autopilots and GPS receivers, and shows a line that it cannot parse. It
+    sends nothing, so that a sensor that waits for a command stays silent. The exit code is 1 if a named port
     cannot be opened.
 
     Parameters
@@ -470,17 +464,15 @@ def drivers(name: str | None = None, /, *, json: cli.Json = False) -> None:
     """
     from magbridge.sensors.options import driver_names, options_of
 
-    facts = {}
-    for one in [name] if name else driver_names():
-        facts[one] = [
-            {"name": o.name, "type": o.kind, "required": o.required, "meaning": o.meaning.replace("``", "")}
-            | ({} if o.required else {"default": o.default})
-            for o in options_of(one)
-        ]
+    facts: dict[str, list[dict[str, Any]]] = {}
     lines = []
-    for one, options in facts.items():
-        lines.append(f"{one}:")
-        for option in options:
-            default = "required" if option["required"] else f"default {option['default']!r}"
-            lines.append(f"  {option['name']} ({option['type']}; {default}): {option['meaning']}")
+    for driver in [name] if name else driver_names():
+        lines.append(f"{driver}:")
+        facts[driver] = []
+        for one in options_of(driver):
+            meaning = one.meaning.replace("``", "")
+            option = {"name": one.name, "type": one.kind, "required": one.required, "meaning": meaning}
+            facts[driver].append(option if one.required else option | {"default": one.default})
+            default = "required" if one.required else f"default {one.default!r}"
+            lines.append(f"  {one.name} ({one.kind}; {default}): {meaning}")
     cli.print_result(facts, "\n".join(lines), json)

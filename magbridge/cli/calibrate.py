@@ -40,30 +40,26 @@ class ModelOptions:
     Parameters
     ----------
     parameter
-        A column that gives the position of a moving mass, or a current; may be repeated. auto: the log's
-        currents, throttles, motors and masses that predict held-out parts better; the command prints by how
-        much (method auto).
+        A column that gives the position of a moving mass, or a current; may be repeated. auto: the columns
+        of the log that predict held-out parts better (method auto).
     order
         Highest total degree of the polynomials in the parameters.
     method
-        auto is the one to use: survey where only the main field or a map is known at the log's positions
-        (the crustal field is estimated with the calibration), else the fit to a known field. For comparison:
-        nominal (one ellipsoid for all positions), cubic (the paper's), runs (an ellipsoid for each run,
-        then polynomials through them: the paper's first stage), horizontal (one ellipsoid, levelled by
-        roll and pitch: the alternative that the paper names).
+        auto is the one to use: survey if only the main field or a map is known (the crustal field is
+        estimated with the calibration), else the fit to a known field. For comparison: nominal (one
+        ellipsoid), cubic (the paper's), runs (the paper's first stage: an ellipsoid for each run),
+        horizontal (one ellipsoid, levelled by roll and pitch).
     vehicle
         A vehicle.toml with the positions of the moving masses relative to the sensor (method auto); with
         --fleet, the vehicle's name in the fleet, which is known for logs that are catalogued.
     position_sigma
-        1-sigma in m by which dead-reckoned positions slowly drift, where the crustal field is estimated with
-        the calibration: the track is corrected to where the field repeats itself; 0: positions are exact.
+        1-sigma in m of the slow drift of dead-reckoned positions (method survey); 0: positions are exact.
     filter_cutoff
         Cut-off frequency in Hz of the sensor's first-order anti-alias filter; 0: no filter. The fit undoes
-        its attenuation in turns; correct and the bridge then undo its lag in the vector and the heading.
+        its attenuation; correct and the bridge undo its lag.
     fleet
-        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from the prediction
-        of the vehicle's earlier deployments and its fleet, and the command prints the gain (method auto). Two
-        runs are then often enough.
+        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the prior is the prediction from the
+        vehicle's earlier deployments and its fleet (method auto). Two runs are then often enough.
     refit
         Which refit it flies with, if its logs are not catalogued; by default a new one.
     """
@@ -112,15 +108,13 @@ class ReferenceOptions:
         A base station's log (total_field, or a vector): the Earth's field variation, to add to the reference.
         A log of an observatory (IAGA-2002) among the logs is added in the same way.
     reference
-        mean: use the mean length of the log's own readings as the reference, if neither the log nor --date
-        gives the Earth's field. The total field then has the sensor's own scale, which site_bias counts: by
-        default 2 %. scalar: use the reading of the column that --scalar names, for a scalar magnetometer away
-        from the vehicle's iron or compensated already; its column's sigma is site_bias, by default 1 nT.
+        mean: the mean of the log's own readings, if the Earth's field is not known; site_bias is then 2 % of
+        it by default. scalar: the column of --scalar, if that magnetometer is away from the vehicle's iron or
+        compensated; site_bias is then its sigma, by default 1 nT.
     site_bias
-        1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
-        the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
-        main-field models do not reach of the crust (error model of the World Magnetic Model 2020). The
-        corrected field's sigma counts it, and level_sigma says how much is common to all samples.
+        1-sigma in nT of a constant error of the reference field over the whole site; sigma and level_sigma
+        include it. By default 0 if the log has reference_field, the map's sigma with --grid (20 if it states
+        none), else 145 (error model of the World Magnetic Model 2020).
     """
 
     grid: Path | None = None

@@ -70,19 +70,13 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
     return check
 
 
-def _log_to_write(kind: Any, path: Any) -> None:
-    file_to_write(*suffixes(write=True))(kind, path)
-
-
 def folder_to_write(_: Any, path: Any) -> None:
     """Validate a folder to write to, before any work is done."""
     if path is None:
         return
-    if path.exists() and not path.is_dir():
-        raise ValueError("Expected a folder, got a file.")
     there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not there.is_dir():
-        raise ValueError(f"Expected a folder, but {there} is a file.")
+        raise ValueError("Expected a folder, got a file." if there == path else f"{there} is a file.")
     if not os.access(there, os.W_OK):
         raise ValueError(f"The folder {there} cannot be written to.")
 
@@ -128,8 +122,7 @@ class ReadingOptions:
     column
         A column under our name, NAME="THEIRS [unit]", as mag_x="Bx [uT]"; may be repeated.
     columns
-        A columns.toml that does so for a whole file: renames, scales, declares units and what headings refer
-        to.
+        A columns.toml that renames and scales columns and declares units and the heading reference.
     """
 
     date: Day = None
@@ -162,10 +155,9 @@ class ScalarOptions:
     Parameters
     ----------
     scalar
-        The column of a scalar magnetometer, nT. calibrate also fits its compensation, by the vector's
-        direction and by telemetry, into the same file. survey makes the map of it: lag, lever arm and heading
-        error are fitted together with the crustal field and the lines' levels. The channels that disturb it
-        are those of --parameter; auto, and in calibrate also no --parameter: all telemetry of the log.
+        The column of a scalar magnetometer, nT. calibrate adds its compensation to the file; survey makes the
+        map of it, and fits lag, lever arm and heading error. The channels that disturb it are those of
+        --parameter; auto, and in calibrate also no --parameter: all telemetry of the log.
     lag
         Time in s by which the scalar is behind the vector and the positions; auto estimates it.
     lever
@@ -206,13 +198,13 @@ class ScalarOptions:
 
 
 AS_THEY_SAY = ReadingOptions()
-"""Logs are read as they say themselves."""
+"""Logs are read as they declare themselves."""
 NO_SCALAR = ScalarOptions()
 """No scalar magnetometer."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 CalibrationOutput = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".json"))]
 SavedCalibration = Annotated[Path | None, Parameter(validator=file_to_write(".json"))]
-Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
+Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(*suffixes(write=True)))]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Base = Annotated[Path | None, Parameter(name=["--base-station", "--base"])]

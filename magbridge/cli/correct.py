@@ -48,15 +48,10 @@ def correct(
 ) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
-    The arithmetic and the state (lags, backlash) are the bridge's own, but the input is the log's rows. In a
-    bridge's own log (also converted to .nc or .parquet) these are MAG_RAW with the latest telemetry before
-    each and its age; [align] and every max_age are known as they were when the log began, not as they were
-    set later. The bridge itself uses every message about a moving mass, and the channels of a sensor that has
-    no counts are float32 here (to 0.002 nT of 50,000 nT). In another log, telemetry counts as new in every
-    row that has it, and rows that have nothing else are not samples: they are left out of the output. To
-    compute the bridge's output bit for bit, put the calibration into a bridge.toml and run:
-    magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from the
-    output published at the time.
+    The input is the log's rows. A bridge's own log has one row for each reading, with the latest telemetry
+    and its age, and the settings with which the bridge started. In another log every value of telemetry
+    counts as new, and rows without a reading are left out of the output. For the bridge's output bit for bit,
+    run magbridge replay LOG --config bridge.toml --log DIR.
 
     Parameters
     ----------
@@ -65,14 +60,12 @@ def correct(
     calibration
         The calibration (cal.json); with --config by default that of the bridge.
     output
-        The file to write: total field with its sigma, vector, anomaly and quality flags; also the log's
-        position, depth, attitude and the calibration's parameters. With a scalar magnetometer in the
-        calibration and in the log: scalar_field, its sigma and flags.
+        The file to write: total field and sigma, vector, anomaly, flags, a compensated scalar if the
+        calibration has one, and the log's position, depth, attitude and parameters.
     learn
         Learn the calibration during the run, as a bridge with [learning] does; the log needs positions.
     config
-        With --learn: the bridge.toml whose [learning] and calibration count. It may have no calibration:
-        learning then starts without one.
+        With --learn: the bridge.toml with [learning]; its calibration, if it has one, is the first.
     save
         With --learn: where to write the calibration that was published last.
     plot
@@ -84,8 +77,8 @@ def correct(
     from magbridge.logs import Writer, read_chunks
 
     known, settings = _known(calibration, config)
-    for doubt in cli.warnings_of(known, source):
-        cli.complain(doubt)
+    for warning in cli.warnings_of(known, source):
+        cli.complain(warning)
     if save is not None and not learn:
         raise WrongUse(
             "--save: expected --learn with it, because it writes the learned calibration; add --learn"
@@ -111,8 +104,8 @@ def correct(
         draw_corrected(join(drawn), plot)
     cli.note_losses(*pieces)
     cli.note_settings(*pieces)
-    if doubt := tally.doubt():
-        cli.complain(f"{source}: {doubt}")
+    if warning := tally.warning():
+        cli.complain(f"{source}: {warning}")
     facts, summary = tally.facts(), tally.summary()
     if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
@@ -267,7 +260,7 @@ class Tally:
     flags: Counter[str] = field(default_factory=Counter)
     """Name of a flag -> samples that carry it."""
     unearthly: int = 0
-    """Samples whose total field is none of the Earth's."""
+    """Samples whose total field is outside the Earth's range."""
 
     def add(self, corrected: xr.Dataset, rows: int) -> None:
         """Count the samples of a corrected piece of the log."""
@@ -275,15 +268,15 @@ class Tally:
 
         self.samples += corrected.sizes["time"]
         self.left_out += rows - corrected.sizes["time"]
-        doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
+        of_total = ~Quality.NO_BORESIGHT  # which concerns the vector alone
         quality = corrected["quality"].to_numpy().astype(int)
-        self.flagged += int((quality & doubtful != 0).sum())
-        self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
+        self.flagged += int((quality & of_total != 0).sum())
+        self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in of_total})
         total = corrected["total_field"]
         self.unearthly += int(((total < MAIN_FIELD_RANGE_NT[0]) | (total > MAIN_FIELD_RANGE_NT[1])).sum())
 
-    def doubt(self) -> str:
-        """Return why the calibration may be another vehicle's; empty without such an indication."""
+    def warning(self) -> str:
+        """Return a warning if most total fields are not the Earth's; else an empty text."""
         from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
         if self.unearthly <= self.samples / 2:
@@ -333,15 +326,14 @@ def export(
     dip: Annotated[float, Parameter(validator=validators.Number(gt=-90, lt=90))] = 60.0,
     json: cli.Json = False,
 ) -> None:
-    """Write a calibration for other programs, and say what they cannot hold of it.
+    """Write a calibration for other programs, and report the parts that their files cannot hold.
 
     Parameters
     ----------
     calibration
         The calibration (cal.json).
     c
-        A folder for magbridge_calibration.h and .c: C99 without allocation, float or double. A scalar
-        magnetometer of the calibration is in magbridge_scalar.h and .c.
+        A folder for magbridge_calibration.h and .c (C99, no allocation), and magbridge_scalar.h and .c.
     ardupilot
         A .param file: offsets, diagonals, off-diagonals and the motors' current of a compass.
     px4
@@ -369,8 +361,10 @@ def export(
     from magbridge.files import atomic_path, new_folder
 
     known = mb.load(calibration)
-    for doubt in [*cli.warnings_of(known, calibration), *_filter_lag(known, calibration)]:
-        cli.complain(doubt)
+    for warning in cli.warnings_of(known, calibration):
+        cli.complain(warning)
+    if cutoff_hz := known.sensor.filter_cutoff:
+        cli.complain(f"{calibration}: no export undoes the sensor's filter of {cutoff_hz:g} Hz")
     texts: dict[Path, str] = {}
     try:
         if c is not None:
@@ -423,12 +417,6 @@ def _in_c(known: mb.Calibration, folder: Path) -> dict[Path, str]:
         texts[folder / "magbridge_scalar.h"] = scalar_header(sensor)
         texts[folder / "magbridge_scalar.c"] = scalar_source(sensor)
     return texts
-
-
-def _filter_lag(known: mb.Calibration, file: Path) -> list[str]:
-    """Return a warning if the exported files lack the sensor's filter."""
-    cutoff = known.sensor.filter_cutoff
-    return [f"{file}: no export undoes the sensor's filter of {cutoff:g} Hz"] if cutoff else []
 
 
 def _seaglider(file: Path, known: mb.Calibration, nt_per_count: float, dip: float) -> str:

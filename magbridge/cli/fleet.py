@@ -136,8 +136,8 @@ def process(
 ) -> None:
     """Read, check, calibrate and correct new logs; continue where it was interrupted.
 
-    A deployment's logs are calibrated together: against a known field where they have reference_field, else
-    with an estimated crustal field (as calibrate does). An error in one log is printed, and the rest goes on.
+    The logs of a deployment are calibrated together, as calibrate does. An error in one log is printed, and
+    the other logs are processed.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def status(*, catalogue: Where = HERE, json: cli.Json = False) -> None:
 def show(
     vehicle: str = "", /, *, catalogue: Where = HERE, html: Path | None = None, json: cli.Json = False
 ) -> None:
-    """Print how a vehicle's coefficients went from deployment to deployment, and when they changed.
+    """Print the changes of a vehicle's coefficients from deployment to deployment.
 
     Parameters
     ----------

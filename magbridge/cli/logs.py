@@ -160,8 +160,7 @@ def convert(
     output
         The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
     metadata
-        A metadata.toml that says of people, platform and sensor what OceanGliders OG1.0 demands: the netCDF
-        is then a file of OG1.0.
+        A metadata.toml with people, platform and sensor, for a netCDF of OceanGliders OG1.0.
     """
     cli.logs_to_read(files, output, metadata)
     if metadata and output.suffix.lower() != ".nc":
@@ -209,19 +208,18 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider,
-        of which the last two need a log to drive them (--trajectory-from); or turn_on, warming, bolt, pump
-        and battery, in which the vehicle changes after its calibration.
+        A scenario file, or a built-in one: demo, survey, bonne_bay, random_glider; comet and seaglider, which
+        need --trajectory-from; turn_on, warming, bolt, pump and battery, in which the vehicle changes.
     output
         The file to write.
     seed
         Determines everything that the scenario leaves open; the same seed gives the same deployment.
     trajectory_from
-        A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
-        may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
+        A log whose attitude, position and masses replace the scenario's mission; may be repeated. All logs
+        of one call are in one world.
     reference
-        What reference_field holds, instead of what the scenario says: none leaves it out, as where the field
-        is not known; true is the true total field; map is the main field and an airborne survey's anomaly.
+        Content of reference_field, instead of the scenario's: none leaves it out; true is the true total
+        field; map is the main field with the anomaly of an airborne survey.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     """
@@ -282,8 +280,8 @@ def map(  # noqa: A001 - the command's name
     survey_altitude
         Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
     smooth
-        Wavelength in km: of shorter waves less than half stays, and the part that is removed counts as the
-        map's sigma. By default nothing is smoothed.
+        Wavelength in km at which half of a wave is left; the removed part counts as the map's sigma. By
+        default nothing is smoothed.
     mask
         A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
     spacing

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from magbridge.field.grid import AnomalyGrid
     from magbridge.navigate import NavigationOptions
 
-__all__ = ["navigate"]
-
 
 @cli.command("navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
 def navigate(
@@ -38,11 +36,10 @@ def navigate(
 ) -> None:
     """Find the track by matching the corrected field to an anomaly map.
 
-    Writes the filtered and the smoothed track with covariance and innovations. Without --map the track is
-    corrected to where it crosses itself in the field: one smoothed track, and how much the field improved it.
-
-    With --bound, FILE is a planned track (time, latitude, longitude; its corners suffice), and the result is
-    the smallest position error that any filter could reach along it.
+    Writes the filtered and the smoothed track with covariance and innovations. Without --map, crossings of
+    the track in the field correct it, and the result is one smoothed track. With --bound, FILE is a planned
+    track (time, latitude, longitude of its corners), and the result is the smallest error that any filter can
+    reach.
 
     Parameters
     ----------
@@ -66,7 +63,6 @@ def navigate(
         A PNG, PDF or SVG to draw: the tracks, on the map if there is one, errors and sigma; or the bound.
     """
     cli.logs_to_read(files, output, map, calibration, config)
-    from magbridge.errors import WrongUse
 
     known, options = mb.load(calibration) if calibration else None, _options(config)
     if bound:
@@ -136,8 +132,8 @@ def _corrected(
     from magbridge.rows import correct_rows
 
     deployment = cli.read_log(files, reading, heading_reference, CHANNELS)
-    for doubt in cli.warnings_of(known, calibration):
-        cli.complain(doubt)
+    for warning in cli.warnings_of(known, calibration):
+        cli.complain(warning)
     cli.note_missing(known, deployment)
     cli.note_settings(deployment.attrs)
     cli.refuse_unsuited(known, deployment)

@@ -41,7 +41,7 @@ class CorrectionOptions:
     save
         The calibration found, to write (cal.json).
     position_sigma
-        As of calibrate: by how many m dead-reckoned positions slowly drift, while the calibration is found.
+        1-sigma in m of the slow drift of dead-reckoned positions; 0: positions are exact.
     base
         A base station's log (total_field, or a vector): its variation is subtracted. A log of an
         observatory (IAGA-2002) among the logs is used in the same way.
@@ -63,9 +63,9 @@ class MapOptions:
     Parameters
     ----------
     spacing
-        m between nodes of the map; by default an eighth of the crustal field's length.
+        Distance between nodes of the map in m; by default an eighth of the crustal field's length.
     altitude
-        m above the sea to which the map is continued upward; by default that of the survey.
+        Altitude in m to which the map is continued upward; by default that of the survey.
     predict
         A table with longitude and latitude (and height or depth): anomaly and anomaly_sigma there are
         written to the output, instead of a map.

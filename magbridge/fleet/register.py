@@ -319,19 +319,21 @@ def status(catalogue: Catalogue) -> dict[str, Any]:
     new = {job.name for job in new_jobs(catalogue, list(every.values()))}
     counts = {row["vehicle"]: Counter[str]() for row in catalogue.rows("vehicles", ["vehicle"])}
     for job in every.values():
-        counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=int(job.name in new))
+        counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=job.name in new)
     calibrated = set[str]()
     for row in current(catalogue, "calibrations", ["vehicle", "supported"]):
         if row["job"] == GIVEN:
-            counts[row["vehicle"]].update(given=1)
+            counts[row["vehicle"]]["given"] += 1
         else:
             calibrated.add(row["job"])
-            counts[row["vehicle"]].update(calibrated=1, unsupported=int(not row["supported"]))
-    for name in every.keys() - calibrated - new:
-        counts[every[name].vehicle["vehicle"]].update(failed=1)
-    for what in ("diagnosed", "mapped"):
-        for name in {row["job"] for row in done if row[what]} & every.keys():
-            counts[every[name].vehicle["vehicle"]].update({what: 1})
+            counts[row["vehicle"]].update(calibrated=1, unsupported=not row["supported"])
+    finished = {"failed": every.keys() - calibrated - new}
+    for column in ("diagnosed", "mapped"):
+        finished[column] = {row["job"] for row in done if row[column]} & every.keys()
+    for column, names in finished.items():
+        counts_of = Counter(every[name].vehicle["vehicle"] for name in names)
+        for vehicle, number in counts_of.items():
+            counts[vehicle][column] += number
     failures = [row["line"] for row in current(catalogue, "failures")]
     sensors: dict[str, set[str]] = {}
     for row in catalogue.rows("sensors"):

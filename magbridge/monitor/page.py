@@ -6,7 +6,7 @@ import csv
 import json
 import platform
 import time
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from importlib.resources import files
 from io import BytesIO, StringIO
 from typing import Any
@@ -42,7 +42,7 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
         "magbridge": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "libraries": {name: _version(name) for name in LIBRARIES},
+        "libraries": {name: version(name) for name in LIBRARIES},
         "link": link,
         "bridge": state.bridge,
         "measured": words.measured(state),
@@ -85,13 +85,6 @@ def _table(names: list[str], rows: list[list[Any]]) -> str:
     writer.writerow(names)
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 SCRIPT = files("magbridge.monitor").joinpath("page.js").read_text(encoding="utf-8")
