@@ -68,6 +68,8 @@ CORRELATION_TIME_S = 30.0
 """s over which the errors of successive positions are correlated."""
 SEPARATION_TIME_S = 120.0
 """s for which a filter goes on without the positions that the navigator uses; then it starts again."""
+RECENT_POSITIONS = 64
+"""Number of positions between which that of a measurement is interpolated."""
 OK_STATE, DETECTED_STATE = 1, 3
 """GPS_JAMMING_STATE and GPS_SPOOFING_STATE: nothing found; found and not mitigated."""
 
@@ -380,7 +382,8 @@ class _FieldTest:
         self._filter: Bank | None = None
         self._separate: Bank | None = None
         self._separated_s = self._log_odds_separate = 0.0
-        self._filtered = self._offset = np.zeros(2)  # position at the last measurement, and the latest
+        self._filtered = np.zeros(2)  # position at the last measurement
+        self._positions: deque[tuple[int, float, float]] = deque(maxlen=RECENT_POSITIONS)
         self._sigma = inf
         self._step = Step()  # since the last measurement that was used
 
@@ -408,7 +411,8 @@ class _FieldTest:
         """Continue at a position (m, north and east of dead reckoning) with its 1-sigma (m)."""
         if restart or time_us - self._time_us > MAX_GNSS_AGE_US:
             self._restart()
-        self._offset, self._sigma, self._time_us = np.array(offset_m), sigma, time_us
+        self._positions.append((time_us, *offset_m))
+        self._sigma, self._time_us = sigma, time_us
 
     def begin_comparison(self) -> None:
         """Discard the evidence so far: from now on the navigator does not use the positions."""
@@ -447,7 +451,7 @@ class _FieldTest:
             x, P = prior(self._options, self._sigma)
             P[2:4, 2:4] = 0.0  # the receiver's positions move the filter, not dead reckoning
             self._filter = Bank(self._grid, x, P, inf, self._options.gate)
-        self._predict(self._filter, whole)
+        self._predict(self._filter, whole, block.time_us)
         seen = self._filter.update(block)
         unmapped = self._unmapped.update(block, whole, self._filter.curvature_variance)
         if is_first or not seen.variance > 0.0:  # off the map
@@ -460,8 +464,11 @@ class _FieldTest:
         gained = seen.log_likelihood - filter_likelihood
         self.log_odds_of_position = self._limited(self.log_odds_of_position + gained)
 
-    def _predict(self, one: Bank, step: Step) -> None:
-        """Propagate the filter of H1: the receiver's error decays, and its position moves."""
+    def _predict(self, one: Bank, step: Step, time_us: int) -> None:
+        """Propagate the filter of H1 to a time: the receiver's error decays, and its position moves."""
+        # Interpolated: with a wrong heading dead reckoning leaves the receiver by metres in a second.
+        times, north, east = np.array(self._positions).T
+        position = np.array([np.interp(time_us, times, north), np.interp(time_us, times, east)])
         F, Q = transition(self._options, *step)
         F[:4], Q[:4] = 0.0, 0.0
         kept = exp(-step.seconds / CORRELATION_TIME_S)
@@ -469,8 +476,8 @@ class _FieldTest:
         Q[0, 0] = Q[1, 1] = self._sigma**2 * (1.0 - kept * kept)
         one.x[:2] -= self._filtered[:, None]
         one.predict(F, Q)
-        one.x[:2] += self._offset[:, None]
-        self._filtered = self._offset
+        one.x[:2] += position[:, None]
+        self._filtered = position
 
     def _limited(self, log_odds: float) -> float:
         return min(max(log_odds, -self.limit), self.limit)
