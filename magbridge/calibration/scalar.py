@@ -148,7 +148,7 @@ class ScalarSeries(NamedTuple):
     vector: FloatArray
     """(n, 3), nT, field of the vector sensor, corrected where it is calibrated."""
     reference: FloatArray
-    """(n,), nT, what the field is known to be (main field, map); NaN where unknown."""
+    """(n,), nT, reference field (main field, map); NaN where unknown."""
     channels: FloatArray
     """(n, k), telemetry, in the channels' order."""
     power_cycle: FloatArray
@@ -252,7 +252,7 @@ def _level(
 
 
 class Witness(NamedTuple):
-    """What the comparison of a scalar and a vector sensor adds, n samples."""
+    """Variances and flags that the comparison of a scalar and a vector sensor adds, n samples."""
 
     scalar_variance: FloatArray
     """(n,), nT^2, to add to the scalar's variance."""

@@ -291,7 +291,7 @@ def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[x
 
 
 def _total(base: xr.Dataset) -> FloatArray:
-    """Return the total field (n,), nT, that a base station measured."""
+    """Return the total field (n,), nT, of a base station's log."""
     for name in ("total_field", "reference_field"):
         if name in base:
             return np.asarray(base[name].to_numpy(), float)

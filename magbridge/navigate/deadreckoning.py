@@ -10,7 +10,7 @@ from magbridge.field.geodesy import offset, separation
 __all__ = ["GLIDE", "DeadReckoning", "MotionNoise", "Step"]
 
 GLIDE = 8.0
-"""Smallest pitch of a glide, deg; a flatter glider turns between dive and climb."""
+"""Smallest pitch of a gliding vehicle, deg; below it the glider turns between dive and climb."""
 DEPTH_BASE = 10.0
 """Time over which the rate of depth is computed, s."""
 MAX_WATER_SPEED_M_S = 3.0

@@ -1,4 +1,4 @@
-"""The estimate: one hypothesis or as many as are needed, and whether to trust it."""
+"""Estimate of the position: one hypothesis or several, and the tests of whether it can be used."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ class Estimate:
         if self._filter is not None:
             self.x, self.P = self._filter.moments()
 
-    # ---- one hypothesis or many, and whether to believe them -----------------------------------------
+    # ---- one hypothesis or many, and the tests of the estimate -------------------------------------------
 
     def _estimator(self, x: FloatArray, P: FloatArray) -> Bank:
         """Return one filter if the position is narrow enough for it, else many."""

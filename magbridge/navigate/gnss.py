@@ -36,13 +36,14 @@ from magbridge.navigate.options import NavigationOptions, any_level
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
 MAX_DEVIATION_SIGMA = 4.5
-"""Deviation from a prediction on which a position is rejected: by chance in 4e-5, two degrees of freedom."""
+"""Deviation from a prediction, in sigmas, beyond which a position is rejected; by chance 4e-5 of right ones
+are, two degrees of freedom."""
 MIN_SIGMA_M = 1.5
 """Smallest sigma of a receiver that is used, m: its error changes slowly."""
 MAX_RETURN_SIGMA, MAX_HOLD_US = 2.0, 180_000_000
-"""Largest change of positions against dead reckoning, in its errors, with which they are used again, and the
-µs for which that counts. A carry-off goes on while the positions are held back; so does a change of the wind.
-By chance 14 % of the changes are larger, two degrees of freedom."""
+"""Largest change of the positions against dead reckoning, in sigmas of dead reckoning, with which rejected
+positions are used again; and the µs for which this limit holds, because a change of the wind lasts. By chance
+14 % of the changes are larger, two degrees of freedom."""
 WINDOW_US = 30_000_000
 """µs over which the motion by GNSS is compared with dead reckoning."""
 MEAN_TIME_S = 20.0
@@ -100,7 +101,7 @@ class GnssReason(IntEnum):
 
 
 class Prediction(NamedTuple):
-    """What the navigator predicts at the time of a GNSS position, relative to dead reckoning."""
+    """Position that the navigator predicts at the time of a GNSS position, relative to dead reckoning."""
 
     position: FloatArray
     """(2,), m, north and east."""
@@ -135,7 +136,7 @@ class _Position(NamedTuple):
 
 
 class GnssMonitor:
-    """Tests GNSS positions, in order of time; `state` and, where they are not used, the `reason`.
+    """Test GNSS positions, in order of time; `state` and, where they are not used, the `reason`.
 
     `drift` (m) is the mean distance of the positions that were used from the navigator's, over 20 s, and
     `evidence` compares the field with the map at its position.
@@ -464,7 +465,7 @@ class _FieldTest:
         gained = seen.log_likelihood - filter_likelihood
         self.log_odds_of_position = self._limited(self.log_odds_of_position + gained)
 
-    def _predict(self, one: Bank, step: Step, time_us: int) -> None:
+    def _predict(self, bank: Bank, step: Step, time_us: int) -> None:
         """Propagate the filter of H1 to a time: the receiver's error decays, and its position moves."""
         # Interpolated: with a wrong heading dead reckoning leaves the receiver by metres in a second.
         times, north, east = np.array(self._positions).T
@@ -474,9 +475,9 @@ class _FieldTest:
         kept = exp(-step.seconds / CORRELATION_TIME_S)
         F[0, 0] = F[1, 1] = kept
         Q[0, 0] = Q[1, 1] = self._sigma**2 * (1.0 - kept * kept)
-        one.x[:2] -= self._filtered[:, None]
-        one.predict(F, Q)
-        one.x[:2] += position[:, None]
+        bank.x[:2] -= self._filtered[:, None]
+        bank.predict(F, Q)
+        bank.x[:2] += position[:, None]
         self._filtered = position
 
     def _limited(self, log_odds: float) -> float:

@@ -1,6 +1,6 @@
-"""Integrity: whether the filter should still be trusted, by comparison with other explanations of the field.
+"""Integrity: tests of the filter against other explanations of the field.
 
-A filter at the wrong place has innocent innovations, because it has moved to where they are small. The error
+A filter at the wrong place has small innovations, because it has moved to where they are small. The error
 shows only when another explanation predicts the same measurements better. Two are kept in addition to the
 filter:
 *elsewhere*, a bank of hypotheses spread around it; and *nowhere*, a random field as rough as the map but
@@ -38,7 +38,7 @@ MAX_AVERAGING_BLOCKS = 3.0
 
 
 class Verdict(Enum):
-    """Result of the comparison."""
+    """Result of comparing the filter with competing ones."""
 
     OPEN = "not yet decided"
     HOLDS = "the filter holds"

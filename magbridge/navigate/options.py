@@ -121,7 +121,7 @@ def _wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
 
 
 NEGLIGIBLE_FRACTION = 0.1
-"""Fraction of the map error below which what lies between the nodes changes it by less than 1 %."""
+"""Interpolation error over the map error, below which the sum of both is less than 1 % larger."""
 
 
 def at_depth(

@@ -56,7 +56,7 @@ class Posterior:
     """The field given its size and length."""
 
     weight: float
-    """How plausible these are."""
+    """Posterior probability of `size` and the field's length."""
     field: GaussianField
     size: float
     sigma: float
@@ -69,7 +69,7 @@ class Posterior:
     precision: csr_array
     """(nodes, nodes), in units of the noise's."""
     inverse: InverseBlocks
-    """Of it."""
+    """Blocks of the inverse of `precision`."""
     levels: FloatArray
     """(n,), nT, subtracted from each sample: its line's level and the slow part, about their mean."""
     mean: float
@@ -90,7 +90,7 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Gridded:
-    """A gridded survey: ask it for the field at any place."""
+    """A gridded survey; :meth:`evaluate` returns the field and its sigma at any place."""
 
     posteriors: tuple[Posterior, ...]
     """Posterior of the likeliest size and length first, then further ones that the data allow."""
@@ -153,7 +153,7 @@ class Gridded:
         return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
 
     def _beside_samples(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the same from the nearest samples; what levels and calibration do to it is the nodes'."""
+        """Return anomaly and 1-sigma (n,), nT, by kriging; levels and calibration add to the sigma."""
         assert self.kriged is not None
         # Kriging gives field and noise; levels and calibration enter by the coarse nodes.
         mean, variance = self.kriged.evaluate(place)
@@ -187,7 +187,7 @@ class Gridded:
 LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
 """nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
-"""As in a survey that calibrates itself."""
+"""Width of slow changes, nT, and the 1-sigma of its logarithm, as in a survey that calibrates itself."""
 UNOBSERVED_CHANGE_NT = 0.25
 """nT of slow changes where the samples show none. On a track that never crosses itself a slow change is as
 likely as a crustal anomaly: with a free width, slow changes absorbed up to 6 nT of it."""
@@ -331,7 +331,7 @@ def _needed(
 def _searched(
     samples: Samples, sigma: float, *, local: bool, start: Choice | None = None
 ) -> tuple[Choice, Roughness]:
-    """Return the field that a part of the samples, with noise of about `sigma` nT, is select_blocks with."""
+    """Return the field that a part of the samples determines, with noise of about `sigma` nT."""
     # The densest part, thinned to so many samples.
     part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, VARIATION_BOX_M))
     step = max(len(part) // SEARCHED, 1)

@@ -26,19 +26,19 @@ from magbridge.survey.samples import Roughness, Samples
 __all__ = ["Kriged", "kriged"]
 
 NEAREST, GIVEN = 100, 40
-"""Samples that a place is predicted from, and one of those that choose the depth."""
+"""Samples from which a place is predicted, and from which each of :data:`CHOOSING` samples is."""
 AMONG = 400
 """Nearest samples among which are the GIVEN."""
 CHOOSING = 600
-"""Samples that do."""
+"""Samples whose predictions choose the depth of the sources."""
 MAX_SEARCH_STEPS = 50
 """Steps of the maximisation over depth, size and noise."""
 SHARE, SPREAD = 0.1, np.log(5.0)
-"""g as expected, and the 1-sigma of its logarithm."""
+"""Centre of the prior of g, and the 1-sigma of its logarithm."""
 SHARES = np.geomspace(0.02, 5.0, 60)
-"""Those that are tried."""
+"""Values of g that are tried."""
 SAMPLE_SPACING_DEPTHS = 2.0
-"""Depths of the sources between a line's samples that tell its own."""
+"""Distance, in depths of the sources, between the samples of a line that determine its g."""
 VARYING_LOG_RATIO = 5.0
 """Nats from which on the field's size may vary from place to place."""
 KRIGED_PLACES = 256
@@ -47,7 +47,7 @@ KRIGED_PLACES = 256
 
 @dataclass(frozen=True, eq=False)
 class Kriged:
-    """Samples and what their field is like; it holds at the height that was flown around."""
+    """Samples and the covariance of their field, for kriging at the height of the samples."""
 
     place: FloatArray
     value: FloatArray
@@ -101,7 +101,7 @@ class Kriged:
         return np.stack([mean + value, np.maximum(variance + wide - known, 0.0)], axis=1)
 
     def _covariance(self, separation: FloatArray) -> FloatArray:
-        """Return that of places `separation` (..., 2), m, where the roughness is 1: nT²."""
+        """Return the covariance, nT², of places that are `separation` (..., 2), m, apart, for roughness 1."""
         # C(r) = s^2 h^3 / (r^2 + h^2)^(3/2)
         h = 2.0 * self.below
         return np.asarray(self.size**2 * h**3 / ((separation**2).sum(axis=-1) + h * h) ** 1.5)

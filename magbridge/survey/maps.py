@@ -25,7 +25,7 @@ A_LENGTH = 8.0
 MAX_MAP_NODES = 250_000
 """Nodes of a map at most, unless a spacing is asked for."""
 DRAWN_FIELDS = 100
-"""Fields by which the sigma of a continued map is found: to 7 %."""
+"""Number of drawn fields that determine the sigma of a continued map, to 7 %."""
 MAX_SIGMA_FRACTION = 0.95
 """Fraction of the field's size at which the sigma counts as unknown, and the map has a hole."""
 

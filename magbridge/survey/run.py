@@ -41,7 +41,7 @@ DRAWN_TRACKS = 16
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A survey that is done."""
+    """Samples, map and crossovers of a survey."""
 
     samples: Samples
     """Corrected."""

@@ -26,7 +26,7 @@ __all__ = ["Crossovers", "Roughness", "Rows", "Samples", "crossovers"]
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a map is made of."""
+    """Corrected samples of a survey, from which a map is computed."""
 
     place: FloatArray
     """(n, 2), m north and east of `origin`."""
@@ -47,9 +47,9 @@ class Samples:
     rho: float | None = 0.0
     """Autocorrelation of successive samples' noise; None: not known."""
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """(n, r), nT, what 1-sigma of each of the calibration's uncertain combinations does to every sample."""
+    """(n, r), nT, change of every sample by 1-sigma of each uncertain combination of coefficients."""
     level_sigma: float = 0.0
-    """1-sigma of what all samples are off by, the reference's level, nT."""
+    """1-sigma of the error that all samples share, the reference's level, nT."""
 
     def __post_init__(self) -> None:
         n = len(self.value)
@@ -59,7 +59,7 @@ class Samples:
             object.__setattr__(self, "modes", np.empty((n, 0)))
 
     def part(self, rows: BoolArray | IndexArray) -> Samples:
-        """Pick samples: an (n,) mask, or places."""
+        """Return the samples `rows`: an (n,) mask, or indices."""
         arrays: dict[str, Any] = {
             name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
@@ -89,12 +89,12 @@ class Roughness:
 
     @classmethod
     def uniform(cls) -> Roughness:
-        """Return one that is the same everywhere."""
+        """Return a roughness of 1 everywhere."""
         return cls(np.zeros(2), 1.0, np.ones((1, 1)))
 
     @classmethod
     def from_samples(cls, samples: Samples, length: float) -> Roughness:
-        """Return that of a survey whose field has a `length`, m."""
+        """Return the roughness of a survey whose field has the correlation length `length`, m."""
         place = samples.place
         low, extent = place.min(axis=0), np.ptp(place, axis=0)
         # Cells of a fraction of the smoothing length, limited in number.
