@@ -1,6 +1,8 @@
 """The evidence for each candidate, its test, and the causes that a log can show or distinguish.
 
-Notes ----- *Information.* One matrix serves the whole search: the inner products of the whitened columns of
+Notes
+-----
+*Information.* One matrix serves the whole search: the inner products of the whitened columns of
 all candidates.
 
 *Score.* For a candidate with score b and information S, the calibration projected out, ``R = b^T S^-1 b`` is

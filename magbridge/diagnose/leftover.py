@@ -1,6 +1,8 @@
 """The part of a signal that no cause of the table accounts for.
 
-Notes ----- The coefficients of a free description have one common free size (:mod:`.joint`). Descriptions are
+Notes
+-----
+The coefficients of a free description have one common free size (:mod:`.joint`). Descriptions are
 scored under two noises: that of the fit, which may have absorbed an effect, and that which is left when slow
 curves are fitted as well. The best are compared by the whole likelihood, with the noise refitted.
 """

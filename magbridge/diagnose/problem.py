@@ -1,6 +1,8 @@
 r"""The comparison of the measured field with a calibration, as a linear problem.
 
-Notes ----- *Forward model.* With the scalar residual e of :mod:`magbridge.estimation.residual` and its
+Notes
+-----
+*Forward model.* With the scalar residual e of :mod:`magbridge.estimation.residual` and its
 derivative g by the nine coefficients, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves e
 by
 
