@@ -1,16 +1,12 @@
 r"""From findings to a calibration: effects become terms, and all coefficients are refitted.
 
-Notes ----- *Within a cell of their grid* the nonlinear parameters s have the derivatives ``J_s = d(X b)/ds``.
-With M their information, calibration and effects projected out, K the change of all other coefficients for a
-unit of each, and the prior N(0, 1) in units of a cell, the covariance of the other coefficients is
+Notes
+-----
+The nonlinear parameters s of a cause have the derivatives ``J_s = d(X b)/ds``. With M their information,
+calibration and effects projected out, K the change of all other coefficients for a unit of each, and the
+prior N(0, 1) in units of a cell of their grid, the covariance of the other coefficients is
 
 .. math:: C + K (M + 1)^{-1} K^T
-
-*Beyond that cell* there may be other peaks: those of an onset may differ by hours. With d_k the difference of
-all coefficients at another point of the grid, C_k their covariance there, and w_k that point's posterior
-weight, the mixture of all points has the covariance
-
-.. math:: C + \sum_k w_k \left(d_k d_k^T + C_k - C\right)
 """
 
 from __future__ import annotations
@@ -27,15 +23,13 @@ from magbridge.calibration.effects import ClockEffect, RateEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import Candidate, Columns, slices
-from magbridge.diagnose.evidence import IDEAL, Information, information, score
-from magbridge.diagnose.joint import Joint, JointDesign, fit_joint, normal
-from magbridge.diagnose.problem import Problem, derivatives, isotropic, linearised, row_blocks, samples_of
+from magbridge.diagnose.evidence import IDEAL, information
+from magbridge.diagnose.joint import Joint, JointDesign, fit_joint
+from magbridge.diagnose.problem import Problem, derivatives, linearised, row_blocks, samples_of
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.residual import residuals_of, robust_scale
 from magbridge.version import __version__
 
-Placed = tuple[Candidate, slice]
-"""A candidate, and where its columns are."""
 STEP_CELL_FRACTION = 0.05
 """Fraction of a grid cell by which a parameter is moved for its derivative."""
 MAX_STEPS = 12
@@ -53,33 +47,19 @@ def loosened(
     model: Sequence[Candidate],
     columns: Sequence[Columns],
     fit: Joint,
-    grid: Sequence[Candidate] = (),
 ) -> Joint:
-    """Return the fit with the covariance of its coefficients widened for free nonlinear parameters.
-
-    `columns` are those of the model in this problem, and `grid` are all candidates of the search.
-    """
+    """Return the fit with its covariance widened for free nonlinear parameters; `columns` are the model's."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
-    if all(piece.point.rebuild is None for piece in pieces):
+    if not any(piece.point.rebuild and piece.point.cells for piece in pieces):
         return fit
-    more = _own_cell(problem, pieces, columns, fit) + _other_cells(problem, pieces, columns, fit, grid)
-    return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
-
-
-def _own_cell(
-    problem: Problem, pieces: Sequence[Candidate], columns: Sequence[Columns], fit: Joint
-) -> FloatArray:
-    """Return (q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
-    jacobian = [
-        slope
-        for piece, at in zip(pieces, slices(pieces), strict=True)
-        for slope in _jacobian(piece, fit.coefficients[at])
-    ]
-    if not jacobian:
-        return np.zeros_like(fit.covariance)
+    jacobian = []
+    for piece, place in zip(pieces, slices(pieces), strict=True):
+        jacobian += _jacobian(piece, fit.coefficients[place])
+    # C + K (M + 1)^-1 K^T, of the information M with calibration and effects projected out
     info = information(problem, fit.noise, fit, [*jacobian, *columns]).fitted(fit)
     K = info.shift
-    return np.asarray(K @ np.linalg.solve(info.matrix + np.eye(len(jacobian)), K.T))
+    more = K @ np.linalg.solve(info.matrix + np.eye(len(jacobian)), K.T)
+    return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
 
 
 def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
@@ -95,61 +75,6 @@ def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
             return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / STEP_CELL_FRACTION)[:, None]
 
         yield columns
-
-
-def _other_cells(
-    problem: Problem,
-    pieces: Sequence[Candidate],
-    columns: Sequence[Columns],
-    fit: Joint,
-    grid: Sequence[Candidate],
-) -> FloatArray:
-    """Return (q + k, q + k) covariance added by all other cells."""
-    more = np.zeros_like(fit.covariance)
-    points = [
-        [c for c in grid if piece.point.rebuild and (c.group, c.names) == (piece.group, piece.names)]
-        for piece in pieces
-    ]
-    every = [candidate for some in points for candidate in some]
-    if not every:
-        return more
-    info = information(problem, fit.noise, fit, [*(candidate.columns for candidate in every), *columns])
-    places = iter(placed := list(zip([*every, *pieces], slices([*every, *pieces]), strict=True)))
-    for placed_piece, some in zip(placed[len(every) :], points, strict=True):
-        if some:
-            more += _elsewhere(info, fit, placed_piece, [next(places) for _ in some])
-    return more
-
-
-def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequence[Placed]) -> FloatArray:
-    """Return (q + k, q + k) covariance added by the other points of one piece's grid."""
-    piece, own = placed_piece
-    q, first = len(fit.z), len(info.score) - fit.coefficients.size
-    here = slice(own.start - first, own.stop - first)
-    # Release this piece, project the other causes out
-    rest = np.setdiff1d(np.arange(first, len(info.score)), np.r_[own])
-    prior = np.diag(fit.prior[q + rest - first])
-    K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + prior, info.matrix[rest])
-    alone = info.released(fit, own)
-
-    def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
-        """Return evidence, all coefficients and their covariance, each up to a part common to all points."""
-        s = score(alone, place, candidate)
-        # the other causes change with this one, and the calibration with all of them
-        way = np.zeros((len(fit.covariance), candidate.size))
-        way[:q] = info.shift[:, rest] @ K[:, place] - info.shift[:, place]
-        way[q + rest - first] = -K[:, place]
-        way[q + here.start : q + here.stop] = np.eye(candidate.size)
-        spread = np.linalg.inv(alone.matrix[place, place] + np.diag(fit.prior[q:][here]))
-        return s.evidence, way @ s.estimate, way @ spread @ way.T
-
-    evidence, c, C = moments(piece, own)
-    others = [moments(candidate, place) for candidate, place in points]
-    # Posterior weights of the grid's points, then the mixture's second moment
-    logs = np.array([evidence - piece.point.narrow, *(e for e, _, _ in others)])
-    weight = np.exp(logs - logs.max())
-    apart = zip(weight[1:] / weight.sum(), others, strict=True)
-    return np.asarray(sum(w * (np.outer(c_k - c, c_k - c) + C_k - C) for w, (_, c_k, C_k) in apart))
 
 
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
@@ -229,31 +154,6 @@ def without_effects_at(calibration: Calibration, places: Sequence[int]) -> Calib
         coefficients=np.delete(calibration.coefficients, own),
         covariance=np.delete(np.delete(calibration.covariance, own, 0), own, 1),
     )
-
-
-def with_map_error(
-    problem: Problem, model: Sequence[Candidate], fit: Joint, extended: Calibration
-) -> Calibration:
-    r"""Return the extended calibration with a map's error in its covariance.
-
-    Notes
-    -----
-    The logs that the calibration was fitted to have the same map as their reference, so the mean of its error
-    may have gone into the calibration's scale. Half of the error is taken to be uncertain. With s the
-    coefficients that raise the corrected field by 1 nT everywhere, and m the error of the map,
-
-    .. math:: C \leftarrow C + \overline{(m / 2)^2}\, s s^T
-    """
-    if not problem.survey.learned.any():
-        return extended
-    # Mean square of half of the map's error over the log
-    power = 0.0
-    for candidate, own in zip(model, slices(model), strict=True):
-        if candidate.about == "place":
-            b = fit.coefficients[own]
-            power += 0.25 * float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
-    s = isotropic(extended)
-    return replace(extended, covariance=extended.covariance + power * np.outer(s, s))
 
 
 def relinearised(

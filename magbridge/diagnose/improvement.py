@@ -31,11 +31,10 @@ from magbridge.diagnose.extend import (
     flyable,
     loosened,
     relinearised,
-    with_map_error,
     with_misfit,
     without_effects_at,
 )
-from magbridge.diagnose.joint import HeldOut, Joint, fit_joint, held_out, paired
+from magbridge.diagnose.joint import HeldOut, Joint, fit_joint, held_out, normal, paired
 from magbridge.diagnose.problem import DELAYS, Problem, derivatives, floor, isotropic, samples_of
 from magbridge.diagnose.survey import Survey, days_of
 from magbridge.estimation.residual import ResidualSamples, residuals, rms
@@ -104,17 +103,15 @@ def extension_of(
     model: Sequence[Candidate],
     fit: Joint,
     counts: BoolArray,
-    grid: Sequence[Candidate] = (),
 ) -> Extension:
     """Extend the calibration by the causes of a model; without a model, refit its own coefficients.
 
-    `counts` (n,) are the samples by which the improvement is measured. All candidates of the search (`grid`)
-    give the uncertainty of nonlinear parameters. Returned is the first attempt, each with a tighter prior
-    than the one before, that passes all checks; or else the first attempt with its reason for refusal.
+    `counts` (n,) are the samples by which the improvement is measured. Returned is the first attempt, each
+    with a tighter prior than the one before, that passes all checks; or else the first, with its refusal.
     """
     first = None
     for factor in TIGHTENING:
-        tried = attempt(problem, model, fit, counts, grid, factor)
+        tried = attempt(problem, model, fit, counts, factor)
         if not tried.refused:
             return tried
         first = first or tried
@@ -128,7 +125,6 @@ def attempt(
     model: Sequence[Candidate],
     fit: Joint,
     counts: BoolArray,
-    grid: Sequence[Candidate] = (),
     factor: float = 1.0,
 ) -> Extension:
     """Extend the calibration with its prior sigma multiplied by `factor`, and check the result."""
@@ -140,7 +136,7 @@ def attempt(
     # Converge, hold every fold out, then widen the covariance for nonlinear parameters and misfit
     settled, blocks, fit = relinearised(problem, model, fit)
     out = held_out(settled, blocks, fit)
-    fit = with_misfit(model, loosened(settled, model, blocks, fit, grid))
+    fit = with_misfit(model, loosened(settled, model, blocks, fit))
     whole = extend(problem, model, fit)
     calibration, dropped = flyable(problem.survey, whole)
     error, reference_error = _held_out_error(problem, model, fit, out, dropped)
@@ -149,16 +145,18 @@ def attempt(
         day_error, _ = _held_out_error(
             problem, model, fit, held_out(settled, blocks, fit, groups=day), dropped
         )
-    calibration = with_map_error(settled, model, fit, calibration)
-    calibration = with_level_change(problem, calibration)
-    calibration = _covering(problem, calibration, error, [counts, counts & (out.fold == out.fold.max())])
+    # Sigma covers the level, and the held-out error of the whole log and of its last fold
+    variance = map_error_variance(settled, model, fit) + level_change_variance(problem, calibration)
+    calibration = with_level_variance(calibration, variance)
+    last = [counts, counts & (out.fold == out.fold.max())]
+    calibration = with_level_variance(calibration, _excess_variance(problem, calibration, error, last))
     if model and not any(isinstance(effect, TimeEffect) for c in model for effect in c.effects):
-        # Forward chaining: the second half by a fit of the first, as a later log will be corrected
-        # Sigma must cover what a fit of the first half leaves in the second
+        # Forward chaining: sigma also covers what a fit of the first half leaves in the second
         late = np.cumsum(counts) > 0.5 * counts.sum()
         halves = held_out(settled, blocks, fit, groups=late.astype(np.int64))
         forward, _ = _held_out_error(problem, model, fit, halves, dropped)
-        calibration = _covering(problem, calibration, forward, [counts & late])
+        variance = _excess_variance(problem, calibration, forward, [counts & late])
+        calibration = with_level_variance(calibration, variance)
     extension = Extension(
         calibration, settled, tuple(blocks), fit, error, reference_error,
         corrected(problem.survey, calibration).sigma, out.score, day_error,
@@ -295,23 +293,37 @@ def tightened(problem: Problem, factor: float) -> Problem:
     return replace(problem, directions=directions, centre=centre, unseen=unseen)
 
 
-def _covering(
-    problem: Problem, calibration: Calibration, error: FloatArray, parts: Sequence[BoolArray]
-) -> Calibration:
-    r"""Return the calibration with a covariance that covers its held-out error (n,), nT, in some parts.
+def with_level_variance(calibration: Calibration, variance: float) -> Calibration:
+    """Return the calibration with a variance, nT², of its corrected field's level added: ``C + v s s^T``.
 
-    Notes
-    -----
-    The covariance of a fit counts noise alone, not the error of its model. With s the coefficients that raise
-    the corrected field by 1 nT at any attitude,
-
-    .. math:: C \leftarrow C + \max(0, \overline{e^2} - \overline{\sigma^2})\, s s^T
+    s are the coefficients that raise the corrected field by 1 nT at any attitude.
     """
-    sigma, s = corrected(problem.survey, calibration).sigma, isotropic(calibration)
-    excess = max(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any())
-    if excess <= 0.0 or not s.any():
-        return calibration
-    return replace(calibration, covariance=calibration.covariance + excess * np.outer(s, s))
+    s = isotropic(calibration)
+    return replace(calibration, covariance=calibration.covariance + variance * np.outer(s, s))
+
+
+def _excess_variance(
+    problem: Problem, calibration: Calibration, error: FloatArray, parts: Sequence[BoolArray]
+) -> float:
+    """Return the excess of the mean square held-out error (n,), nT, over the stated variance, largest part.
+
+    The covariance of a fit counts noise alone, not the error of its model.
+    """
+    sigma = corrected(problem.survey, calibration).sigma
+    return max(0.0, *(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any()))
+
+
+def map_error_variance(problem: Problem, model: Sequence[Candidate], fit: Joint) -> float:
+    """Return the mean square of half of a map's error, nT², if the calibration's own logs have the same map.
+
+    The mean of the map's error may have gone into the calibration then; half of it is taken to be uncertain.
+    """
+    power = 0.0
+    for candidate, place in zip(model, slices(model), strict=True):
+        if candidate.about == "place" and problem.survey.learned.any():
+            b = fit.coefficients[place]
+            power += 0.25 * float(b @ normal(candidate.columns, problem.residual)[0] @ b) / len(problem)
+    return power
 
 
 def _own_part(given: Calibration, extended: Calibration) -> Calibration:
@@ -320,24 +332,18 @@ def _own_part(given: Calibration, extended: Calibration) -> Calibration:
     return replace(given, coefficients=extended.coefficients[:K], covariance=extended.covariance[:K, :K])
 
 
-def with_level_change(problem: Problem, extended: Calibration) -> Calibration:
-    r"""Return the extended calibration with the changes of the field's level between logs in its covariance.
+def level_change_variance(problem: Problem, extended: Calibration) -> float:
+    """Return the variance, nT², of the difference in level between this log and a later one.
 
-    Notes ----- A reference without the crustal field has another level in each log. Where the calibration's
-    own coefficients move the mean of the corrected field by m, beyond the sigma as given, each log has the
-    variance ``v = m^2 - sigma^2``, and two logs differ by 2 v:
-
-    .. math:: C \leftarrow C + 2 \max(0, m^2 - \overline{\sigma^2})\, s s^T
+    A reference without the crustal field has another level in each log. Where the calibration's own
+    coefficients move the mean of the corrected field by m, beyond the sigma as given, each log has the
+    variance ``m^2 - sigma^2``, and the difference of two logs twice that.
     """
     fresh = ~problem.survey.learned
-    given, moved = (
-        corrected(problem.survey, one)
-        for one in (problem.calibration, _own_part(problem.calibration, extended))
-    )
+    given = corrected(problem.survey, problem.calibration)
+    moved = corrected(problem.survey, _own_part(problem.calibration, extended))
     change = float(np.mean((moved.total - given.total)[fresh]))
-    variance = 2.0 * max(0.0, change**2 - float(np.mean(given.sigma[fresh] ** 2)))
-    s = isotropic(extended)
-    return replace(extended, covariance=extended.covariance + variance * np.outer(s, s))
+    return 2.0 * max(0.0, change**2 - float(np.mean(given.sigma[fresh] ** 2)))
 
 
 def fit_without(

@@ -276,7 +276,7 @@ def _examine(
     refit = extension_of(problem, [], outcome.null, counts)
     refit.problem.let_go()
     progress("extending the calibration")
-    kept, extension, gains = _extended(problem, names, refit, counts, candidates, causes)
+    kept, extension, gains = _extended(problem, names, refit, counts, causes)
     if len(kept.chosen) < len(names.chosen):
         names = kept if kept.chosen else nothing
         rest = leftover(problem, names.model, names.fit, tone)
@@ -352,13 +352,12 @@ def _extended(
     names: SearchOutcome,
     refit: Extension,
     counts: BoolArray,
-    grid: Sequence[Candidate],
     causes: Mapping[str, Cause],
 ) -> tuple[SearchOutcome, Extension, dict[int, Improvement]]:
     """Extend the calibration by the names that the held-out dives support, with each family's improvement."""
     while names.chosen:
         # Extend by all names, then measure each family against an extension by the others
-        extension = extension_of(problem, names.model, names.fit, counts, grid)
+        extension = extension_of(problem, names.model, names.fit, counts)
         extension.problem.let_go()
         if extension.score < refit.score - ODDS:  # the held-out dives contradict these names 20:1
             break

@@ -15,7 +15,8 @@ from magbridge.diagnose.assessment import level
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.columns import Candidate, absent_before, of_effect
 from magbridge.diagnose.evidence import IDEAL
-from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_map_error, with_misfit
+from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_misfit
+from magbridge.diagnose.improvement import map_error_variance, with_level_variance
 from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.noise import fit_noise
 from magbridge.diagnose.problem import Problem, pose
@@ -162,8 +163,8 @@ def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map() -> No
         for learned in (False, True)
     )
     extended = extend(whole, [chart], found)
-    assert with_map_error(new, [chart], found, extended) is extended
-    spread = with_map_error(seen, [chart], found, extended)
+    assert map_error_variance(new, [chart], found) == 0.0
+    spread = with_level_variance(extended, map_error_variance(seen, [chart], found))
     before, after = (
         correct(c, whole.survey.field, whole.survey.values(c.channels), whole.survey.time).sigma
         for c in (extended, spread)

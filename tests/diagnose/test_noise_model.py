@@ -9,7 +9,7 @@ import pytest
 from posed import candidate, right
 
 from magbridge.diagnose.columns import Candidate, GridPoint
-from magbridge.diagnose.evidence import certainty, log_bayes
+from magbridge.diagnose.evidence import certainty
 from magbridge.diagnose.extend import loosened
 from magbridge.diagnose.joint import Joint, fit_joint, normal
 from magbridge.diagnose.noise import ResidualNoise, autoregressive_order, fit_noise
@@ -174,41 +174,3 @@ def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Probl
     found = loosened(problem, [one], [one.columns], fit).covariance
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(expected)), rtol=0.03)
     assert found[-1, -1] > 1.1 * fit.covariance[-1, -1]
-
-
-def step(onset: float) -> Candidate:
-    """An effect of unknown onset."""
-    x = (np.arange(ROWS) >= onset).astype(float)
-    return candidate("made", x, point=GridPoint({"onset": (onset, "s")}, step, cells=(4.0,)))
-
-
-def test_other_peaks_of_the_likelihood_count_by_their_evidence() -> None:
-    """Against the mixture of fits at every onset: a small one early or a large one late explain the same.
-
-    Beside them is another cause, which gives way to each by as much as it must.
-    """
-    t = np.arange(ROWS)
-    signal = 0.25 * (t >= 60) + 0.5 * (t >= 240)
-    problem = replace(right(ROWS), residual=signal + np.random.default_rng(6).normal(size=ROWS))
-    conditional_on = replace(decay(LAG), cause="other", point=GridPoint())
-    grid = [step(float(onset)) for onset in range(10, ROWS, 10)]
-    fits = [fitted(problem, conditional_on, one) for one in grid]
-    null = fitted(problem, conditional_on).log_likelihood
-    weight = np.exp([log_bayes(2.0 * (one.log_likelihood - null), 1) for one in fits])
-    best = int(np.argmax(weight))
-    fit = fits[best]
-    apart = np.array([np.append(one.z, one.coefficients) for one in fits]) - np.append(
-        fit.z, fit.coefficients
-    )
-    weight /= weight.sum() + weight[best]  # the estimate is a point of the grid as well
-    more = sum(
-        w * (np.outer(d, d) + one.covariance - fit.covariance)
-        for w, d, one in zip(weight, apart, fits, strict=True)
-    )
-    model = [conditional_on, grid[best]]
-    found = loosened(problem, model, [one.columns for one in model], fit, grid).covariance
-    # each of those fits has noise of its own, so that weights differ a little
-    units = np.sqrt(np.outer(np.diag(found), np.diag(found)))
-    np.testing.assert_allclose(found / units, (fit.covariance + more) / units, atol=0.15)
-    assert found[-1, -1] > 1.3 * fit.covariance[-1, -1]
-    np.linalg.cholesky(found)
