@@ -244,22 +244,18 @@ def _bends(candidate: Candidate) -> bool:
     return any(isinstance(effect, ResponseEffect) and effect.power for effect in candidate.effects)
 
 
-def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
-    """List the descriptions of structure of any kind in a survey.
-
-    Passages and packets are those in the residual of a `fit` without any cause; `tone` is the strongest,
-    where tones are not among the causes.
-    """
+def descriptions(problem: Problem, fit: Joint) -> list[Description]:
+    """List the descriptions of any structure, with passages and packets in the residual of a `fit`."""
     return [
-        *_in_time(problem, fit, tone),
+        *_in_time(problem, fit),
         *_of_reading(problem),
         *_of_channels(problem),
         *_of_attitude(problem),
     ]
 
 
-def _in_time(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Description]:
-    """Return slow curves, a constant, passages, what each dive repeats, oscillations that end, a tone."""
+def _in_time(problem: Problem, fit: Joint) -> list[Description]:
+    """Return slow curves, a constant, passages, what each dive repeats, oscillations that end."""
     time, dive, field = problem.survey.time, problem.survey.dive, problem.reference_jacobian
     constant = field * ~problem.survey.learned
     turn = np.exp(1j * np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1.0))
@@ -285,9 +281,6 @@ def _in_time(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Descr
     if rings is not None:
         count, period = rings.look_elsewhere, rings.period
         listed.append(_described(rings.columns, "tone", look_elsewhere=count, period=period))
-    if tone is not None:
-        count, period = tone.look_elsewhere, tone.point.shape["period"][0]
-        listed.append(_described(tone.columns, "tone", 1.0, look_elsewhere=count, period=period))
     return listed
 
 

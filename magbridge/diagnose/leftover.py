@@ -160,18 +160,16 @@ def leftover(
     problem: Problem,
     model: Sequence[Candidate],
     fit: Joint,
-    tone: Candidate | None = None,
     *,
     but: Sequence[Candidate] = (),
     also: Sequence[Description] = (),
 ) -> Leftover | None:
     """Return the best significant description of what the fit of `model` leaves, or None.
 
-    A description that only repeats the regressors of the causes in `but` is not tried; those in `also` are,
-    and the strongest `tone`, where tones are not among the causes.
+    A description that only repeats the regressors of the causes in `but` is not tried; those in `also` are.
     """
     # Descriptions that only repeat an excluded cause's own regressors are no alternatives
-    listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
+    listed = [one for one in (*descriptions(problem, fit), *also) if not one.covers(but)]
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]

@@ -17,7 +17,6 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import in_seconds
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
-from magbridge.diagnose.causes.instrument import InterferenceTone
 from magbridge.diagnose.columns import Candidate, Group, absent_before, slices
 from magbridge.diagnose.diagnosis import MIN_RMS_REDUCTION, Diagnosis, Finding, counted, small, verdict_of
 from magbridge.diagnose.evidence import (
@@ -62,7 +61,7 @@ MIN_SLOW_FRACTION = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
 
 
-def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
+def accept(problem: Problem, outcome: SearchOutcome) -> tuple[bool, Leftover | None]:
     """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
 
     Names and free descriptions pay for the number of alternatives they were chosen from. Names are asserted
@@ -73,7 +72,7 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
     # Names: their likelihood ratio with all prices
     varied = [varying(problem, candidate, outcome.look_elsewhere) for candidate in model]
     uneven = [description for description in varied if description is not None]
-    rest = residual = leftover(problem, model, outcome.fit, tone, also=uneven)
+    rest = residual = leftover(problem, model, outcome.fit, also=uneven)
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
@@ -88,7 +87,7 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
     # a description that contains the names' own regressors and nothing else is not an alternative
     alone = rest is None or _same(outcome.chosen, rest)
     but = model if alone else ()
-    free = leftover(problem, [], outcome.null, tone, but=but, also=uneven)
+    free = leftover(problem, [], outcome.null, but=but, also=uneven)
     if not alone:
         names -= ODDS
     if free is None:
@@ -102,7 +101,7 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
 
 
 def settle(
-    problem: Problem, candidates: Sequence[Candidate], causes: int, tone: Candidate | None
+    problem: Problem, candidates: Sequence[Candidate], causes: int
 ) -> tuple[SearchOutcome, bool, Leftover | None]:
     """Search, and return the selected outcome with the result of :func:`accept`.
 
@@ -111,15 +110,15 @@ def settle(
     """
 
     def rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> float | None:
-        free = leftover(problem, model, fit, tone, but=[further])
+        free = leftover(problem, model, fit, but=[further])
         return None if free is None else _foretold(problem, model, fit, free)
 
     plain = search(problem, candidates, causes, rival)
-    asserted, rest = accept(problem, plain, tone)
+    asserted, rest = accept(problem, plain)
     if not asserted or plain.switches:
         return plain, asserted, rest
     outcome = beside_slow_noise(plain, candidates, causes, rival)
-    return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome, tone))
+    return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome))
 
 
 def _foretold(problem: Problem, model: Sequence[Candidate], fit: Joint, best: Leftover | None) -> float:
@@ -252,10 +251,7 @@ def _examine(
     progress("preparing causes")
     candidates, untestable = _put_forward(problem, causes)
     progress("searching")
-    # The strongest tone describes the remainder where tones are not among the causes
-    known_tone = any(isinstance(e, TimeEffect) and e.shape == "tone" for c in candidates for e in c.effects)
-    tone = None if known_tone else next(iter(InterferenceTone().candidates(problem)), None)
-    outcome, stand, rest = settle(problem, candidates, len(causes), tone)
+    outcome, stand, rest = settle(problem, candidates, len(causes))
     # The search is over: for a month its arrays would fill hundreds of megabytes during the extension
     rest = rest and rest._replace(fitted=())
     for one in (problem, outcome.problem):
@@ -279,7 +275,7 @@ def _examine(
     kept, extension, gains = _extended(problem, names, refit, counts, causes)
     if len(kept.chosen) < len(names.chosen):
         names = kept if kept.chosen else nothing
-        rest = leftover(problem, names.model, names.fit, tone)
+        rest = leftover(problem, names.model, names.fit)
     named, model = names.chosen, names.model
     progress("measuring the improvement")
     fit = extension.fit if model else outcome.null

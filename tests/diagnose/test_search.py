@@ -142,7 +142,7 @@ def test_a_name_is_asserted_possible_or_ruled_out() -> None:
     outcome = search(problem, [name], 1)
     output = []
     for price in np.arange(4.0, 9.0) * bayes_factor_threshold(outcome.chosen[0].ratio):
-        stands, rest = accept(problem, replace(outcome, look_elsewhere={"a": float(np.exp(price))}), None)
+        stands, rest = accept(problem, replace(outcome, look_elsewhere={"a": float(np.exp(price))}))
         output.append(
             "asserted" if stands else "possible" if rest is not None and rest.within else "ruled out"
         )
@@ -160,7 +160,7 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
         alike = candidate(
             "a", bent + share * bent.std() * rng.normal(size=ROWS), point=GridPoint(likelier=300.0)
         )
-        assert accept(problem, search(problem, [alike], 1), None)[0] == named
+        assert accept(problem, search(problem, [alike], 1))[0] == named
 
 
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])
@@ -174,7 +174,7 @@ def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float
     name = candidate("a", drawn, channel="amps")
     outcome = search(problem, [name], 1)
     assert [h.candidate for h in outcome.chosen] == [name]
-    assert accept(problem, outcome, None)[0] == named
+    assert accept(problem, outcome)[0] == named
 
 
 def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem) -> None:
