@@ -52,7 +52,7 @@ def loosened(
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if not any(piece.point.rebuild and piece.point.cells for piece in pieces):
         return fit
-    jacobian = []
+    jacobian: list[Columns] = []
     for piece, place in zip(pieces, slices(pieces), strict=True):
         jacobian += _jacobian(piece, fit.coefficients[place])
     # C + K (M + 1)^-1 K^T, of the information M with calibration and effects projected out
