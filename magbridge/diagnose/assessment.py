@@ -82,10 +82,9 @@ class Budget(NamedTuple):
 
 
 def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration) -> Level | None:
-    """Return by how much the corrected field is shifted as a whole, if the reference may be wrong.
+    """Return the shift of the whole corrected field if an error of the reference is among the causes.
 
-    That is, if an error of it is among the `possible` causes: a constant may belong to either then. None
-    where shift and sigma are below the noise.
+    None where shift and sigma are below the noise.
     """
     if not any(candidate.about != "vehicle" for candidate in possible):
         return None
@@ -116,9 +115,9 @@ def delays(problem: Problem, fit: Joint) -> Delays | None:
 
 
 def motion(problem: Problem, finding: Finding) -> dict[str, float] | None:
-    """Return the fraction of a cause's power next to moving masses, that of such samples, the interval, s.
+    """Return the fractions of a cause's power and of the samples next to moving masses, and the interval, s.
 
-    An unseen motion between rows acts there alone; None where the cause acts elsewhere as well.
+    None where the cause acts elsewhere as well.
     """
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
@@ -132,11 +131,7 @@ def motion(problem: Problem, finding: Finding) -> dict[str, float] | None:
 
 
 def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | None:
-    """Return the delay that a clock offset puts on the telemetry, with the field that it corrects.
-
-    The corrector runs with the calibration as given and with each parameter interpolated to the later time.
-    None for other causes.
-    """
+    """Return the telemetry delay of a clock offset, with the corrector's errors; None for other causes."""
     candidate = finding.candidate
     row = diagnosis.causes.get(candidate.cause)
     if row is None or not row.delays_telemetry:

@@ -50,8 +50,7 @@ class Finding:
     covariance: FloatArray
     """(k, k)."""
     over_random_walk: float = np.inf
-    """Log odds over a sensor whose offsets wander (:mod:`.run`); infinite for a cause that
-    is not slow."""
+    """Log odds over a sensor whose offsets wander (:mod:`.run`); infinite for a cause that is not slow."""
     further: tuple[Candidate, ...] = ()
     """Further causes of the same family that the fit contains: alternatives, not findings of their own."""
 
@@ -103,9 +102,9 @@ class Diagnosis:
     fit: Joint
     """At the extended calibration."""
     before: FloatArray
+    """Corrected field less reference (n,), nT, with the calibration as given."""
     after: FloatArray
-    """`before`, `after` (n,): corrected field less reference, nT, with the calibration as given, and held out
-    with the extended one, the named errors of the reference subtracted."""
+    """The same, held out, with the extended one, the named errors of the reference subtracted."""
     total: Improvement
     """Improvement by all findings together, with the named errors of the reference subtracted."""
     improvement: Improvement

@@ -29,22 +29,11 @@ ERROR = 20.0
 
 
 class MapError(Cause):
-    r"""The anomaly map is wrong: it holds at another height than the vehicle's, or is drawn wrong.
+    """The anomaly map is wrong: it holds at another height than the vehicle's, or is drawn wrong.
 
-    *Another height* (least-squares collocation). Rock below has the field T. The map gives it at an altitude
-    a, the vehicle meets it at a depth z:
-
-    .. math:: e(x, z) = T(x, z) - T(x, -a)
-
-    The error is the same on every pass at one depth. Sources at a depth d give T the covariance (Moritz 1980,
-    the reciprocal distance)
-
-    .. math:: C(z, z') = (s^2 + r^2)^{-1/2}, \quad s = 2 d - z - z'
-
-    between places at a distance r, and e the covariance ``C(z, z') - C(z, -a) - C(-a, z') + C(-a, -a)``.
-
-    *Drawn wrong*: a smooth function of the position that is the same at every depth (Matern 3/2). A constant
-    is another cause.
+    *Another height*: the map gives the field T at an altitude a, the vehicle meets it at a depth z, and the
+    error is ``T(x, z) - T(x, -a)`` (:func:`_lacking`). *Drawn wrong*: a smooth function of the horizontal
+    position (Matern 3/2).
     """
 
     name = "map_error"
@@ -135,7 +124,11 @@ def _interpolated(weights: csr_array, values: FloatArray, rows: slice) -> FloatA
 
 
 def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
-    """Return the covariance (n, m), at places (n, 3), (m, 3), of a map's missing field of depth d."""
+    """Return the covariance (n, m), at places (n, 3), (m, 3), of a map's error by sources at a depth d.
+
+    Between places at a distance r the field has ``C(z, z') = (s^2 + r^2)^(-1/2)``, ``s = 2 d - z - z'``
+    (Moritz 1980, the reciprocal distance).
+    """
     r2 = cdist(a[:, :2], b[:, :2], "sqeuclidean")
 
     def reciprocal(upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:

@@ -23,7 +23,7 @@ MIN_FONT_PT = 9.0
 CURVE_POINTS = 4000
 """Points drawn per curve; more only make the page heavy."""
 PALETTE_SIZE = 256
-"""Colours of a plot: as many as fit a byte for each pixel, which needs two fifths of the memory."""
+"""Colours of a plot: a byte for each pixel."""
 DOT_STYLE: dict[str, Any] = {
     "marker": "s",
     "markersize": 1.6,
@@ -31,7 +31,7 @@ DOT_STYLE: dict[str, Any] = {
     "alpha": 0.5,
     "ls": "none",
 }
-"""Samples as squares of whole pixels: round dots look the same, but their edges double the picture."""
+"""Samples as squares of whole pixels: the edges of round dots double the size of the picture."""
 LINE_GAP_STEPS = 20.0
 """Median steps between two points beyond which no line joins them."""
 STRETCHES = 150
@@ -110,10 +110,7 @@ def ends(*values: FloatArray, margin: float) -> tuple[float, float]:
 
 
 def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
-    """Return the two residuals (n,) to compare, each with its colour.
-
-    Without findings, the second is that of the refitted calibration.
-    """
+    """Return the two residuals (n,) to compare, each with its colour."""
     if not diagnosis.findings:
         return {
             "as calibrated": (diagnosis.before, BEFORE),
@@ -169,17 +166,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
 
 
 def spectrum(diagnosis: Diagnosis) -> str:
-    r"""Draw the spectral density of the difference, before and after, with the noise model's.
-
-    Notes
-    -----
-    Autoregressive noise of coefficients a and innovations of variance sigma^2 has at the interval D the
-    one-sided power density (Box & Jenkins 1976, ch. 3)
-
-    .. math:: S(f) = 2 D \sigma^2 \, |1 - \sum_k a_k e^{-2 \pi i f k D}|^{-2}
-
-    Student's t with nu degrees of freedom and a scale s has the variance ``s^2 nu / (nu - 2)``.
-    """
+    """Draw the spectral density of the difference, before and after, with the noise model's."""
     survey = diagnosis.problem.survey
     interval = float(np.median(np.diff(survey.time)))
     figure, axes = canvas(5.8, 4.0)
@@ -194,6 +181,8 @@ def spectrum(diagnosis: Diagnosis) -> str:
     noise = diagnosis.fit.noise
     f = np.geomspace(1.0 / float(np.ptp(survey.time)), 0.5 / interval, 200)
     lags = np.exp(-2j * np.pi * f[:, None] * interval * np.arange(1, len(noise.ar) + 1))
+    # S(f) = 2 D sigma^2 / |1 - sum_k a_k e^(-2 pi i f k D)|^2 at the interval D (Box & Jenkins 1976, ch. 3);
+    # Student's t of scale s and nu degrees of freedom has the variance s^2 nu / (nu - 2)
     sigma = float(np.median(noise.scale)) * (np.sqrt(noise.nu / (noise.nu - 2.0)) if noise.nu < 1e5 else 1.0)
     model = sigma * np.sqrt(2.0 * interval) / np.abs(1.0 - lags @ noise.ar)
     axis.loglog(f, model, "--", color=INK, linewidth=1.2, label="noise model")

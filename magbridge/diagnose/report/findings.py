@@ -106,12 +106,9 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
 
 
 def _rms(finding: Finding, samples: int) -> dict[str, Any]:
-    """Return RMS over the log of ``X b``, nT, and its sigma.
-
-    ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``.
-    """
+    """Return the RMS ``f = sqrt(b^T M b)`` over the log of ``X b``, nT, and its sigma."""
     b = finding.coefficients
-    # M = X^T X / n, summed in pieces
+    # M = X^T X / n, summed in pieces; df/db = M b / f
     M = normal(finding.candidate.columns, np.zeros(samples))[0] / samples
     f = float(np.sqrt(b @ M @ b))
     slope = M @ b / max(f, 1e-12)
@@ -214,10 +211,7 @@ def _corrected(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _round(value: Any) -> Any:
-    """Return plain data with its numbers rounded to five digits; values without a sigma keep theirs.
-
-    An onset, in seconds since 1970, is such a value.
-    """
+    """Return plain data with its numbers rounded to five digits, except values without a sigma (an onset)."""
     if isinstance(value, dict):
         exact = value.get("sigma", 0.0) is None
         return value if exact else {name: _round(x) for name, x in value.items()}

@@ -1,8 +1,4 @@
-"""``report.html``: the values that its template shows. Also writes the files of a diagnosis.
-
-The template, ``report.html`` in this folder, has the verdict on the first screen and the details folded
-below.
-"""
+"""``report.html``: the values that its template in this folder shows; and the files of a diagnosis."""
 
 from __future__ import annotations
 
@@ -167,10 +163,7 @@ def _visible(result: DiagnosisResult) -> dict[str, Any]:
 
 
 def write(result: DiagnosisResult, out_dir: str | os.PathLike[str], remarks: Sequence[str] = ()) -> None:
-    """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none.
-
-    WriteError: one of them cannot be written; the previous files are unchanged.
-    """
+    """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none (WriteError)."""
     contents = {
         "calibration.json": encode_calibration(result.diagnosis.calibration),
         "findings.json": findings_json(result, remarks),
