@@ -89,7 +89,7 @@ def direction(rng: Generator) -> Array:
 
 
 def relays(x: Array, centres: Array, widths: Array) -> Array:
-    """Mean state of relays along a history x (n,) (Preisach 1935), less that without hysteresis."""
+    """Return the mean state (n,) of relays along a history x (n,) less that without hysteresis (Preisach)."""
     total = np.zeros(len(x))
     for c, w in zip(centres, widths, strict=True):
         up, down = x >= c + w / 2, x <= c - w / 2
@@ -151,20 +151,20 @@ def _warmer(scene: Scene, rng: Generator) -> Array:
 
 
 def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
-    """An offset that follows the core's temperature; size in nT/degC."""
+    """Add an offset that follows the temperature of the core; the size is in nT/degC."""
     warmer, vector = _warmer(scene, rng), size * direction(rng)
     scene.add(warmer, vector)
     scene.record_truth(vector)
 
 
 def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
-    """Copper in the coils: gains follow the core's temperature; size in 1/degC, times 5e4."""
+    """Let the gains follow the temperature of the coils' copper; the size is 5e4 times that in 1/degC."""
     gains = 1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * _warmer(scene, rng)[:, None]
     scene.field = scene.field * gains
 
 
 def jump(scene: Scene, size: float, rng: Generator) -> None:
-    """A shock: the offset jumps and relaxes within a minute; amplitude in nT."""
+    """Shift the offset by a shock and relax it within a minute; the size is the amplitude in nT."""
     t0 = rng.uniform(0.15, 0.85) * scene.t[-1]
     settled = np.where(scene.t > t0, 1.0 - 0.15 * np.exp(-np.maximum(scene.t - t0, 0.0) / 20.0), 0.0)
     vector = size * direction(rng)
@@ -173,14 +173,14 @@ def jump(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def creep(scene: Scene, size: float, rng: Generator) -> None:
-    """Stress relaxes logarithmically (magnetic viscosity: Street & Woolley 1949); size in nT over the log."""
+    """Relax the offset logarithmically (Street & Woolley 1949); the size is in nT over the log."""
     tau = rng.uniform(0.3, 1.5) * scene.t[-1]
     crept = np.log1p(scene.t / tau) / np.log1p(scene.t[-1] / tau)
     scene.add(crept, size * direction(rng))
 
 
 def multiplexed(scene: Scene, size: float, rng: Generator) -> None:
-    """The converter samples the channels in turn, and the log does not say so; size in s between channels."""
+    """Sample the channels in turn without logging it; the size is the time between channels in s."""
     order = rng.choice([-1.0, 1.0])
     delays = (0.0, size, 2 * size) if order > 0 else (2 * size, size, 0.0)
     scene.instrument = msgspec.structs.replace(scene.instrument, channel_delay=delays)
@@ -188,19 +188,19 @@ def multiplexed(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def anti_alias(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (a filter has no direction)
-    """A slow RC filter before the converter; size is its time constant in s."""
+    """Put a slow RC filter before the converter; the size is its time constant in s."""
     scene.instrument = msgspec.structs.replace(scene.instrument, corner=1.0 / (2 * np.pi * max(size, 1e-6)))
     scene.truth["delay"] = size
 
 
 def late_stamps(scene: Scene, size: float, rng: Generator) -> None:
-    """The telemetry's clock is behind, or ahead; size in s."""
+    """Set the telemetry's clock back or forward; the size is in s."""
     scene.late = size * float(rng.choice([-1.0, 1.0]))
     scene.truth["delay"] = scene.late
 
 
 def core(scene: Scene, size: float, rng: Generator) -> None:
-    """The feedback's gain is finite, so the core's nonlinearity shows; size in nT at 50,000 nT."""
+    """Add the nonlinearity of a core whose feedback has a finite gain; the size is in nT at 50,000 nT."""
     a, b = rng.normal(0, 1, 3), rng.normal(0, 1, 3)
     scene.bend.append(
         lambda H: H - size * (a * (H / 5e4) ** 2 + b * np.tan(np.clip(H / 5e4, -1.2, 1.2)) / 1.5574)
@@ -208,7 +208,7 @@ def core(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def rail(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (the rail is where it is)
-    """An amplifier compresses softly towards its rail; size in nT lost at the largest reading."""
+    """Compress the readings softly towards a rail; the size is the loss at the largest reading in nT."""
 
     def bend(H: Array) -> Array:
         axis = int(np.argmax(np.abs(H).max(axis=0)))
@@ -223,7 +223,7 @@ def rail(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (t
 
 
 def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
-    """A bus flips bits now and then: a dozen samples are off by `size` nT, or two or four times that."""
+    """Flip bits of a dozen samples, which are then wrong by `size` nT, or two or four times that."""
 
     def bend(H: Array) -> Array:
         rows = rng.choice(len(H) // 4, 12, replace=False) * 4
@@ -240,7 +240,7 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
-    """Sq's four harmonics and the tide of the ocean, mostly along the field; size in nT."""
+    """Add the four harmonics of Sq and the ocean's tide, mostly along the field; the size is in nT."""
     hours = scene.t / 3600.0
     total = sum(
         amplitude * np.cos(2 * np.pi * hours / period + rng.uniform(0, 2 * np.pi))
@@ -250,7 +250,7 @@ def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def bad_map(scene: Scene, size: float, rng: Generator) -> None:
-    """The map lacks some bodies: bumps a kilometre or so across; size in nT."""
+    """Leave bodies out of the map, which make bumps of about a kilometre; the size is in nT."""
     seen = scene.track.pose_at(scene.when)
     north, east = scene.track.local(seen["latitude"], seen["longitude"])
     width = 0.35 * max(np.ptp(north), np.ptp(east))
@@ -263,14 +263,14 @@ def bad_map(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
-    """The main-field model is off at this site, by slightly different amounts along the way; size in nT."""
+    """Add an error of the main-field model that varies slightly along the way; the size is in nT."""
     along = scene.when / scene.when[-1] - 0.5
     scene.reference = scene.reference + size * (1.0 + 0.02 * rng.normal() * along)
     scene.truth["bias"] = size
 
 
 def hum(scene: Scene, size: float, rng: Generator) -> None:
-    """A machine's field of a steady frequency, turning in an ellipse, seen by the sampling; size in nT."""
+    """Add the field of a machine with a steady frequency, aliased by the sampling; the size is in nT."""
     f = rng.uniform(0.1, 0.4) * scene.instrument.rate
     phase = 2 * np.pi * f * scene.t + 0.1 * np.sin(scene.t / 3000.0)
     a, b = direction(rng), direction(rng)
@@ -281,7 +281,7 @@ def hum(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def wires(scene: Scene, size: float, rng: Generator) -> None:
-    """A motor's supply loop, four wires by Biot and Savart; size times the field of a loop 30 cm away."""
+    """Add the field of a motor's supply loop at 30 cm, by Biot and Savart; the size multiplies it."""
     name = str(rng.choice(["amps_a", "amps_b"]))
     centre, u = 0.3 * direction(rng), direction(rng)
     v = np.cross(u, direction(rng))
@@ -298,7 +298,7 @@ def wires(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
-    """A magnet on a lever that another actuator turns moves and turns; size in nT at 12 deg."""
+    """Add a magnet on a lever that an actuator moves and turns; the size is in nT at 12 deg."""
     arm, m = np.array([0.08, 0.0, 0.0]), direction(rng)
     place = np.array([-0.5, 0.1, 0.1]) + 0.1 * rng.normal(size=3)
 
@@ -312,14 +312,14 @@ def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def neighbours(scene: Scene, size: float, rng: Generator) -> None:
-    """Two masses that magnetise each other, and a field too curved for a cubic; size in nT."""
+    """Add the field of two masses that magnetise each other, too curved for a cubic; the size is in nT."""
     x, y = (scene.track.parameters[name] / SWING[name] for name in ("battpos", "ballast"))
     curved = (35 * x**4 - 30 * x**2 + 3) / 8 + rng.normal(0, 0.5) * x**3 * y
     scene.add(np.tanh(0.5 * curved), size * direction(rng))
 
 
 def preisach(scene: Scene, size: float, rng: Generator) -> None:
-    """Steel in the battery's path, remagnetised as it moves: relays of many widths; size in nT."""
+    """Add the hysteresis of steel along the battery's path, by relays of many widths; the size is in nT."""
     x = scene.track.parameters["battpos"] / SWING["battpos"]
     # relays() leaves out what depends on the position alone: a calibration has that already
     memory = relays(x, rng.normal(0, 0.35, 80), rng.lognormal(np.log(0.5), 0.4, 80))
@@ -327,7 +327,7 @@ def preisach(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
-    """A conducting ring with inductance; size in s, which multiplies the field's rate of change.
+    """Add the field of a conducting ring with inductance; the size in s multiplies the field's rate.
 
     It lies where its own field at the sensor is perpendicular to its axis n. The field of a dipole along n,
     in the direction p, is ``3 p (p . n) - n``: at the magic angle, ``(p . n)^2 = 1/3``, it has no part
@@ -345,7 +345,7 @@ def ring(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def squeezed(scene: Scene, size: float, rng: Generator) -> None:
-    """Hull and mount under pressure, with a little creep; size in nT at 100 m."""
+    """Add an offset of hull and mount under pressure, with a little creep; the size is in nT at 100 m."""
     depth = scene.track.depth
     strain = depth / 100.0 * (1.0 + 0.03 * depth / 100.0)
     strain = 0.93 * strain + 0.07 * first_order(strain, scene.track.step, 120.0)

@@ -115,7 +115,7 @@ def _state_at(survey: xr.Dataset, begin: float) -> xr.Dataset:
 
 
 def _play(survey: xr.Dataset, config: Path, master: int, router: _Router, stop: Stop) -> None:
-    """Speak as the two devices do, each byte at its time."""
+    """Send what the two devices send, each byte at its time."""
     for event in emulate(survey, load_config(config)):
         if stop.wait(max(0.0, event.time_us * 1e-6 - time.time())):
             return

@@ -143,7 +143,7 @@ def fly(
 
 
 def _depth(sink: FloatArray, deepest: float) -> FloatArray:
-    """(n,) m: it floats at the surface until it sinks, and stays at its greatest depth until it climbs."""
+    """Return the depth (n,), m: not above the surface, and not below the greatest depth."""
     return np.array(
         [*accumulate(sink.tolist(), lambda depth, by: min(max(depth + by, 0.0), deepest), initial=0.0)][1:]
     )

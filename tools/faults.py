@@ -137,13 +137,13 @@ def fault_of(
 
 
 def spikes(values: FloatArray, _: FloatArray) -> FloatArray:
-    """3 % of the samples are 500 nT off."""
+    """Shift 3 % of the samples by 500 nT."""
     hit = np.random.default_rng(5).random(len(values)) < 0.03
     return np.asarray(values + np.where(hit, 500.0, 0.0))
 
 
 def silent(rows: Rows) -> Rows:
-    """Telemetry is silent for 25 of every 60 s."""
+    """Remove the telemetry of 25 of every 60 s."""
     seconds = rows["time"].to_numpy() - float(rows["time"][0])
     return rows.assign(
         {n: ("time", np.where(seconds % 60 < 25, np.nan, rows[n]), rows[n].attrs) for n in MASSES}
@@ -151,13 +151,13 @@ def silent(rows: Rows) -> Rows:
 
 
 def late(rows: Rows) -> Rows:
-    """Telemetry is 2 s late."""
+    """Delay the telemetry by 2 s."""
     time = rows["time"].to_numpy()
     return rows.assign({n: ("time", np.interp(time - 2.0, time, rows[n]), rows[n].attrs) for n in MASSES})
 
 
 def with_motion(rows: Rows) -> Rows:
-    """The offset of x changes by 100 nT in the very moment that a mass and the course change."""
+    """Shift the offset of x by 100 nT at the moment at which a mass moves and the course changes."""
     moves = np.abs(np.diff(rows["battpos"].to_numpy())) > 0.01 * np.ptp(rows["battpos"].to_numpy())
     late = np.arange(len(moves)) > FAULT_AT * len(moves)
     begin = int(np.argmax(moves & late)) + 1
@@ -166,7 +166,7 @@ def with_motion(rows: Rows) -> Rows:
 
 
 def noise(values: FloatArray, _: FloatArray) -> FloatArray:
-    """Twenty times the noise."""
+    """Add noise of twenty times the instrument's."""
     seed = int(abs(values[0]))  # each channel's own
     return np.asarray(values + np.random.default_rng(seed).normal(0.0, 20.0, len(values)))
 

@@ -18,7 +18,7 @@ PAIRS = tuple((i, j) for i in range(3) for j in range(i, 3))
 
 
 def features(vector: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """(n, 18) of Tolles and Lawson, of the measured vector (n, 3)."""
+    """Return the terms (n, 18) of Tolles and Lawson of the measured vector (n, 3)."""
     u = vector / np.linalg.norm(vector, axis=1)[:, None]
     rate = np.gradient(u, time, axis=0) / np.radians(1.0)
     induced = [u[:, i] * u[:, j] for i, j in PAIRS]

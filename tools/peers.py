@@ -32,7 +32,7 @@ MAGFIT_SAMPLES = 250
 
 
 def magfit(data: dict[str, np.ndarray], *, motors: bool = False) -> np.ndarray:
-    """MAVProxy's magfit: offsets, scale, diagonals, off-diagonals by attitude and the Earth's field.
+    """Fit offsets, scale, diagonals and off-diagonals by attitude and the Earth's field with MAVProxy.
 
     `motors`: also its compensation of the battery's current.
     """

@@ -48,7 +48,7 @@ class Log:
 
 
 def rotated(columns: dict[str, FloatArray], field: FloatArray) -> FloatArray:
-    """(n, 3) field (n, 3), north east down, in the body: turned about z, y, x."""
+    """Rotate a field (n, 3) from north, east and down to body axes: about z, y, x."""
     roll, pitch, heading = (np.radians(columns[name]) for name in ("roll", "pitch", "heading"))
     n, e, d = field.T
     x, y = np.cos(heading) * n + np.sin(heading) * e, np.cos(heading) * e - np.sin(heading) * n
@@ -106,7 +106,7 @@ def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
 
 
 def dipole(r: FloatArray, m: FloatArray) -> FloatArray:
-    """(n, 3) nT of moments m (n, 3), A m², seen from r (n, 3), m."""
+    """Return the field (n, 3), nT, of moments m (n, 3), A m², at r (n, 3), m, from them."""
     far = np.linalg.norm(r, axis=1)[:, None]
     return np.asarray(100.0 * (3.0 * r * np.sum(r * m, axis=1)[:, None] / far**5 - m / far**3))
 
@@ -122,7 +122,7 @@ class Glider:
         self.chi = [2e-6, 1e-6]
 
     def reads(self, log: Log) -> FloatArray:
-        """(n, 3) nT, what the sensor reads without noise and without anything hidden."""
+        """Return the readings (n, 3), nT, without noise and without a hidden effect."""
         H = log.body + log.body @ self.soft.T + self.hard
         for at, m, chi, name, scale in zip(
             self.at, self.m, self.chi, ("battpos", "vbd"), (1e-3, 1e-4), strict=True
@@ -168,7 +168,7 @@ def _telegraph(log: Log, rng: np.random.Generator, minutes: float) -> FloatArray
 
 
 def _chart(log: Log, rng: np.random.Generator) -> FloatArray:
-    """Error of the reference: a regional gradient and two bumps, nT."""
+    """Return an error of the reference (n,), nT: a regional gradient and two bumps."""
     north, east = 111_200.0 * (log.columns["latitude"] - 61.0), 53_900.0 * (log.columns["longitude"] - 4.0)
     found = (north * rng.normal() + east * rng.normal()) / np.std(np.hypot(north, east))
     for _ in range(2):

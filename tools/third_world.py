@@ -74,7 +74,7 @@ class Vehicle:
         self.at = np.array([[-0.7, 0.05, 0.08], [-1.0, -0.04, 0.0]])
 
     def reads(self, log: Log, later: float = 0.0) -> FloatArray:
-        """(n, 3) nT; with the masses as they will be `later`, s."""
+        """Return the readings (n, 3), nT, with the masses as they will be `later`, s."""
         H = log.body + log.body @ self.soft.T + self.hard
         time = log.columns["time"]
         for at, pole, bar, name, scale in zip(
@@ -97,7 +97,7 @@ def _along(x: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _bouc_wen(log: Log) -> FloatArray:
-    """Hysteresis of a battery's tray: ``dz = dx - (0.6 |dx| z + 0.4 dx |z|)``, x in units of 6 mm."""
+    """Return the hysteresis ``dz = dx - (0.6 |dx| z + 0.4 dx |z|)`` of a tray, x in units of 6 mm."""
     dx = np.diff(log.columns["battpos"], prepend=log.columns["battpos"][0]) / 6.0
     z = np.zeros(len(dx))
     for k in range(1, len(z)):
@@ -106,20 +106,20 @@ def _bouc_wen(log: Log) -> FloatArray:
 
 
 def _filtered(H: FloatArray) -> FloatArray:
-    """Bessel's filter of second order, 0.02 Hz."""
+    """Filter by Bessel's filter of second order, 0.02 Hz."""
     sections = bessel(2, 0.02, fs=1.0 / STEP, output="sos")
     return np.asarray(sosfilt(sections, H - H[0], axis=0) + H[0])
 
 
 def _shifted(log: Log, H: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Each axis read at a moment of its own."""
+    """Read each axis at a moment of its own."""
     t = log.columns["time"]
     late = zip(rng.uniform(0.0, 2.0, 3), H.T, strict=True)
     return np.stack([np.interp(t - d, t, x) for d, x in late], axis=1)
 
 
 def _soaked(log: Log, seconds: float) -> FloatArray:
-    """One lag: temperature of the electronics."""
+    """Return the temperature of the electronics, which follows the water's with one lag."""
     y = log.columns["sensor_temperature"].copy()
     for k in range(1, len(y)):
         y[k] += (y[k - 1] - y[k]) * np.exp(-STEP / seconds)
@@ -135,7 +135,7 @@ def _hours(log: Log) -> FloatArray:
 
 
 def _pendulum(log: Log) -> FloatArray:
-    """A cable that swings, with a period of 40 s, when the vehicle turns."""
+    """Return the angle of a cable that swings, with a period of 40 s, when the vehicle turns."""
     rate = np.gradient(np.unwrap(np.radians(log.columns["heading"])))
     x, v, found = 0.0, 0.0, np.zeros(len(rate))
     for k, push in enumerate(rate):
@@ -146,14 +146,14 @@ def _pendulum(log: Log) -> FloatArray:
 
 
 def _strokes(log: Log, rng: np.random.Generator) -> FloatArray:
-    """Shocks that magnetise a frame, each forgotten within minutes."""
+    """Return the magnetisation of a frame by shocks, each of which decays within minutes."""
     since = _hours(log)[:, None] - rng.uniform(0.2, 3.6, 7)
     fading = np.exp(-np.maximum(since, 0.0) / 0.05) * (since > 0.0)
     return np.asarray(fading @ rng.normal(size=7))
 
 
 def _escort(log: Log, rng: np.random.Generator) -> FloatArray:
-    """(n, 3) A vessel that circles, its dipole seen from the vehicle."""
+    """Return the field (n, 3) of a vessel that circles, a dipole, in body axes."""
     turn = 2.0 * np.pi * np.cumsum(1.0 + 0.3 * np.sin(_hours(log) * 5.0)) * STEP / 1500.0
     r = np.stack([90.0 * np.cos(turn) + 60.0, 70.0 * np.sin(turn), np.full_like(turn, -60.0)], axis=1)
     m = rng.normal(size=3)
@@ -162,13 +162,13 @@ def _escort(log: Log, rng: np.random.Generator) -> FloatArray:
 
 
 def _heater(log: Log, rng: np.random.Generator) -> FloatArray:
-    """A thermostat's current that is not logged: on while it is cold, for ever longer."""
+    """Return the state of a heater that is not logged: on in 30 % of a cycle that becomes longer."""
     cycle = np.cumsum(1.0 / (300.0 + 400.0 * _hours(log) / HOURS)) * STEP
     return ((cycle + rng.random()) % 1.0 < 0.3).astype(float)
 
 
 def _step(log: Log, rng: np.random.Generator) -> FloatArray:
-    """A shock that half relaxes."""
+    """Return the offset after a shock, which relaxes in part."""
     since = _hours(log) - rng.uniform(0.8, 3.0)
     return (since > 0.0) * (0.6 + 0.4 * np.exp(-np.maximum(since, 0.0) / 0.2))
 
@@ -199,19 +199,19 @@ EVERY = (*OWN, *FOREIGN, "", *FOREIGN)
 
 
 def _colour(n: int) -> FloatArray:
-    """Amplitude of the noise by frequency: 1/f in power, below a tenth of the sampling frequency."""
+    """Return the noise's amplitude by frequency: 1/f in power below a tenth of the sampling frequency."""
     f = np.fft.rfftfreq(n)
     return np.asarray(np.sqrt(1.0 + 0.1 / np.maximum(f, 1.0 / n)))
 
 
 def flicker(rng: np.random.Generator, n: int) -> FloatArray:
-    """(n, 3) nT of noise, 1 nT RMS."""
+    """Return noise (n, 3) of 1 nT RMS."""
     made = np.fft.irfft(np.fft.rfft(rng.normal(size=(n, 3)), axis=0) * _colour(n)[:, None], n, axis=0)
     return np.asarray(made / np.std(made))
 
 
 def loudness(x: FloatArray) -> float:
-    """Signal-to-noise of x (n,), nT, in such noise: its norm when filtered so that the noise is white."""
+    """Return the signal-to-noise of x (n,), nT: its norm after a filter that makes the noise white."""
     n, colour = len(x), _colour(len(x))
     white = np.fft.irfft(np.fft.rfft(x - x.mean()) / colour, n)
     return float(np.linalg.norm(white) * np.sqrt(np.mean(colour**2)))

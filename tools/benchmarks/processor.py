@@ -45,7 +45,7 @@ class Edge:
         yield from self._events
 
     def credit(self, frames: list[bytes]) -> None:
-        """Nobody signs."""
+        """Do nothing: no frame is signed."""
 
     def send(self, number: int, data: bytes) -> None:
         """Keep what goes to the link."""

@@ -93,7 +93,7 @@ class Deployment(NamedTuple):
     chart: AnomalyGrid | None = None
 
     def measure(self, hidden: tuple[HiddenEffect, ...], number: int) -> xr.Dataset:
-        """The log with effects, before its noise and its losses."""
+        """Return the log with effects, before its noise and its losses."""
         ds = disturb(self.twin, hidden, self.track, self.when, number, EFFECTS | FOREIGN)
         return ds if self.chart is None else charted(ds, self.chart)
 
@@ -130,7 +130,7 @@ def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Deployment
 
 
 def drawn(twin: Twin, reference: str) -> AnomalyGrid:
-    """The map of a twin's waters: one of :data:`CHARTS`."""
+    """Return the map of a twin's waters, one of :data:`CHARTS`."""
     chart = twin.anomaly_map()
     if reference == "map at its depth":
         return chart
@@ -202,7 +202,7 @@ def project(X: FloatArray, A: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def size_of(name: str, d: FloatArray, A: FloatArray, covariance: FloatArray) -> float:
-    """Signal-to-noise of a signature d: its norm with the calibration projected out.
+    """Return the signal-to-noise of a signature d: its norm with the calibration projected out.
 
     For outliers, each at an unknown moment of its own, it is that of the largest.
     """
@@ -242,7 +242,7 @@ class Background(NamedTuple):
         return cls(deployment, number, noise, rows, e, whiten(J[rows], noise, rows))
 
     def measure(self, *hidden: HiddenEffect) -> xr.Dataset:
-        """The log with effects, before its noise and its losses."""
+        """Return the log with effects, before its noise and its losses."""
         return self.deployment.measure(hidden, self.number)
 
     def show(self, hidden: HiddenEffect) -> Injected:
@@ -271,7 +271,7 @@ class Background(NamedTuple):
 
 
 def statistics(noise: str) -> tuple[float, float]:
-    """Correlation of neighbouring samples, and 1-sigma (nT), with which theory whitens this noise."""
+    """Return correlation of neighbouring samples and 1-sigma (nT) with which theory whitens this noise."""
     return (MEMORY if noise in ("ar", GLIDER) else 0.0), {"half": 1.5, GLIDER: 8.0}.get(noise, 1.0)
 
 
@@ -299,7 +299,7 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
 
 
 def kept_rows(losses: str, n: int, seed: int) -> Rows:
-    """Rows of a log that are kept; all of its n rows where `losses` is empty."""
+    """Return the rows of a log that are kept; all of its n rows where `losses` is empty."""
     rng = np.random.default_rng([seed, 98])
     there = np.ones(n, bool)
     if losses == "single":
@@ -317,7 +317,7 @@ def kept_rows(losses: str, n: int, seed: int) -> Rows:
 
 
 def whiten(x: FloatArray, noise: str, rows: Rows) -> FloatArray:
-    """Innovations, in units of their 1-sigma under the true noise, of a signal x sampled at `rows` alone.
+    """Return the innovations of a signal x at `rows`, in units of their 1-sigma under the true noise.
 
     Over a step of k rows an AR(1) is one of ``rho^k``. The first row has no past and is left out.
     """

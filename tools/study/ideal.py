@@ -98,7 +98,7 @@ class Draws(NamedTuple):
         return float(np.sqrt(self.S[-1, -1]))
 
     def ratio(self, span: Span, scale: float | FloatArray = 1.0) -> tuple[FloatArray, float]:
-        """Likelihood ratios of a hypothesis, with the truth scaled by `scale`, and its degrees of freedom."""
+        """Return likelihood ratios of a hypothesis, the truth times `scale`, and its degrees of freedom."""
         statistic = Statistic(self.S[span.own, span.own], span.spectra)
         given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
         scores = np.moveaxis(self.noise[span.own] + scale[..., None] * given[:, None], -2, 0)
@@ -117,7 +117,7 @@ class Draws(NamedTuple):
 
 
 def explained(S: FloatArray, span: Span) -> float:
-    """Power of the truth's signature that a hypothesis explains; one of the wrong sign explains nothing."""
+    """Return the power of the true signature that a hypothesis explains; 0 if its sign is wrong."""
     if span.positive and S[span.own, -1].min() < 0.0:
         return 0.0
     return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
@@ -141,7 +141,7 @@ def root_of(S: FloatArray, span: Span) -> FloatArray:
 
 
 def numbers(S: FloatArray, span: Span) -> float:
-    """Number of coefficients that the data determine: of one common size, those not held by the prior."""
+    """Return the number of coefficients that the data determine and not the prior."""
     root = root_of(S, span)
     return float(np.trace(root.T @ S[span.own, span.own] @ root))
 
@@ -149,7 +149,7 @@ def numbers(S: FloatArray, span: Span) -> float:
 def by_cause(
     evidences: Mapping[Span, FloatArray], name: str = "", truth: FloatArray | None = None
 ) -> dict[str, FloatArray]:
-    """Each cause's log evidence, averaged over its grid, for its best channel; the truth pays as much."""
+    """Return the log evidence of each cause, averaged over its grid, for its best channel, truth included."""
     groups: dict[tuple[str, str | None], list[tuple[FloatArray, float]]] = {}
     for span, evidence in evidences.items():
         groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))
