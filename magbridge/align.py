@@ -146,7 +146,7 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
     """Three channels and the telemetry at one time."""
 
     reading: Reading
-    """As the instrument sent it."""
+    """The reading that the instrument sent."""
     reading_us: int
     """Our time at the reading's ``device_time``, µs."""
     time_us: int

@@ -12,7 +12,7 @@ __all__ = ["BoolArray", "FloatArray", "IndexArray", "IntArray", "RealArray", "pl
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 RealArray = NDArray[np.floating[Any]]
-"""Of either precision, as files hold them."""
+"""Array of numbers of either precision, as files hold them."""
 IndexArray = NDArray[np.intp]
 IntArray = NDArray[np.int64]
 

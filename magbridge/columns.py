@@ -32,7 +32,7 @@ class Column(NamedTuple):
 CHANNELS = ("mag_x", "mag_y", "mag_z")
 """The raw, uncorrected channels in sensor axes (x forward, y starboard, z down)."""
 CHANNEL_TIMES = ("mag_time_x", "mag_time_y", "mag_time_z")
-"""When each channel was sampled, where not all were at ``time``."""
+"""Times of the samples of each channel, if not all are at ``time``."""
 FURTHER_AXIS = re.compile(r"mag[1-9]\d*_[xyz]")
 """Name of an axis of a further vector sensor, in nT as those of the first."""
 AGE = "age_"
@@ -83,7 +83,7 @@ COLUMNS: dict[str, Column] = {
     "scalar_quality": Column("1", "flags of a compensated scalar sample"),
 }
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
-"""What ``magbridge correct`` writes in addition to ``time``."""
+"""Columns that ``magbridge correct`` writes in addition to ``time``."""
 
 HEADINGS = ("magnetic_heading", "heading", "heading_sigma", "declination", "declination_sigma")
 """Written by ``magbridge correct`` if the log has roll and pitch, and the calibration a boresight."""
@@ -92,7 +92,7 @@ NT_PER_UNIT = {
     "fT": 1e-6, "pT": 1e-3, "nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9,
     "uG": 1e-1, "mG": 1e2, "G": 1e5,
 }  # fmt: skip
-"""nT in one unit of magnetic flux density."""
+"""Size of each unit of magnetic flux density, nT."""
 
 _FACTORS = {
     **{(unit, "nT"): factor for unit, factor in NT_PER_UNIT.items()},
@@ -133,7 +133,7 @@ _SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
 MAX_NAMES = 60
 """Largest number of columns that a message names."""
 YEAR_1980 = 315_532_800.0
-"""s since 1970: no log of a magnetometer with a computer is older; a clock that was never set is."""
+"""Start of 1980, s since 1970: only a clock that was never set shows an earlier time."""
 
 
 def counts_from_boot(deployment: xr.Dataset) -> bool:

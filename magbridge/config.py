@@ -45,9 +45,9 @@ class Sensor(Table, frozen=True):
     (``i2c:1:0x20``, ``spi:0.0``), or a pattern such as ``/dev/ttyUSB*``: the first device that sends a
     reading within `timeout`. A device that sends NMEA 0183 instead gets no start-up commands."""
     baudrate: Baudrate = 9600
-    """bit/s."""
+    """Baud rate, bit/s."""
     timeout: Positive = 10.0
-    """s without a reading after which the sensor counts as silent."""
+    """Time without a reading after which the sensor counts as silent, s."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     """The driver's own settings."""
     name: Annotated[str, Meta(max_length=16, pattern=r"^\w*$")] = ""
@@ -62,8 +62,8 @@ class Sensor(Table, frozen=True):
     """Scalar sensors only: nT, 1-sigma of the reading where the instrument is mounted. With it the reading
     needs no calibration."""
     filter_delay: NotNegative | None = None
-    """s by which the sensor's own filter delays the reading, in place of ``align.filter_delay``. Default for
-    a scalar sensor: 0, because its calibration includes the lag."""
+    """Delay of the sensor's own filter, s, instead of ``align.filter_delay``. Default for a scalar sensor: 0,
+    because its calibration includes the lag."""
 
     @property
     def label(self) -> str:
@@ -80,7 +80,7 @@ class Link(Table, frozen=True):
     """``[link]``: the MAVLink side."""
 
     url: Name
-    """As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and ``HOST:PORT`` or
+    """MAVLink URL: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and ``HOST:PORT`` or
     ``[IPV6]:PORT``, or a serial device."""
     system: SystemId = 1
     """The vehicle's system id: ours, and the only one we listen to."""
@@ -89,11 +89,11 @@ class Link(Table, frozen=True):
     autopilot: SystemId = 1
     """The autopilot's component id."""
     baudrate: Baudrate = 57600
-    """bit/s, where the link is a serial device."""
+    """Baud rate of a serial link, bit/s."""
     signing_key: Name | None = None
     """File of 32 bytes; packets are signed and unsigned ones refused."""
     max_other_peers_rate: NotNegative = 1000.0
-    """kB/s that all peers but the autopilot's get together, on ``udpin`` and ``tcpin``."""
+    """Largest rate to all peers except the autopilot's together, kB/s, on ``udpin`` and ``tcpin``."""
     request_streams: bool = True
     """Request from the autopilot the messages that the bridge needs, if they arrive too rarely."""
     parameters: Name | None = None
@@ -158,15 +158,15 @@ class Align(Table, frozen=True):
     """``[align]``: one time base for channels and telemetry; each key is also a MAVLink parameter."""
 
     filter_delay: NotNegative = 0.0
-    """s by which the anti-alias filter delays the channels."""
+    """Delay of the channels by the anti-alias filter, s."""
     gap_factor: Annotated[float, Meta(gt=1, le=1e9)] = 2.5
     """A pause longer than this many sample periods is a gap."""
     moving_rate: Positive = 0.005
     """A parameter that changes faster than this fraction of its calibrated range per second is moving."""
     settle_time: NotNegative = 0.0
-    """s after a movement during which samples stay flagged."""
+    """Time after a movement during which samples stay flagged, s."""
     stale_growth: NotNegative = 1.0
-    """nT/s by which the sigma grows with the age of stale telemetry."""
+    """Growth of the sigma with the age of stale telemetry, nT/s."""
     turn_on_sigma: NotNegative = 20.0
     """1-sigma, by which the sensor's offset changes at every power-on, nT."""
     reference_sigma: Positive = 145.0
@@ -180,11 +180,11 @@ class Navigation(Table, frozen=True):
     map: Name
     """The anomaly grid."""
     fix: str = "EXTERNAL_POSITION_ESTIMATE"
-    """In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4, the
+    """Message that sends a fix to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4, the
     default), ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4)."""
     rate: NotNegative | None = None
-    """Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for ``ODOMETRY``, else
-    0."""
+    """Rate of the fixes, Hz, dead-reckoned between updates; 0 is with each update. Default 5 for
+    ``ODOMETRY``, else 0."""
     depth: NotNegative = 0.0
     """Depth of the deepest dives, m; a map whose altitude is known is continued to half this depth."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -199,15 +199,15 @@ class HeadingOutput(Table, frozen=True):
     """Message in which the heading goes to the autopilot as a yaw: ``odometry`` or
     ``vision_position_estimate``; not sent by default."""
     rate: NotNegative = 10.0
-    """Hz of that message; 0 is with every sample. ArduPilot needs 4 Hz at least, PX4 10 Hz."""
+    """Rate of that message, Hz; 0 is with every sample. ArduPilot needs 4 Hz at least, PX4 10 Hz."""
     tilt_sigma: Positive | None = None
     """1-sigma of the autopilot's roll and pitch, deg; by default that of the calibration's runs."""
     nmea: Name | None = None
     """Port for the NMEA 0183 sentences HDG, HDT and PASHR: ``udp:HOST:PORT`` or a serial device."""
     nmea_baudrate: Baudrate = 4800
-    """bit/s, where `nmea` is a serial device."""
+    """Baud rate, bit/s, if `nmea` is a serial device."""
     nmea_rate: Positive = 1.0
-    """Hz of the sentences."""
+    """Rate of the sentences, Hz."""
 
 
 class Learning(Table, frozen=True):
@@ -216,7 +216,7 @@ class Learning(Table, frozen=True):
     enabled: bool = False
     """True to learn from the start; ``MB_LEARN`` changes that over the link."""
     reference: Name = "igrf"
-    """What the corrected field is compared with: ``igrf``, or an anomaly grid's file, above the IGRF."""
+    """Reference of the corrected field: ``igrf``, or the file of an anomaly grid to add to the IGRF."""
     map_sigma: NotNegative = 20.0
     position_sigma: NotNegative = 100.0
     """`map_sigma`, `position_sigma`: 1-sigma of that grid, nT, and of the vehicle's position on it, m."""
@@ -243,9 +243,9 @@ class Log(Table, frozen=True):
     directory: str
     """The folder."""
     max_size: Positive = 64.0
-    """MB of a file."""
+    """Largest size of a file, MB."""
     max_age: Positive = 24.0
-    """h that a file covers."""
+    """Longest time that a file covers, h."""
 
 
 class Config(Table, frozen=True):

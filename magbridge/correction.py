@@ -1,4 +1,4 @@
-"""From readings and telemetry to corrected samples: what the live bridge and ``magbridge correct`` share.
+"""Correct readings with telemetry, for the live bridge and ``magbridge correct`` alike.
 
 Alignment gives the channels and the parameters at the sample's time; the calibration turns them into the
 corrected field. A parameter that is not known exactly (a mass in motion, telemetry that never came) widens
@@ -34,7 +34,7 @@ MOVING = int(Quality.MOVING)
 NOT_MASS_UNITS = frozenset({"A", "mA", "V", "W", "degC", "K", "bar", "dbar", "Pa", "kPa"})
 """Units of parameters that are not the position of a mass: a sample while they change is not `moving`."""
 MAX_AGE = 30.0
-"""s after which telemetry is stale, unless :meth:`magbridge.align.Aligner.tune` has said otherwise."""
+"""Age from which telemetry is stale, s, unless :meth:`magbridge.align.Aligner.tune` sets another."""
 
 
 class Correction:
@@ -112,7 +112,7 @@ class Correction:
         self.aligner.tune(self.aligner.settings, {name: age for name, age in ages.items() if age})
 
     def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
-        """Take a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
+        """Add a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
         self.aligner.telemetry(name, time_us, value, guessed=guessed)
         if name in self._conditions:
             self._hold(name, value)

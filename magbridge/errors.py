@@ -1,7 +1,7 @@
-"""What can go wrong, as one tree.
+"""Define all errors as one tree.
 
-Every error carries values and builds its own one-line sentence from them; each also inherits from
-the built-in that a caller who does not know magbridge would catch::
+Every error carries values and builds its own one-line sentence from them. Each also inherits from the
+built-in error of its kind::
 
     MagbridgeError
     ├── WrongUse                          exit 2: the request itself is wrong

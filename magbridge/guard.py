@@ -33,13 +33,13 @@ __all__ = ["Guarded", "GuardedJob", "guarded"]
 T = TypeVar("T")
 
 SECONDS, PER_MEGABYTE = 8.0, 0.2
-"""s of processor time for a file, and for each MB of it: reading any format takes a tenth of that."""
+"""Processor time for a file, s, and for each MB of it: any format needs a tenth of that."""
 MEMORY, PER_BYTE = 500_000_000, 50
 """Bytes of memory for a file, and for each byte of it: compressed, a log may be thirty times smaller."""
 RESERVED_BYTES = 8_000_000_000
 """Bytes of address space beyond that: dbdreader asks for a GB, and uses little of it."""
 POLL = 0.1
-"""s between two looks at a child's memory."""
+"""Time between two checks of a child's memory, s."""
 TOO_LARGE = "asks for far more memory than its size allows: damaged"
 WAIT = 10.0
 """Wall-clock over processor time after which a child counts as stuck: disks and other processes are slow."""
@@ -74,7 +74,7 @@ class GuardedJob(NamedTuple):
 
 
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
-    """Yield what ``read()`` yields, run in a child process that ends where the file lets it run away.
+    """Yield what ``read()`` yields, run in a child process with limits on time and memory.
 
     The objects must be picklable; the size of the file `path` sets the limits. Without fork (Windows), and
     in a process that may not have children (a worker of a pool), this process reads the file without limits.
@@ -236,7 +236,7 @@ def _limit(seconds: int, memory: int) -> None:
 
 
 def _memory(process: int | str | None = "self") -> tuple[int, int]:
-    """Return the bytes of address space and of memory of a process; 0 where the system does not tell."""
+    """Return the bytes of address space and of memory of a process; 0 if the system does not report it."""
     try:
         size, resident = Path(f"/proc/{process}/statm").read_text().split()[:2]
     except OSError:

@@ -108,8 +108,8 @@ class OneTime:
     def bring(self, field: Vector, delay: Vector, time_us: int) -> tuple[Vector, float]:
         """Return a reading's channels at one time, and how long after `time_us` (µs) that is, s.
 
-        `field` (nT) tells nothing of the readings before and after if one is not a number; `delay` has the s
-        after `time_us` when each was sampled.
+        `field` (nT) does not enter the slopes if a channel is not a number; `delay` is the time from
+        `time_us` to the sample of each channel, s.
         """
         x_late, y_late, z_late = delay
         earliest = min(x_late, y_late, z_late)

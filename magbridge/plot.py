@@ -70,7 +70,7 @@ def residuals(
     Parameters
     ----------
     calibration : Calibration
-        What to correct with.
+        Calibration to correct with.
     data : Observations
         Of any log with a reference: :func:`magbridge.observations`.
     against : str

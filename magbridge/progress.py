@@ -13,13 +13,13 @@ __all__ = ["track", "waiting"]
 
 T = TypeVar("T")
 BAR_DELAY_S = 2.0
-"""s before a bar appears."""
+"""Time before a bar appears, s."""
 BAR_INTERVAL_S = 0.1
-"""s between two updates of the bar: drawing takes longer than most items do."""
+"""Time between two updates of the bar, s: drawing takes longer than most items."""
 
 
 LINE_INTERVAL_S = 10.0
-"""s between two lines if stderr is not a terminal."""
+"""Time between two lines if stderr is not a terminal, s."""
 
 
 def track(items: Iterable[T], task: str, total: int | None = None, *, in_lines: bool = False) -> Iterator[T]:

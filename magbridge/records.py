@@ -16,7 +16,7 @@ __all__ = ["MAX_DEVICE_TIME_S", "MAX_MEASURED_NT", "Channel", "Corrected", "Qual
 Vector = tuple[float, float, float]
 
 MAX_MEASURED_NT: Final = 1e9
-"""nT (1 T): a field or a sigma above it is not a measurement, but garbage that happens to be a number."""
+"""Largest field or sigma that can be a measurement, nT (1 T)."""
 MAX_DEVICE_TIME_S: Final = 1e11
 """Largest time of an instrument, s: one beyond 3,000 years is an error of transmission."""
 
@@ -24,8 +24,7 @@ MAX_DEVICE_TIME_S: Final = 1e11
 class Quality(IntFlag):
     """Why a corrected sample is doubtful; 0 is a sample without a flag.
 
-    The lower-case names are the public ones: in files they stand in the column ``quality``, on the
-    link in ``MAG_FIELD.flags``.
+    The lower-case names are the public ones: of the column ``quality`` and of ``MAG_FIELD.flags``.
     """
 
     STALE_TELEMETRY = 1
@@ -65,7 +64,7 @@ class Quality(IntFlag):
 
 
 class Channel(IntEnum):
-    """Where a record of the log came from; kept in the low two bits of its time stamp (µs)."""
+    """Origin of a record of the log; kept in the low two bits of its time stamp (µs)."""
 
     SENT = 0
     LINK = 1
@@ -83,14 +82,14 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     sequence: int | None = None
     """Frame number, wrapping at the driver's ``SEQUENCE_MODULO``."""
     device_time: float = nan
-    """s on the instrument's clock; NaN where it has none."""
+    """Time on the instrument's clock, s; NaN if it has none."""
     channel_delay: Vector = (0.0, 0.0, 0.0)
-    """s after `device_time` at which each channel was sampled."""
+    """Time from `device_time` to the sample of each channel, s."""
     temperature: float = nan
     supply: float = nan
     """`temperature`, `supply`: degC at the fluxgate and V; NaN where unknown."""
     power_cycle: int | None = None
-    """How often the instrument was powered on."""
+    """Number of times that the instrument was powered on."""
     saturated: bool = False
     """A channel was at the end of its range."""
 

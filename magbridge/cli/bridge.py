@@ -455,7 +455,7 @@ def ports(
 
 @cli.command("drivers [NAME] [OPTIONS]")
 def drivers(name: str | None = None, /, *, json: cli.Json = False) -> None:
-    """List the drivers of sensors, or the options of one, as they stand in [sensor.options] of a bridge.toml.
+    """List the drivers of sensors, or the options of one for [sensor.options] of a bridge.toml.
 
     Parameters
     ----------

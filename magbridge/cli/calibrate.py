@@ -98,7 +98,7 @@ class ModelOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ReferenceOptions:
-    """What the field was, and what headings refer to.
+    """Reference field and heading reference.
 
     Parameters
     ----------
@@ -389,7 +389,7 @@ def _with_scalar(
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
     """Return a log whose reference is its own mean, and the 1-sigma of that mean, nT.
 
-    WrongUse: the log tells the true field.
+    WrongUse: the log has positions or reference_field.
     """
     from magbridge.columns import counts_from_boot
     from magbridge.estimation.priors import GAIN_SIGMA

@@ -1,4 +1,4 @@
-"""What the commands share: the application, common arguments, printing of results."""
+"""Share the application, common options and the printing of results among the commands."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ Day = Annotated[dt.date | None, Parameter(converter=_day)]
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How to read logs.
+    """Options for reading logs.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class ReadingOptions:
         The day (UTC, YYYY-MM-DD) of a log whose times count from the boot: the Earth's field is that day's.
     compass
         Which of several compasses to use: its number, from 0, or its device id. If not given: the one that
-        the log says was in use.
+        the log declares as used.
     sensor_log
         The log of a sensor with its own logger, to be combined with the vehicle's logs; may be repeated. If
         not given: found by its columns.
@@ -287,7 +287,7 @@ def naming(deployment: xr.Dataset) -> Iterator[None]:
 
 
 def warnings_of(calibration: mb.Calibration, file: Path) -> list[str]:
-    """Return a line that says why the data that a calibration was fitted to do not support it, or none."""
+    """Return a line with the reasons why the data do not support a calibration; empty if they do."""
     warnings = "; ".join(calibration.warnings)
     return [f"{file}: the data it was fitted to do not support it: {warnings}"] if warnings else []
 

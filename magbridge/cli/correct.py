@@ -232,7 +232,7 @@ def _keep_learned(learner: Learner, known: mb.Calibration, facts: dict[str, Any]
 def _with_log_columns(
     log: xr.Dataset, corrected: xr.Dataset, known: mb.Calibration, file: Path
 ) -> xr.Dataset:
-    """Return the corrected columns with those of the log that say where and in what state they were taken."""
+    """Return the corrected columns with the log's position, attitude, state and parameters."""
     from magbridge.calibration.file import calibration_id
     from magbridge.logs.deployment import HISTORY_ATTRIBUTE, MEANING, lasting
 
@@ -303,7 +303,7 @@ class Tally:
 
 
 SEAGLIDER_COUNT_NT = 100.0
-"""nT in a count of most of a Seaglider's compasses."""
+"""Field of one count of most compasses of Seagliders, nT."""
 
 
 @cli.command(

@@ -153,7 +153,7 @@ def process(
     workers
         Processes on this machine.
     memory
-        What each of them may use.
+        Memory that each process may use.
     scheduler
         Address of a dask scheduler to use instead, as tcp://host:8786. Its workers see the same folders.
     """

@@ -278,7 +278,7 @@ def map(  # noqa: A001 - the command's name
     altitude
         Altitude in m to which every grid is continued upward; by default that of the highest.
     survey_altitude
-        Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
+        Altitude in m of surveys whose grids do not state it: one for all grids, or repeated, one for each.
     smooth
         Wavelength in km at which half of a wave is left; the removed part counts as the map's sigma. By
         default nothing is smoothed.

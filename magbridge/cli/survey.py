@@ -1,4 +1,4 @@
-"""From a survey's logs to its anomaly map; and plan the next survey or calibration runs."""
+"""Make a survey's anomaly map from its logs, and plan the next survey or calibration runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class CorrectionOptions:
-    """How raw logs are corrected.
+    """Correction of raw logs.
 
     Parameters
     ----------

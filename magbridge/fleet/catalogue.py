@@ -71,7 +71,7 @@ CATALOGUE_TABLES: dict[str, dict[str, pl.DataType]] = {
     "failures": {"job": TEXT, "attempt": COUNT, "vehicle": TEXT, "deployment": TEXT, "line": TEXT},
 }  # fmt: skip
 """Table -> columns and their types, in nT, deg and s since 1970. `calibration` is a whole cal.json,
-`precision` and `vector` what the data alone say of its coefficients (:func:`.packed`); `job` names what a
+`precision` and `vector` the information of the data alone (:func:`.packed`); `job` identifies what a
 result is made of, and its last `attempt` is the one that counts. A catalogue may lack a table that is newer
 than it: it is empty."""
 PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {

@@ -46,7 +46,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.information import GaussianInformation, covariance_of
 
 FLEET_LEVELS = ("vehicle", "refit", "power-up")
-"""What coefficients vary with, from the root down."""
+"""Levels of the tree at which coefficients vary, from the root down."""
 VARIATION_FRACTIONS = (1.0, 0.1, 0.02)
 """Fractions of the physical widths by which they are expected to vary with each, before any fleet is seen."""
 PRIOR_DIFFERENCES = 2.0
@@ -59,14 +59,14 @@ MAX_LOG_CHANGE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """How refits move coefficients together."""
+    """Directions in which refits move coefficients together."""
 
     of: Mapping[str, FloatArray]
     """Vehicle -> D (K, s); a vehicle that is not listed has none."""
     groups: IndexArray
-    """(s,): Number of the group that each column shares its variance with."""
+    """Group with which each column shares its variance, (s,)."""
     rest: FloatArray | float = VARIATION_FRACTIONS[1]
-    """(K,): Expected variation of each coefficient with refits besides D, in physical widths."""
+    """Expected variation of each coefficient with refits besides D, (K,), in physical widths."""
 
     def expected(self, K: int) -> FloatArray:
         """Return the expected variation of coefficients (3, K), as fractions, before any fleet is seen."""
@@ -82,9 +82,9 @@ class Variances(NamedTuple):
     """Variances of the differences between members and their parents."""
 
     own: FloatArray
-    """(3, K): Of each coefficient, at each of :data:`FLEET_LEVELS`."""
+    """Variance of each coefficient at each of :data:`FLEET_LEVELS`, (3, K)."""
     shaped: FloatArray
-    """(s,): Variances of the amplitude of each shape, from refit to refit."""
+    """Variance of the amplitude of each shape from refit to refit, (s,)."""
 
     @classmethod
     def expected(cls, K: int, shapes: Shapes) -> Variances:
@@ -161,7 +161,7 @@ class Population:
     variances: Variances
     """Variances of the differences at each of :data:`.FLEET_LEVELS`."""
     shapes: Shapes
-    """How refits move the coefficients of each vehicle."""
+    """Directions in which refits move the coefficients of each vehicle."""
     total: GaussianInformation
     """Posterior of the fleet's mean, its prior included."""
     each: dict[str, GaussianInformation]

@@ -27,7 +27,7 @@ from magbridge.fleet.hierarchy import NO_SHAPES, Observed, Population, Shapes, V
 
 SHAPE_ITERATIONS = 4
 SHAPE_KINDS = 3
-"""Of shapes of a mass: moment, susceptibility, place; three numbers each."""
+"""Kinds of shapes of a mass: moment, susceptibility and position, with three numbers each."""
 
 
 def shapes_of(
@@ -42,7 +42,7 @@ def shapes_of(
 
     A refit changes the moment of a mass, its susceptibility, and its place. Each moves the coefficients along
     the derivative of the mass's polynomials, here for the usual width of the dipole's number. That by the
-    place needs the moment: so a dipole is first fitted to what the vehicle's deployments say together, N(m,
+    place needs the moment: so a dipole is first fitted to the posterior of the vehicle's deployments, N(m,
     P), ``l = argmin (c(l) - m)^T P^-1 (c(l) - m) + l^T W^-1 l`` with W the dipole's usual widths, linearised
     again in each iteration. `mean` (K,) is m and `covariance` (K, K) P; the others are as in :class:`.Known`.
     """
@@ -131,12 +131,12 @@ class Fleet:
     exponents: tuple[Exponents, ...]
     """The m monomials."""
     basis: FloatArray
-    """(9 m, 9 m), nT; coefficients of z, which is in units of the physical widths."""
+    """Coefficients for each element of z, which is in physical widths, (9 m, 9 m), nT."""
     population: Population
     mounted: Mapping[str, Mapping[str, Mounting]]
     """Vehicle -> where its masses sit."""
     lessons: tuple[Lesson, ...]
-    """In the order of time."""
+    """Deployments in the order of time."""
     observed: tuple[Observed, ...]
     """Information of z."""
 
@@ -260,7 +260,7 @@ class History:
     names: tuple[str, ...]
     """The k quantities: hard iron, and what each mass changes over half its range."""
     lessons: tuple[Lesson, ...]
-    """In the order of time."""
+    """Deployments in the order of time."""
     expected: FloatArray
     expected_sigma: FloatArray
     """`expected`, `expected_sigma`, (n, k), nT, from the earlier value."""
@@ -268,7 +268,7 @@ class History:
     found_sigma: FloatArray
     """`found`, `found_sigma`, (n, k), nT, with its own data."""
     changes: tuple[tuple[Change, ...], ...]
-    """Of each deployment."""
+    """Changes of each deployment."""
 
 
 def history(fleet: Fleet, vehicle: str) -> History:

@@ -21,7 +21,7 @@ from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, Catalo
 
 SCHEMA = sql.Identifier("magbridge_fleet")
 CONNECT_TIMEOUT_S = 10
-"""s until a server that does not answer is given up."""
+"""Longest time to wait for the answer of a server, s."""
 CREATION_LOCK = 0x6D616762
 """Key of the advisory lock under which a process creates the tables."""
 TYPES: dict[pl.DataType, str] = {

@@ -173,7 +173,7 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
 
 
 def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list[Row], list[Row]]:
-    """Return a row for each cause found, or one that says that there is none; and their improvements."""
+    """Return a row for each cause found (one with an empty cause if there is none), and the improvements."""
     found = diagnose([log], calibration, training_logs=[log]).diagnosis
     nothing: Row = {**job.mark, "verdict": found.verdict}
     if not found.findings:

@@ -95,7 +95,7 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
 def masses(row: Row) -> dict[str, Mounting]:
     """Return where a vehicle's masses sit, by the columns that move them.
 
-    FormatError: the catalogue's text does not say so.
+    FormatError: the catalogue's text is not a table of positions.
     """
     try:
         return msgspec.json.decode(row["mass"], type=dict[str, Mounting])
@@ -142,7 +142,7 @@ def add_logs(
 ) -> tuple[int, list[str]]:
     """Put a deployment's logs on record; return how many are new, and a line for each that cannot be.
 
-    `logs` are the files that its patterns stand for.
+    `logs` are the files that match its patterns.
 
     WrongUse: there is no such vehicle, or the deployment's name can be no folder's.
     """
@@ -219,7 +219,7 @@ GIVEN = "given"
 STATUS_COLUMNS = (
     "deployments", "logs", "calibrated", "unsupported", "failed", "new", "given", "diagnosed", "mapped"
 )  # fmt: skip
-"""Of each vehicle; `given` are calibrations made elsewhere."""
+"""Counts of each vehicle; `given` are calibrations made elsewhere."""
 
 
 @dataclass(frozen=True)

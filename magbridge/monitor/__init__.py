@@ -1,7 +1,7 @@
-"""The ground station's page of a vehicle and its bridge.
+"""Show a vehicle and its bridge on the ground station's page.
 
-:mod:`.link` listens on a thread of its own, and has a :mod:`.state` for each vehicle: what its messages said,
-which requests are open, its :mod:`.history` in bounded memory and its alarms. :mod:`.words` puts that into
-words, which :mod:`.panels` and :mod:`.charts` show in NiceGUI on the :mod:`.page`. :mod:`.serve` is the web
-server; :mod:`.security` refuses requests of other sites.
+:mod:`.link` receives on a thread of its own and keeps a :mod:`.state` for each vehicle: its last messages,
+open requests, alarms, and its :mod:`.history` in bounded memory. :mod:`.words` turns the state into texts,
+which :mod:`.panels` and :mod:`.charts` show with NiceGUI on the :mod:`.page`. :mod:`.serve` is the web
+server, and :mod:`.security` rejects requests of other sites.
 """

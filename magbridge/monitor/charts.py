@@ -25,7 +25,7 @@ CHARTS = json.loads(files("magbridge.monitor").joinpath("charts.json").read_text
 """Options of ECharts by the kind of a chart. ECharts knows no variables of the page: the colours are seen by
 day and by night. An axis has no labels at its ends, where they would cover the round numbers next to them."""
 BREAK = 10.0
-"""s without a sample that interrupt the curve, unless the interval before was at least a third as long."""
+"""Time without a sample that interrupts the curve, s, unless the interval before was a third as long."""
 ROOM, TAIL = 3.0, 0.02
 """The axis covers the points without the fraction `TAIL` at either end, extended by `ROOM` times their range.
 A step of the field soon has more points than that fraction; a spike never has."""
@@ -34,14 +34,14 @@ MIN_AXIS_RANGE = 1e-5
 ASPECT = 4.0 / 3.0
 """Width to height of the map: both of the chart and of its margins, so that a circle is one at any width."""
 MIN_MAP_WIDTH_M = 200.0
-"""m across that the map shows at least."""
+"""Smallest width of the map, m."""
 PIXELS = 600
 """Pixels of the picture of a grid along its longer side, at most."""
 SIDES = 48
 """Corners of the polygon that is drawn for an ellipse."""
 KEYS = "; keys: plus and minus zoom, arrows pan, 0 shows all, S saves it as PNG"
 MAX_CHART_INTERVAL_S = 3.0
-"""s between two drawings of a chart of telemetry: there may be many, and a phone draws them."""
+"""Shortest time between two drawings of a chart of telemetry, s: a phone may have to draw many."""
 
 
 def chart_options(kind: str, name: str) -> dict[str, Any]:
@@ -114,7 +114,7 @@ class Background:
     picture: str
     """A PNG as a ``data:`` address; north is up."""
     span: float
-    """nT at the darkest red; the darkest blue is as far below zero."""
+    """Anomaly at the darkest red, nT; the darkest blue is the negative of it."""
 
 
 def read_background(path: Path) -> Background:

@@ -16,7 +16,7 @@ TIERS = {"10 min": (600.0, 1.0), "2 h": (7_200.0, 10.0), "24 h": (86_400.0, 120.
 MAX_PLOTTED_VALUE = 1e12
 """Larger values are kept as this: no field, and no sum of them overflows."""
 LAST_YEAR = 4.1e9
-"""s since 1970: a later time (in 2100) is invalid."""
+"""Latest valid time (in 2100), s since 1970."""
 TRAIL = 2000
 """Places that a trail keeps at most."""
 
@@ -91,7 +91,7 @@ class TrackPoint:
 
 
 class Trail:
-    """Where a vehicle was: at most `TRAIL` places, of which every second goes when they are full."""
+    """Positions of a vehicle: at most `TRAIL`; a full trail drops every second position."""
 
     def __init__(self) -> None:
         self._places: list[TrackPoint] = []
@@ -155,7 +155,7 @@ class Alarm:
     active: bool = True
     """The condition holds at present."""
     count: int = 1
-    """How often it has begun."""
+    """Number of times that the condition has begun."""
     acknowledged: bool = False
     """Somebody has seen it since it last began."""
 
@@ -190,7 +190,7 @@ class AlarmGroup:
 
     @property
     def started_s(self) -> float:
-        """When the last of them began, s of the receiver's clock."""
+        """Time at which the last of them began, s of the receiver's clock."""
         return self.alarms[0].since
 
     @property

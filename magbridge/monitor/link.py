@@ -31,7 +31,7 @@ class ReceivedBridges:
         self._beat = self._checked = -inf
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a message that came at `now_s`, s of a monotonic clock."""
+        """Process a message received at `now_s`, s of a monotonic clock."""
         if not message.known:
             return
         sender = message.system, message.component

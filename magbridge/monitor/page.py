@@ -89,7 +89,7 @@ def _table(names: list[str], rows: list[list[Any]]) -> str:
 
 SCRIPT = files("magbridge.monitor").joinpath("page.js").read_text(encoding="utf-8")
 PERIOD = 0.5
-"""s between two checks of received data."""
+"""Time between two checks of received data, s."""
 BUTTON = "flat dense no-caps color=white size=md padding='4px 10px'"
 
 Bridge = tuple[int, int]
@@ -223,7 +223,7 @@ class Page:
         return f"magbridge{vehicle}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
 
     def _snapshot(self) -> None:
-        """Have the browser draw one PNG of all charts."""
+        """Send a script with which the browser saves all charts as one PNG."""
         with self._station.lock:
             figures = [f"{name}: {' '.join(texts)} nT" for name, texts in words.measured(self._state).items()]
             flags = ", ".join(self._state.flags) or "none"

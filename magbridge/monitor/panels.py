@@ -67,7 +67,7 @@ class Figures:
 
 
 class Flags:
-    """The flags, and since when they stand."""
+    """The present flags, and since when each is set."""
 
     def __init__(self) -> None:
         self._changes = Changes()
@@ -75,7 +75,7 @@ class Flags:
             self._box = ui.column().classes("gap-2")
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the flags that stand."""
+        """Show the present flags."""
         flags = {
             name: f"since {clock(t)}, {words.duration(now_s - t)}" for name, (t, _) in state.flags.items()
         }
@@ -156,7 +156,7 @@ class NavigationPanel:
 
 
 class Texts:
-    """What the bridge announced."""
+    """The status texts of the bridge."""
 
     def __init__(self) -> None:
         self._changes = Changes()
@@ -226,7 +226,7 @@ class ParameterPanel:
 
 
 REPEAT = 5.0
-"""s between two sounds while an alarm is not acknowledged."""
+"""Time between two sounds of an alarm that is not acknowledged, s."""
 
 
 class Row:
@@ -241,7 +241,7 @@ class Row:
             self._seen: ui.button | None = None
 
     def show(self, alarm: AlarmGroup) -> None:
-        """Show how it stands; the button is there until somebody has seen it."""
+        """Show text and times of the alarms; the button stays until somebody acknowledges them."""
         color = RED if alarm.active else AMBER
         self.box.style(f"border-color: {'transparent' if alarm.acknowledged else color}")
         self._text.set_text(alarm.text)
@@ -325,7 +325,7 @@ LEARNING_COMMANDS = {
 
 
 class LearningPanel:
-    """What one bridge learns; hidden where it does not."""
+    """The state of learning of one bridge; hidden if it does not learn."""
 
     def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
@@ -376,7 +376,7 @@ class LearningPanel:
 RADIUS = 80.0
 """Radius of the circle in units of the picture, which is 200 wide."""
 MAX_BAND_DEG = 180.0
-"""deg either side of the heading: the band is then the whole circle."""
+"""Half width of a band that is the whole circle, deg."""
 BLUE, GREY = "#3b82f6", "#778599"
 
 

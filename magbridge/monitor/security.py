@@ -41,7 +41,7 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""With every answer: nothing from elsewhere is loaded, and no site frames the page."""
+"""Headers of every answer: the page loads nothing from other sites, and no site may frame it."""
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 MAX_COOKIE_CHARACTERS = 4096
 """Characters of a cookie header that are looked at."""
@@ -68,7 +68,7 @@ class Guard:
 
     * with 421 where ``Host`` is neither a name of this computer nor, where the page is served to others, an
       address: a name that somebody else owns may resolve to us, an address cannot;
-    * with 403 where ``Origin`` is another site's, or the browser says that another site asks
+    * with 403 where ``Origin`` is another site's, or the browser reports a request of another site
       (``Sec-Fetch-Site``), except for following a link to the page;
     * with 401 without the token.
     """
@@ -162,7 +162,7 @@ async def _answer(send: Send, status: int, text: bytes, **headers: str) -> None:
 
 
 def _same(secret: str, expected: str) -> bool:
-    """Compare two secrets in a time that does not tell where they differ."""
+    """Compare two secrets in a time that is independent of where they differ."""
     return compare_digest(secret.encode("utf-8", "replace"), expected.encode("utf-8", "replace"))
 
 

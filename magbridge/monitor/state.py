@@ -1,4 +1,4 @@
-"""What a ground station knows of one bridge: messages in, requests out. No port, no clock, no page."""
+"""Keep the state of one bridge from its messages, without port, clock or page."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magbridge.records import Quality
 FLAG_HOLD_TIME_S = 3.0
 """Time for which a flag is shown after it was last set, s."""
 REQUEST_RETRY_S = 1.5
-"""s after which a request without an answer is repeated."""
+"""Time after which a request without an answer is repeated, s."""
 WAITING = "no answer yet"
 MAX_SENSORS = 8
 """Sensors of a bridge that are kept at most."""
@@ -25,7 +25,7 @@ MIN_COMPARISON_TIME_S = 1.0
 SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 """Largest numbers of samples, parameters and series of telemetry that are kept."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
-"""States of the position filter in which it says where the vehicle is."""
+"""States of the position filter in which its position is valid."""
 COMMAND_PARAMETERS = {"MB_LEARN_CMD"}
 """Parameters that go back to 0 once the request is done."""
 FIX_2D = 2
@@ -66,11 +66,11 @@ class SensorState:
 
     @property
     def label(self) -> str:
-        """Name in the configuration, or the number before a MAG_SENSOR has told it."""
+        """Name of the sensor in the configuration; its number until a MAG_SENSOR has come."""
         return str(self.report.get("name", "")) or f"sensor {self.number}"
 
     def take(self, fields: dict[str, Any], now_s: float) -> None:
-        """Take a MAG_FIELD that came at `now_s`."""
+        """Store a MAG_FIELD received at `now_s`."""
         self.interval = now_s - self.sampled if self.field else 0.0
         self.field, self.sampled = fields, now_s
 
@@ -129,7 +129,7 @@ class BridgeState:
         self._others = by_id(NAMED_VALUE_FLOAT=self._named_value, **place)
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a message of the bridge that came at `now_s`."""
+        """Process a message of the bridge received at `now_s`."""
         gap = (message.sequence - self._sequence - 1) % 256
         self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
         self._sequence, self.received_at = message.sequence, now_s
@@ -139,7 +139,7 @@ class BridgeState:
             handle(message, now_s)
 
     def receive_other(self, message: Message, now_s: float) -> None:
-        """Take a message of another component of the same vehicle, such as its autopilot."""
+        """Process a message of another component of the vehicle, such as its autopilot."""
         if handle := self._others.get(message.id):
             handle(message, now_s)
 

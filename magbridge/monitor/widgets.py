@@ -21,13 +21,13 @@ body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
 """Colours by day and, where the browser asks for it, by night; the header is the same at both."""
 INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--suspect)", "var(--bad)"
 FADED_COLOUR = "var(--faded)"
-"""Of figures that are not the present ones, which are also slanted; they stay legible."""
+"""Colour of old figures, which are also slanted; they stay legible."""
 MUTED = "text-slate-600 dark:text-slate-400"
 GRID = "w-full grid gap-4 grid-cols-1"
 
 
 class Changes:
-    """What one browser was shown, so that only new data are sent to it."""
+    """Values that one browser shows, so that only changes are sent to it."""
 
     def __init__(self) -> None:
         self._shown: dict[str, Any] = {}
@@ -41,7 +41,7 @@ class Changes:
         return new
 
     def forget(self, key: str) -> None:
-        """Have the next value shown, even if it is the same as before."""
+        """Show the next value even if it has not changed."""
         self._shown.pop(key, None)
 
 

@@ -21,8 +21,8 @@ from magbridge.monitor.state import BridgeState
 from magbridge.records import Quality
 
 SILENT, SLOW = 3.0, 30.0
-"""s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
-status three of their intervals, at least `SILENT` and at most `SLOW`."""
+"""Shortest reported silence, s: `SILENT` for the bridge, which sends every second; for field and status three
+of their intervals, at least `SILENT` and at most `SLOW`."""
 FLAG_TEXTS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the calibrated range",
@@ -39,9 +39,9 @@ FLAG_TEXTS = {
 ROUTINE = {"moving", "no_boresight", "late_join"}
 """Flags that come and go, or stay, in a mission without faults: they are shown, and raise no alarm."""
 STARTING = 15.0
-"""s after its first message in which a bridge may still be waiting for its sensor and its autopilot."""
+"""Time after its first message in which a bridge may still wait for its sensor and autopilot, s."""
 MAX_ALARM_TIME_S = 4_102_444_800
-"""s since 1970: no alarm began after 2099."""
+"""Latest start of an alarm (in 2099), s since 1970."""
 NORMAL_95 = 1.96
 """Half width of the 95 % interval of a normal variable, standard deviations."""
 MAX_PLAIN_NUMBER = 1e9
