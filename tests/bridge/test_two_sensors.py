@@ -266,7 +266,7 @@ def test_the_log_of_two_lines_and_a_socket_replays_to_the_same_bytes(tmp_path: P
         bridge = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         ear, fields = Codec(0, 0), list[Message]()
         begun, sent = time.monotonic(), 0
-        while len({one["sensor_id"] for one in fields}) < 2 or len(fields) < 40:
+        while len({one["sensor_id"] for one in fields}) < 2 or len(fields) < 80:
             assert time.monotonic() - begun < PATIENCE_S
             os.write(lines[0], b"20000.0 0.0 %d.0 %.3f\n" % (40_000 + sent % 3, time.monotonic()))
             os.write(lines[1], b"%.4f\n" % (44_721.3596 + 0.1 * (sent % 3)))
