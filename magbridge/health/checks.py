@@ -23,17 +23,9 @@ from magbridge.records import Vector
 if TYPE_CHECKING:
     from magbridge.health.scatter import Scatter  # which needs the messages of this module
 
-__all__ = ["LevelCheck", "Messages", "RepetitionCheck"]
-
 
 class Messages:
-    """Messages for the operator, each kind once.
-
-    Attributes
-    ----------
-    lines : list of str
-        Messages since the caller last emptied it.
-    """
+    """Messages for the operator, each kind once: `lines` has those since the caller last emptied it."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -82,7 +74,7 @@ class Repetition:
 
 
 class RepetitionCheck:
-    """Check three channels."""
+    """Check whether the three channels repeat their readings."""
 
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
@@ -121,6 +113,7 @@ class RepetitionCheck:
         return stuck
 
     def _repeat_all(self, white_sigma: float) -> bool:
+        """Record a reading that repeats on all axes; return True if that is a fault."""
         # probability that one channel repeats: step of the readings over sigma, as in the module
         axis_probability = min(self._step / (2.0 * sqrt(pi) * max(white_sigma, 1e-9)), 1.0)
         if not self._common.repeat(axis_probability**3, MIN_COMMON_RUN):
@@ -129,6 +122,7 @@ class RepetitionCheck:
         return True
 
     def _repeat(self, number: int, axis: Repetition, value: float) -> bool:
+        """Record a reading that repeats on one axis; return True if that is a fault."""
         # a value at which the axis was stuck before is a limit: no probability is needed
         if abs(value) == axis.limit:
             axis.run += 1
@@ -158,12 +152,8 @@ LEVEL_HOLD_US: Final = 3_600_000_000
 class LevelCheck:
     """Compare the total field with the main field.
 
-    Attributes
-    ----------
-    is_wrong : bool
-        Whether the last sample's total field is not the Earth's.
-    until_us : int
-        Time until which samples are flagged because it was wrong, µs.
+    `is_wrong` is True if the last sample's total field is not the Earth's. Because of that, samples are
+    flagged until the time `until_us`, µs.
     """
 
     def __init__(self, messages: Messages) -> None:

@@ -20,8 +20,6 @@ from typing import Final, NamedTuple
 from magbridge.calibration.scalar import DISAGREEMENT_SIGMA
 from magbridge.records import Quality
 
-__all__ = ["SensorComparison"]
-
 MIN_COMPARED: Final = 5
 MIN_DISAGREEMENT_US: Final = 1_000_000
 """Comparisons in a row, and time, after which a disagreement is reported; so many that agree end it."""
@@ -53,14 +51,8 @@ class ComparedSample(NamedTuple):
 class SensorComparison:
     """Compare the samples of two sensors as they come; `names` is what messages call the sensors.
 
-    Attributes
-    ----------
-    message : str
-        The last change, for the operator; empty if there is none since the caller last emptied it.
-    is_wrong : bool
-        Whether the sensors disagree.
-    blamed : int or None
-        Which of the two is wrong; None if that is not known.
+    `message` is the last change, for the operator; the caller empties it. `is_wrong` is True while the
+    sensors disagree, and `blamed` (0 or 1) is the one that is wrong, or None if that is not known.
     """
 
     def __init__(self, names: tuple[str, str]) -> None:

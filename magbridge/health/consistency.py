@@ -38,8 +38,6 @@ from magbridge.health.checks import Messages
 from magbridge.health.trend import TrendCheck
 from magbridge.records import Vector
 
-__all__ = ["MASS_FRACTION", "ConsistencyCheck", "TestedSample"]
-
 MIN_INTERVAL_S: Final = 1.0
 MAX_INTERVAL_S: Final = 4.0
 INTERVAL_M: Final = 25.0
@@ -108,11 +106,7 @@ class ConsistencyCheck:
     """Test the total field for dependence on attitude, temperature, time and mass positions.
 
     `noise` is the calibration's noise model, `masses` the number of mass positions that it depends on.
-
-    Attributes
-    ----------
-    is_wrong : bool
-        Whether an alarm is active.
+    `is_wrong` is True during an alarm.
     """
 
     def __init__(self, noise: Noise, masses: int, messages: Messages) -> None:
@@ -180,6 +174,7 @@ class ConsistencyCheck:
             self._test_sample(self._pending.popleft())
 
     def _test_sample(self, sample: TestedSample) -> None:
+        """Predict the total field of a sample, test the innovation, and update the filter."""
         time_us, unit, total, sigma, temperature, mass_changes, speed, course = sample
         seconds = 1e-6 * (time_us - self._time_us)
         # after a gap the crustal field is another one; a clock that goes back restarts all

@@ -19,8 +19,6 @@ from typing import Final
 from magbridge.health.checks import Messages
 from magbridge.records import Quality
 
-__all__ = ["DirectionCheck"]
-
 INCLINED: Final = radians(10.0)
 """Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), crust."""
 MAX_HEADING_ERROR: Final = radians(60.0)
@@ -28,24 +26,18 @@ MAX_HEADING_ERROR: Final = radians(60.0)
 MIN_HORIZONTAL_FRACTION: Final = 0.2
 """Share of the field that is horizontal, below which no heading is read from it."""
 EVERY_US: Final = 1_000_000
-"""µs from one look to the next: a mounting does not change from sample to sample."""
+"""Time from one check to the next, µs: a mounting does not change from sample to sample."""
 MAX_DIRECTION_AGE_US: Final = 5_000_000
-"""µs for which an attitude is the present one."""
+"""Age of an attitude, µs, up to which it is used."""
 MIN_DIFFERING_CHECKS: Final = 8
-"""Looks in a row that differ: what a manoeuvre does to an attitude is over by then."""
+"""Number of checks in a row that differ until it counts: a manoeuvre is over by then."""
 LONG_US: Final = 3_600_000_000
 """Time for which a disagreement is remembered, µs: at some headings a reversed axis looks right."""
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 
 
 class DirectionCheck:
-    """Check the vector at intervals.
-
-    Attributes
-    ----------
-    flags : int
-        :class:`~magbridge.records.Quality` bits of the last sample.
-    """
+    """Check the vector at intervals; `flags` are the :class:`~magbridge.records.Quality` bits of the last."""
 
     def __init__(self, messages: Messages | None = None) -> None:
         self.flags = 0
@@ -104,7 +96,7 @@ class DirectionCheck:
         return self._variance
 
     def _judge(self, time_us: int, tilt: float, turn: float) -> None:
-        """Count looks that differ, by `tilt` in inclination and by `turn` in heading, rad."""
+        """Count the checks that differ, by `tilt` in inclination and by `turn` in heading, rad."""
         self._tilted = self._tilted + 1 if abs(tilt) > INCLINED else 0
         self._turned = self._turned + 1 if abs(turn) > MAX_HEADING_ERROR else 0
         if self._tilted >= MIN_DIFFERING_CHECKS:

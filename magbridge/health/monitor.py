@@ -15,8 +15,6 @@ from magbridge.health.scatter import ACCELERATION, MIN_FASTER_M_S, Scatter
 from magbridge.health.trend import TrendCheck
 from magbridge.records import Quality, Vector
 
-__all__ = ["HealthMonitor"]
-
 SUPPOSED_SPEED: Final = 30.0
 """Speed until it is known, m/s."""
 MAX_AGE_S: Final = 60.0

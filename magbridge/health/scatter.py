@@ -25,8 +25,6 @@ from magbridge.calibration.model import Noise
 from magbridge.field.geodesy import separation
 from magbridge.health.checks import Messages
 
-__all__ = ["ACCELERATION", "MIN_FASTER_M_S", "MIN_NOISE_NT", "Scatter"]
-
 MIN_NOISE_NT: Final = 0.1
 """No fluxgate's noise is lower."""
 MEDIAN_FACTOR: Final = 1.02
@@ -105,13 +103,8 @@ class MedianDifference:
 class Scatter:
     """Estimate the noise of a total field, beyond the calibration's noise model.
 
-    Attributes
-    ----------
-    variance : float
-        Variance of an innovation from one sample to the next, nT²; at least that of the calibration's noise
-        model.
-    speed : float
-        Speed of the vehicle, m/s; NaN while it is not known.
+    `variance` is that of an innovation from one sample to the next (nT²), at least that of the calibration's
+    noise model; `speed` is the vehicle's, m/s, or NaN while it is not known.
     """
 
     def __init__(self, noise: Noise, messages: Messages) -> None:

@@ -29,8 +29,6 @@ from typing import Final, NamedTuple
 from magbridge.health.checks import Messages
 from magbridge.health.scatter import Scatter
 
-__all__ = ["GATE_SIGMA", "TrendCheck"]
-
 GATE_SIGMA: Final = 7.0
 """Sigmas of an innovation; 5.5 would be one false alarm a month, were the noise Gaussian."""
 GATE: Final = GATE_SIGMA * GATE_SIGMA
@@ -86,14 +84,8 @@ class TrendState(NamedTuple):
 class TrendCheck:
     """Follow the total field and find outliers and jumps; `scatter` gives the noise of the samples.
 
-    Attributes
-    ----------
-    is_outlier : bool
-        Whether the last sample is an outlier.
-    has_moved : bool
-        Whether a mass may have moved since the last sample.
-    is_away : bool
-        Whether the field has jumped and not come back.
+    `is_outlier` is True if the last sample is an outlier, `has_moved` if a mass may have moved since the last
+    sample, `is_away` if the field has jumped and not come back.
     """
 
     def __init__(self, scatter: Scatter, messages: Messages) -> None:

@@ -38,18 +38,6 @@ from magbridge.learning.estimator import Estimator
 from magbridge.learning.samples import LearnedTerms, LearningSample, Observation
 from magbridge.records import Quality, Vector
 
-__all__ = [
-    "CAUSE_UNITS",
-    "NO_COEFFICIENT",
-    "AlarmState",
-    "CauseRegressors",
-    "ChangeDetector",
-    "LateTelemetryTest",
-    "LearningAlarm",
-    "StoredSample",
-    "named",
-]
-
 CAUSE_UNITS: Final = {
     "offset_step": 20.0,
     "offset_drift": 20.0,
@@ -72,26 +60,8 @@ def named(causes: Sequence[str]) -> str:
     return " or ".join(causes[:2]).replace("_", " ")
 
 
-class CauseRegressors(NamedTuple):
-    """Regressors of the causes at one sample, and what a change adds to its residual.
-
-    `time` is s since 1970 UTC, `positions` are the parameters, scaled, and `watched` the temperature (degC)
-    and the currents (A), NaN where unknown.
-    """
-
-    time: float
-    by_offset: FloatArray
-    """(3,): Derivative of the residual by the offset of each axis."""
-    positions: tuple[float, ...]
-    watched: tuple[float, ...]
-    by_delay: float
-    """Change of the residual with the telemetry's time, nT/s."""
-    by_level: float
-    """Derivative of the residual by the reference's level."""
-
-
 class AlarmCause(NamedTuple):
-    """One to test: its name, the telemetry it follows, and the states (3,) that would take it up, if any."""
+    """A cause to test: its name, the telemetry that it follows, and the states (3,) that represent it."""
 
     name: str
     channel: str
@@ -99,7 +69,7 @@ class AlarmCause(NamedTuple):
 
 
 class LearningAlarm(NamedTuple):
-    """The model no longer explains the data.
+    """An alarm: the model no longer explains the data.
 
     `causes` are those that fit, the likeliest first, and `channels` the telemetry that each follows, or "".
     `since` is the onset of the likeliest cause (s since 1970 UTC), `size` the RMS of its effect on the total
@@ -121,7 +91,7 @@ MAX_CAUSE_LOG_RATIO: Final = log(20.0)
 
 
 class ChangeDetector:
-    """Test the innovations of an estimator for every cause; another estimator may replace it."""
+    """Test the innovations of an estimator for every cause."""
 
     def __init__(self, model: LearnedTerms, estimator: Estimator) -> None:
         self._offsets, self._states, self._origin = estimator.offsets, estimator.states, model.origin
@@ -154,23 +124,28 @@ class ChangeDetector:
         """Propagate the absorbed part by `F` (4, 4), the transition of :meth:`.Estimator.propagate`."""
         estimator.advance(self._test.absorbed, F, seconds)
 
-    def test(self, estimator: Estimator, regressors: CauseRegressors) -> LearningAlarm | None:
-        """Test the estimator's prediction; return an alarm if a cause exceeds the threshold."""
-        self._now = regressors.time
-        now = [
-            1.0,
-            regressors.time / 3600.0,
-            *regressors.positions,
-            *regressors.watched,
-            regressors.by_delay,
-            regressors.by_level,
-        ]
+    def test(
+        self,
+        estimator: Estimator,
+        sample: LearningSample,
+        by_offset: FloatArray,
+        by_delay: float,
+        by_level: float,
+    ) -> LearningAlarm | None:
+        """Test the estimator's prediction of a sample; return an alarm if a cause exceeds the threshold.
+
+        `by_offset` (3,) is the derivative of the residual by the offset of each axis, `by_delay` the change
+        of the residual with the telemetry's time, nT/s, `by_level` its derivative by the reference's level.
+        """
+        time = self._now = sample.time_us * 1e-6
+        # one regressor for each cause, in their order; NaN where a channel's value is not known
+        now = [1.0, time / 3600.0, *sample.positions, *sample.watched, by_delay, by_level]
         # each cause adds its regressor times the derivative by the offset of each axis; telemetry delay and
         # level act on the total field alone, not on an axis
-        effects = np.outer(self._unit, regressors.by_offset)
+        effects = np.outer(self._unit, by_offset)
         effects[self._no_vector] = 0.0
         effects[self._no_vector, 0] = self._unit[self._no_vector]
-        largest = self._test.test(estimator.filter, regressors.time, np.nan_to_num(np.array(now)), effects)
+        largest = self._test.test(estimator.filter, time, np.nan_to_num(np.array(now)), effects)
         return self._alarm() if largest > ALARM_LOG_RATIO else None
 
     def updated(self, gain: FloatArray) -> None:
@@ -178,6 +153,7 @@ class ChangeDetector:
         self._test.update(gain)
 
     def _alarm(self) -> LearningAlarm:
+        """Return an alarm with the causes that fit."""
         test = self._test
         rows = test.competing(MAX_CAUSE_LOG_RATIO)[0]
         fitting = list(dict.fromkeys(self._causes[int(test.kind[row])][:2] for row in rows))
@@ -237,17 +213,17 @@ class ChangeDetector:
 
 
 DELAYS_US: Final = (8_000_000, 16_000_000, 32_000_000)
-"""D, µs: shorter ones are those of telemetry that comes seldom."""
+"""Delays d that are tested, µs. Telemetry that is sent seldom has shorter ones."""
 MAX_DELAY_ERROR: Final = 0.25
-"""By how much of d a later report may be off."""
+"""Largest difference of a report's delay from d, as a fraction of d."""
 DELAY_UNCERTAINTY: Final = 0.4
-"""w: the next d is the double."""
+"""w of the module: each d is the double of the last."""
 MAX_HINDSIGHT_SQUARE: Final = 36.0
-"""v²/S at most: two samples are needed in any case, and the last before a motion is none of them."""
+"""Largest v²/S that a sample contributes, so that an alarm needs two samples."""
 MAX_STORED_SAMPLES: Final = 41
-"""Samples kept, at most one a second."""
+"""Number of samples that are kept, at most one a second."""
 MIN_MOTION: Final = 0.01
-"""Of its scale, by which a parameter has moved."""
+"""Change of a parameter, as a fraction of its scale, that is a motion."""
 
 
 class StoredSample(NamedTuple):
@@ -258,26 +234,60 @@ class StoredSample(NamedTuple):
     variance: float
 
 
+class DelayTest:
+    """Page's test of telemetry that is late by `delay_us`."""
+
+    def __init__(self, delay_us: int) -> None:
+        self._delay_us, self._tested_us = delay_us, 0
+        self._ratio = self._square = 0.0
+        self.count, self._since_us = 0, 0
+
+    def reported_since(self, time_us: int, kept: Sequence[StoredSample]) -> StoredSample | None:
+        """Return the sample not tested yet that a report of now would match, or None."""
+        delay_us = self._delay_us
+        stored = min(kept, key=lambda one: abs(time_us - one.sample.time_us - delay_us), default=None)
+        if stored is None or abs(time_us - stored.sample.time_us - delay_us) > MAX_DELAY_ERROR * delay_us:
+            return None
+        if stored.sample.time_us <= self._tested_us:
+            return None
+        self._tested_us = stored.sample.time_us
+        return stored
+
+    def add(self, stored: StoredSample, change: float) -> LearningAlarm | None:
+        """Test a sample whose innovation is larger by `change` (nT) at the positions reported now."""
+        # the innovation v at the positions of then against v' at those of now, of variances S and S'
+        v, S = stored.innovation, stored.variance
+        S_late = S + (DELAY_UNCERTAINTY * change) ** 2
+        square = min(v * v / S, MAX_HINDSIGHT_SQUARE)
+        late = (v + change) ** 2 / S_late + log(S_late / S)
+        # a ratio of 0 begins a new onset
+        if self._ratio == 0.0:
+            self._square, self.count, self._since_us = 0.0, 1, stored.sample.time_us
+        self._ratio = max(0.0, self._ratio + 0.5 * (square - late))
+        self._square += change**2 * (square > late)
+        if self._ratio <= ALARM_LOG_RATIO:
+            return None
+        size = sqrt(self._square / self.count)
+        return LearningAlarm(("clock_offset",), ("",), self._since_us * 1e-6, size, self._ratio)
+
+
 class LateTelemetryTest:
-    """Keeps the samples of the last half minute."""
+    """Keep the samples of the last half minute, and test each delay with them."""
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all evidence."""
+        """Discard all evidence."""
         self._kept: deque[StoredSample] = deque(maxlen=MAX_STORED_SAMPLES)
-        self._ratio = [0.0] * len(DELAYS_US)
-        self._square = [0.0] * len(DELAYS_US)
-        self._count = [0] * len(DELAYS_US)
-        self._since_us = [0] * len(DELAYS_US)
-        self._tested_us = [0] * len(DELAYS_US)
+        self._tests = [DelayTest(delay_us) for delay_us in DELAYS_US]
 
     def keep(self, stored: StoredSample) -> None:
         """Keep a sample."""
         if not self._kept or stored.sample.time_us - self._kept[-1].sample.time_us >= 1_000_000:
             self._kept.append(stored)
-            self._count = [count + 1 for count in self._count]
+            for test in self._tests:
+                test.count += 1
 
     def test(
         self,
@@ -290,39 +300,18 @@ class LateTelemetryTest:
 
         `observe` compares a field (nT), measured at some regressors, with a reference (nT).
         """
-        for k in range(len(DELAYS_US)):
-            one = self._reported_since(time_us, k)
-            if one is None:
+        for test in self._tests:
+            stored = test.reported_since(time_us, self._kept)
+            if stored is None:
                 continue
-            self._tested_us[k] = one.sample.time_us
-            sample = one.sample
+            sample = stored.sample
             if np.abs(np.subtract(positions, sample.positions)).max(initial=0.0) < MIN_MOTION:
                 continue
             then = observe(sample.field, sample.phi, sample.reference).e
             now = observe(sample.field, phi, sample.reference).e
-            # Page's test: the innovation at the positions reported now, against that of then
-            S = one.variance
-            # the delay is known to a share only, which widens S
-            more = S + (DELAY_UNCERTAINTY * (now - then)) ** 2
-            v = min(one.innovation**2 / S, MAX_HINDSIGHT_SQUARE)
-            late = (one.innovation + now - then) ** 2 / more + log(more / S)
-            # a ratio of 0 begins a new onset
-            if self._ratio[k] == 0.0:
-                self._square[k], self._count[k], self._since_us[k] = 0.0, 1, one.sample.time_us
-            self._ratio[k] = max(0.0, self._ratio[k] + 0.5 * (v - late))
-            self._square[k] += (now - then) ** 2 * (v > late)
-            if self._ratio[k] > ALARM_LOG_RATIO:
-                size = sqrt(self._square[k] / self._count[k])
-                return LearningAlarm(("clock_offset",), ("",), self._since_us[k] * 1e-6, size, self._ratio[k])
+            if alarm := test.add(stored, now - then):
+                return alarm
         return None
-
-    def _reported_since(self, time_us: int, k: int) -> StoredSample | None:
-        """Return the stored sample that the present report would match at the k-th d, or None."""
-        late_us = DELAYS_US[k]
-        one = min(self._kept, key=lambda one: abs(time_us - one.sample.time_us - late_us), default=None)
-        if one is None or abs(time_us - one.sample.time_us - late_us) > MAX_DELAY_ERROR * late_us:
-            return None
-        return one if one.sample.time_us > self._tested_us[k] else None
 
 
 MIN_GROWTH: Final = 6.0
@@ -345,25 +334,15 @@ SIGNIFICANT_SQUARE: Final = 16.0
 
 
 class AlarmState:
-    """The current alarm, if any; `mapped` is True if the reference is a map.
+    """The current `alarm`, if any; `mapped` is True if the reference is a map.
 
     A relapse is an alarm that comes before the last learned cause has explained :data:`SILENT_SAMPLES`
     informative samples. Alarms after a relapse continue the first one: it is announced once, and ends once a
     learned calibration has explained as many samples.
 
-    Attributes
-    ----------
-    alarm : LearningAlarm or None
-        Alarm at its last update.
-    flags : int
-        ``unexplained`` during an alarm, or 0.
-    variance : float
-        Variance of the unexplained residual, nT².
-    relapses : int
-        Number of relapses.
-    is_tried, is_pending : bool
-        True if the cause was learned and no alarm has followed; and if, in addition, the learned calibration
-        is not published, as no later samples have confirmed it.
+    During an alarm, `flags` has the bit ``unexplained``, and `variance` is that of the unexplained residual,
+    nT². `is_tried` is True if the alarm's cause was learned and no alarm has followed, `is_pending` if in
+    addition no later samples have confirmed the learned calibration, so that it is not published.
     """
 
     def __init__(self, *, mapped: bool = False) -> None:

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from math import exp, log
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -48,16 +48,6 @@ from magbridge.estimation.sequential import ALARM_LOG_RATIO
 from magbridge.estimation.track_process import CORRELATION_LENGTH_M, TRACK_STATES, TrackProcess
 from magbridge.learning.samples import LearnedTerms, Way, observe
 from magbridge.records import Vector
-
-__all__ = [
-    "BEYOND_CHANCE",
-    "LAST_FIT_SAMPLES",
-    "BatchFit",
-    "Estimator",
-    "EstimatorBank",
-    "Nuisance",
-    "class_prior",
-]
 
 
 class Nuisance(TrackProcess):
@@ -99,15 +89,9 @@ STEEPEST: Final = 20.0 / 3600.0
 class Estimator:
     """Learn coefficients sample by sample, from their prior (K,) and its covariance (K, K).
 
-    Attributes
-    ----------
-    filter : KalmanFilter
-        Its state.
-    offsets, slope : (3,) int array
-        The states of the constant offset, which walk by `creep` (nT per square root of a second), and of its
-        slope.
-    is_informative : bool
-        Whether the last sample contributes to the coefficients.
+    The states of `filter` with the indices `offsets` (3,) are the constant offset, which walks by `creep` (nT
+    per square root of a second); those of `slope` (3,) are its slope, nT/s. `is_informative` is True if the
+    last sample contributes to the coefficients.
     """
 
     def __init__(
@@ -309,16 +293,9 @@ DRIFT_CORRELATION_TIME_S: Final = 2.0 * 3600.0
 class EstimatorBank:
     """Estimators of the coefficients, one for each hypothesis.
 
-    Attributes
-    ----------
-    all : list of Estimator
-        All estimators; the baseline is the first.
-    without_map : Estimator or None
-        Estimator that does not use the map, the last of `all`; only if the reference is a map.
-    map_doubted : bool
-        True if `without_map` predicts significantly better, and is selected.
-    map_since, map_lead : float
-        Time since when it leads, s, and its lead in log w.
+    The baseline is the first of `all`. If the reference is a map, the last of them is `without_map`, which
+    does not use it. `map_doubted` is True if that one predicts significantly better, and is selected;
+    `map_lead` is its lead in log w, since the time `map_since`, s.
     """
 
     def __init__(self, model: LearnedTerms, quiet: Estimator, mapless: Nuisance | None = None) -> None:
@@ -409,33 +386,22 @@ class EstimatorBank:
 
 FIRST_FIT_SAMPLES: Final = 32
 LAST_FIT_SAMPLES: Final = 4096
-"""Samples at which they are fitted first and last: 2 minutes and 4.5 hours of 0.25 Hz."""
+"""Number of samples of the first and the last fit: 2 minutes and 4.5 hours of 0.25 Hz."""
 MAX_GAUSS_NEWTON_STEPS: Final = 12
-"""Of Gauss-Newton, at most."""
 MIN_STEP_SIGMA: Final = 0.01
-"""Prior sigmas: a step this small is the last."""
+"""Step, in sigmas of the prior, that ends the iteration."""
 START_NOISE_NT: Final = 2.0
-"""1-sigma of a channel's noise, until the samples say more, nT."""
+"""1-sigma of a channel's noise until it is estimated, nT."""
 MIN_SAMPLES_FOR_NOISE: Final = 256
-"""Samples from which on they do."""
+"""Number of samples from which on it is estimated."""
 
 
 def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, order: int = 3) -> Calibration:
-    """Return the prior of any vehicle: an identity and its uncertainty.
+    """Return the prior of any vehicle with some moving masses: an identity and its uncertainty.
 
-    Parameters
-    ----------
-    parameters : tuple of Parameter
-        Moving masses of the vehicle.
-    field : float
-        Reference field F_0, nT.
-    order : int
-        Highest total degree of the polynomials.
-
-    Notes
-    -----
-    The widths are those that the fit begins with (:mod:`magbridge.estimation.priors`), each with its
-    own uncertainty: the mean of a log-normal's square.
+    `field` is the reference field F_0 (nT), `order` the highest total degree of the polynomials. The widths
+    are those that the fit begins with (:mod:`magbridge.estimation.priors`), each with its own uncertainty:
+    the mean of a log-normal's square.
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
@@ -451,16 +417,6 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
         reference=Reference(field),
         method="none",
     )
-
-
-class BatchResult(NamedTuple):
-    """Result of a fit: coefficients (K,), nuisance after the last sample (4,), and their covariance."""
-
-    coefficients: FloatArray
-    nuisances: FloatArray
-    covariance: FloatArray
-    noise: float
-    """Noise of a channel, nT, 1-sigma."""
 
 
 class BatchFit:
@@ -492,11 +448,17 @@ class BatchFit:
 
     @property
     def is_over(self) -> bool:
-        """Whether a filter can go on alone."""
+        """Return True if a filter can go on alone."""
         return len(self._samples) >= LAST_FIT_SAMPLES
 
-    def fit(self, coefficients: FloatArray, nuisance: Nuisance) -> BatchResult:
-        """Fit all samples, beginning at `coefficients` (K,)."""
+    def fit(
+        self, coefficients: FloatArray, nuisance: Nuisance
+    ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Fit all samples, beginning at `coefficients` (K,).
+
+        Return the coefficients (K,), the nuisance after the last sample (4,), the covariance of both
+        together, and the 1-sigma noise of a channel, nT.
+        """
         c, z = coefficients, np.full(self._root.shape[1], np.inf)
         for _ in range(MAX_GAUSS_NEWTON_STEPS):
             # Gauss-Newton step in the whitened prior's coordinates z, as in the module
@@ -514,7 +476,7 @@ class BatchFit:
         both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
         covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
         covariance[-TRACK_STATES:, -TRACK_STATES:] += Pb
-        return BatchResult(c, nuisances, covariance, noise)
+        return c, nuisances, covariance, noise
 
     def _whitened(
         self, c: FloatArray, nuisance: Nuisance

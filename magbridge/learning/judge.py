@@ -32,8 +32,6 @@ from magbridge.arrays import FloatArray
 from magbridge.estimation.track_process import CORRELATION_LENGTH_M, TRACK_STATES
 from magbridge.learning.estimator import Nuisance
 
-__all__ = ["CANDIDATE", "FIRST", "JUDGE_MEMORY_SAMPLES", "PUBLISHED", "Coverage", "Judge"]
-
 FIRST, PUBLISHED, CANDIDATE = range(3)
 MAX_JUDGE_SQUARE: Final = 25.0
 """Normalised square of the smaller innovation above which a sample has a larger variance: an outlier of both
@@ -59,7 +57,6 @@ MIN_DIRECTIONS: Final = 4
 known at all attitudes."""
 MIN_CHANGE_RATIO: Final = 3.0
 """Least ratio of a change's mean square to its variance, at all attitudes so far."""
-MAX_ROWS: Final = 64
 CRUST_FACTORS: Final = np.array([1.0, 0.3, 0.1, 0.03])
 """Standard deviations of the crustal field that are compared, as fractions of the nuisance's."""
 CRUST_MEMORY_SAMPLES: Final = 2000.0
@@ -126,13 +123,8 @@ class Blocks:
 class Judge:
     """Follow the predictions of the first and the published calibration and of the candidates.
 
-    Attributes
-    ----------
-    mean_square : (3,) array
-        Recent mean square of the prediction errors of the first and the published calibration and the
-        candidate, nT².
-    last : tuple of 2 float
-        Error of the published calibration's last prediction (nT), and its predicted variance (nT²).
+    `mean_square` (3,) are the recent mean squares of their prediction errors, nT²; `last` is the error of the
+    published calibration's last prediction (nT), with its predicted variance (nT²).
     """
 
     def __init__(self, nuisance: Nuisance) -> None:
@@ -156,7 +148,7 @@ class Judge:
         self.discard()
 
     def discard(self) -> None:
-        """Discard all blocks: other candidates follow."""
+        """Discard all blocks, because other candidates follow."""
         self._to_first, self._to_published = Blocks(), Blocks()
         self._begin_block()
 
@@ -266,11 +258,11 @@ class Judge:
 
 
 class Coverage:
-    """Attitudes, masses and temperatures at which a change of the `size` coefficients is evaluated."""
+    """Evaluate a change of the `size` coefficients at all attitudes, masses and temperatures so far."""
 
     def __init__(self, size: int) -> None:
-        self._rows = np.zeros((2 * MAX_ROWS, size))
-        self._stored, self._step, self._samples = 0, 1, 0
+        # moments of the samples' derivatives: number, mean, and sum of squares about the mean
+        self._samples, self._mean, self._scatter = 0, np.zeros(size), np.zeros((size, size))
         self._directions: list[FloatArray] = []
 
     def add(self, row: FloatArray, direction: FloatArray) -> None:
@@ -279,25 +271,19 @@ class Coverage:
         nearest = min((float(np.sum((direction - one) ** 2)) for one in self._directions), default=np.inf)
         if nearest > TURN * TURN:
             self._directions.append(direction)
+        # the mean is subtracted, because the reference hides the level
         self._samples += 1
-        if self._samples % self._step:
-            return
-        if self._stored == len(self._rows):  # keep every second row
-            self._stored //= 2
-            self._rows[: self._stored] = self._rows[::2]
-            self._step *= 2
-        self._rows[self._stored] = row
-        self._stored += 1
+        change = row - self._mean
+        self._mean += change / self._samples
+        self._scatter += np.outer(change, row - self._mean)
 
     def is_significant(self, change: FloatArray, covariance: FloatArray) -> bool:
         """Return True if a change of the coefficients (K,) exceeds its uncertainty (K, K) at all attitudes.
 
-        The level, the mean over all rows, does not count.
+        The level, the mean over all samples, does not count.
         """
         if len(self._directions) < MIN_DIRECTIONS:
             return False
-        # the level is hidden by the reference, so only the variation over the attitudes counts
-        rows = self._rows[: self._stored] - self._rows[: self._stored].mean(axis=0)
-        by_change = rows @ change
-        variance = float(np.einsum("ij,jk,ik->", rows, covariance, rows))
-        return float(by_change @ by_change) > MIN_CHANGE_RATIO * variance
+        # mean square of the change and its variance, both as a sum over the samples
+        square, variance = float(change @ self._scatter @ change), float(np.sum(self._scatter * covariance))
+        return square > MIN_CHANGE_RATIO * variance

@@ -8,21 +8,22 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from magbridge.arrays import FloatArray
+from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
-from magbridge.learning.alarms import AlarmState
-from magbridge.learning.decision import NO_METHOD, Decision, Knowledge, Publication
-from magbridge.learning.estimator import Nuisance
-from magbridge.learning.samples import Intake, LearnedTerms, LearningSample
+from magbridge.learning.alarms import NO_COEFFICIENT, AlarmState, LearningAlarm, named
+from magbridge.learning.estimator import BEYOND_CHANCE, Nuisance
+from magbridge.learning.judge import FIRST
+from magbridge.learning.knowledge import NO_METHOD, Knowledge, Publication
+from magbridge.learning.samples import Intake, LearnedTerms, LearningSample, Observation, Way
 from magbridge.records import Quality, Vector
 
 if TYPE_CHECKING:
     from magbridge.field.grid import AnomalyGrid  # it brings scipy
 
-__all__ = ["Learner", "LearnerState", "Notice"]
-
 
 class Notice(NamedTuple):
-    """A change to announce, and when (s); `grave` where someone should look."""
+    """Text of a notification, its time (s since 1970 UTC), and whether it is `grave`, so a warning."""
 
     text: str
     time: float
@@ -30,12 +31,16 @@ class Notice(NamedTuple):
 
     @property
     def date(self) -> str:
-        """The time, UTC."""
+        """Date and time, UTC."""
         return f"{np.datetime64(round(self.time), 's')}Z"
 
 
 class LearnerState(NamedTuple):
-    """What MAG_LEARNING says: see there."""
+    """Contents of MAG_LEARNING: samples learned from, and RMS errors of three calibrations, nT.
+
+    The calibrations are the first, the published and the learned one; `better` is the log-likelihood ratio of
+    the last over the first. The `causes` are those of an alarm of `size` (nT), since the time `since_us`.
+    """
 
     learned_samples: int
     rms: tuple[float, float, float]
@@ -45,15 +50,20 @@ class LearnerState(NamedTuple):
     size: float
 
 
+MIN_CAUSE_LOG_RATIO: Final = 9.0
+"""Log-likelihood ratio below which an alarm is closed instead of its cause learned."""
+MAX_MISFIT: Final = 2.0
+"""Mean normalised square of the innovations that a cause leaves, up to which it explains them. A cause that
+leaves more is not the true one, as where a current has no telemetry."""
 MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
-"""Samples that nothing is learned from."""
+"""Flags of samples from which nothing is learned."""
 MAIN_FIELD_SIGMA_NT: Final = 145.0
 """1-sigma of the field about the main field alone, nT."""
 
 
 class Learner:
-    """Learns a calibration's coefficients while the bridge corrects with it.
+    """Learn a calibration's coefficients while the bridge corrects with it.
 
     Parameters
     ----------
@@ -75,6 +85,8 @@ class Learner:
     ----------
     watched : tuple of str
         Telemetry that :meth:`sample` wants: the temperature, and the currents.
+    samples : int
+        Number of samples that coefficients were learned from.
     notices : list of Notice
         Notifications since the caller last emptied the list.
     enabled, frozen : bool
@@ -135,13 +147,8 @@ class Learner:
         return self._standing.variance
 
     @property
-    def samples(self) -> int:
-        """That coefficients were learned from."""
-        return self._decision.samples
-
-    @property
     def state(self) -> LearnerState:
-        """How learning stands."""
+        """The present state of learning."""
         judge, alarm = self._publication.judge, self._standing.alarm
         first, published, learned = np.sqrt(judge.mean_square).tolist()
         causes = alarm.causes if alarm else ()
@@ -150,26 +157,31 @@ class Learner:
 
     def learned(self) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
-        return self._decision.learned(self._knowledge)
+        knowledge = self._knowledge
+        return self._publication.made(knowledge.bank.best, self.samples, knowledge.noise)
 
     def accept(self) -> None:
         """Make the learned calibration the first one, which no rollback undoes, and close the alarm."""
         if self.samples:
-            self._decision.publish(self._knowledge, "accepted: learned calibration")
+            self._publish("accepted: learned calibration")
             self._publication.accept()
-        self._decision.settle(self._knowledge, "acknowledged")
+        self._settle("acknowledged")
 
     def forget(self) -> None:
         """Return to the initial calibration and restart learning from it."""
-        self._decision.settle(self._knowledge, "forgotten")
+        self._settle("forgotten")
         self._publication.forget(self._knowledge.nuisance)
         self._begin(self._knowledge.nuisance)
         self._notify("learning: all forgotten")
 
     def _begin(self, nuisance: Nuisance) -> None:
+        """Begin to learn from the first calibration."""
         self._restart(nuisance)
-        self._decision = Decision(self._publication, self._standing, self._notify)
         self._intake = Intake(self._max_rate)
+        self.samples = 0
+        self._unconfirmed = False  # a cause was learned, and nothing was published since
+        self._expected = False  # the cause that was learned explains the samples
+        self._refuted = False  # another alarm came before later samples confirmed it
 
     def _restart(self, nuisance: Nuisance) -> None:
         """Begin to learn from the published calibration; offsets may have changed at this power-on."""
@@ -183,6 +195,7 @@ class Learner:
         self._knowledge = Knowledge(self._model, published, nuisance, mapless, self._turn_on)
 
     def _notify(self, text: str, grave: bool = False) -> None:
+        """Add a notification, which is a warning if it is `grave`."""
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))
 
     def restarted(self) -> None:
@@ -234,7 +247,7 @@ class Learner:
             self._nothing(time_us)
             return
         # late telemetry shows only now, in samples that have waited or are kept
-        self._decision.raise_alarm(self._knowledge.look_back(time_us, phi, positions))
+        self._raise_alarm(self._knowledge.look_back(time_us, phi, positions))
         if unfit:
             self._intake.drop()
         # newer telemetry has come without a motion: the waiting samples are at rest
@@ -253,9 +266,227 @@ class Learner:
             self._notify("learning: an hour without a sample to learn from", True)
 
     def _take(self, sample: LearningSample) -> None:
-        """Learn from a sample, or keep it to look back at."""
+        """Predict a sample, compare the calibrations, learn from it, and decide what to publish."""
         knowledge = self._knowledge
         if sample.faulty:
             knowledge.keep_faulty(sample)
-        elif self._decision.take(knowledge, sample, self._intake.moved(sample), frozen=self.frozen):
-            self._restart(knowledge.nuisance)
+            return
+        way = self._intake.moved(sample)
+        now, best = knowledge.predict(sample, way), knowledge.bank.best
+        if knowledge.outlying(learnable=self._standing.is_learnable):
+            self._standing.count(best.filter.innovation, best.filter.variance, informative=False)
+            return
+        published = self._judge(sample, way)
+        difference = published.e - now.e
+        if knowledge.start is None:
+            # compare and test before learning: a prediction must not know its own sample
+            self._compare(sample.time_us * 1e-6, difference)
+            alarm, learned = knowledge.learn(sample, way.seconds, frozen=self.frozen)
+            self._raise_alarm(alarm)
+            self._count(learned=learned)
+        elif not self.frozen:
+            self._learn_start(sample, way)
+        # until the first fit, nothing is published or judged
+        if knowledge.start is None or knowledge.start.fitted:
+            self._decide(difference * now.s)
+
+    def _raise_alarm(self, alarm: LearningAlarm | None) -> None:
+        """Update the alarm's state with an alarm, if there is one, and send the notification that results."""
+        if alarm is None:
+            return
+        pending = self._standing.is_pending
+        if news := self._standing.update(alarm):
+            self._notify(news, True)
+        self._refuted = self._refuted or (pending and not self._standing.is_pending)
+
+    def _publish(self, how: str) -> None:
+        """Publish the learned calibration; `how` is the reason in the notification."""
+        self._notify(self._publication.publish(self.learned(), how))
+        self._unconfirmed = False
+
+    def _settle(self, how: str) -> None:
+        """Close the alarm, if there is one; `how` is the reason in the notification."""
+        if self._standing.alarm is None:
+            return
+        self._standing.end()
+        # the evidence so far belongs to the alarm that is over
+        self._knowledge.detector.restart()
+        self._knowledge.late_telemetry.restart()
+        self._notify(f"explained again: {how}")
+
+    def _close_unexplained(self) -> None:
+        """Close an alarm that no coefficient explained, and restart the judge, which its cause affected."""
+        self._publication.judge.restart()
+        self._settle("gone")
+
+    def _judge(self, sample: LearningSample, way: Way) -> Observation:
+        """Predict a sample by every calibration; return the published one's observation."""
+        publication, judge = self._publication, self._publication.judge
+
+        def observe(nine: FloatArray) -> Observation:
+            return self._knowledge.observe(sample.field, nine, sample.reference)
+
+        direction = observe(publication.nine(sample.phi)[FIRST]).direction
+        if judge.is_due(way.metres, way.seconds, direction) and self._knowledge.start is None:
+            publication.propose(self._knowledge.bank.best.coefficients)
+        seen = [observe(nine) for nine in publication.nine(sample.phi)]
+        # a calibration that was replaced goes on with the level of its crustal field
+        for which, nine in publication.replaced(sample.phi).items():
+            judge.replace(which, seen[which].e - observe(nine).e, seen[which].s)
+        first, published, candidate = seen
+        # the judge's filters move on over the same way as the estimators
+        F = self._knowledge.believed.transition(*way)[0]
+        judge.judge(F, (first.e, published.e, candidate.e), first.s)
+        return published
+
+    def _compare(self, time: float, difference: float) -> None:
+        """Select the best estimator; `difference` (nT): published residual less the best's."""
+        bank, publication = self._knowledge.bank, self._publication
+        best, was_doubted = bank.best, bank.map_doubted
+        seen = (
+            (best.filter.innovation + difference, best.filter.variance)
+            if publication.learned
+            else publication.judge.last
+        )
+        self._standing.count(*seen, informative=bank.quiet.is_informative)
+        bank.judge(time)
+        if bank.map_doubted and bank.without_map is not None:
+            size = abs(bank.without_map.crust)
+            alarm = LearningAlarm(("map_error",), ("",), bank.map_since, size, bank.map_lead, mapless=True)
+            self._raise_alarm(alarm)
+        if bank.map_doubted != was_doubted:
+            publication.judge.restart(self._knowledge.believed)
+
+    def _learn_start(self, sample: LearningSample, way: Way) -> None:
+        """Learn from a sample while the batch fit runs, before a filter can be linearised."""
+        if not self._knowledge.begin(sample, way):
+            self._count(learned=True)
+            return
+        self._publication.propose(self._knowledge.bank.quiet.coefficients)
+        self._publication.judge.restart(self._knowledge.nuisance)
+        if self._publication.learned:
+            self._publication.renew(self.learned())
+            self._publication.is_update = False  # the previous fit may have caused the jump
+        self._knowledge.go_on()
+
+    def _count(self, *, learned: bool) -> None:
+        """Count a sample, and whether coefficients were learned from it."""
+        self.samples += learned
+        self._publication.age += 1
+
+    def _decide(self, difference: float) -> None:
+        """Publish or roll back; `difference` is the difference of learned and published total field, nT."""
+        publication = self._publication
+        if not self.frozen and (self._refuted or self._end()):
+            self._standing.restart()
+            self._restart_judged()
+            return
+        worse, relapsed = publication.judge.roll_back, self._standing.relapses > 0
+        # discard the worse calibration first, then publish the better one
+        if worse and not publication.learned and self._standing.alarm is None:
+            publication.judge.discard()  # the learned calibration may improve yet
+        elif worse or (relapsed and publication.judge.improves < -BEYOND_CHANCE):
+            self._standing.mark_mistaken()
+            if worse and publication.learned:
+                self._notify(publication.roll_back())
+            self._restart_judged()
+            return
+        if self.frozen or not self._trusted():
+            return
+        # the first publication needs the judge; later ones follow the estimator
+        pending = self._standing.is_pending
+        if pending or not publication.learned:
+            if self._holds():
+                self._publish_learned()
+        elif publication.stale(difference):
+            publication.renew(self.learned())
+
+    def _restart_judged(self) -> None:
+        """Restart learning and the judge from the published calibration."""
+        self._publication.judge.restart()
+        self._unconfirmed = self._refuted = False
+        self._restart(self._knowledge.nuisance)
+
+    def _holds(self) -> bool:
+        """Return True if the learned calibration is better, and its change significant everywhere."""
+        publication, best = self._publication, self._knowledge.bank.best
+        if self._knowledge.start is not None and not publication.learned:  # no calibration is published
+            return publication.judge.better > BEYOND_CHANCE
+        # better in the last blocks, and known at all attitudes so far
+        change = best.coefficients - publication.coefficients
+        expected = self._standing.is_pending and self._expected
+        return publication.judge.adopt(expected=expected) and self._knowledge.coverage.is_significant(
+            change, best.covariance
+        )
+
+    def _publish_learned(self) -> None:
+        """Publish the learned calibration; close the alarm that it explains."""
+        if not self._standing.is_pending:
+            for estimator in self._knowledge.bank.all:
+                estimator.keep_level(self._publication.coefficients)
+            self._publish("learned")
+            return
+        self._publication.publish(self.learned(), "learned")
+        self._unconfirmed = False
+        how = self._explained
+        if self._standing.confirm():
+            self._notify(f"explained again: {how}")
+
+    def _trusted(self) -> bool:
+        """Return True without an alarm, or if the best estimator's hypothesis explains the alarm."""
+        standing, bank = self._standing, self._knowledge.bank
+        if standing.alarm is None or standing.is_mapless or standing.is_tried:
+            return True
+        return standing.is_learnable and not standing.relapses and bank.best is not bank.quiet
+
+    def _end(self) -> bool:
+        """Close an alarm that has been silent for long, or learn the cause of one that is certain enough.
+
+        Return True if learning has to restart, because no later samples confirmed the learned calibration.
+        """
+        standing, publication = self._standing, self._publication
+        judge = publication.judge
+        if standing.is_pending and (judge.improves > 0.0 or not judge.is_complete):
+            return False
+        if not standing.is_silent:
+            if standing.is_certain:
+                self._take_up()
+            return False
+        # learning that nothing has confirmed restarts from the published calibration
+        restart = self._unconfirmed or (standing.relapses > 0 and not standing.is_tried)
+        if not standing.is_tried:
+            self._close_unexplained()
+        elif publication.learned and not standing.is_pending:
+            self._settle(self._explained)
+        else:
+            name = "learned" if publication.learned else "first"
+            which = calibration_id(publication.calibration)
+            self._settle(f"the {name} calibration holds, {which:08x}")
+        return restart
+
+    @property
+    def _explained(self) -> str:
+        """The learned causes of the alarm, in words."""
+        assert self._standing.alarm is not None
+        causes = named([one for one in self._standing.alarm.causes if one not in NO_COEFFICIENT])
+        return f"{causes}, learned {calibration_id(self._publication.calibration):08x}"
+
+    def _take_up(self) -> None:
+        """Learn the cause of the alarm, if coefficients can represent it, on trial."""
+        bank, alarm = self._knowledge.bank, self._standing.alarm
+        strength = self._knowledge.detector.strength
+        if strength < MIN_CAUSE_LOG_RATIO:
+            self._close_unexplained()
+            return
+        assert alarm is not None
+        # a cause that explains the samples needs less confirmation than a change without an alarm
+        self._expected = self._knowledge.detector.misfit < MAX_MISFIT
+        if "temperature_offset" not in alarm.causes or not bank.take_over(strength):
+            moved = self._knowledge.detector.learned()
+            if moved is None:
+                return
+            bank.explained(*moved, strength)
+        self._knowledge.detector.restart()
+        self._publication.judge.discard()
+        self._standing.try_cause()
+        self._unconfirmed = True

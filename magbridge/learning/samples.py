@@ -29,8 +29,6 @@ from magbridge.estimation.track_process import Course
 from magbridge.field.geodesy import separation
 from magbridge.records import Vector
 
-__all__ = ["Intake", "LearnedTerms", "LearningSample", "Observation", "Way", "observe"]
-
 
 class Observation(NamedTuple):
     """Residual ``e = (|A (H_r - T)| - H_e) / s`` (nT), s, and de by the nine coefficients (9,)."""
@@ -41,65 +39,46 @@ class Observation(NamedTuple):
 
     @property
     def direction(self) -> FloatArray:
-        """Direction of the field in sensor axes (3,), up to the soft iron."""
+        """Direction of the field in sensor axes (3,), but for the soft iron."""
         return -self.s * self.by_nine[6:]
 
 
-def observe(field: Vector, nine: FloatArray, F_0: float, reference: float, kappa: float = 0.0) -> Observation:
+def observe(field: Vector, nine: FloatArray, F_0: float, reference: float) -> Observation:
     """Compare one sample with its reference.
 
-    `nine` (9,) are the coefficients of A (as ``(A - I) F_0``) and of T at the sample's positions, nT; `kappa`
-    is the noise of the reference over the sensor's.
+    `nine` (9,) are the coefficients of A (as ``(A - I) F_0``: xx, yy, zz, xy, xz, yz) and of T at the
+    sample's positions, nT.
     """
-    axx, ayy, azz, axy, axz, ayz, tx, ty, tz = nine.tolist()
-    # A and b = A (H_r - T), written out: numpy would cost ten times as much
-    xx, yy, zz = 1.0 + axx / F_0, 1.0 + ayy / F_0, 1.0 + azz / F_0
-    xy, xz, yz = axy / F_0, axz / F_0, ayz / F_0
-    dx, dy, dz = field[0] - tx, field[1] - ty, field[2] - tz
-    bx, by, bz = xx * dx + xy * dy + xz * dz, xy * dx + yy * dy + yz * dz, xz * dx + yz * dy + zz * dz
-    F = sqrt(bx * bx + by * by + bz * bz)
-    ux, uy, uz = bx / F, by / F, bz / F
-    # w = A^T u; s^2 = kappa^2 + w^T w, the variance of the residual over the sensor's
-    wx, wy, wz = xx * ux + xy * uy + xz * uz, xy * ux + yy * uy + yz * uz, xz * ux + yz * uy + zz * uz
-    s2 = kappa * kappa + wx * wx + wy * wy + wz * wz
+    xx, yy, zz, xy, xz, yz = (nine[:6] / F_0).tolist()
+    A = np.array(((1.0 + xx, xy, xz), (xy, 1.0 + yy, yz), (xz, yz, 1.0 + zz)))
+    # corrected vector A (H_r - T), its length F and direction u
+    d = np.array(field) - nine[6:]
+    b = A @ d
+    F = sqrt(b @ b)
+    u = b / F
+    # w = A^T u; s^2 = w^T w, the variance of the residual over the sensor's
+    w = A @ u
+    s2 = float(w @ w)
     s = sqrt(s2)
     e = (F - reference) / s
-    # derivative of s: dA enters by A w
-    vx, vy, vz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
-    # the part of v along the field does not turn it, so it is left out of the derivative by the direction
-    along = ux * vx + uy * vy + uz * vz
-    k = e / s2
-    kF = k / F
-    zx, zy, zz_ = (
-        ux / s - kF * (vx - ux * along),
-        uy / s - kF * (vy - uy * along),
-        uz / s - kF * (vz - uz * along),
-    )
-    # first the six of A, diagonal then off-diagonal, then the three of T
-    by_nine = np.array(
-        (
-            (zx * dx - k * wx * ux) / F_0,
-            (zy * dy - k * wy * uy) / F_0,
-            (zz_ * dz - k * wz * uz) / F_0,
-            (zx * dy + zy * dx - k * (wx * uy + wy * ux)) / F_0,
-            (zx * dz + zz_ * dx - k * (wx * uz + wz * ux)) / F_0,
-            (zy * dz + zz_ * dy - k * (wy * uz + wz * uy)) / F_0,
-            -(xx * zx + xy * zy + xz * zz_),
-            -(xy * zx + yy * zy + yz * zz_),
-            -(xz * zx + yz * zy + zz * zz_),
-        )
-    )
-    return Observation(e, s, by_nine)
+    # derivative of e by b: that of F / s, and that of s, to which the part of A w along u does not contribute
+    v, k = A @ w, e / s2
+    z = u / s - k / F * (v - u * (u @ v))
+    # derivative by the elements of A; by an element off the diagonal it is that by both of its places
+    by_A = np.outer(z, d) - k * np.outer(w, u)
+    both = by_A + by_A.T
+    by_six = np.array((by_A[0, 0], by_A[1, 1], by_A[2, 2], both[0, 1], both[0, 2], both[1, 2]))
+    return Observation(e, s, np.concatenate([by_six / F_0, -(A @ z)]))
 
 
 MAX_WAITING_SAMPLES: Final = 64
-"""Samples that wait for newer telemetry, at most: the first are then left out."""
+"""Largest number of samples that wait for newer telemetry; the oldest are then discarded."""
 SHORTAGE_US: Final = 3_600_000_000
 """Time without a usable sample after which the bridge sends a notification, µs."""
 
 
 class LearningSample(NamedTuple):
-    """One that may be learned from, unless it is `faulty`: see :meth:`.Learner.sample`.
+    """A sample to learn from, or of a `faulty` sensor: see :meth:`.Learner.sample`.
 
     ``phi`` (m,) are all regressors, ``positions`` the masses', scaled.
     """
@@ -115,7 +94,7 @@ class LearningSample(NamedTuple):
 
 
 class Way(NamedTuple):
-    """The way from one sample to the next."""
+    """Distance, time and change of course from one sample to the next."""
 
     metres: float
     seconds: float
@@ -135,7 +114,7 @@ class Intake:
         self._course = Course()
 
     def due(self, time_us: int, *, fit: bool) -> bool:
-        """Return whether it is time for another sample, `fit` to learn from or not."""
+        """Return True if it is time for another sample; `fit` is True if it can be learned from."""
         return not 0 <= time_us - (self._taken_us if fit else self._looked_us) < 0.99 * self._period_us
 
     def drop(self) -> None:
@@ -143,7 +122,7 @@ class Intake:
         self._held.clear()
 
     def confirmed(self, time_us: int, age: float) -> list[LearningSample]:
-        """Return those that waited for a sample now, at which nothing moves, with telemetry `age` (s) old."""
+        """Return the waiting samples that are older than the telemetry, which has the `age` (s) at a time."""
         self._looked_us = time_us
         out = []
         # a sample is confirmed by telemetry that is newer than it
@@ -173,7 +152,7 @@ class Intake:
         return True
 
     def moved(self, sample: LearningSample) -> Way:
-        """Return the way from the last sample that was taken, which this one is now."""
+        """Return the way from the previous sample that was learned from to this one."""
         before, last_us = self._where or sample.where, self._last_us or sample.time_us
         self._where, self._last_us = sample.where, sample.time_us
         north, east = separation(*before, *sample.where)
@@ -184,15 +163,9 @@ class Intake:
 class LearnedTerms:
     """A calibration's terms, and offsets that follow the temperature and `currents` (telemetry in ampere).
 
-    Attributes
-    ----------
-    parameters, watched, further : tuple of str
-        Names of the calibration's parameters; the temperature and the currents; and those of them that the
-        calibration does not follow itself.
-    size : int
-        Number of coefficients K with those of the further terms, three a channel.
-    offsets : (3,) int array
-        Which coefficients are the constant offset of x, y and z.
+    `parameters` are the names of the calibration's parameters, `watched` the temperature and the currents,
+    `further` those of them that the calibration does not follow itself. `size` is the number of coefficients
+    K with those of the further terms, three a channel; `offsets` (3,) are the indices of the constant offset.
 
     Raises
     ------
@@ -297,7 +270,7 @@ class LearnedTerms:
         return np.asarray((coefficients @ self._flat).reshape(self._tensor.shape[1:]))
 
     def derivative(self, phi: FloatArray, by_nine: FloatArray) -> FloatArray:
-        """Return (K,) derivative by the coefficients of what changes with the nine by `by_nine` (9,)."""
+        """Return the derivative (K,) by the coefficients from that by the nine coefficients (9,)."""
         return np.asarray(self._flat @ np.outer(phi, by_nine).ravel())
 
     def _index(self, used: Sequence[int]) -> IndexArray:
@@ -307,7 +280,7 @@ class LearnedTerms:
         return np.array([*range(self._own), *further])
 
     def coefficients(self, calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-        """Return (K,) and covariance (K, K) of a calibration that :meth:`calibration` made, or the first."""
+        """Return the coefficients (K,) and covariance (K, K) of a calibration with some of the terms."""
         names = [name for name in calibration.channels if name not in self._base.channels]
         index = self._index([self.watched.index(name) for name in names])
         coefficients, covariance = np.zeros(self.size), np.zeros((self.size, self.size))

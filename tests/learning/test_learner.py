@@ -22,11 +22,11 @@ def test_one_sample_is_the_fits_own_residual() -> None:
     rng = np.random.default_rng(2)
     nine = rng.normal(size=9) * 500.0
     field = rng.normal(size=(5, 3)) * 30_000.0
-    samples = ResidualSamples(field, np.full(5, FIELD), np.ones((5, 1)), np.ones(5), 48_000.0, 0.3)
+    samples = ResidualSamples(field, np.full(5, FIELD), np.ones((5, 1)), np.ones(5), 48_000.0)
     e, g = residuals(samples, nine)
     for n in range(5):
         x, y, z = field[n].tolist()
-        one = observe((x, y, z), nine, 48_000.0, FIELD, 0.3)
+        one = observe((x, y, z), nine, 48_000.0, FIELD)
         assert one.e == pytest.approx(e[n], rel=1e-12)
         np.testing.assert_allclose(one.by_nine, g[n], rtol=1e-9)
 

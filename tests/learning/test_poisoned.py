@@ -169,7 +169,7 @@ def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None
     learner._publication.judge._to_first._sums[:, 1] = 10.0
     assert learner.state.better > 5.0
     assert learner.flags == Quality.UNEXPLAINED
-    learner._decision.close_unexplained(learner._knowledge)
+    learner._close_unexplained()
     assert (learner.state.better, learner.flags) == (0.0, 0)
 
 
