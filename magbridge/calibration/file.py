@@ -198,9 +198,9 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
     """Build the calibration; refuse inconsistent numbers."""
     # shapes before values: a ragged covariance has no array
     coefficients = np.array(content.coefficients, float)
-    rows = {len(row) for row in content.covariance}
-    if rows != {coefficients.size} or len(content.covariance) != coefficients.size:
-        raise CalibrationError(f"covariance: expected {coefficients.size} x {coefficients.size} numbers")
+    size = coefficients.size
+    if [len(row) for row in content.covariance] != [size] * size:
+        raise CalibrationError(f"covariance: expected {size} x {size} numbers")
     covariance = np.array(content.covariance, float)
     _check_covariance(covariance)
     if content.boresight:

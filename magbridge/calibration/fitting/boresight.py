@@ -51,7 +51,7 @@ from magbridge.errors import CalibrationError
 # ---- From roll and pitch alone ----
 
 INCLINATION_SIGMA_DEG = 0.2
-"""1-sigma of a main-field model's inclination (Chulliat et al, deg. 2020, table 14)."""
+"""1-sigma of a main-field model's inclination (Chulliat et al. 2020, table 14), deg."""
 RUN_TILT_SIGMA_DEG = 0.2
 """Expected 1-sigma of the offset of roll and of pitch in one run, deg."""
 RUN_TILT_PRIOR_COUNT = 2.0
@@ -61,15 +61,15 @@ MAX_RUN_TILT_SIGMA_DEG = 10.0
 MIN_SQUARED_LEVER = 1e-12
 """Smallest sum of squared derivatives of a run, so that none divides by zero."""
 MIN_TILT_SIGMA_DEG = 0.02
-"""Smallest 1-sigma of the tilt's noise that is believed, deg."""
+"""Smallest 1-sigma of the tilt's noise, deg."""
 MAX_ITERATIONS = 50
 CONVERGED_RAD = 1e-8
 MIN_SAMPLES = 30
 SEARCH_SAMPLES = 400
 MAX_STEP_RAD = 0.5
-"""Longest step, rad: the residual is linear in the rotation over that at most."""
+"""Longest step over which the residual counts as linear in the rotation, rad."""
 LEAST_INFORMATION = 3.0 / np.pi**2
-"""1/rad^2, of an angle of which nothing is known: it is uniform over a full turn."""
+"""Information about an angle that is uniform over a full turn, 1/rad^2."""
 DAMPING = 1e-9
 """Fraction of the information's trace that keeps an angle which the rows do not see where it is."""
 AXIS_ANGLES = ("roll", "pitch", "heading")
@@ -112,11 +112,11 @@ def boresight_from_tilt(
 ) -> TiltBoresight:
     """Estimate the rotation from corrected sensor axes to body axes from roll and pitch alone.
 
-    `vector` (n, 3): nT, corrected field in sensor axes. `roll`, `pitch` (n,): rad. `total` (n,): nT,
-    reference total field. `inclination` (n,): rad, of the reference field, positive downwards. `runs` (n,):
-    run of each sample: the tilt's offset is common to a run.
+    `vector` (n, 3): corrected field in sensor axes, nT. `roll`, `pitch` (n,): rad. `total`, `inclination`
+    (n,): of the reference field, nT and rad, positive downwards. `runs` (n,): run of each sample, with one
+    offset of the tilt.
 
-    CalibrationError: fewer than :data:`MIN_SAMPLES` samples, or the iteration does not converge.
+    CalibrationError: fewer than :data:`MIN_SAMPLES` samples.
     """
     if len(vector) < MIN_SAMPLES:
         raise CalibrationError(
@@ -265,13 +265,10 @@ def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
 def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnostic | None:
     """Return a warning if headings seem to be measured from magnetic north; else None.
 
-    Notes
-    -----
-    Headings short of the declination D turn every vector by D about the vertical. For a vehicle that stays
-    level that is a boresight of D, and the mounting looks turned. For one that dives and climbs at a pitch p
-    it is not a rotation of the sensor: the best one is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 +
-    sin^2 I) / 2)`` about z, I the inclination (7.4 deg of 17.6 at p = 24 and I = 70 deg), and leaves angles
-    that a correct heading does not.
+    Notes ----- Headings short of the declination D turn every vector by D about the vertical. For a level
+    vehicle that is a boresight of D. For one that dives and climbs at a pitch p, in a field of inclination I,
+    the best rotation is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 + sin^2 I) / 2)`` about z (7.4 deg
+    of 17.6 at p = 24 and I = 70 deg), and leaves angles that a correct heading does not.
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
@@ -323,13 +320,11 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
 
 
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
-    """Find the rotation from corrected sensor axes to body axes.
+    """Find the rotation from corrected sensor axes to body axes from attitude with headings.
 
-    Returns: None if too few samples have both attitude and reference direction, or the calibration has
-    effects.
+    Returns None if too few samples have attitude and reference direction, or the calibration has effects.
 
-    CalibrationError: no rotation takes the corrected vectors to where attitude and main field say they
-    point.
+    CalibrationError: no rotation takes the corrected vectors to where attitude and main field say they point.
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:

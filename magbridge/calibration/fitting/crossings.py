@@ -19,36 +19,34 @@ MIN_CROSSING_DEG = 30.0
 REVERSED_COURSE_DEG = 150.0
 """Difference of two courses from which on the second is the reverse of the first, deg."""
 FEW = 3
-"""Crossed places below which a survey says nothing about itself."""
+"""Number of crossed places below which a survey does not test itself."""
 PLACE_LENGTH_FRACTION = 0.25
 """Distance within which places count as one, as a fraction of the crustal field's length."""
 FARTHEST, NEAR = 5.0, 1000.0
 """Multiple of the distance from the middle within which 99 % of the samples stay, and its least value, m."""
 PLACES = (125.0, 250.0, 500.0)
-"""Distance within which places count as one before the length is known, m
-(:data:`PLACE_LENGTH_FRACTION` of 0.5 to 2 km)."""
+"""Distances within which places count as one before the length is known, m."""
 OFTEN, TWICE = 0.08, 2
 """Least fraction and number of the places that a survey has to meet again on another course: six hours of a
 glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
 AHEAD, LEGS = 0.8, 6
 """Mean resultant length of the courses (Mardia & Jupp 2000, eq. 2.3.3) below which legs have different
-courses, and number of the widest places to which they must lead: a crustal field that is smooth near a leg is
-then not correlated with heading. A zigzag of 3 h without crossings has 0 to 0.6, dives along one line 0.93;
-runs stay at one place."""
+courses, and number of the widest places to which they must lead. A zigzag of 3 h without crossings has 0
+to 0.6, dives along one line 0.93."""
 AREA = 120.0
-"""Extent, m, below which the crustal field is nearly constant: its level, and the rest is the vehicle's."""
+"""Extent below which the crustal field is nearly constant, m."""
 LEAP = 100.0
-"""m beyond what the vehicle can have moved: a jump in position."""
+"""Distance beyond what the vehicle can have moved that is a jump in position, m."""
 MIN_LENGTH_SPACINGS = 0.5
-"""Fraction of the distance between tracks: a crustal field of shorter length differs from track to track."""
+"""Fraction of the distance between tracks: a shorter field differs from track to track."""
 MIN_COURSE_M = 5.0
-"""m between samples, below which a course is not one."""
+"""Smallest distance between samples that gives a course, m."""
 
 
 def tells_rock(data: Observations) -> bool:
     """Return True if the track separates the crustal field from the vehicle's.
 
-    It does where it came back to places on other courses, or where legs on other courses follow each other.
+    It came back to places on other courses, or legs on other courses follow each other.
     """
     if data.place is None:
         return False
@@ -96,8 +94,7 @@ def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float)
 def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[Diagnostic]:
     """Yield a warning if a crustal field of a `length`, m, changes too fast for a track (n, 2), m.
 
-    `shortest` is the least length, m, that was tried: a fit that ends there has found the limit, not the
-    length of the field.
+    `shortest`: least length that was tried, m; a fit that ends there has not found the length.
     """
     place = courses(track)[0]
     if len(place) < FEW:
@@ -146,9 +143,9 @@ def jumps(place: FloatArray, time: FloatArray) -> IndexArray:
 
 
 def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, int]:
-    """Return at how many places courses (n,), rad, cross, and at how many others one is the other's reverse.
+    """Return at how many places courses (n,), rad, cross, and at how many others they are reversed.
 
-    `place` (n, 2) and `cell`, the size of one place, are in m.
+    `place` (n, 2), `cell`: places, and size of one, m.
     """
     # number the cells, and go through the samples cell by cell
     _, of = np.unique(np.floor(place / cell).astype(np.int64), axis=0, return_inverse=True)

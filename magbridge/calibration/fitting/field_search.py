@@ -33,7 +33,7 @@ RUNGS = 7
 NODES_PER_LENGTH = {2: 8.0, 3: 8.0, 4: 5.0}
 SMOOTH, ENOUGH = 6, 3.0
 """Nodes a length by the power alpha, and from SMOOTH on: of a field 40 times the noise they leave out less
-than that noise (rough ones on coarser nodes gave maps with errors of 5 to 8 sigmas)."""
+than the noise."""
 PAD_LENGTHS = 1.0
 """Lengths around the track that have nodes."""
 MAX_FIELD_NODES = 4_000
@@ -56,11 +56,10 @@ def _nodes_per_length(alpha: int, finer: float) -> float:
 def nodes_for(
     place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES, finer: float = 1.0
 ) -> Nodes:
-    """Return the nodes of a field around places (n, 2), m; coarser if they are too many.
+    """Return the nodes of a field around places (n, 2), m, of a `length`, m, and power `alpha`.
 
-    `place` (n, 2): m. `length`: m, of the field. `alpha`: its smoothness: a rough one takes finer nodes.
-    `most`: nodes at most, about. `finer`: factor of the nodes per length of a smooth field; the error of its
-    splines falls as the fourth power.
+    `most`: number of nodes, about, at which they become coarser. `finer`: factor of the nodes per length of a
+    smooth field; the error of its splines falls as the fourth power.
     """
     # finest spacing that the length needs, coarser until there are few enough nodes
     box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
@@ -71,7 +70,7 @@ def nodes_for(
 
 
 def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolArray:
-    """Return which of places (n, 2), m, are the `number` nearest to the middle one, or within `wide` m: (n,).
+    """Return True for the `number` of places (n, 2), m, nearest to the middle, or within `wide` m.
 
     They lie in a square, so that whole stretches of lines are among them.
     """
@@ -82,7 +81,7 @@ def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolA
 
 
 def ladder(place: FloatArray) -> FloatArray:
-    """Return seven lengths to try, m: from the resolution of samples at places (n, 2), m, to the area."""
+    """Return lengths to try, m: from the resolution of samples at places (n, 2), m, to the area."""
     # shortest: four steps between samples; longest: a fraction of the area
     known = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(known, axis=0)))
@@ -106,7 +105,7 @@ WHITE_AUTOCORRELATION = 0.03
 MAX_FIT_AUTOCORRELATION = 0.995
 """Largest autocorrelation of a sample with the next one."""
 SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
-"""Crustal field, nT, and the 1-sigma of its logarithm: sea floor and land, as airborne surveys find them."""
+"""Crustal field, nT, as airborne surveys find it, and the 1-sigma of its logarithm."""
 LENGTH_SPREAD = np.log(6.0)
 """1-sigma of the logarithm of the length, about the middle of those that are tried."""
 
@@ -159,10 +158,10 @@ def choose(
 ) -> Choice:
     """Choose the field without a start: lengths from a ladder, then smoothness and the rest.
 
-    `sums_of`: the samples' sums with a field. `place` (n, 2): m, where they are. `weighed`: what each is
-    weighed with. `start`: the field's size over the noise's, to begin with. `harmonic`: whether the depth
-    varies, so that a field which falls off upwards differs from one that does not. `rho`: autocorrelation of
-    the noise, where it is known. `effort`: share of the usual steps. `most`: nodes at most.
+    `sums_of`: normal equations of the samples with a field. `place` (n, 2): m. `start`: size of the field
+    over the noise. `harmonic`: True if the depth varies, so that a field that falls off upwards differs.
+    `rho`: autocorrelation of the noise, if known. `effort`: fraction of the usual steps. `most`: nodes at
+    most.
     """
     # 1. length by a ladder at the usual smoothness; 2. falling off upwards or not; 3. smoothness; 4.
     # sources at a depth. Each step starts from the best so far and maximises the evidence over size, memory
@@ -303,11 +302,11 @@ def refined(
 # ---- What the search leaves open ----
 
 MAX_UNCERTAIN_NODES = 2_500
-"""Nodes from which on size and length are known well enough."""
+"""Number of nodes from which on size and length are known well enough."""
 LOG_STEP = 0.3
 """Step in the logarithms of amplitude and length with which the evidence's curvature is computed."""
 WIDEST = 0.7
-"""Largest spread of these logarithms: beyond, the evidence is not a parabola."""
+"""Largest spread of these logarithms, beyond which the evidence is not a parabola."""
 RULE = ((0.0, 2.0 / 3.0), (3.0**0.5, 1.0 / 6.0), (-(3.0**0.5), 1.0 / 6.0))
 """Nodes and weights for a standard normal distribution."""
 MIN_WEIGHT = 0.01
@@ -317,8 +316,7 @@ MIN_WEIGHT = 0.01
 def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[float, Choice]]:
     """Return choices about the best one with their weights, which add up to 1; the best one first.
 
-    `score`: the log evidence of a choice; may raise LinAlgError where there is none. `best`: about where
-    that is largest.
+    `score`: log evidence of a choice; may raise LinAlgError where there is none.
     """
     if best.field.nodes.size > MAX_UNCERTAIN_NODES:
         return [(1.0, best)]

@@ -63,9 +63,9 @@ from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import rms
 
 REFERENCE_ERROR_LENGTH_M = 25_000.0
-"""m over which the reference's error, of waves far longer than a site, changes by its size: 6 nT/km."""
+"""Distance over which the reference's error changes by its size, m: 6 nT/km."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
-"""nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
+"""Slow change over a stretch, nT, and 1-sigma of its logarithm: a quiet day's currents aloft."""
 DRIFTING = 2700.0
 """Half the period of the fastest drift of a position, s."""
 
@@ -81,10 +81,9 @@ def fit_in_place(
 ) -> Fit:
     """Fit coefficients, level, slow changes, what the offset follows, and the field in place.
 
-    `data`: with places, none of them far from all others. `order`: highest total degree of the polynomials
-    in the masses' positions. `level`: nT, 1-sigma of the reference's error that is the same everywhere.
-    `vehicle`, `known`: as for :func:`~.methods.fit_auto`. `position_sigma`: m, by which dead-reckoned
-    positions slowly drift; the fit then corrects the track to the field.
+    `level`: 1-sigma of the reference's error that is the same everywhere, nT. `vehicle`, `known`: as for
+    :func:`~.methods.fit_auto`. `position_sigma`: size of the slow drift of dead-reckoned positions, m; the
+    fit then corrects the track to the field.
 
     CalibrationError: the data have no positions. NoSolutionError: the fit collapsed or did not converge.
     """
@@ -152,11 +151,8 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
 def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, SurveySamples]:
     """Return the converged fit, and the samples with the optional terms that the log needs.
 
-    A long log converges with every second or tenth sample first, and then with all. Optional terms that are
-    kept have changed the field that was searched with them: if they gain little, another search without them
-    may be better.
-
-    CalibrationError: the fit does not converge.
+    A long log converges with every second or tenth sample first, and then with all. The field was searched
+    with all optional terms in the fit: where a kept term gains little, a search without it may be better.
     """
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), family)
@@ -209,12 +205,11 @@ def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:
 
 
 TEMPERATURE_LAGS_S = (0.0, 600.0, 2400.0)
-"""Time constants with which the offset may follow the temperature, s: a bare sensor, in its housing, in a
-hull."""
+"""Time constants between temperature and offset, s: a bare sensor, its housing, a hull."""
 SHORTEST_DRIFT_HALF_PERIOD_S = 1200.0
-"""Half the period of the fastest creep, s: it follows a random walk of 20 nT in 6 h to 1 nT, and a step."""
+"""Half the period of the fastest drift of the offset, s."""
 VARIES = 0.5
-"""Standard deviation of a temperature, from which on it can tell anything, degC."""
+"""Smallest standard deviation of a temperature that can be fitted, degC."""
 PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 """nT/degC and nT along an axis (fluxgates' data sheets: 0.1 to 3 nT/degC), 1-sigma of their logarithms."""
 
@@ -253,10 +248,10 @@ def with_temperature(
     groups: tuple[ParameterBlock, ...],
     found: tuple[FloatArray, FloatArray, FloatArray],
 ) -> Calibration:
-    """Return the calibration with the effect of the temperature that was found, if any.
+    """Return the calibration with the effect of temperature that was found, if any.
 
-    `calibration`: its position terms. `data`: of the fit. `groups`: that are in the fit, in order. `found`
-    (q,): the unknowns, their covariance, and what they do to the coefficients.
+    `groups`: the blocks of the fit, in order. `found`: the unknowns (q,), their covariance, and the matrix
+    from them to the coefficients.
     """
     # The offset by temperature becomes a channel effect with three more coefficients: the rows of z that
     # are its own are copied into them, with their covariance with all others.
@@ -277,7 +272,7 @@ def with_temperature(
 
 
 def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
-    """Return the calibration with the spread of the offsets (n, 3), nT, of the survey."""
+    """Return the calibration with the variance of the survey's offsets (n, 3), nT, added to that of T."""
     covariance = calibration.covariance.copy()
     # beyond the survey the offset may have any value that it had: add its variance to that of T
     covariance[6:9, 6:9] += creep.T @ creep / len(creep)

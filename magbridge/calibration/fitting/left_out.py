@@ -33,20 +33,19 @@ from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
 PARTS, BLOCKS = 10, 4
-"""Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three, or one
-that is most of the log."""
+"""Number of parts of a log with runs, at most, and of blocks where it has fewer than three runs."""
 ATTITUDES = 6
-"""Groups of samples with the field in like directions, each of which is left out, too."""
+"""Number of groups of samples with similar field directions, each of which is left out, too."""
 MAX_GROUP_AUTOCORRELATION = 0.98
-"""Autocorrelation of neighbours from which on a group of like attitude cannot be left out."""
+"""Autocorrelation of neighbours up to which groups of like attitude are left out."""
 FORWARD_PARTS = 4
 """Parts of a log in time, of which the earlier ones predict the next."""
 REFIT_STEPS = 10
-"""Gauss-Newton's, at most, of a fit without a part: it begins at the fit to all."""
+"""Largest number of Gauss-Newton steps of a fit without a part; it begins at the fit to all."""
 TESTED = 20_000
-"""Samples that are predicted: enough for any ratio."""
+"""Largest number of samples that are predicted."""
 ISOLATED = 0.02
-"""Share of the samples up to which outliers are single wrong samples, of which a model need know nothing."""
+"""Fraction of the samples up to which outliers are single wrong samples and do not count."""
 CHANCE = 2.0
 """Standard errors by which R^2 must exceed 1 before it counts."""
 
@@ -56,20 +55,18 @@ class LeftOut:
     """Errors of the parts left out, each predicted from the others."""
 
     rms: float
-    """RMS error in the sensor's own units, nT; single samples count as five sigmas at most."""
+    """RMS error in the sensor's units, nT; an outlier counts as five sigmas."""
     ratio: float
-    """Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
-    The larger one, where groups of like attitude are left out, too."""
+    """RMS of errors over claimed sigmas, of parts or of groups; 1 where not more than chance."""
     carried: float
-    """RMS with later parts of the log predicted from the earlier ones among the parts, nT."""
+    """RMS that includes later parts predicted from the earlier ones, nT."""
 
 
 def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitudes: bool = False) -> LeftOut:
-    """Predict each part of a fit's samples from the others, and later parts of the log from the earlier ones.
+    """Predict each part of a fit's samples from the others, and later parts from the earlier ones.
 
-    `runs` (n,): a label for each sample: whole runs are left out, or blocks of neighbours where there are few
-    runs. `attitudes`: leave out groups of like attitude, too. (Not where noise is correlated for longer than
-    an attitude lasts, as on an aircraft: neighbours that stay would then predict the group.)
+    `runs` (n,): labels; whole runs are left out, or blocks of neighbours where there are few runs.
+    `attitudes`: leave out groups of like attitude, too, where neighbours that stay do not predict the group.
     """
     # positions that come late in the log do not test the fit to its beginning
     left = _left_out(found, _parts(runs), forward=found.samples.phi.shape[1] == 1)
@@ -80,7 +77,7 @@ def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitud
 
 
 def _left_out(found: CoefficientPosterior, parts: list[IndexArray], *, forward: bool = False) -> LeftOut:
-    """Predict each of the `parts` from the others; and, `forward`, from the earlier ones."""
+    """Predict each of the `parts` from the others and, if `forward`, from the earlier ones."""
     samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
     c = found.coefficients
     # Normal equations are sums over samples. Those without a part are the whole minus the part's, and one
@@ -165,10 +162,9 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
 
 
 def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
-    """Return the places of each part: runs, several in one where there are many; else blocks.
+    """Return the rows of each part: runs, several in one where there are many; else blocks.
 
-    The rest of a log says little about a run that is most of it: the comparison is then of extrapolations
-    beyond the samples of each fit, and the wider prior loses.
+    Blocks, too, where one run is most of the log, since the rest says little about it.
     """
     _, first, label, count = np.unique(runs, return_index=True, return_inverse=True, return_counts=True)
     if len(first) < 3 or count.max() > len(runs) / 2:
@@ -180,7 +176,7 @@ def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
 
 
 def _alike(samples: ResidualSamples) -> list[IndexArray]:
-    """Return the places of each group of samples in which the field has like directions, by k-means."""
+    """Return the rows of each group of samples with similar field directions, by k-means."""
     u = samples.field / np.linalg.norm(samples.field, axis=1)[:, None]
     _, group = kmeans2(u, ATTITUDES, minit="++", rng=np.random.default_rng(1))
     return [rows for k in range(ATTITUDES) if len(rows := np.flatnonzero(group == k))]

@@ -50,13 +50,13 @@ from magbridge.toml import check_entries, convert, load_toml
 Vector = tuple[float, float, float]
 
 MOMENT, INDUCED = 2000.0, 30.0
-"""nT at the sensor, of a mass' own and induced moment: a battery pack at arm's length."""
+"""Permanent and induced moment of a mass, nT at the sensor: a battery pack at arm's length."""
 INDUCED_APART = 0.4
-"""Share of the induced moment by which the susceptibilities of the three axes differ."""
+"""Difference of the susceptibilities of the three axes, as a fraction of the induced moment."""
 TRAVEL_SIGMA = 0.03
-"""Share of the travel: sensor and vehicle are a degree or two out of alignment."""
+"""1-sigma of the travel, as a fraction: sensor and vehicle are a degree or two out of alignment."""
 REST_T, REST_A = 1.0, 0.25
-"""nT over half the range, in T and in a: what the dipole does not describe."""
+"""Size of what the dipole does not describe, nT over half the range, in T and in a."""
 LATENT = 12
 """Latent numbers of a mass."""
 
@@ -85,7 +85,7 @@ def read_vehicle(path: str | Path) -> dict[str, Mounting]:
 
 @dataclass(frozen=True, eq=False)
 class _Mass:
-    """A mounted mass in the fit: which monomials it contributes to, and the line along which it travels."""
+    """A mounted mass in the fit: its monomials, and the line along which it travels."""
 
     rows: IndexArray  # of its monomials x, x^2 ...
     at: FloatArray
@@ -104,11 +104,10 @@ class _Mass:
 def mass_columns(
     place: FloatArray, travel: FloatArray, parameter: Parameter, order: int, latent: FloatArray
 ) -> FloatArray:
-    """Return ``dc/dl`` (order + 1, 9, 12) of a mass: its coefficients, the constant first, by latent numbers.
+    """Return ``dc/dl`` (order + 1, 9, 12): coefficients of a mass, the constant first, by its latent numbers.
 
-    `place`, `travel` (3,): m, and m per unit of the parameter. `parameter`: that moves it. `order`: of the
-    highest power. `latent` (12,): moment (nT), induced moment (nT), shift (m), change of the travel (m per
-    unit).
+    `place`, `travel` (3,): m, and m per unit of the parameter. `latent` (12,): moment and induced moment
+    (nT), shift (m), change of the travel (m per unit).
     """
     # A dipole's field is evaluated at Chebyshev points of the travel, together with its derivatives, and
     # expanded in powers of the position: these are the coefficients of the monomials x, x^2 ...
@@ -130,10 +129,7 @@ def mounted_prior(
     parameters: tuple[Parameter, ...],
     vehicle: Mapping[str, Mounting | Mapping[str, Any]],
 ) -> PriorFamily:
-    """Add to the free polynomials a dipole for each mass of `vehicle`.
-
-    `free`: the result of :func:`~magbridge.estimation.priors.polynomial_prior`. `exponents`: its monomials.
-    `parameters`: scales of the monomials' positions. `vehicle`: keyed by the parameter's name.
+    """Add to the free polynomials `free` a dipole for each mass of `vehicle`.
 
     CalibrationError: `vehicle` names a mass that no parameter moves, or one too near the sensor for a power
     series.
@@ -216,7 +212,7 @@ def _linearised(family: PriorFamily, masses: list[_Mass], latent: FloatArray) ->
 # ---- A prior that is known ----
 
 DEPARTURE = "departure from the prior"
-"""Name of the width of z among ``widths_nT``: 1 where a deployment is as it was expected."""
+"""Name of the width of z: 1 where a deployment is as it was expected."""
 SPREAD = np.log(1.5)
 """1-sigma of the logarithm of that width."""
 
@@ -288,10 +284,9 @@ def rescaling(
     field_old: float,
     field_new: float,
 ) -> FloatArray:
-    """Return the matrix (9 m, 9 m) that makes coefficients in `new` scales of those in `old`.
+    """Return the matrix (9 m, 9 m) from coefficients in `old` scales of the positions to `new` ones.
 
-    `exponents`: the m monomials: all up to a degree. `old`, `new`: the same ones, scaled in two ways.
-    `field_old`, `field_new`: nT, F_0.
+    `exponents`: the m monomials, all up to a degree. `field_old`, `field_new`: F_0, nT.
     """
     # x_old = s x_new + t, so x_old^p = sum of binom(p, q) s^q t^(p-q) x_new^q; A is over F_0, T is not
     s = [n.scale / o.scale for o, n in zip(old, new, strict=True)]
@@ -321,11 +316,9 @@ class Posed:
 
 
 def pose(data: Observations, order: int, vehicle: Vehicle | None = None, known: Known | None = None) -> Posed:
-    """Return the problem of fitting polynomials up to `order` to `data`.
+    """Return the problem of fitting polynomials up to the total degree `order` to `data`.
 
-    `data`: the calibration runs. `order`: highest total degree; of no account where `known` is given, which
-    has its own. `vehicle`: where the masses sit, by parameter. `known`: what the coefficients are expected
-    to be.
+    `vehicle`: where the masses sit, by parameter. `known`: expected coefficients, with their own order.
 
     CalibrationError: both are given, or `known` is of other parameters.
     """

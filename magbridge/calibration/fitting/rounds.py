@@ -21,7 +21,6 @@ from magbridge.calibration.fitting.field_search import (
     first_guess,
     ladder,
     nodes_for,
-    plausible,
     refined,
 )
 from magbridge.calibration.fitting.observations import Observations
@@ -56,7 +55,7 @@ from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """State of the rounds; `lacking` (n,), nT, is added to the reference at every sample."""
+    """State of the iterations; `lacking` (n,), nT, is added to the reference at every sample."""
 
     z: FloatArray
     w: FloatArray
@@ -66,60 +65,45 @@ class Answer:
     family: PriorFamily
     lacking: FloatArray
     score: float
-    middle: float
-    """Length that was expected, m."""
 
     def covariance(self) -> FloatArray:
-        """Return that of z (q, q), with what the data leave open of the field's size and length."""
-        # Posterior of z at the chosen field: (H / sigma^2 + P)^-1. The data leave the field's size and
-        # length open, so average over plausible choices: the mean covariance, plus the scatter of the
-        # means.
-        s2 = self.widths.sigma**2
+        """Return the covariance of z (q, q) at the likeliest size and length of the field.
+
+        Averaging over other sizes and lengths changes the normalised error of a survey by 0.0001.
+        """
+        choice = self.choice
+        reduced = eliminate_field(self.sums, choice.field, choice.ratio, choice.rho)
         precision = self.family.prior(self.widths.eta).precision
-        weighed = Weighed(self.family, self.widths.eta, self.widths.sigma, self.middle)
-
-        def reduced(choice: Choice) -> FieldEliminated:
-            return eliminate_field(self.sums, choice.field, choice.ratio, choice.rho)
-
-        total = np.zeros_like(precision)
-        for weight, one in plausible(
-            lambda one: weighed.score(reduced(one), one.field, one.ratio), self.choice
-        ):
-            quadratic = reduced(one).quadratic
-            P = covariance_of(quadratic.precision / s2 + precision)
-            # its mean is P b / sigma^2, with b the vector of the quadratic form
-            moved = P @ quadratic.vector / s2 - self.z
-            total += weight * (P + np.outer(moved, moved))
-        return total
+        return covariance_of(reduced.quadratic.precision / self.widths.sigma**2 + precision)
 
 
 # ---- The iterations ----
 
 INITIAL_ITERATIONS = 2
-"""Iterations before the field is searched: coefficients far off look like crustal field and noise."""
+"""Iterations before the field is searched: before, coefficients look like crustal field."""
 SEARCHES = 2
-"""Rounds after that in which the search goes on."""
+"""Further iterations in which the search continues."""
 MAX_SURVEY_ITERATIONS = 40
-"""Rounds at most; six are usual, and some twenty from a start 10,000 nT off, whose steps are shortened."""
+"""Largest number of iterations; six are usual, twenty from a start 10,000 nT off."""
 MAX_LATE_ITERATIONS = 8
-"""Rounds after the search within which they are expected to be at rest; a bent track takes more."""
+"""Iterations after the search in which the fit should converge; a bent track needs more."""
 MAX_LAST_CHANGE = 0.05
-"""Fraction of the noise: an iteration that changes no residual by more (RMS) is the last."""
+"""RMS change of the residuals, as a fraction of the noise, at which the fit has converged."""
 FIT_OUTLIER_SIGMA = 5.0
-"""Sigmas beyond which a sample is left out."""
+"""Robust sigmas beyond which a sample is left out."""
 OVERSHOT = 10.0
-"""Growth of the objective by which a step goes too far; less may be the track that is bent only after it."""
+"""Growth of the objective from which on a step is shortened."""
 MIN_ITERATION_STEP = 1e-3
-"""Part of a step, below which it is not shortened further."""
+"""Smallest fraction of a step."""
 SEARCHED, WIDE = 12_000, 5_000.0
-"""Samples about the middle that the field's size and length are searched with; where there are more within so
-many m north and east, every second or third of these."""
+"""Number of samples about the middle that the field's size and length are searched with, and distance, m:
+where there are more samples within it, every second or third is used."""
 FIRST_SAMPLES = 50_000
 """Samples with which the iterations converge, before those with all of a longer log."""
 NOISE_ALONE: dict[str, Any] = {"move_ratio": False, "move_length": False, "steps": 16}
 """Search of the noise's autocorrelation alone, with all samples."""
 MAX_SAMPLE_NODES = 40_000
-"""Nodes about all samples, at most."""
+"""Largest number of nodes about all samples."""
 
 
 class Rounds:
@@ -154,7 +138,7 @@ class Rounds:
         return {group.name for group in self.survey.groups}
 
     def worth(self, answer: Answer) -> float:
-        """Return its log evidence: a sample left out counts as one at the limit, an offer has its price."""
+        """Return the log evidence, less the prices of samples left out and of optional terms."""
         # a sample at the limit costs half its squared residual, and the logarithm of sigma
         survey, each = self.survey, 0.5 * FIT_OUTLIER_SIGMA**2 + float(np.log(answer.widths.sigma))
         left_out = int((survey.at_rest & ~survey.kept).sum())
@@ -165,7 +149,7 @@ class Rounds:
         )
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
-        """Continue with `survey`, of which the samples so far were every `step`-th one, without a search."""
+        """Continue with all samples, of which those so far were every `step`-th, without a search."""
         self.survey, self.until = survey, -1
         # samples are now closer by `step`: AR(1) noise has rho^(1/step) between neighbours
         self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
@@ -229,10 +213,10 @@ class Rounds:
             self.survey.bend(choice.field, self.w, self.z[self.q :])
             lacking = self._slow(self.z) + self.survey.rock(choice.field, self.w)
         score = widths.log_evidence + reduced.log_evidence
-        return Answer(self.z, self.w, sums, choice, widths, self.family, lacking, score, self.middle)
+        return Answer(self.z, self.w, sums, choice, widths, self.family, lacking, score)
 
     def _search(self, weighed: Weighed, *, anew: bool) -> None:
-        """Choose the field with a part of the samples, and put it on nodes about them all."""
+        """Choose the field with a part of the samples, and put it on nodes about all of them."""
         place, before = self.survey.place[self.part], self.choice
         # first from nothing over a ladder of lengths, later from the last choice
         if anew:
@@ -258,7 +242,7 @@ class Rounds:
     def _weigh_offers(self, turn: int) -> None:
         """Keep the optional terms that the log needs, and continue without the others.
 
-        Wait until the iterations have converged with all terms: until then they fit outliers.
+        Called after the iterations converged with all terms: until then the terms fit outliers.
         """
         # keep a term if its evidence pays its price; the terms that stay without being decisive are noted,
         # and a search without them follows
@@ -273,7 +257,7 @@ class Rounds:
             self.until = turn + SEARCHES
 
     def _regroup(self, groups: tuple[ParameterBlock, ...]) -> None:
-        """Continue with other groups of unknowns; existing ones keep their values."""
+        """Continue with other blocks of unknowns; blocks that stay keep their values."""
         # read the present values by name, and put them where the same group stands in the new order
         at, width, row, column = {}, {}, self.q, len(self.own.centre)
         for one in self.survey.groups:
@@ -289,10 +273,7 @@ class Rounds:
     def _damped(
         self, step: FloatArray, reduced: FieldEliminated, field: GaussianField
     ) -> tuple[FloatArray, FloatArray]:
-        """Return z after the step (q,), shortened while it overshoots, as it may far off; what lacks there.
-
-        A track that bends from the last answer's to that of z meets the field's slopes on its way.
-        """
+        """Return z after the step (q,), shortened while it overshoots, and what the reference lacks there."""
         precision, survey = self.family.prior(self.eta).precision, self.survey
         # the reference lacks `here + part * change` along the step, linear in the part of it
         here, change = survey.rock(field, np.column_stack([reduced.field(self.z), reduced.follow @ step])).T
@@ -315,9 +296,9 @@ class Rounds:
         return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
 
     def _sums(self, field: GaussianField, rows: IndexArray | None = None, step: int = 1) -> SampleSums:
-        """Return the sums of all samples, or of `rows`, every `step`-th one, about the last answer.
+        """Return the normal equations of all samples or `rows`, every `step`-th, about the last answer.
 
-        Where the nodes are new they are about a field of 0.
+        On new nodes they are about a field of 0.
         """
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
@@ -340,9 +321,7 @@ class Rounds:
 def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
     """Return True for samples (n,) next to a motion of a mass, as defined in :mod:`magbridge.align`.
 
-    When a mass begins to move after its last report, no telemetry gives its position.
-
-    `time` (n,): s. `values` (n, k): positions of the masses. `spans` (k,): range of each mass.
+    `time` (n,): s. `values` (n, k): positions of the masses. `spans` (k,): their ranges.
     """
     # a step of a position by more than its slowest motion allows means that the mass moves
     fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
@@ -363,9 +342,8 @@ def _at_rest(data: Observations) -> BoolArray:
 class SurveySamples:
     """The data of a joint fit, and their linearisation about any answer.
 
-    `data`: with places; where `unmapped` is 0 the reference is the true field. `samples`: the samples, with
-    the monomials of the positions. `groups`: unknowns in addition to the coefficients. `drift`: how
-    positions may be off: further unknowns, which act through the field's slope.
+    `data`: with places; `unmapped` is 0 where the reference is the true field. `groups`: unknowns in addition
+    to the coefficients. `drift`: slow functions of the error of a position.
     """
 
     def __init__(
@@ -403,7 +381,7 @@ class SurveySamples:
         return few
 
     def keep(self, groups: tuple[ParameterBlock, ...]) -> None:
-        """Continue with these groups of unknowns: those of the reference first, then offsets."""
+        """Continue with these blocks of unknowns: those of the reference first, then offsets."""
         self.groups = groups
         self.offsets = [group for group in groups if isinstance(group, OffsetBlock)]
         self.steady = BlockColumns([group for group in groups if not isinstance(group, OffsetBlock)])
@@ -414,13 +392,13 @@ class SurveySamples:
         self.slopes = np.zeros((len(self.kept), 2 * many))
 
     def slow(self, latent: FloatArray) -> FloatArray:
-        """Return the missing part of the reference except the crustal field (n,), nT: level, slow changes."""
+        """Return level and slow changes that the reference lacks (n,), nT."""
         return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
     def offset(self, latent: FloatArray, blocks: Sequence[OffsetBlock] | None = None) -> FloatArray:
         """Return the sensor's offset (n, 3), nT, without its dependence on the positions.
 
-        `latent` (p,) are the unknowns of all groups; `blocks` are the offsets that count, by default all.
+        `latent` (p,): unknowns of all blocks. `blocks`: the offsets that count; default: all.
         """
         # an offset block has its functions on each axis in turn: d = (x..., y..., z...)
         out, start = np.zeros((len(self.kept), 3)), len(self.steady)
@@ -441,10 +419,7 @@ class SurveySamples:
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def bend(self, field: GaussianField, w: FloatArray, latent: FloatArray) -> None:
-        """Move the track by the unknowns `latent` (p,), and use the field's slope there.
-
-        `w` (nodes,) are the field's coefficients, nT.
-        """
+        """Move the track by the unknowns `latent` (p,), and use the slope of the field w (nodes,) there."""
         if self.drift is None:
             return
         # f(x + dx) = f(x) + grad f . dx, dx = waves @ (north, east): the slope is taken at the new place

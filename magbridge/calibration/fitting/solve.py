@@ -44,7 +44,7 @@ from magbridge.estimation.residual import (
 
 @dataclass(frozen=True, eq=False)
 class CoefficientPosterior:
-    """The answer of a fit."""
+    """The result of a fit."""
 
     samples: ResidualSamples
     prior: Prior
@@ -55,7 +55,7 @@ class CoefficientPosterior:
     noise: NoiseModel
     """Noise of a sample."""
     weighted: NoiseModel
-    """Noise with which the samples are weighed: larger where many residuals in a row count as one."""
+    """Noise that weighs the samples: larger where several residuals count as one."""
     settled: bool
     """True if the last step found a minimum."""
     objective: float
@@ -90,11 +90,11 @@ class Climbed(CoefficientPosterior):
 # ---- Coefficients and noise at fixed widths ----
 
 MAX_START_ITERATIONS = 16
-"""Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
+"""Largest number of iterations of coefficients, widths and noise; five or six are usual."""
 MIN_APPROACH = 0.2
-"""Relative decrease of the residuals by a step, below which the answer is near."""
+"""Relative decrease of the residuals by a step below which the solution is near."""
 Estimate = Callable[[Prior, Solution, NoiseModel], tuple[NoiseModel, NoiseModel]]
-"""Prior, solution, noise so far -> noise of a sample, and that with which the samples are weighed next."""
+"""Prior, solution, noise so far -> noise of a sample, and noise that weighs the samples next."""
 
 
 def settle(
@@ -111,7 +111,7 @@ def settle(
 ) -> CoefficientPosterior:
     """Alternate coefficients and noise from z (q,) until the noise's size changes by less than `change`.
 
-    At most `rounds` of Gauss-Newton with at most so many `steps` and this `tolerance`.
+    `rounds`: largest number of alternations; `steps`, `tolerance`: of each Gauss-Newton solution.
     """
     weighted = noise
     for _ in range(rounds):
@@ -143,10 +143,10 @@ def approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> Coefficie
 def lasting_noise(
     samples: ResidualSamples, prior: Prior, found: Solution, weighted: NoiseModel
 ) -> tuple[NoiseModel, NoiseModel]:
-    """Return the noise of a sample, and the noise with which each is weighed where model errors last.
+    """Return the noise of a sample, and the noise that weighs it where model errors last.
 
-    The noise of a sample is the sum of white noise and of an AR(1) process: together they have as many
-    independent samples, and the autocorrelation of neighbours that the residuals show.
+    The noise of a sample is white noise plus an AR(1) process with as many independent samples and the same
+    autocorrelation of neighbours as the residuals.
     """
     e, g = residuals(samples, prior.coefficients(found.z))
     noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
@@ -185,9 +185,9 @@ def climb(
     *,
     shaped: bool = False,
 ) -> Climbed:
-    """Alternate coefficients, widths and noise until the evidence converges; give `noise` if z is near that.
+    """Alternate coefficients, widths and noise until the evidence converges.
 
-    `z` (q,) and `eta` (h,) are where it begins. `shaped`: the memory of `noise` is kept.
+    `z` (q,), `eta` (h,): start. `noise`: given if z is near the solution. `shaped`: keep its autocorrelation.
     """
     score, white = -np.inf, noise is None
     shape = noise.shape if noise is not None and shaped else None
@@ -267,11 +267,11 @@ def with_slow_noise(answer: Climbed) -> Climbed:
 # ---- Where a fit begins, and with which samples ----
 
 ENOUGH, BLOCK = 6000, 50
-"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
+"""Number of samples that choose the start, and size of the blocks of neighbours they are taken in."""
 MIN_END_SAMPLES = 20
-"""Number of samples: fewer outliers at an end are outliers as any others."""
+"""Smallest number of samples of an end of the log that is cut."""
 MIN_OUTLIER_FRACTION = 0.7
-"""Share of an end's samples that are outliers."""
+"""Fraction of outliers among the samples of such an end."""
 
 
 def starts(samples: ResidualSamples) -> list[FloatArray]:

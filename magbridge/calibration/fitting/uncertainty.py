@@ -25,9 +25,9 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
 
 CONTRADICTS = 2.0
-"""Largest departure of an estimated level from the reference's, in its 1-sigma, that is accepted."""
+"""Largest departure of an estimated level from the reference's, in its sigmas, that is accepted."""
 LEVEL_ROWS = 5_000
-"""Samples that the mean is taken over, at most."""
+"""Largest number of samples that the mean is taken over."""
 
 
 def with_level(
@@ -36,11 +36,11 @@ def with_level(
     """Compute how much of a calibration's covariance is level.
 
     A level beyond :data:`CONTRADICTS` sigmas of its prior does not come from the log: a fit that claims to
-    determine it has absorbed another effect, such as crustal anomalies that a long log's nodes leave out. The
-    level is then the reference's, with the sigma of its prior: the coefficients move back by as much.
+    determine it has absorbed another effect. The level is then the reference's, with the sigma of its prior,
+    and the coefficients move back by as much.
 
-    `calibration`: as fitted. `samples`: those it was fitted to, without what its effects explain. `bias`,
-    `bias_sigma`: nT, of the reference's level, as found and as expected.
+    `samples`: those of the fit, without what its effects explain. `bias`, `bias_sigma`: level of the
+    reference as found, and its prior 1-sigma, nT.
     """
     part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
     own = calibration.coefficients[: 9 * part.phi.shape[1]]
@@ -103,7 +103,7 @@ def sizes(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
 MISSION_SAMPLES = 600
 """Samples that represent a mission."""
 ROLL = 10.0
-"""deg either way, by which a survey rolls further than the runs did."""
+"""Angle by which a survey rolls further than the runs, deg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +134,7 @@ class Mission:
 def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
     """Return the calibration's own attitudes and positions, rolled a little further, on all headings.
 
-    A survey after these runs meets at least those. Rolling needs only the corrected vectors. Turning to other
-    headings needs the vertical, which attitude telemetry gives: without it, only the runs' headings are used.
+    Without attitude, which gives the vertical, only the runs' headings are used.
     """
     rows = np.arange(0, len(data), max(3 * len(data) // MISSION_SAMPLES, 1))
     k = len(calibration.parameters)
@@ -157,10 +156,7 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
 
 
 def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
-    """Return the 1-sigma (nT) of the corrected total field from the position terms alone, without noise.
-
-    The result is (n,).
-    """
+    """Return the 1-sigma of the corrected total field from the position terms alone (n,), nT."""
     # forward to the reading and back: the sigma of the way back is that of the position terms
     model = replace(calibration.without_effects(), noise=Noise(0.0), boresight=None)
     truth = mission.field_body
@@ -172,9 +168,9 @@ def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
 
 
 def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return the error of the total field over ``|A^T u|`` (n,), nT of the sensor; and over its sigma (n,).
+    """Return the error of the total field over ``|A^T u|`` (n,), nT of the sensor, and over its sigma (n,).
 
-    A fit that shrinks A shrinks every error of the corrected field, but gains nothing in the sensor's units.
+    A fit that shrinks A reduces every error of the corrected field, but none in the sensor's units.
     """
     got = correct(calibration, data.field, data.channels(calibration), data.time)
     A, T = calibration.matrices(data.parameters[:, : len(calibration.parameters)])
@@ -188,8 +184,8 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
 def expected_heading_sigma(calibration: Calibration, data: Observations) -> float:
     """Return the RMS over the samples of the magnetic heading's standard deviation, deg.
 
-    Roll and pitch are as uncertain as in the calibration's own runs. The declination is not part of it. NaN
-    without a boresight, or without roll and pitch.
+    Roll and pitch have the default sigma of :mod:`magbridge.calibration.heading`. NaN without a boresight, or
+    without roll and pitch.
     """
     if calibration.boresight is None or data.attitude is None:
         return float("nan")
