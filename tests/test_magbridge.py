@@ -59,6 +59,10 @@ def test_a_type_checker_sees_the_same_names() -> None:
     assert {name for name, _ in seen} == set(mb.__all__)
 
 
+READ_LOG = (
+    "from magbridge.cli.common import without_dask; without_dask(); "
+    "from magbridge.logs.deployment import deployment; deployment('a.csv', [0.0, 1.0], {'mag_x': [1.0, 2.0]})"
+)
 RUN_COMMAND = (
     "import magbridge.bridge.run as bridge; bridge.run = lambda path: None; "
     "from magbridge.__main__ import main; main(['run', '--config', 'bridge.toml'])"
@@ -75,8 +79,18 @@ RUN_COMMAND = (
         ("from magbridge.cli import main; main(['--help'])", {"numpy", *ASHORE}),
         ("from magbridge.cli import main; main(['calibrate', 'none', '-o', 'x'])", {"numpy", *ASHORE}),
         ("from magbridge.field import grid, read, reference", ASHORE),
+        (READ_LOG, {"dask"}),
     ],
-    ids=["the package", "the live path", "run", "the main field", "help", "a log that is not there", "maps"],
+    ids=[
+        "the package",
+        "the live path",
+        "run",
+        "the main field",
+        "help",
+        "a log that is not there",
+        "maps",
+        "a log",
+    ],
 )
 def test_importing_brings_nothing_heavy(imports: str, heavy: set[str]) -> None:
     script = f"{imports}\nimport sys; print(sorted({heavy} & set(sys.modules)))"

@@ -203,6 +203,7 @@ def calibrate(
     model.check()
     scalar.check(is_reference=truth.reference == "scalar")
     cli.logs_to_read(files, output, model.masses, truth.grid, truth.base)
+    cli.without_dask()
 
     anomalies = mb.read_grid(truth.grid) if truth.grid else None
     request = _Request(files, output, model, truth, scalar, plot, force, reading, anomalies)

@@ -244,6 +244,20 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
             existing(other)
 
 
+def without_dask() -> None:
+    """Import xarray without dask: a log has no dask arrays, and importing them takes 0.4 s.
+
+    xarray looks for dask when it is imported and with its first array, and keeps the result.
+    """
+    if {"xarray", "dask"} & sys.modules.keys():
+        return
+    sys.modules["dask"] = None  # type: ignore[assignment]  # Python then refuses to import it
+    import xarray as xr
+
+    xr.Dataset({"a": ("x", [0.0])}).load()
+    del sys.modules["dask"]
+
+
 class FailedResult(DataError):
     """An error that the result, which is already printed, describes: JSON output has no second object."""
 

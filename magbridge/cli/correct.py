@@ -73,6 +73,7 @@ def correct(
     """
     source = _source(calibration, config, learn=learn)
     cli.logs_to_read(files, output, source, reading.columns)
+    cli.without_dask()
 
     from magbridge.logs import Writer, read_chunks
 
