@@ -41,7 +41,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.columns import Candidate, Columns, Group, join_columns, parts, places, slices
 from magbridge.diagnose.joint import ALL_PRODUCTS, Joint, Statistic, normal, volume_of
 from magbridge.diagnose.noise import ResidualNoise
-from magbridge.diagnose.problem import DERIVATIVE_ROWS, Problem, side_by_side
+from magbridge.diagnose.problem import Problem, side_by_side
 
 FALSE_ALARM_RATE = 0.01
 """Family-wise false-alarm rate."""
@@ -54,8 +54,6 @@ REMNANT = 0.3
 SMOOTH, MOST_REMAINING = 0.1, 8.0
 """Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant."""
 SIMULATIONS = 400
-PIECE, PIECES = 600, 64
-"""Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 CONFOUNDED = 0.85
 """Correlation above which two causes are listed as a pair: distinguished in 95 % of cases at S/N 6."""
 MAX_PLAUSIBLE_MULTIPLE = 50.0
@@ -252,46 +250,6 @@ def log_odds(
     # A Gaussian process has paid for its size already; the others pay by the part that it leaves
     worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped
     return 0.5 * (ratio - shaped) + worth + known - further - prices
-
-
-def certainty(residual: FloatArray, noise: ResidualNoise, columns: Sequence[Columns]) -> list[float]:
-    r"""Return the degrees of freedom of the noise's level at the frequencies of each of `columns`.
-
-    `residual` (n,) is what the noise was fitted to, nT.
-
-    Notes
-    -----
-    The fitted coefficients a have the covariance C. A column x has the information ``|w|^2``,
-    ``w_t = x_t - sum_k a_k x_(t-k)``, and the log of a variance with f degrees of freedom the variance 2 / f:
-
-    .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
-              \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
-    """
-    n, p = len(residual), len(noise.ar)
-    # Covariance C of the autoregressive coefficients: the inverse of their regression's information
-    rows = np.flatnonzero(noise.past.whole)
-    if len(rows) <= 2 * p:
-        return [float(n)] * len(columns)
-    information = np.zeros((p, p))
-    for start in range(0, len(rows), DERIVATIVE_ROWS):
-        some = rows[start : start + DERIVATIVE_ROWS]
-        before = np.array([residual[some - k] for k in range(1, p + 1)]) / noise.scale[some]
-        information += before @ before.T
-    C = np.linalg.pinv(information)
-    # Derivative D of each column's whitened power by those coefficients, over pieces spread along the log
-    pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
-    found = []
-    for column in columns:
-        power, slope = 1e-300, np.zeros(p)
-        for start in pieces:
-            x = column(slice(start, start + PIECE))
-            lags = np.array([x[p - k : len(x) - k] for k in range(1, p + 1)])
-            w = x[p:] - np.tensordot(noise.ar, lags, 1)
-            power += float(np.sum(w * w))
-            slope += np.tensordot(lags, w, 2)
-        D = -2.0 * slope / power
-        found.append(2.0 / float(2.0 / n + D @ C @ D))
-    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import chdtrc
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.columns import Candidate, Columns, Group, Mixture, join_columns, parts, slices
@@ -21,7 +21,6 @@ from magbridge.diagnose.evidence import (
     Hypothesis,
     Information,
     bayes_factor_threshold,
-    certainty,
     evidence_of,
     information,
     log_odds,
@@ -48,9 +47,8 @@ COLUMNS, STAGES = 144, 2
 class SearchState:
     """The problem of one search, its candidates, and quantities of the log.
 
-    `null` is the fit without any cause, `look_elsewhere` the number of hypotheses behind each cause,
-    `certain` the degrees of freedom of the noise's level for each group. One piece of a long log in `stride`
-    screens the candidates. If `brief`, noise is correlated for a short time only.
+    `null` is the fit without any cause, `look_elsewhere` the number of hypotheses of each cause. One piece of
+    a long log in `stride` screens the candidates. If `brief`, noise is correlated for a short time only.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
@@ -59,7 +57,6 @@ class SearchState:
         self.at = slices(self.candidates)
         self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
         self.look_elsewhere: dict[str, float] = {}
-        self.certain: dict[Group, float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
         self.groups: dict[Group, list[int]] = {}
         for k, candidate in enumerate(self.candidates):
@@ -173,11 +170,6 @@ class SearchState:
             brief=self.brief,
             stride=self.stride,
         )
-        # How well the noise's level is known at the frequencies of each group (F test)
-        if not model:
-            middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
-            certain = certainty(everything.residual, everything.noise, middle)
-            self.certain = dict(zip(self.groups, certain, strict=True))
         return self._information_under(everything.noise, model, base, self.stride).fitted(base)
 
     def _information_under(
@@ -216,9 +208,7 @@ class SearchState:
         """Return the p-value of a likelihood ratio, times the hypotheses of its cause, times the causes."""
         hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.point.likelier))
         tests = candidate.tail * hypotheses * self.causes
-        # Fisher's F, with as many degrees of freedom in the denominator as the level of the noise has
-        freedom, certain = max(freedom, 1), self.certain.get(candidate.group, np.inf)
-        return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
+        return min(1.0, tests * float(chdtrc(max(freedom, 1), ratio)))
 
 
 def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:

@@ -9,7 +9,6 @@ import pytest
 from posed import candidate, right
 
 from magbridge.diagnose.columns import Candidate, GridPoint
-from magbridge.diagnose.evidence import certainty
 from magbridge.diagnose.extend import loosened
 from magbridge.diagnose.joint import Joint, fit_joint, normal
 from magbridge.diagnose.noise import ResidualNoise, autoregressive_order, fit_noise
@@ -119,22 +118,6 @@ def test_the_information_about_a_constant_is_right_next_to_gaps(lost: str) -> No
         one = noise.filter(np.ones((len(place), 1)))[:, 0]
         pulls.append(float(one @ noise.response(whole[place]) / np.sqrt(one @ one)))
     assert float(np.std(pulls)) == pytest.approx(1.0, abs=0.3)
-
-
-@pytest.mark.parametrize(("period", "slow"), [(np.inf, True), (5.0, False)])
-def test_the_level_is_known_as_well_as_refitted_noises_agree_on_it(period: float, slow: bool) -> None:
-    """Against many noises fitted to as many residuals: the scatter of the column's information is 2 / f."""
-    n = 1200
-    t = np.arange(n)
-    column = np.cos(2.0 * np.pi * t / period)[:, None]
-    logs, freedoms = [], []
-    for seed in range(60):
-        r, steps = made("white", n, rho=0.9, seed=seed)
-        noise = fit_noise(r, Past(steps, 1))
-        logs.append(float(np.log(np.sum(noise.filter(column) ** 2))))
-        freedoms += certainty(r, noise, [lambda rows: column[rows]])
-    assert 2.0 / np.var(logs) == pytest.approx(np.median(freedoms), rel=0.5)
-    assert (np.median(freedoms) < 100) == slow
 
 
 # ---- nonlinear parameters are estimates, too ---------------------------------------------------------------
