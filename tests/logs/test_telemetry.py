@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as v1
 
@@ -15,9 +18,12 @@ from magbridge import logs
 from magbridge.bridge.events import declarations
 from magbridge.config import Telemetry
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import deployment, passed_over
+from magbridge.logs import Options, telemetry
+from magbridge.logs.compasses import compasses_in
+from magbridge.logs.deployment import deployment, noted, passed_over
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, pack_record
+from magbridge.mavlink.tlog import blocks
 from magbridge.records import Channel, Quality
 
 T0 = 1_700_000_000_000_000  # µs
@@ -40,10 +46,10 @@ class Log:
     def mag(self, t: float, x: int, **fields: Any) -> None:
         self.write_message(t, "RAW_IMU", xmag=x, ymag=10, zmag=-20, temperature=2550, **fields)
 
-    def read(self, tmp_path: Path) -> Any:
+    def read(self, tmp_path: Path, **options: Any) -> Any:
         path = tmp_path / "log.tlog"
         path.write_bytes(self.data)
-        return logs.read(path)
+        return logs.read(path, options=Options(**options))
 
 
 def test_a_row_holds_what_was_known_then(tmp_path: Path) -> None:
@@ -367,3 +373,73 @@ def test_any_mavlink_tool_reads_what_we_write(tmp_path: Path) -> None:
     assert rolls == pytest.approx([np.pi / 2, 0])
     assert [message.value for message in seen if message.get_type() == "NAMED_VALUE_FLOAT"] == [0.5, 1]
     assert not [message for message in seen if message.get_type() == "BAD_DATA"]
+
+
+# ---- which of several senders a column is taken from ------------------------------------------------------
+
+
+NAMED, FIVE = "NAMED_VALUE_FLOAT", np.arange(5)
+GIMBAL = [("ATTITUDE", (1, 154), {"pitch": -1.2})] * 3
+SENDERS: dict[
+    str, tuple[Callable[[int], list[tuple[str, tuple[int, int], dict[str, Any]]]], dict[str, Any]]
+] = {
+    "a named value never takes a column with a source": (
+        lambda _: [
+            ("ATTITUDE", (1, 1), {"yaw": 1.0}),
+            (NAMED, (1, 1), {"name": "heading", "value": 7.0}),
+            (NAMED, (1, 1), {"name": "mag_x", "value": 8.0}),
+        ],
+        {"heading": np.degrees(1.0), "named_heading": 7.0, "named_mag_x": 8.0},
+    ),
+    "a named value is the autopilot's where two send it": (
+        lambda k: [
+            (NAMED, (1, 1), {"name": "battpos", "value": k}),
+            (NAMED, (1, 99), {"name": "battpos", "value": -9.0}),
+            (NAMED, (1, 99), {"name": "ballast", "value": 200.0 + k}),
+        ],
+        {"battpos": FIVE, "ballast": 200.0 + FIVE},
+    ),
+    "a gimbal's attitude is not the vehicle's": (
+        lambda _: [("ATTITUDE", (1, 1), {"pitch": 0.1}), *GIMBAL],
+        {"pitch": np.degrees(0.1)},
+    ),
+    "a temperature of 0 is none": (lambda _: [], {}),
+}
+
+
+@pytest.mark.parametrize("case", SENDERS)
+def test_a_column_is_taken_from_one_source(case: str, tmp_path: Path) -> None:
+    sent, expected = SENDERS[case]
+    log = Log()
+    for k in range(5):
+        for message, by, fields in sent(k):
+            log.write_message(k, message, by=by, **fields)
+        log.write_message(k, "RAW_IMU", xmag=100 + k)
+    back = log.read(tmp_path)
+    assert set(back.data_vars) - {"roll", "pitch", "heading"} <= {"mag_x", "mag_y", "mag_z", *expected}
+    for name, values in (expected | {"mag_x": 100.0 * (100 + FIVE)}).items():
+        np.testing.assert_allclose(back[name], np.broadcast_to(values, 5), rtol=1e-6)
+    renamed = [name for name in expected if name.startswith("named_")]
+    assert all(name in " ".join(noted(back.attrs)) for name in renamed)
+
+
+def test_another_compass_makes_the_rows(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.write_message(k, "RAW_IMU", xmag=k)
+        log.write_message(k + 0.5, "SCALED_IMU2", xmag=50 + k)
+    assert [one.number for one in compasses_in(log.read(tmp_path))] == [0, 1]
+    back = log.read(tmp_path, compass="1")
+    np.testing.assert_allclose(back["mag_x"], 100.0 * (50 + FIVE))
+    np.testing.assert_allclose(back["time"] - T0 / S, 0.5 + FIVE)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["small.tlog", "damaged.tlog"])
+def test_blocks_of_any_size_give_the_same(
+    name: str, real_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = real_data / "ardusub" / name
+    whole = logs.read(path)
+    monkeypatch.setattr(telemetry, "blocks", partial(blocks, block_bytes=5_000))
+    xr.testing.assert_identical(whole, logs.read(path))
