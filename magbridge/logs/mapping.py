@@ -66,8 +66,7 @@ class ColumnSource(Table, frozen=True, rename={"heading": "from"}):
     heading: str | None = None
     """Their name of the column (key ``from``), as the file has it; by default our own."""
     unit: str | None = None
-    """Its unit after scaling, where the file does not say it or is wrong. Of ``time`` also: excel, julian,
-    mjd, gps, matlab, iso, or a pattern as ``%d.%m.%Y %H:%M:%S``."""
+    """Unit after scaling; of ``time`` also excel, julian, mjd, gps, matlab, iso, or a pattern as ``%d.%m.%Y``."""
     scale: float = 1.0
     offset: float = 0.0
     """`scale`, `offset`: By which their number becomes one in `unit`."""
@@ -90,8 +89,7 @@ class ColumnMapping(Table, frozen=True):
     """The number that stands for a missing value."""
     separator: str | None = None
     decimal: Literal[".", ","] | None = None
-    """`separator`, `decimal`: Characters of a text file; found in its first lines where they are not
-    given."""
+    """`separator`, `decimal`: Characters of a text file; found in its first lines if not given."""
     zone: str | None = None
     """Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given."""
 

@@ -56,10 +56,9 @@ class Format(NamedTuple):
     guarded: bool = False
     """True if another library reads it, which damage may hang or crash: it is read in a child process."""
     compasses: bool = False
-    """True if it handles itself which compass the options ask for; else its columns are looked through."""
+    """True if it handles the compass that the options ask for; else the columns are renamed."""
     maps_columns: bool = False
-    """True if it handles itself the columns that the options declare of columns; else they are renamed when
-    it is read."""
+    """True if it handles the columns that the options declare; else they are renamed."""
     packed: bool = False
     """True if it may be compressed as a whole."""
     plugin: EntryPoint | None = None

@@ -380,9 +380,9 @@ def test_any_mavlink_tool_reads_what_we_write(tmp_path: Path) -> None:
 
 NAMED, FIVE = "NAMED_VALUE_FLOAT", np.arange(5)
 GIMBAL = [("ATTITUDE", (1, 154), {"pitch": -1.2})] * 3
-SENDERS: dict[
-    str, tuple[Callable[[int], list[tuple[str, tuple[int, int], dict[str, Any]]]], dict[str, Any]]
-] = {
+Sent = Callable[[int], list[tuple[str, tuple[int, int], dict[str, Any]]]]
+"""Number of the row -> message, sender and fields."""
+SENDERS: dict[str, tuple[Sent, dict[str, Any]]] = {
     "a named value never takes a column with a source": (
         lambda _: [
             ("ATTITUDE", (1, 1), {"yaw": 1.0}),
