@@ -66,7 +66,7 @@ class ColumnSource(Table, frozen=True, rename={"heading": "from"}):
     heading: str | None = None
     """Their name of the column (key ``from``), as the file has it; by default our own."""
     unit: str | None = None
-    """Unit after scaling; of ``time`` also excel, julian, mjd, gps, matlab, iso, or a pattern as ``%d.%m.%Y``."""
+    """Unit after scaling; of ``time`` also excel, julian, mjd, gps, matlab, iso, or a strptime pattern."""
     scale: float = 1.0
     offset: float = 0.0
     """`scale`, `offset`: By which their number becomes one in `unit`."""

@@ -41,7 +41,7 @@ class TableReader:
         self.faults = Faults(path, strict=strict)
         self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
         self.guesses: list[str] = []
-        self._midnights, self._last = 0.0, 0.0
+        self._midnights, self._last, self._first_number = 0.0, 0.0, 1
         self._counter = CountState(0.0, np.empty(0), 0.0)
         self._clock = clock or self._clock_by(rows[: max(LAYOUT_LINES - layout.first, 1)])
         self._start = self._start_by(rows)
@@ -102,6 +102,8 @@ class TableReader:
         self, lines: list[str], numbers: Sequence[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
         """Return the times (n,), the values (n,) of each column, and the numbers of the rows' lines."""
+        if not self.faults.rows:
+            self._first_number = numbers[0]
         self.faults.rows += len(lines)
         open_quotes = [line.count('"') % 2 == 1 for line in lines]
         lines, numbers = self._dropping(open_quotes, lines, numbers, UNCLOSED_QUOTE)
@@ -193,8 +195,8 @@ class TableReader:
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
         """Return the times (n,), and which rows (n,) hold a cell that is no time."""
         if self._layout.rate:  # a row that was left out keeps its time
-            lines = np.asarray(numbers, np.float64) - 1.0 - self._layout.first
-            return lines / self._layout.rate, np.zeros(len(lines), bool)
+            rows = np.asarray(numbers, np.float64) - self._first_number
+            return rows / self._layout.rate, np.zeros(len(rows), bool)
         first, *others = self._layout.stamp
         column = frame[first]
         for k in others:

@@ -32,16 +32,18 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace as replace_fields
+from functools import partial
 from itertools import chain, groupby, islice
 from math import isnan, nan
 from pathlib import Path
-from typing import TextIO
+from typing import NamedTuple, TextIO
 
 import msgspec
 import numpy as np
 import xarray as xr
+from msgspec.structs import replace
 
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT
@@ -49,7 +51,7 @@ from magbridge.errors import FormatError
 from magbridge.logs.checks import validity_of
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, lasting, with_guesses, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout, Rows, cells, header_of, is_remark, rows_among
-from magbridge.logs.mapping import ColumnMapping, Options
+from magbridge.logs.mapping import ColumnMapping, ColumnSource, Options
 from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.registry import metadata_path, opened
 from magbridge.logs.table import TableReader
@@ -110,16 +112,16 @@ def _chunks(
     """Yield the rows, each piece with the numbers of its lines."""
     lines = _lines(file)
     header = list(islice(lines, LAYOUT_LINES))
-    if reader := _capture_reader(header):
-        yield from reader(path, chain(header, lines), rows)
-        return
-    added = 0
-    if convert := _as_table(header):
-        lines, added = convert(chain(header, lines)), 1
+    declared, added = options.declared, 0
+    if capture := _capture(header):
+        lines, added = capture.table(chain(header, lines)), 1
         header = list(islice(lines, LAYOUT_LINES))
+        if capture.guess:
+            guess = [*guess, capture.guess]
+            declared = replace(declared, columns={"time": CAPTURE_TIME, **declared.columns})
     further = list(islice(lines, FURTHER))
     foreign = not metadata_path(path).is_file()
-    layout, first_rows = layout_of(path, header, further, options.declared, foreign=foreign)
+    layout, first_rows = layout_of(path, header, further, declared, foreign=foreign)
     table = TableReader(path, layout, first_rows, strict=options.strict)
     attrs = {**_attributes(path), **layout.attrs, **table.attrs}
     attrs = with_guesses(path, attrs, [*guess, *layout.guesses, *table.guesses])
@@ -153,7 +155,7 @@ def layout_of(
         return layout, rows
     layout = units_of_angles(layout, rows)
     validity = validity_of(layout.names, rows)
-    return replace(layout, validity=tuple(validity)).guessing(*(rule.text for rule in validity)), rows
+    return replace_fields(layout, validity=tuple(validity)).guessing(*(rule.text for rule in validity)), rows
 
 
 def _lines(file: TextIO) -> Iterator[str]:
@@ -200,8 +202,8 @@ class _LineMarks:
         return np.append(nan, self._labels)[np.searchsorted(self.rows, rows)]
 
 
-CAPTURE_RATE_HZ = 100.0
-"""Lines a second that MotionCal's senders write."""
+CAPTURE_TIME = ColumnSource(heading="row [100 Hz]")
+"""MotionCal's senders write a hundred lines a second, without times."""
 CAPTURE_LINE = re.compile(
     r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*"
 )
@@ -214,44 +216,58 @@ EXPLORER = re.compile(
     r"(?: S:(?P<signal>[-+\d.]+))?(?: D:(?P<depth>[-+\d.]+)m)?(?: A:(?P<altitude>[-+\d.]+)m)?.*"
 )
 """A sentence: year and day of the year, time, field in nT, signal strength, depth and altitude in m."""
-EXPLORER_HEADINGS = "time,total_field [nT],signal,depth [m],altitude [m]\n"
+EXPLORER_HEADINGS = ["time", "total_field [nT]", "signal", "depth [m]", "altitude [m]"]
 MIN_LINE_FRACTION = 0.5
 """Least fraction of the first lines that are of a form."""
-Pieces = Iterator[tuple[xr.Dataset, Sequence[int]]]
 
 
-def _capture_reader(header: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces] | None:
-    """Return the reader of a capture of MotionCal that begins with these lines; None: it is none."""
-    kinds = [match[1] for line in header if (match := CAPTURE_LINE.fullmatch(line.strip()))]
-    if not kinds or len(kinds) < len(header) / 4:
-        return None
-    kind = "Uni" if "Uni" in kinds else "Raw"
-    return lambda path, lines, rows: _motioncal(path, lines, rows, kind)
+class Capture(NamedTuple):
+    """Lines without headings that become a table."""
+
+    headings: list[str]
+    cells: Callable[[str], list[object]]
+    """Returns the cells of a line: none of one of another kind, one of a damaged one, which is dropped."""
+    guess: str = ""
+
+    def table(self, lines: Iterable[str]) -> Iterator[str]:
+        """Yield the lines of the table."""
+        rows = (self.cells(line.strip()) for line in lines if line.strip())
+        for row in chain([list[object](self.headings)], rows):
+            if row:
+                text = io.StringIO()
+                csv.writer(text, lineterminator="\n").writerow(row)
+                yield text.getvalue()
 
 
-def _as_table(header: Sequence[str]) -> Callable[[Iterator[str]], Iterator[str]] | None:
-    """Return the function that turns JSON lines or sentences into a table; None: they are neither.
-
-    A damaged line stays as it is, and is counted by the reader.
-    """
+def _capture(header: Sequence[str]) -> Capture | None:
+    """Return the kind of capture that begins with these lines; None for other text."""
     lines = [line.strip() for line in header if line.strip()]
+    kinds = [match[1] for line in lines if (match := CAPTURE_LINE.fullmatch(line))]
+    if kinds and len(kinds) >= len(header) / 4:
+        kind = "Uni" if "Uni" in kinds else "Raw"
+        guess = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count"
+        return Capture([f"{name} [nT]" for name in CHANNELS], partial(_motioncal, kind), guess)
     if sum(EXPLORER.fullmatch(line) is not None for line in lines) > MIN_LINE_FRACTION * len(lines):
-        return _explorer
+        return Capture(EXPLORER_HEADINGS, _explorer)
     objects = [one for line in lines if (one := _json(line)) is not None]
     if len(objects) > MIN_LINE_FRACTION * len(lines):
         names = list(dict.fromkeys(name for one in objects for name in one))
-        return lambda lines: _json_lines(names, lines)
+        return Capture(names, partial(_json_cells, names))
     return None
 
 
-def _explorer(lines: Iterator[str]) -> Iterator[str]:
-    yield EXPLORER_HEADINGS
-    for line in lines:
-        if match := EXPLORER.fullmatch(line.strip()):
-            values = (match[name] or "" for name in ("field", "signal", "depth", "altitude"))
-            yield f"20{match['year']}-{match['day']}T{match['clock']},{','.join(values)}\n"
-        else:
-            yield line
+def _motioncal(kind: str, line: str) -> list[object]:
+    match = CAPTURE_LINE.fullmatch(line)
+    if match and match[1] == kind:
+        return [COUNT[kind] * float(text) for text in match[2].split(",")[6:]]
+    return [] if match or line.startswith(OTHER_PREFIXES) else [line]
+
+
+def _explorer(line: str) -> list[object]:
+    if match := EXPLORER.fullmatch(line):
+        time = f"20{match['year']}-{match['day']}T{match['clock']}"
+        return [time, *(match[name] or "" for name in ("field", "signal", "depth", "altitude"))]
+    return [line]
 
 
 def _json(line: str) -> dict[str, object] | None:
@@ -263,48 +279,9 @@ def _json(line: str) -> dict[str, object] | None:
     return found if isinstance(found, dict) else None
 
 
-def _json_lines(names: Sequence[str], lines: Iterator[str]) -> Iterator[str]:
-    yield _csv_line(names)
-    for line in lines:
-        one = _json(line.strip())
-        yield (
-            line if one is None else _csv_line(["" if one.get(name) is None else one[name] for name in names])
-        )
-
-
-def _csv_line(values: Sequence[object]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(values)
-    return text.getvalue()
-
-
-def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces:
-    """Yield the lines of one kind, each piece with their numbers; those that are damaged are counted."""
-    damaged = 0
-
-    def wanted() -> Iterator[tuple[int, str]]:
-        nonlocal damaged
-        for number, line in enumerate(lines, 1):
-            match = CAPTURE_LINE.fullmatch(line.strip())
-            if match and match[1] == kind:
-                yield number, match[2]
-            elif not match and line.strip() and not line.startswith(OTHER_PREFIXES):
-                damaged += 1
-
-    note = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {CAPTURE_RATE_HZ:g} lines a second"
-    attrs = with_guesses(path, {"time_reference": "boot"}, [note])
-    found, done = wanted(), 0
-    block = list(islice(found, rows))
-    if not block:
-        raise FormatError(path, f"expected lines as {kind}:0,0,8192,0,0,0,300,50,450")
-    while block:
-        following = list(islice(found, rows))
-        lost, damaged = damaged, 0
-        values = np.array([[float(text) for text in numbers.split(",")] for _, numbers in block])
-        axes = dict(zip(CHANNELS, COUNT[kind] * values[:, 6:].T, strict=True))
-        piece = deployment(path, (done + np.arange(len(block))) / CAPTURE_RATE_HZ, axes, attrs=attrs)
-        yield with_losses(piece, {"rows_dropped": lost}), [number for number, _ in block]
-        done, block = done + len(block), following
+def _json_cells(names: Sequence[str], line: str) -> list[object]:
+    one = _json(line)
+    return [line] if one is None else ["" if one.get(name) is None else one[name] for name in names]
 
 
 class FileWriter:
