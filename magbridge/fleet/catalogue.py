@@ -1,6 +1,6 @@
 """The catalogue: tables to which rows are only ever added, in a folder or on a server.
 
-A row's key is the SHA-256 of its content, so that a row is stored once, whoever adds it and however often. No
+A row's key is the SHA-256 of its content, so that repeated additions store a row once. No
 row holds the time of writing: an interrupted and repeated run gives the same catalogue.
 :class:`FolderCatalogue` keeps the tables in a folder, :mod:`.postgres` in a database.
 """
