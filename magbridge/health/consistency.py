@@ -56,7 +56,8 @@ telemetry as a fraction of the calibrated range."""
 RETENTION_SAMPLES: Final = 2000.0
 """Tested samples over which evidence is forgotten."""
 CONSISTENCY_ALARM_LOG_RATIO: Final = 15.0
-"""L above which an alarm begins: by chance once in a million tested samples at most."""
+"""L above which an alarm begins: by chance once in a million tested samples at most, if the crustal field and
+the calibration's error are as modelled."""
 NOISE_DOF: Final = 8.0
 """Degrees of freedom with which the noise of the innovations is known."""
 MIN_ERROR_SIGMA: Final = 1.0
