@@ -157,7 +157,7 @@ class _Child:
             )  # of a fork with other threads: the child uses none
             self._process.start()
         end.close()
-        self.end = weakref.finalize(self, _end, self._process, self._pieces)
+        self.end = weakref.finalize(self, _end, os.getpid(), self._process, self._pieces)
 
     def receive(self, job: GuardedJob) -> tuple[bool, Any]:
         """Return whether `job` is done, and its piece; FormatError: it takes too much, or ends the child."""
@@ -176,7 +176,10 @@ class _Child:
         return bool(done), piece
 
 
-def _end(process: BaseProcess, pieces: Connection) -> None:
+def _end(parent: int, process: BaseProcess, pieces: Connection) -> None:
+    """End the child, in the process that started it: `parent` is its number."""
+    if os.getpid() != parent:  # a copy of the object in a process that was forked since
+        return
     process.kill()
     process.join()
     pieces.close()

@@ -162,3 +162,19 @@ def test_each_of_several_files_has_its_own_time(file: Path, monkeypatch: pytest.
 
     child = Guarded([GuardedJob(file, busy)] * 4)
     assert [list(child.pieces(k)) for k in range(4)] == [[1]] * 4
+
+
+def test_a_process_that_is_forked_while_a_file_is_read_does_not_end_the_child(file: Path) -> None:
+    def read() -> Iterator[int]:
+        yield 1
+        yield 2
+
+    pieces = guarded(file, read)
+    assert next(pieces) == 1
+    if (pid := os.fork()) == 0:  # the copy in this process is dropped without an exception and without a kill
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sys.unraisablehook", lambda _: os._exit(1))
+            del pieces
+        os._exit(0)
+    assert os.waitpid(pid, 0)[1] == 0
+    assert list(pieces) == [2]
