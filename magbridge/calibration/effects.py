@@ -53,10 +53,9 @@ def held(values: FloatArray, first: float) -> FloatArray:
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
-    """Return (n,) y that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
+    """Return y (n,) that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
 
-    `time`, `values` (n,): s, and x. `lag`: s, the sum of all stages; at 0, y is x. `stages`: number of lags
-    in series.
+    `time`, `values` (n,): s, and x. `lag`: s, the sum of all `stages`; at 0, y is x.
     """
     if lag <= 0.0 or len(time) < 2:
         return values
@@ -231,13 +230,12 @@ class PowersEffect(PathEffect, frozen=True, kw_only=True):
 class SourcesEffect(PathEffect, frozen=True, kw_only=True):
     """Iron that a mass passes on its path: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
 
-    Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the
-    mass, makes a field that falls with the cube of their distance. Its place is unknown, but a row of
-    sources near the path can make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
+    Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the mass,
+    makes a field that falls with the cube of their distance. A row of sources near the path can make the same
+    field as iron at an unknown place: an equivalent layer (Dampney 1969, Geophysics 34:39).
 
-    `centre`, `scale`: position of the first source, and distance of all of them from the path, in the
-    channel's unit. `apart`: distance between neighbouring sources, in units of `scale`. `count`: number of
-    sources.
+    `centre`, `scale`: position of the first source, and distance of all from the path, in the channel's unit.
+    `apart`: distance between neighbouring sources, in units of `scale`. `count`: number of sources.
     """
 
     kind: ClassVar[str] = "sources"
@@ -257,10 +255,10 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
 
 
 class LegendreEffect(MomentaryEffect, frozen=True, kw_only=True):
-    """What the calibration's own positions do beyond its terms: ``T += c prod_k P_e_k(x_k)``.
+    """Field of the calibration's own positions beyond its terms: ``T += c prod_k P_e_k(x_k)``.
 
-    P_e is Legendre's polynomial of degree e: of x^e it is what a fit of all lower powers leaves, over the
-    travel that the calibration saw.
+    P_e, Legendre's polynomial of degree e, is what a fit of all lower powers leaves of x^e over the
+    calibrated travel.
     """
 
     kind: ClassVar[str] = "legendre"
@@ -308,14 +306,14 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
     ``y = min(max(y, p - width / 2), p + width / 2)``: y lags behind p by up to half the width, on the side
     from which the mass came. A drive's backlash makes a loop of constant width (S linear). Steel near the
-    path is remagnetised only while the mass is near (Preisach relays of one width about one place), so its
-    loop closes farther away: ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate &
-    Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
+    path is remagnetised only while the mass is near, so its loop closes farther away: ``S(v) = scale tanh((v
+    - centre) / scale)``, a generalised play (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*,
+    sec. 2.1 and 2.4).
 
     `width`: in the channel's unit. `centre`, `scale`: position of the steel, and how far its effect reaches,
-    in the channel's unit. With a scale far beyond the travel S is linear, as for backlash. `order`: 0: S as
-    above. In older files, the highest power of a polynomial in its place: ``sum_k c_k (v^k - x^k)`` with ``v
-    = (y - centre) / scale`` and ``x = (p - centre) / scale``.
+    in the channel's unit; with a scale far beyond the travel S is linear. `order`: 0: S as above. In older
+    files, the highest power of a polynomial in its place: ``sum_k c_k (v^k - x^k)`` with ``v = (y - centre) /
+    scale`` and ``x = (p - centre) / scale``.
     """
 
     kind: ClassVar[str] = "play"

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 # ---- What the data determine ----
 
 JACOBIAN_ROWS = 5_000
-"""Rows of the Jacobian: more do not change its rank."""
+"""Largest number of rows of the Jacobian: more do not change its rank."""
 MIN_POSITION_STEP_FRACTION = 0.02
-"""Share of the half range by which neighbouring positions of a mass differ that are not one; and share of the
+"""Difference of neighbouring positions of a mass, as a fraction of half its range, and fraction of the
 samples that a position must have to count."""
 SWEPT = 0.3
-"""Share of the half range that one position spans where its mass moved all along."""
+"""Fraction of half the range that one position spans where its mass moved all along."""
 MAX_CORRELATION = 0.9
 """Correlation of two positions above which their effects cannot be distinguished."""
 BANKED = 10.0
@@ -40,16 +40,16 @@ BANKED = 10.0
 DIVE_PITCH_DEG = 5.0
 """Pitch from which on a run is a dive or a climb, deg."""
 OPEN = 60.0
-"""Gap in the headings that is remarked on, deg."""
+"""Gap in the headings that is reported, deg."""
 RANK_TOLERANCE = 1e-9
-"""Share of the largest singular value, below which one counts as zero."""
+"""Fraction of the largest singular value below which one counts as zero."""
 
 
 def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> FloatArray:
     """Return the 1-sigma, nT, of each estimable combination of coefficients (rank,), best known first.
 
-    From the data alone, by the singular values of the Jacobian at `coefficients` (9 m,) over the noise of a
-    sample, `sigma`, nT. The rank is the number of combinations that are determined, however large the noise.
+    From the data alone, by the singular values of the Jacobian at `coefficients` (9 m,) over the noise
+    `sigma` of a sample, nT.
     """
     # thin the rows, and scale them so that they carry the information of all
     step = max(len(samples.field) // JACOBIAN_ROWS, 1)
@@ -169,26 +169,25 @@ CHECKS: tuple[Callable[[Calibration, Observations], Iterator[Diagnostic]], ...] 
 UNSUPPORTED = 5.0
 """Expected error over noise, above which the data do not support the fit."""
 LIKELIER = 3.0
-"""Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
+"""Gain in log evidence of one more order from which on the order is too low (20:1)."""
 MAX_ERROR_RATIO = 1.25
-"""Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
+"""Errors of held-out parts over their sigmas from which on a warning is due."""
 MIN_SIGNAL_TO_NOISE = 3.0
-"""Standard deviation of the field along the sensor axis with the least variation, over the noise. Below it,
-noise is more than a tenth of the variance there: a fit takes noise for attitudes (errors in variables of
-second order), and 6,000 samples of 1,500 nT noise gave an ideal compass an offset of 13,900 nT at nine
-sigmas."""
+"""Standard deviation of the field along the sensor axis with the least variation, over the noise. Below it, a
+fit takes noise for attitudes (errors in variables of second order): 6,000 samples of 1,500 nT noise gave an
+ideal compass an offset of 13,900 nT at nine sigmas."""
 GAIN = 0.08
 """Departure of the middle scale from 1 that few sensors have, four sigmas of the prior. A wrong reference
-shrinks all scales: in a real flight over an unmapped crustal anomaly to 0.88 to 0.94."""
+shrinks all scales: over an unmapped crustal anomaly of a real flight to 0.88 to 0.94."""
 MAX_PRIOR_CHI_SQUARED = 27.9
 """Sum of the squares of nine coefficients over their prior's sigmas that one sensor in 1,000 exceeds."""
 MAX_SCALE_SIGMA_RATIO = 0.25
 """Sigma of a scale over its prior's, from which on the prior shows in it: at 0.25 it moves the scale by a
-sixteenth of its departure. A gain of 0.8 came out as 0.84 to 0.98 at ratios of 0.36 to 1."""
+sixteenth of its departure."""
 MAX_NOISE_AUTOCORRELATION = 0.98
 """Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
 MAX_HEADING_GAP_DEG = 270.0
-"""Gap in the headings, deg: less than a quarter of the compass does not determine the rest."""
+"""Gap in the headings above which they do not determine the rest, deg."""
 
 
 def judged(found: Fit, data: Observations) -> Fit:

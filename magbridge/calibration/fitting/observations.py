@@ -19,7 +19,7 @@ from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
 
 RARE = 0.001
-"""Share of the samples at either end that does not count for the range of a condition: it may be wrong."""
+"""Fraction of the samples at either end that does not count for the range of a condition."""
 COMMON, FAR = 0.005, 10.0
 """A position is implausible if it is farther from the median than FAR times the span between the quantiles
 COMMON and 1 - COMMON."""
@@ -45,10 +45,9 @@ class Observations:
     """(n, k): Actuator positions; k may be 0."""
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    """`names`, `units`: Names and units of the parameters."""
+    """`names`, `units`: of the parameters."""
     runs: NDArray[np.generic] = attribute(default_factory=_nothing)
-    """(n,): A label for each sample: dive, spiral, file. Validation leaves out whole runs. If not given, one
-    run."""
+    """(n,): label of each sample: dive, spiral, file; default: one run. Whole runs are left out."""
     time: FloatArray = attribute(default_factory=_nothing)
     """(n,), s since 1970 UTC; if not given, one sample a second."""
     attitude: FloatArray | None = None
@@ -58,12 +57,11 @@ class Observations:
     place: FloatArray | None = None
     """(n, 3), m north, east, down of `origin`."""
     unmapped: FloatArray | None = None
-    """(n,): 1 where the reference lacks the crustal field, or a map's missing part of it; 0 where it is the
-    true field."""
+    """(n,): 1 where the reference lacks the crustal field, or what a map misses; 0 where it is true."""
     temperature: FloatArray | None = None
-    """(n,), degC, of the fluxgate; NaN where it is not known."""
+    """(n,), degC, of the sensor; NaN where unknown."""
     depth: FloatArray | None = None
-    """(n,), m; NaN where it is not known."""
+    """(n,), m; NaN where unknown."""
     map_sigma: float | None = None
     """1-sigma of the map in the reference, nT; None without a map."""
     origin: tuple[float, float] = (0.0, 0.0)
@@ -135,7 +133,7 @@ class Observations:
     def channels(self, calibration: Calibration) -> FloatArray:
         """Return the channels (n, c), in order, that a calibration of these data needs for correction.
 
-        The first columns are the positions; of effects, the temperature is known.
+        The first columns are the positions; of effects' channels, the temperature is known.
         """
         positions = self.parameters[:, : len(calibration.parameters)]
         if TEMPERATURE not in calibration.channels[positions.shape[1] :] or self.temperature is None:
@@ -143,9 +141,9 @@ class Observations:
         return np.column_stack([positions, self.temperature])
 
     def directed(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Return a mask (n,) of samples with attitude and reference direction, and those m samples.
+        """Return True for samples (n,) with attitude and reference direction, and those of the m samples.
 
-        The attitude (m, 3) is in rad, the reference (m, 3) in nT, as the attributes are.
+        The attitude (m, 3) is in rad, the reference (m, 3) in nT.
         """
         if self.attitude is None or self.reference_ned is None:
             return np.zeros(len(self), bool), np.empty((0, 3)), np.empty((0, 3))
@@ -246,7 +244,7 @@ def _plausible(names: Sequence[str], positions: FloatArray) -> None:
 def monomials(
     positions: FloatArray, parameters: Sequence[Parameter], exponents: Sequence[Exponents]
 ) -> FloatArray:
-    """Return (n, m) monomials of positions (n, k), in their units, scaled as the k `parameters` say."""
+    """Return (n, m) monomials of positions (n, k), scaled as the k `parameters` say."""
     # each monomial is the product of the scaled positions to its powers
     x = (positions - [p.centre for p in parameters]) / [p.scale for p in parameters]
     return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
@@ -258,7 +256,7 @@ def polynomial_samples(
     kappa: float = 0.0,
     ranges: Sequence[Parameter] | None = None,
 ) -> ResidualSamples:
-    """Return the samples of `data` with the monomials of their positions; `kappa` as in Samples.
+    """Return the samples of `data` with the monomials of their positions.
 
     The positions are scaled to the range seen, unless `ranges` are given.
     """
@@ -267,13 +265,11 @@ def polynomial_samples(
 
 
 MIN_SLOPE_TIME_CONSTANTS = 4.0
-"""Time constants that a slope spans at least: over shorter spans it would be noise."""
+"""Time constants that a slope spans at least: over less it would be noise."""
 
 
 def unfiltered(data: Observations, corner: float) -> Observations:
-    """Return `data` as they would be without a first-order filter of that corner.
-
-    `data`: as the filter passed them on. `corner`: Hz.
+    """Return `data` as they would be without a first-order filter of cutoff `corner`, Hz.
 
     CalibrationError: the time constant of the filter is longer than the data.
     """

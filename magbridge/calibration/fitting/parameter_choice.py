@@ -30,29 +30,27 @@ if TYPE_CHECKING:
 # ---- Columns that a fit suggests ----
 
 PARTS, BLOCKS = 8, 32
-"""Parts of a log, of which each is left out in turn; and the blocks of neighbours that they are dealt. A mass
-that nearly always moves with a declared one is known only by a few: no part may have them all."""
+"""Number of parts of a log, of which each is left out in turn, and of blocks of neighbours that they get: no
+part may have all motions of a mass that rarely moves alone."""
 MAX_REMAINING_FRACTION = 0.8
-"""Share of the residual that must be left on the parts left out, for a column to be named."""
+"""Fraction of the residual left on held-out parts, at most, for a column to be named."""
 MIN_IMPROVEMENT_NT = 2.0
 """Least improvement that is reported, nT."""
 MAX_REPORTED_COLUMNS = 3
-"""Largest number of reported columns, each given the previous ones: a correlate of a mass is not a second."""
+"""Largest number of reported columns, each given the previous ones."""
 WORTHY = 0.5
-"""Share of the first one's worth that another must have: a mass's higher powers leave what anything fits."""
+"""Improvement by a further column, as a fraction of the first one's, from which on it is reported."""
 
 
 def undeclared(calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray]) -> list[str]:
     """Return a line for each column that explains the residual of a fit without being its parameter.
 
-    `calibration`: fitted to `data`. `data`: whose sensor's channels are exactly the calibration's
-    parameters. `columns` (n,): telemetry at the samples of `data`.
+    `data`: of the fit. `columns` (n,): telemetry at the samples of `data`.
 
-    Notes
-    -----
-    A mass at c adds a field ``d(c)`` to the vector, and ``d(c) . u`` to the total field, u its direction: the
-    residual is regressed on ``u, c u, c^2 u`` and the same functions of each declared parameter, which may
-    have absorbed part of it without c; the improvement by c is measured on held-out parts.
+    Notes ----- A mass at c adds a field ``d(c)`` to the vector, and ``d(c) . u`` to the total field, u its
+    direction: the residual is regressed on ``u, c u, c^2 u`` and the same functions of each declared
+    parameter, which may have absorbed part of it without c; the improvement by c is measured on held-out
+    parts.
     """
     lines: list[str] = []
     conditional_on: tuple[str, ...] = ()
@@ -81,8 +79,8 @@ def worths(
 ) -> dict[str, float]:
     """Return the reduction (nT) of a residual on held-out parts by each column (n,); see :func:`undeclared`.
 
-    `columns` are (n,), at the n samples. Columns that leave more than the fraction `better` of it are left
-    out, as are those that the others are `conditional_on`.
+    Omitted are columns that leave more than the fraction `better` of it, and those of `conditional_on`, which
+    explain their part first.
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
@@ -131,19 +129,18 @@ def _left_out(design: FloatArray, residual: FloatArray) -> float:
 AUTO = "auto"
 """``--parameter auto``."""
 MAX_PARAMETERS = 3
-"""Parameters at most: each of several currents is in part the sum of the others."""
+"""Largest number of parameters: each of several currents is in part the sum of the others."""
 FAILURES = 2
-"""Columns in a row that were not worth it, after which no more are tried."""
+"""Number of rejected columns in a row after which no more are tried."""
 MAX_HELD_OUT_ERROR_RATIO = 0.95
-"""Share of the error on parts left out that may be left, for a column to be worth its coefficients."""
+"""Fraction of the error on held-out parts that a useful column may leave."""
 SCREENING_SAMPLES = 20_000
-"""Samples at most with which columns are chosen, every second, third ... of a longer log: enough for a ratio
-of errors, and the time is bounded."""
+"""Largest number of samples with which columns are chosen."""
 USUAL_DEPARTURE = 0.15
-"""Departure of a scale from 1 that sensors have. Beyond it a parameter must not move the scales further away:
-its coefficients have then absorbed attitudes, because it moved with them."""
+"""Departure of a scale from 1 that sensors have. A parameter must not move the scales beyond it and further
+away: it moved with the attitude then, and its coefficients have absorbed that."""
 HINTED = 0.98
-"""Share of the residual that may be left, for a column to be tried."""
+"""Fraction of the residual that may be left, for a column to be tried."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,7 @@ class Offer:
     name: str
     without: float
     left_out: float
-    """`without`, `left_out`: nT, RMS on parts left out of the fit without it, and with it."""
+    """`without`, `left_out`: RMS on held-out parts without it, and with it, nT."""
     taken: bool
 
 
@@ -162,8 +159,7 @@ def best_parameters(
 ) -> tuple[tuple[str, ...], list[Offer]]:
     """Return the columns to use as parameters, and the improvement of each that was tried.
 
-    `deployment`: as :func:`~.observe.observations` takes it. `offered`: columns that may move the field.
-    `grid`: added to the IGRF. `options`: of :func:`~.fit.fit`.
+    `offered`: columns that may move the field. `grid`: added to the IGRF. `options`: of :func:`~.fit.fit`.
 
     CalibrationError: the data do not support a fit without parameters.
     """

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 MAX_JOINT_RMS_RATIO = 3.0
-"""RMS of a fit to all logs over that of fits to each: sampling and slow errors alone do not reach it."""
+"""RMS of a fit to all logs over that of a fit to each, from which on they differ."""
 JUDGED = 10
-"""Logs, those with most samples, that are fitted each on its own."""
+"""Number of logs, the largest, that are fitted each on its own."""
 
 
 def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
     """Return the index (n,) of the log of the sample at each `time` (n,), s; -1 for none.
 
-    Of logs that have all channels at the same time it is the first, as when they are joined.
+    Of logs with all channels at the same time it is the first, as when they are joined.
     """
     # from the last log to the first, so that the first one wins
     which = np.full(len(time), -1)
@@ -60,8 +60,8 @@ def heterogeneous_logs(
 ) -> Diagnostic | None:
     """Return a warning if logs are not of one vehicle in one state.
 
-    `logs`: the logs of which `data` was made. `data`: samples of the fit. `found`: the fit to all; None if
-    it collapsed. `refit`: fits a part of the data in the same way.
+    `data`: samples of the fit. `found`: the fit to all; None if it collapsed. `refit`: fits a part of the
+    data in the same way.
     """
     if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
         return None  # the residuals are noise from one sample to the next
