@@ -25,7 +25,7 @@ from magbridge.calibration.model import (
 )
 from magbridge.config import Align
 from magbridge.correction import Correction
-from magbridge.errors import CalibrationError
+from magbridge.errors import FormatError
 from magbridge.filter_lag import LagCorrection
 from magbridge.records import Quality, Reading
 from magbridge.rows import correct_rows
@@ -256,5 +256,5 @@ def test_a_calibration_that_names_the_filter_corrects_without_lag(delay_s: float
 @pytest.mark.parametrize("cutoff", [-1.0, 1e9])
 def test_an_impossible_cutoff_is_refused(cutoff: float) -> None:
     calibration = replace(identity(), sensor=CalibratedSensor("ascii", filter_cutoff=cutoff))
-    with pytest.raises(CalibrationError, match="filter_cutoff"):
+    with pytest.raises(FormatError, match="filter_cutoff"):
         decode_calibration(encode_calibration(calibration))
