@@ -31,6 +31,7 @@ CHECKS = (
     ("ruff", "format", "--check", "."),
     ("mypy",),
     ("lint-imports", "--no-cache"),
+    ("python", "tools/collection.py"),
     ("mkdocs", "build", "--quiet", "--site-dir", ".site"),
     ("python", "tools/prose.py", "--gate"),
     ("python", "tools/names.py", "--gate"),
