@@ -1,13 +1,13 @@
 """Read and write deployments: a module for each format, a table of formats, one reader and one writer.
 
-A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
-magnetometer sample; every other column holds the values known at that time:
+A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). Each row is one sample of the
+magnetometer. Every other column holds its value at the row's time, which depends on the kind of log:
 
-- logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN once
-  it is older than 30 s. The bridge itself would have known this, so a calibration is fitted to the same kind
-  of data as it will correct live;
-- logs that were assembled ashore (Slocum, Seaglider): interpolated linearly, headings on the circle, NaN
-  across gaps.
+- in logs of a live link (``.tlog``, ``.BIN``, ``.ulg``) it is the last value received at or before the row,
+  and NaN once older than 30 s. A live bridge uses the same value, so a calibration is fitted to the kind of
+  data that it will correct;
+- in logs that were assembled after a mission (Slocum, Seaglider) it is interpolated linearly, headings on the
+  circle, and NaN in gaps.
 
 :mod:`.registry` is the table of formats, :mod:`.access` reads and writes all of them, and :mod:`.mapping` has
 the user's declarations. :mod:`.tlog` is separate: it writes the bridge's log.
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "Options", "Writer", "read", "read_chunks", "read_each", "suffixes", "write"]
 
 MODULES = {"FORMATS": "registry", "suffixes": "registry", "Options": "mapping"}
-"""The module of each name that is not in :mod:`.access`."""
+"""Exported name -> its module, for names that are not in :mod:`.access`."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name when it is first used: a bridge, which only writes its log, starts sooner."""
+    """Return an exported name, imported at its first use so that a bridge starts sooner."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{MODULES.get(name, 'access')}"), name)

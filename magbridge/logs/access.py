@@ -1,7 +1,7 @@
 """Read and write deployments in files of any format, whole or in pieces.
 
-Bad rows and values are dropped by :mod:`magbridge.logs.checks`, a whole file of several here; both are
-counted and named in attributes.
+:mod:`magbridge.logs.checks` drops bad rows and values; this module skips unreadable files among several.
+Attributes of the deployment count and name both losses.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
-"""Number of rows that no file reaches."""
+"""Number of rows that is larger than any file has."""
 MAX_SHARED_BYTES = 4_000_000
-"""Bytes of a file below which one child process reads several."""
+"""Size of files below which one child process reads several of them, bytes."""
 DEFAULTS = Options()
 
 
@@ -48,7 +48,7 @@ def read(
     options : Options
         Declarations of the user about the logs.
     decode_times : bool
-        Times are datetime64 (UTC), as xarray decodes them, and not s since 1970.
+        True for times as datetime64 (UTC), False for s since 1970.
 
     Returns
     -------
@@ -56,13 +56,13 @@ def read(
         On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the
         file's name, and the source that it states), ``heading_reference`` where it is not true north,
         ``time_reference`` where time does not count from 1970, counts of losses (``rows_dropped`` ...), and
-        ``losses``, which names it.
+        ``losses``, a line for each loss.
 
     Raises
     ------
     FormatError
-        Nothing can be read: names file, row, column and expectation. One of several files that cannot be read
-        is skipped and counted, unless `options` are strict.
+        No file can be read; the message names file, row, column and expectation. An unreadable file among
+        several is skipped and counted, unless `options` are strict.
     MissingExtra
         The format needs a package that is not installed.
     """
@@ -74,9 +74,9 @@ def read(
 
 
 def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
-    """Return the deployment of each file as :func:`read` does; a Slocum's flight and science file are one.
+    """Return one deployment for each file, and one for a Slocum's flight and science file together.
 
-    A sensor's own logs get the telemetry of the vehicle's logs, which are then not among the results.
+    A log of a sensor's own logger gets the telemetry of the vehicle's logs, which are then not returned.
     """
     from magbridge.logs.merge import combine  # noqa: PLC0415 - xarray is for ashore
 
@@ -95,8 +95,8 @@ def read_chunks(
 ) -> Iterator[xr.Dataset]:
     """Yield the result of :func:`read` in pieces of about `rows` rows with the same columns.
 
-    One CSV, netCDF or Parquet is streamed in bounded memory. A file of another format is held in memory, and
-    each of several files until the times of the next begin.
+    A single CSV, netCDF or Parquet file is streamed in bounded memory. A file of another format is in memory
+    as a whole. Each of several files is in memory until the times of the next file begin.
     """
     from magbridge.logs.merge import merge, refuse_offset  # noqa: PLC0415 - xarray is for ashore
 
@@ -109,14 +109,14 @@ def read_chunks(
     else:
         named = [files.is_sensor_log(k) for k in range(len(sources))]
         stream = merge(sources, rows, named, options.clock_offset_s)
-    for dataset, _ in pairwise(chain(stream, [None])):  # one ahead, so that the last can tell of all
+    for dataset, _ in pairwise(chain(stream, [None])):  # one ahead: the last piece reports all skipped files
         if dataset is not None:
             require(dataset, required)
             yield files.counted(dataset)
 
 
 class _Files:
-    """Several files, of which some may not be readable."""
+    """Files to read, of which some may be unreadable."""
 
     def __init__(self, paths: Sequence[Path], options: Options) -> None:
         self.paths, self._options = paths, options
@@ -125,7 +125,7 @@ class _Files:
         self._together: dict[int, Iterator[Any]] | None = None
 
     def pieces(self, k: int, rows: int) -> Iterator[xr.Dataset]:
-        """Yield the pieces of one file, as far as it can be read; FormatError: none of the files can be."""
+        """Yield the readable pieces of file `k`; FormatError: no file is readable, or options are strict."""
         path = self.paths[k]
         if self._together is None:
             self._together = _read_together(self.paths, rows, self._options)
@@ -137,11 +137,11 @@ class _Files:
                 raise
 
     def is_sensor_log(self, k: int) -> bool:
-        """Return True if the user declares a file as a sensor's own log."""
+        """Return True if the user declares file `k` as the log of a sensor's own logger."""
         return self.paths[k] in self._options.sensor_log
 
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
-        """Return a deployment with the files counted and named that were skipped since the last call."""
+        """Return the deployment with attributes that count and name the files skipped since the last call."""
         from magbridge.logs.deployment import with_losses  # noqa: PLC0415 - xarray is for ashore
 
         lines = [str(error) for error in self._bad.values()][self._reported :]
@@ -160,7 +160,7 @@ def _paths(paths: Paths, options: Options) -> list[Path]:
 
 
 def without_companions(paths: Sequence[Path]) -> list[Path]:
-    """Return the files without those that are read with another, as a Slocum's science file is."""
+    """Return the files without those that are read together with another, as a Slocum's science file."""
     given = set(paths)
 
     def is_companion(path: Path) -> bool:
@@ -171,7 +171,7 @@ def without_companions(paths: Sequence[Path]) -> list[Path]:
 
 
 def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:
-    """Read the small files that need a child process in one child; return their contents by place."""
+    """Read the small files that need a child process in one child; return their pieces by index."""
     small = [
         k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < MAX_SHARED_BYTES
     ]
@@ -186,7 +186,7 @@ def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[i
 
 
 def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]:
-    """Yield the pieces of a file from its format; what another package's code raises names that package."""
+    """Yield the pieces that the format's module reads; PluginError: another package's module fails."""
     chunks = form.load().chunks
     more = (options,) if "options" in signature(chunks).parameters else ()
     with form.blamed():
@@ -199,7 +199,7 @@ def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]
 def _chunks(
     path: Path, rows: int, options: Options, contents: Iterator[Any] | None = None
 ) -> Iterator[xr.Dataset]:
-    """Yield one file in pieces, checked and dated; `contents` are its contents, read with other files."""
+    """Yield a file's pieces, checked and dated; `contents` are its pieces if a shared child reads them."""
     from magbridge.logs.checks import checked  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import passed_over  # noqa: PLC0415
 
@@ -235,7 +235,7 @@ def _chunks(
 
 
 def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield each piece with the numbers of its rows: those that it came with, or counted from 1."""
+    """Yield each piece with its row numbers, as the reader gives them or counted from 1."""
     row = 1
     for piece in pieces:
         if isinstance(piece, tuple):
@@ -246,7 +246,7 @@ def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]
 
 
 def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
-    """Return a deployment whose times count from the boot, with the boot at `date` (s) if that is given."""
+    """Return the deployment with `date` (s since 1970 UTC) added to times that count from a boot."""
     if date is None or not counts_from_boot(part):
         return part
     from magbridge.logs.deployment import shifted  # noqa: PLC0415 - xarray is for ashore
@@ -257,7 +257,7 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
 
 
 def _origin(source: str) -> str:
-    """Return ``a.csv`` of ``b.nc (a.csv)``, else `source`."""
+    """Return the source in brackets, as ``a.csv`` of ``b.nc (a.csv)``; without brackets, `source` itself."""
     name, opened, inside = source.partition(" (")
     depths = list(accumulate((char == "(") - (char == ")") for char in inside))
     # one pair of brackets around the rest, and not several files
@@ -268,18 +268,18 @@ def _origin(source: str) -> str:
 def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a deployment in the format of the suffix of `path`; times are s since 1970, or datetime64.
 
-    FormatError: the suffix is not that of a format that can be written. WriteError: the file cannot be
-    written, and is as it was before.
+    FormatError: no format with this suffix can be written. WriteError: the file cannot be written and remains
+    unchanged.
     """
     with Writer(path) as writer:
         writer.append(dataset)
 
 
 class Writer:
-    """A file to which successive deployments are appended; it appears when it is complete.
+    """Writer of successive deployments to one file, which appears when it is complete.
 
-    The columns are those of the first deployment; a later one that lacks a column has NaN there. When the
-    block raises, nothing is left behind. `finish` may add to the file once all rows are in it; `options` are
+    The columns are those of the first deployment; a column that a later one lacks is NaN there. If the block
+    raises, no file remains. `finish` is called with the path of the file after the last row. `options` are
     the format's own, as ``og1=True`` of netCDF. Times may be datetime64.
 
     >>> with Writer("out.nc") as writer:  # doctest: +SKIP
@@ -313,7 +313,7 @@ class Writer:
                 temporary.write_bytes(metadata)
 
     def append(self, dataset: xr.Dataset) -> None:
-        """Write the rows of `dataset`, which begin after the last ones.
+        """Write the rows of `dataset`, whose times follow those of all earlier rows.
 
         FormatError: time does not increase, or a column was not in the first deployment.
         """

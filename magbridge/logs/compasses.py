@@ -1,11 +1,11 @@
-"""Logs with several magnetometers: their compasses, the choice of one, and rows at its samples.
+"""Choose one of several magnetometers in a log, and form rows at its samples.
 
-Unless the user asks for another, ``mag_x``, ``mag_y``, ``mag_z`` are those of the compass that the estimator
-names, that is enabled and healthy; the others keep their number, as in ``mag2_x`` of the second.
+By default, ``mag_x mag_y mag_z`` are the compass that the vehicle's estimator used, if it is enabled and
+healthy. Every other compass has its number in the name of its columns: ``mag2_x`` is the second.
 
-In the logs of ArduPilot, PX4 and ROS, a row is a sample of that magnetometer; every other column is the last
-value before it. A log that does not tell UTC counts from the boot, and has the attribute
-``time_reference = "boot"``. Each boot is a run with its own UTC.
+In logs of ArduPilot, PX4 and ROS, each row is a sample of the chosen magnetometer. Every other column is the
+last value at or before the row. Times of a log without UTC count from the boot, and its attribute
+``time_reference`` is ``"boot"``. Each boot is a run with its own UTC offset.
 """
 
 from __future__ import annotations
@@ -30,38 +30,38 @@ from magbridge.logs.fields import latest
 from magbridge.wording import counted
 
 Series = tuple[FloatArray, str, str, FloatArray]
-"""Times (m,), s; column, unit and values (m,)."""
+"""Times (m,), s, name and unit of a column, and its values (m,)."""
 MIN_BOOT_INTERVAL_S = 60.0
-"""s between two boots whose times would overlap: no value is carried from one to the other."""
+"""Interval set between two boots whose times would overlap, s, so that no value is carried across."""
 OTHER = re.compile(r"mag[1-9]\d*_x$")
-"""Name of the first axis of another compass than the first."""
+"""Name of the x axis of a numbered compass, as ``mag2_x``."""
 AXIS = re.compile(r"mag([1-9]\d*)?_[xyz]$")
 """Name of an axis of any compass."""
 HEALTHY = 0.5
-"""Least share of its samples in which a compass in use is healthy."""
+"""Smallest fraction of healthy samples of a compass that is fit for use."""
 COMPASSES_ATTRIBUTE = "compasses"
 
 
 class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One compass of a log."""
+    """Description of one compass in a log."""
 
     number: int
-    """From 0, as the log counts; the option ``--compass`` takes it."""
+    """Number in the log, from 0; the option ``--compass`` accepts it."""
     samples: int
     rate: float
     """Median rate, Hz."""
     id: str = ""
-    """The device's id or topic; the option takes it, too. Empty where the log does not say."""
+    """Device id or topic, which ``--compass`` also accepts; empty if the log does not state it."""
     enabled: bool | None = None
     """True if the vehicle's settings allow its use; None if the log does not say."""
     healthy: float | None = None
-    """Share of its samples that the vehicle found healthy."""
+    """Fraction of the samples that the vehicle found healthy; None if the log does not say."""
     priority: int | None = None
-    """The vehicle's own: of ArduPilot 1 is the first, of PX4 100 the highest."""
+    """Priority set in the vehicle: in ArduPilot 1 is the first, in PX4 100 is the highest."""
     in_use: bool = False
-    """The log says that the vehicle used this one."""
+    """True if the log states that the vehicle used this compass."""
     chosen: bool = False
-    """It is ``mag_x`` of the deployment."""
+    """True if this compass is ``mag_x mag_y mag_z`` of the deployment."""
 
     @property
     def fit(self) -> bool:
@@ -81,17 +81,17 @@ class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Magnetometer(NamedTuple):
-    """The samples of a magnetometer."""
+    """Samples of one magnetometer."""
 
     compass: LogCompass
     time: FloatArray
-    """(n,), s of the log."""
+    """(n,): Times on the log's clock, s."""
     field: Mapping[str, FloatArray]
-    """(n,) each, nT, by axis (``x``, ``y``, ``z``)."""
+    """Field by axis (``x``, ``y``, ``z``), (n,) each, nT."""
 
 
 def sampled(number: int, time: FloatArray, axes: FloatArray, **facts: Any) -> Magnetometer:
-    """Return a magnetometer by its times (n,), s, and its axes (3, n), nT; `facts` are of its compass."""
+    """Return a magnetometer sampled at `time` (n,), s, with `axes` (3, n), nT; `facts` describe it."""
     compass = LogCompass(number, len(time), rate(time), **facts)
     return Magnetometer(compass, time, dict(zip("xyz", axes, strict=True)))
 
@@ -104,27 +104,28 @@ def symmetric(diagonal: Sequence[float], off_diagonal: Sequence[float]) -> Float
 
 
 class BootRun(NamedTuple):
-    """The records between one boot and the next."""
+    """Records between one boot and the next."""
 
     magnetometers: list[Magnetometer]
-    """At least one."""
+    """Magnetometers of the run, at least one."""
     telemetry: Iterable[Series]
-    """The first of several with one name is taken."""
+    """Other columns; of several with the same name, the first is used."""
     offset: float | None
-    """UTC minus the log's time, s; None where it is not known."""
+    """UTC minus the log's time, s; None if UTC is not known."""
 
 
 def rate(time: Sequence[float] | np.ndarray[Any, Any]) -> float:
-    """Return the median rate, Hz, of times in s; 0 of fewer than two."""
+    """Return the median rate, Hz, of times (n,), s; 0 for fewer than two times."""
     steps = np.diff(np.asarray(time, dtype=np.float64))
     steps = steps[steps > 0]
     return float(1 / np.median(steps)) if len(steps) else 0.0
 
 
 def choose(path: Path, found: Sequence[LogCompass], wanted: str | None) -> list[LogCompass]:
-    """Return the compasses with one marked as chosen: that with the number or id `wanted`.
+    """Return the compasses with one marked as chosen: the compass with the number or id `wanted`.
 
-    None: the one in use, else the first that is enabled and healthy. FormatError: there is none of that name.
+    If `wanted` is None, prefer an enabled and healthy compass, then the compass in use, then the first.
+    FormatError: no compass has this number or id.
     """
     if wanted is None:
         best = min(found, key=lambda one: (not one.fit, not one.in_use, one.number))
@@ -138,7 +139,7 @@ def choose(path: Path, found: Sequence[LogCompass], wanted: str | None) -> list[
 
 
 def compass_notes(found: Sequence[LogCompass], wanted: str | None) -> list[str]:
-    """Return notes on the choice: which compass was chosen of which, and reasons against it."""
+    """Return notes for the user: which of several compasses was chosen, and whether it is unfit for use."""
     best = next(one for one in found if one.chosen)
     words = []
     if wanted is None and len(found) > 1:
@@ -150,14 +151,14 @@ def compass_notes(found: Sequence[LogCompass], wanted: str | None) -> list[str]:
 
 
 def listed(found: Sequence[LogCompass]) -> dict[str, str]:
-    """Return the attribute of a deployment that holds its compasses; none where there is only one unnamed."""
+    """Return the attribute of a deployment that lists its compasses as JSON."""
     return {COMPASSES_ATTRIBUTE: msgspec.json.encode(found).decode()}
 
 
 def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
-    """Return a deployment whose ``mag_x`` is that of the compass `wanted`: ``mag2_x`` for the compass 1.
+    """Return the deployment with compass `wanted` as ``mag_x mag_y mag_z``: ``mag2_x`` if `wanted` is 1.
 
-    The rows stay those of the first compass. FormatError: there are no such columns.
+    The rows remain at the samples of compass 0. FormatError: the deployment has no columns of the compass.
     """
     if wanted in (None, "0"):
         return deployment
@@ -176,23 +177,23 @@ def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
 
 
 def further(deployment: xr.Dataset) -> xr.Dataset:
-    """Return a deployment whose ``mag_x`` is ``mag2_x``, or has the first free number after that."""
+    """Return the deployment with ``mag_x mag_y mag_z`` renamed to a number above all others, at least 2."""
     found = {name: match for name in map(str, deployment.data_vars) if (match := AXIS.match(name))}
     highest = max((int(match[1] or 1) for match in found.values()), default=1)
     return deployment.rename({name: f"mag{highest + 1}_{name[-1]}" for name in CHANNELS if name in found})
 
 
 def compasses_in(log: xr.Dataset) -> list[LogCompass]:
-    """Return the compasses of a deployment: those that it lists, or those that its columns are.
+    """Return the compasses that an attribute of the deployment lists, else one for each vector of columns.
 
-    A log of several boots lists those of its first.
+    A log of several boots lists the compasses of its first boot.
     """
     text = log.attrs.get(COMPASSES_ATTRIBUTE)
     return msgspec.json.decode(text, type=list[LogCompass]) if isinstance(text, str) else _by_names(log)
 
 
 def _by_names(log: xr.Dataset) -> list[LogCompass]:
-    """Return a compass for ``mag_x mag_y mag_z``, and for each ``mag2_x ...`` that is there."""
+    """Return a compass for each vector in the columns: ``mag_x mag_y mag_z``, ``mag2_x ...``."""
     others = [str(name) for name in log.data_vars if OTHER.match(str(name))]
     prefixes = {0: "mag", **{int(name[3:-2]) - 1: name[:-2] for name in others}}
     found = []
@@ -207,9 +208,9 @@ def _by_names(log: xr.Dataset) -> list[LogCompass]:
 def pieces(
     path: Path, rows: int, runs: Sequence[BootRun], attrs: Mapping[str, Any], compass: str | None = None
 ) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows, run by run; the first has the counts of `attrs`.
+    """Yield the log run by run in pieces of at most `rows` rows; the first has the counts in `attrs`.
 
-    Runs without a date are left out, and counted, where others have one.
+    If some runs have UTC, runs without UTC are left out, and their rows are counted as dropped.
     """
     dated = [run for run in runs if run.offset is not None]
     chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)
@@ -233,7 +234,7 @@ def pieces(
 
 
 def _assembled(path: Path, run: BootRun, wanted: LogCompass) -> xr.Dataset:
-    """Return a run at the times of a compass; without that compass, at those of the run's own choice."""
+    """Return a run as a deployment at the samples of compass `wanted`, or of another if the run lacks it."""
     there = [one.compass for one in run.magnetometers]
     same = [one for one in there if (one.id, one.number) == (wanted.id, wanted.number)]
     compass = same[0] if same else next(one for one in choose(path, there, None) if one.chosen)
@@ -254,7 +255,7 @@ def _assembled(path: Path, run: BootRun, wanted: LogCompass) -> xr.Dataset:
 
 
 def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
-    """Shift runs that begin before the end of the previous run, in place; return a note for each."""
+    """Shift runs that begin before the previous run ends, in place; return a note for each shifted run."""
     notes, ended = [], -inf
     for k, run in enumerate(runs):
         time = run["time"].values

@@ -1,7 +1,7 @@
-"""IAGA-2002: an observatory's or a base station's field, minute by minute or second by second.
+"""Read IAGA-2002: the field at an observatory or base station, one row per minute or second.
 
-The elements become ``observatory_x`` (or ``_h``, ``_d`` ...), nT or minutes of arc, and the total field is
-``total_field``: F where it is there, else from the vector. The place is the observatory's. Source:
+Each element becomes a column ``observatory_x`` (``_h``, ``_d`` ...), in nT or minutes of arc. ``total_field``
+is F or S, else the vector's magnitude. Latitude and longitude are the observatory's. Source:
 https://www.ncei.noaa.gov/services/world-data-system/v-dat-working-group/iaga-2002-data-exchange-format
 """
 
@@ -20,13 +20,13 @@ from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.registry import opened
 
 MIN_CODE_NT = 88_888.0
-"""Code for values that were not recorded, as 99,999 for those not observed, nT."""
+"""Lowest code of a missing value, nT: 88,888 means not recorded, 99,999 not observed."""
 TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
-"""Elements whose length is the total field, the surest first."""
+"""Elements whose root sum of squares is the total field, the most reliable first."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file in pieces; it is held whole."""
+    """Yield the file in pieces of at most `rows` rows; the whole file is in memory."""
     with opened(path) as file:
         lines = file.read().decode("ascii", "replace").splitlines()
     first = next((k for k, line in enumerate(lines) if line.startswith("DATE ")), None)
@@ -59,7 +59,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _row(fields: list[str], elements: int) -> list[float] | None:
-    """Return time (s since 1970) and values of a row; None for one that is damaged."""
+    """Return time (s since 1970) and values of a row; None if the row is damaged."""
     try:
         date, clock, _, *values = fields
         when = datetime.fromisoformat(f"{date}T{clock}").replace(tzinfo=UTC).timestamp()
@@ -70,12 +70,12 @@ def _row(fields: list[str], elements: int) -> list[float] | None:
 
 
 def _total(elements: dict[str, FloatArray]) -> FloatArray | None:
-    """Return the total field (n,), nT, from the elements, (n,) each; None: they do not give it."""
+    """Return the total field (n,), nT, from elements (n,) by name; None if they do not determine it."""
     lengths = [
         np.asarray(np.sqrt(sum(np.square(elements[name]) for name in names)))
         for names in TOTALS
         if set(names) <= elements.keys()
     ]
-    # one instrument for the whole file: between two there is a step of some nT
+    # the same elements for the whole file: two instruments differ by some nT
     known = [int(np.isfinite(length).sum()) for length in lengths]
     return next((one for one, count in zip(lengths, known, strict=True) if 2 * count >= max(known)), None)

@@ -18,16 +18,16 @@ from magbridge.logs.layout import Layout, Rows
 from magbridge.logs.mapping import CELL_NUMBER, NAMES, WITH_UNIT, aliases, bare, is_unit, split
 
 ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
-"""Declaration of the time where a file has none: the rows, so many a second."""
+"""Declared time of a file without times: ``row [20 Hz]`` counts the rows at this rate."""
 HOUR = re.compile(
     r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
 )
 DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyy.?mm.?dd|dd.?mm.?yy|mm.?dd.?yy)", re.IGNORECASE)
-"""What in a heading says that the column holds dates."""
+"""Part of a heading that marks a column of dates."""
 TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
-"""What in a heading says that the column holds times, if it is the only one."""
+"""Part of a heading that marks the column of times, if only one heading has it."""
 REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
-"""Words in brackets behind a heading that are not a unit."""
+"""Words in brackets after a heading that are not units."""
 DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
 """A cell that is a date with its time of day."""
 CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
@@ -35,19 +35,19 @@ CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
 HOUR_AND_MINUTE = re.compile(r"([01]?\d|2[0-3])?[0-5]?\d(\.\d+)?")
 """A cell that is a time of day as HHMM.mmm, as in the exchange format MGD77T."""
 SECONDS_HEADING = re.compile("day|sod|utc|midnight", re.IGNORECASE)
-"""What in a heading says that seconds count from midnight, next to a date."""
+"""Part of a heading that marks seconds since midnight, in a file with a column of dates."""
 JOINED: dict[str, list[str]] = NAMES["times"]
-"""What several columns are together -> what they are called, with neither capitals nor punctuation."""
+"""Kind of time that several columns form -> patterns of their names, in lower case without punctuation."""
 UNIT_CELL_COLUMNS = "depth", "total_field", "sensor_temperature"
-"""Columns of ours before whose cells a unit may stand, as in 5.8m; a position has its own letters."""
+"""Standard columns whose cells may end with a unit, as 5.8m; those of a position end with N, S, E or W."""
 HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 
 
 def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -> Layout:
-    """Return a layout with name and unit of each column: as declared, by its heading, or by another name.
+    """Return the layout with name and unit of each column, as declared or as recognised by its heading.
 
-    `units` are those of a row of units, or empty. FormatError: a declared column is not there, or two have
-    one name of ours.
+    `units`: cells of the row of units, empty without one. FormatError: a declared column is missing, or two
+    columns have the same standard name.
     """
     if layout.separator != ",":
         sign = {"\t": "tabs", " ": "blanks"}.get(layout.separator, repr(layout.separator))
@@ -62,7 +62,7 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
 
 
 def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[str]) -> Layout:
-    """Return the layout with the names of the columns; '' for columns that are not read."""
+    """Return the layout with a name for each column; '' for a column that is not read."""
     headings = layout.headings
     # a name that stands twice, with different units: the second keeps them in its name
     names = [name if name not in names[:k] else headings[k] for k, name in enumerate(names)]
@@ -78,7 +78,7 @@ def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[st
             raise FormatError(path, "expected a rate other than 0 Hz", column="time")
         layout = replace(layout, rate=float(match[1]))
     taken = _declared(path, layout, names)
-    # a simulation's truth is not a reading: a log that lacks a channel must not take it from there
+    # a simulation's true values are not readings: they must not fill a channel that the log lacks
     open_to_all = ["" if k in taken or name.startswith("truth_") else name for k, name in enumerate(names)]
     known = {k: name for k, name in aliases(open_to_all, units).items() if name not in taken.values()}
     if "time" not in {*taken.values(), *known.values(), *names}:
@@ -102,7 +102,7 @@ def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[st
 
 
 def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
-    """Return the layout with the unit of a column, and with what its heading states to refer to."""
+    """Return the layout with a column's unit; a heading that states magnetic sets ``heading_reference``."""
     source = layout.declared.columns.get(name)
     if name == "heading" and (match := re.search(r"\b(magnetic|mag)\b", f"{heading} {unit}".lower())):
         layout = replace(layout, attrs={"heading_reference": "magnetic", **layout.attrs})
@@ -117,7 +117,7 @@ def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
 
 
 def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str]:
-    """Return position -> our name of the columns that the caller declares."""
+    """Return index and standard name of each column that the user declares; FormatError: one is missing."""
     taken: dict[int, str] = {}
     for name, source in layout.declared.columns.items():
         theirs = source.heading or name
@@ -138,7 +138,7 @@ def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str
 
 
 def _with_time(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with the column of the time, or the columns that form it, as date and time of day."""
+    """Return the layout with the column of the time, or with the columns that together form the time."""
     place = layout.names.index("time") if "time" in layout.names else None
     ours = [name if name in layout.declared.columns else "" for name in layout.names]
     called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, layout.headings, strict=True)]
@@ -162,7 +162,7 @@ def _with_time(layout: Layout, rows: Rows) -> Layout:
 
 
 def _with_date(layout: Layout, date: int, place: int, rows: Rows) -> Layout:
-    """Return the layout in which a date belongs to the time, if the time is a time of day."""
+    """Return the layout with column `date` joined to column `place`, if the latter holds times of day."""
     cells = [row[place] for row in rows if len(row) > place]
     numbers = pd.to_numeric(pd.Series([cell.replace(",", ".") or "0" for cell in cells]), errors="coerce")
     counted = SECONDS_HEADING.search(layout.headings[place]) and numbers.between(0.0, DAY, "left").all()
@@ -177,7 +177,7 @@ def _with_date(layout: Layout, date: int, place: int, rows: Rows) -> Layout:
 
 
 def _with_stamp(layout: Layout) -> Layout:
-    """Return the layout whose last field of the time has the name ``time``, and the others none."""
+    """Return the layout in which the last field of the time is named ``time`` and its other fields ''."""
     stamp = layout.stamp
     if layout.rate:
         return layout
@@ -196,14 +196,14 @@ def _all_match(pattern: re.Pattern[str], rows: Rows, place: int) -> bool:
 
 
 def _by_hour(cells: Sequence[str]) -> bool:
-    """Return True if numbers next to a date are times of day as HHMM.mmm."""
+    """Return True if the cells in a column next to a date are times of day written as HHMM.mmm."""
     there = [cell for cell in cells if cell]
     long = [cell for cell in there if len(cell.partition(".")[0]) >= 3]
     return bool(long) and all(map(HOUR_AND_MINUTE.fullmatch, there)) and any("." in cell for cell in there)
 
 
 def _with_calendar(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with the fields, other than those of the time, that give date and time of day."""
+    """Return the layout with the fields, other than the time, that alone give date and time of day."""
     others = [k for k in range(len(layout.headings)) if k not in layout.stamp]
     moments = [k for k in others if _all_match(DATE_AND_TIME, rows, k)]
     dates = [k for k in others if DATED.search(layout.headings[k])]
@@ -216,7 +216,7 @@ def _with_calendar(layout: Layout, rows: Rows) -> Layout:
 
 
 def _without_texts(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout without columns of text; N and S, E and W are the signs of a position."""
+    """Return the layout without columns of text; a column of N/S or E/W letters gives a position its sign."""
     names, units, hemispheres = list(layout.names), dict(layout.units), dict(layout.hemispheres)
     left = []
     for k, name in enumerate(layout.names):
@@ -241,30 +241,30 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
 
 
 def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
-    """Return latitudes or longitudes (n,) with the sign of letters (n,); NaN without a letter."""
+    """Return latitudes or longitudes (n,), deg, signed by hemisphere `letters` (n,); NaN without a letter."""
     side = letters.astype("str").str.strip().str.upper()
     signed = np.where(side.isin(["S", "W"]), -np.abs(values), values)
     return np.asarray(np.where(side.isin([*HEMISPHERES[name]]), signed, np.nan))
 
 
 READING_RANGE_NT = LOWEST_NT, HIGHEST_NT = 15_000.0, 90_000.0
-"""Range of the Earth's field with a vehicle's own, nT."""
+"""Range of a reading's magnitude, the Earth's field plus the vehicle's, nT."""
 TOTAL_NAME = re.compile(
     "f|nt|mag|tm[fi]|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?(field|intensity)|magneticfield"
     "|reading1|scalar.*|magnitude"
 )
-"""What the one column of a scalar magnetometer is called, with neither capitals nor punctuation."""
+"""Names of a scalar magnetometer's column, in lower case without punctuation."""
 
 
 SCALAR_NAME = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
-"""Names of a scalar sensor next to a vector, whose length may be there under the other names."""
+"""Names of a scalar sensor in a file with a vector, whose magnitude may have the other names."""
 ANGLES = "roll", "pitch", "heading"
 NEAR_HALF_TURN_RAD = 0.1
-"""Largest distance, rad, of the extreme heading from half a turn or a whole turn, to be in rad."""
+"""Largest distance of the largest heading below pi or 2 pi, rad, if headings are in radians."""
 
 
 def units_of_angles(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with rad for an attitude without a unit, if headings end just below pi or 2 pi."""
+    """Return the layout with rad for angles without a unit, if headings end just below pi or 2 pi."""
     names = [name for name in ANGLES if name in layout.names and name not in layout.units]
     if "heading" not in names:
         return layout
@@ -281,7 +281,7 @@ def units_of_angles(layout: Layout, rows: Rows) -> Layout:
 
 
 def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with the unit of axes that have none: one that has it, or the field's length."""
+    """Return the layout with a unit for axes without one, from another axis or from the field's magnitude."""
     undeclared = layout.foreign and not set(CHANNELS) & set(layout.declared.columns)
     if not undeclared or not set(CHANNELS) <= set(layout.names):
         return layout
@@ -304,7 +304,7 @@ def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
 
 
 def with_total(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with a scalar magnetometer's column: the only one, as large as the Earth's field."""
+    """Return the layout with ``total_field``, if just one column has a scalar sensor's name and size."""
     if not layout.foreign or "total_field" in layout.names:
         return layout
     pattern = SCALAR_NAME if set(CHANNELS) <= set(layout.names) else TOTAL_NAME
@@ -325,7 +325,7 @@ def with_total(layout: Layout, rows: Rows) -> Layout:
 
 
 def _numbers(layout: Layout, rows: Rows, places: Sequence[int]) -> FloatArray:
-    """Return the numbers (n, k) of the rows that have them in all of k columns."""
+    """Return the numbers (n, k) in k columns, from the rows in which all k cells are numbers."""
     texts = [[layout.number(row[k]) for k in places] for row in rows if max(places) < len(row)]
     frame = pd.DataFrame(texts, columns=range(len(places)), dtype="str").apply(pd.to_numeric, errors="coerce")
     numbers = frame.to_numpy(np.float64)
@@ -333,6 +333,6 @@ def _numbers(layout: Layout, rows: Rows, places: Sequence[int]) -> FloatArray:
 
 
 def _length(layout: Layout, rows: Rows, places: Sequence[int]) -> float:
-    """Return the median length of the vector in some columns; 0 without numbers."""
+    """Return the median magnitude of the vector in the columns `places`, in their unit; 0 without numbers."""
     numbers = _numbers(layout, rows, places)
     return float(np.median(np.linalg.norm(numbers, axis=1))) if len(numbers) else 0.0

@@ -1,16 +1,16 @@
-"""Read and write netCDF: one trajectory.
+"""Read and write netCDF files of one trajectory.
 
-A file is written along the dimension ``time`` with the documented names of the columns. With the vocabulary
-of OceanGliders OG1.0 it is written along ``N_MEASUREMENTS`` in capitals instead: ``TIME LATITUDE LONGITUDE
-DEPTH ROLL PITCH HEADING TEMP PRES`` are names of OG1.0, the others the documented names in capitals
-(``MAG_X``). The attribute ``column`` keeps the documented name in both.
+The writer uses the dimension ``time`` and the documented names of the columns. With the vocabulary of
+OceanGliders OG1.0 it uses ``N_MEASUREMENTS`` and names in capitals. ``TIME LATITUDE LONGITUDE DEPTH ROLL
+PITCH HEADING TEMP PRES`` are OG1.0 names; the others are documented names in capitals (``MAG_X``). The
+attribute ``column`` holds the documented name in both cases.
 
-Any trajectory is read, as of pyglider, the IOOS Glider DAC, EGO, OG1.0, seagliderOG1, VOTO and Argo. The time
-is the variable with the standard name ``time`` (or in a unit ``... since ...``) along which most variables
-lie; a dimension of length 1 does not count. Every numeric variable along that time becomes a column: by the
-attribute ``column`` (ours), by its standard name, by a name that is known to mean the same, else under its
-own name in small letters. A value that a flag of its own calls bad or missing is not known. A basestation's
-Seaglider file is recognised by its dimensions (:mod:`.seaglider`).
+The reader accepts trajectories of pyglider, the IOOS Glider DAC, EGO, OG1.0, seagliderOG1, VOTO, Argo and
+others. The time is the variable with the standard name ``time`` (or a unit ``... since ...``) along whose
+dimension most variables lie. Every numeric variable along this dimension becomes a column. Its name is the
+attribute ``column``, else the column of its standard name or of a known synonym, else its own name in small
+letters. A value whose flag means bad or missing becomes NaN. :mod:`.seaglider` interprets a basestation's
+file, which is recognised by its dimensions.
 
 References
 ----------
@@ -53,7 +53,7 @@ NANOSECONDS = re.compile(r"(nanosecond|nanosec|nsec|ns)s?(?= since)")
 WHOLE_AXIS = slice(None)
 OG1_DIMENSION = "N_MEASUREMENTS"
 OG1_NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
-"""Columns whose OG1.0 name is not simply our name in capitals."""
+"""Column -> OG1.0 name, where it is not the documented name in capitals."""
 CF_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH},
     "latitude": {"standard_name": "latitude", "units": "degrees_north"},
@@ -67,23 +67,23 @@ CF_ATTRIBUTES: dict[str, dict[str, Any]] = {
 }
 COORDINATES = "time", "latitude", "longitude", "depth"
 NO_FLAGS = -1
-"""Stands for flags that are not known."""
+"""Integer stored for unknown quality flags."""
 STORED_ROWS = 8192
-"""Rows stored together."""
+"""Rows in one chunk of the file."""
 STANDARD_NAMES = {one.field: one for one in field_maps("cf")[""]}
-"""Standard name to the column, with the factor of its sign; the unit is the variable's."""
+"""Standard name -> column and sign (`factor`); the unit is the variable's own."""
 KNOWN_NAMES = {name.lower(): column for column, name in OG1_NAMES.items()}
 FLAG_VARIABLE = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
-"""Name of a variable with the flags of another."""
+"""Name of a variable that holds the quality flags of another variable."""
 BAD = re.compile(r"bad|fail|missing|reject|erroneous|not_used")
 BAD_CODES = (3, 4, 9)
-"""Flags of a bad or missing value where the file does not say what they mean (OceanSITES, Argo, IODE)."""
+"""Flags of a bad or missing value, if the file does not define its flags (OceanSITES, Argo, IODE)."""
 GENERATED = ("Conventions", "featureType", "title", "start_date", "time_coverage_start", "time_coverage_end")
-"""Attributes of a file that are written again for each."""
+"""Attributes that the writer generates for each file."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset | tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file in pieces, those of a trajectory with the numbers of their rows."""
+    """Yield the file in pieces of at most `rows` rows; pieces of a trajectory come with their row numbers."""
     try:
         with netCDF4.Dataset(path) as file:
             if seaglider.DIMENSION in file.dimensions:
@@ -96,7 +96,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset | tuple[xr.Dataset, Seq
 
 
 class CfColumn(NamedTuple):
-    """A variable as a column; `flags` is the variable with its flags."""
+    """Variable, its column, the factor of its sign, and the variable with its quality flags."""
 
     variable: Any
     name: str
@@ -105,7 +105,7 @@ class CfColumn(NamedTuple):
 
 
 def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the rows of an open file in pieces of at most `rows`, each with their numbers."""
+    """Yield the rows of an open file in pieces of at most `rows`, each with its row numbers."""
     clock = _clock(path, file)
     dimension = _along(clock)
     total = len(file.dimensions[dimension])
@@ -144,7 +144,7 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
 
 
 def _along(variable: Any) -> str | None:
-    """Return the one dimension of a variable that is longer than 1, or its last; None: there are several."""
+    """Return the only dimension of a variable that is not 1 long, else its last; None if several are not."""
     sizes = dict(zip(variable.dimensions, variable.shape, strict=True))
     long = [name for name, size in sizes.items() if size != 1] or [*variable.dimensions[-1:]]
     return long[0] if len(long) == 1 else None
@@ -176,7 +176,7 @@ def _clock(path: Path, file: Any) -> Any:
 
 
 def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[list[CfColumn], list[str]]:
-    """Return the columns along a dimension, and a line for each whose unit is not that of its meaning."""
+    """Return the columns along a dimension, and a message for each variable whose unit does not fit."""
     found: dict[str, CfColumn] = {}
     lying = {
         name: one
@@ -188,7 +188,7 @@ def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[
     left_out = []
     names = [name for name in lying if name not in of_others]
     called = {names[k]: ours for k, ours in aliases(names).items()}
-    # of several with one meaning, the one that has its name, or comes first, is it
+    # of several variables that mean one column, read the one with the column's name, else the first
     for name in sorted(names, key=lambda name: not _is_ours(lying[name])):
         variable = lying[name]
         column, sign = _meaning(variable, called.get(name, name.lower()))
@@ -207,12 +207,12 @@ def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[
 
 
 def _is_ours(variable: Any) -> bool:
-    """Return True if a variable has the name of one of our columns, whatever its standard name."""
+    """Return True if a variable names a standard column, by its attribute ``column`` or by its own name."""
     return hasattr(variable, "column") or variable.name.lower() in COLUMNS
 
 
 def _meaning(variable: Any, called: str) -> tuple[str, float]:
-    """Return the column that a variable is, and the factor that its sign needs; `called` goes by its name."""
+    """Return the column of a variable and the factor of its sign; `called` is the column by its name."""
     if hasattr(variable, "column"):
         return str(variable.column), 1.0
     known = STANDARD_NAMES.get(str(getattr(variable, "standard_name", "")))
@@ -225,7 +225,7 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
 
 
 def _flags(file: Any, name: str) -> Any | None:
-    """Return the variable with the flags of another; None where there is none."""
+    """Return the variable that holds the quality flags of variable `name`; None without flags."""
     ancillary = str(getattr(file[name], "ancillary_variables", "")).split()
     for other in (*ancillary, f"{name}_QC", f"{name}_qc"):
         one = file.variables.get(other)
@@ -241,13 +241,13 @@ def _values(variable: Any, rows: slice) -> FloatArray:
 
 
 def _index(variable: Any, rows: slice) -> tuple[slice, ...]:
-    """Return the index of rows along the one dimension of a variable that is not 1."""
+    """Return the index that selects rows along a variable's dimension (:func:`_along`)."""
     along = _along(variable)
     return tuple(rows if name == along else WHOLE_AXIS for name in variable.dimensions)
 
 
 def _bad(flags: Any, rows: slice) -> BoolArray:
-    """Return the rows that are flagged as bad or missing."""
+    """Return a mask (n,) of the rows that are flagged as bad or missing."""
     flags.set_auto_maskandscale(False)
     stored = np.asarray(flags[_index(flags, rows)]).ravel()
     if stored.dtype.kind in "SU":
@@ -260,7 +260,7 @@ def _bad(flags: Any, rows: slice) -> BoolArray:
 
 
 def _seaglider(path: Path, file: Any) -> seaglider.Dive:
-    """Return the dive in a basestation's file; variables of another length than their times are left out."""
+    """Return the dive in a basestation's file, without variables that differ in length from their times."""
     rows = file.dimensions[seaglider.DIMENSION].size
     if (time := _numbers(file, "time", rows)) is None:
         raise FormatError(path, "expected this variable, as of a Seaglider", column="time")
@@ -295,17 +295,17 @@ def _seaglider(path: Path, file: Any) -> seaglider.Dive:
 
 
 def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
-    """Return a variable (size,), or None if it has another size or no numbers."""
+    """Return the values (size,) of a variable; None if it is missing, not numeric or of another size."""
     if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
         return None
     return floats(file[name]) if file[name].dtype.kind in "iuf" else None
 
 
 def _epoch(path: Path, variable: Any) -> tuple[float, float]:
-    """Return the s since 1970 at which a time variable is 0, and the s in one of its units."""
+    """Return the zero of a time variable, s since 1970, and the length of its unit, s."""
     units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
     unit = 1.0
-    if nano := NANOSECONDS.match(units):  # which the library does not know
+    if nano := NANOSECONDS.match(units):  # netCDF4 does not know nanoseconds
         units, unit = f"seconds{units[nano.end() :]}", 1e-9
     days = [datetime(1970, 1, 1), datetime(1970, 1, 2)]
     try:
@@ -318,19 +318,19 @@ def _epoch(path: Path, variable: Any) -> tuple[float, float]:
 
 
 def floats(variable: Any, rows: slice | tuple[slice, ...] = WHOLE_AXIS) -> FloatArray:
-    """Return rows of a variable in its shape; a missing value is NaN.
+    """Return rows of a variable as unpacked numbers in its shape; a missing value is NaN.
 
-    Missing are the values that the variable declares as missing, compared as stored, before unpacking, and
-    rounded to the variable's type where they are of another; and those never written, which the library fills
-    with a number of its own. ``valid_range`` is ignored: one that begins at 0 would discard a depth of -2 cm.
-    FormatError: packed by something other than a number.
+    A value is missing if it equals a number that the variable declares as missing, or netCDF's fill value.
+    Both are compared with the stored values before unpacking, in the variable's type. ``valid_range`` is
+    ignored: a range from 0 would discard a depth of -2 cm.
+    FormatError: ``scale_factor`` or ``add_offset`` is not a number.
     """
     variable.set_auto_maskandscale(False)
     stored = np.asarray(variable[rows])
     attributes = variable.ncattrs()
     nothing = [variable.getncattr("missing_value")] if "missing_value" in attributes else []
     fill = variable.get_fill_value()
-    # any byte may be meant: of bytes, only a fill value that is declared counts
+    # every byte can be a value: for bytes, only a declared fill value counts
     if "_FillValue" in attributes or (fill is not None and stored.dtype.itemsize > 1):
         nothing.append(fill)
     try:
@@ -344,7 +344,7 @@ def floats(variable: Any, rows: slice | tuple[slice, ...] = WHOLE_AXIS) -> Float
 
 
 def _as_stored(declared: Any, kind: np.dtype[Any]) -> list[Any]:
-    """Return the numbers that an attribute declares, in a variable's type; none that this cannot hold."""
+    """Return the numbers of an attribute in a variable's type, without numbers that the type cannot hold."""
     try:
         numbers = np.atleast_1d(np.asarray(declared)).astype(np.float64)  # also from text
     except ValueError:
@@ -356,7 +356,7 @@ def _as_stored(declared: Any, kind: np.dtype[Any]) -> list[Any]:
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one, with the names of OG1.0 if `og1`."""
+    """Writer of successive deployments with the columns of the first, and with OG1.0 names if `og1`."""
 
     def __init__(self, path: Path, *, og1: bool = False) -> None:
         self._path, self._og1 = path, og1
@@ -367,7 +367,7 @@ class FileWriter:
         self._rows = 0
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows, and before the first ones the definitions."""
+        """Write the rows; if `first`, define dimensions, variables and attributes before."""
         with systems_reason(self._path):
             if first:
                 self._define(dataset)
@@ -436,7 +436,7 @@ class FileWriter:
             self._variables[name] = variable
 
     def _written(self, name: str) -> str:
-        """Return the name of a column's variable; netCDF forbids slashes in it."""
+        """Return the name of a column's variable, without the slashes that netCDF forbids."""
         return (OG1_NAMES.get(name, name.upper()) if self._og1 else name).replace("/", "_")
 
     def close(self) -> None:

@@ -1,23 +1,23 @@
-"""MAVLink telemetry logs (``.tlog``) as deployments.
+"""Read MAVLink telemetry logs (``.tlog``) as deployments.
 
-A row is a magnetometer message of the best kind that the log holds (:data:`SOURCES`), from the component
-that sent most of them; every other column is the last value from this vehicle before it (NaN once older than
-:data:`~magbridge.logs.fields.MAX_AGE`).
+Each row is one magnetometer message, of the best kind in the log (:data:`SOURCES`) and from its most frequent
+sender. Every other column is the vehicle's last value at or before the row, and NaN once it is older than
+:data:`~magbridge.logs.fields.MAX_AGE`.
 
-- ``MAG_RAW`` (ours): nT computed from the counts as by the driver, where the log declares the nT per count,
-  else float32 (0.004 nT at 50,000 nT); time to the µs, channel times, temperature, supply, power cycles. The
-  ``MAG_FIELD`` that follows it becomes the columns of ``magbridge correct``.
-- ``HIGHRES_IMU`` (gauss), ``RAW_IMU`` and ``SCALED_IMU*`` (mgauss, so steps of 100 nT): in the autopilot's
-  axes, with its own offsets applied; time is the record's time stamp. Further magnetometers become ``mag1_x``
-  ... ``mag3_z``.
-- Without any of these, each ``ATTITUDE`` or position makes a row, and there is no ``mag_x``.
+- ``MAG_RAW`` of a bridge: the field in nT, computed from the counts if the log declares the nT per count,
+  else float32 (0.004 nT at 50,000 nT). It also has the time to 1 µs, channel times, temperature, supply and
+  power cycles. The ``MAG_FIELD`` that follows becomes the columns of ``magbridge correct``.
+- ``HIGHRES_IMU`` (gauss), ``RAW_IMU`` and ``SCALED_IMU*`` (mgauss, so steps of 100 nT): the field in the
+  autopilot's axes, with its offsets applied. The time is the record's stamp. Further magnetometers become
+  ``mag1_x`` ... ``mag3_z``.
+- Without these messages, each ``ATTITUDE`` or position makes a row, and the deployment has no ``mag_x``.
 
-Telemetry is what the log itself declares by ``MAG_COLUMN`` (a bridge's own log, with the age of each value,
-or one written by :mod:`.telemetry_writer`), what :data:`TELEMETRY` lists, and every ``NAMED_VALUE_FLOAT`` by
-its name. Where the clock of a bridge was set, its rows are dated by the clock as it was set last in the file.
-Attitude and position are the autopilot's, not a gimbal's, and a named value never takes the place of a column
-that the log has a source for. Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and
-``damages``. The messages that are read are held whole.
+Telemetry has three sources: columns that the log declares by ``MAG_COLUMN``, the fields in :data:`TELEMETRY`,
+and every ``NAMED_VALUE_FLOAT`` by its name. Logs of a bridge (with the age of each value) and of
+:mod:`.telemetry_writer` declare columns. If a bridge's clock was set, all rows are dated by its last setting.
+Attitude and position come from the autopilot, not from a gimbal. A named value never replaces a column that
+has another source in the log. Damaged bytes are skipped and counted in the attributes ``bytes_skipped`` and
+``damages``. All messages that are read are in memory.
 """
 
 from __future__ import annotations
@@ -50,32 +50,32 @@ if TYPE_CHECKING:
 __all__ = ["FileWriter", "chunks"]
 
 Payloads = NDArray[np.uint8]
-"""(n, size): the payloads of messages of one kind, without zeros cut off."""
+"""(n, size): Payloads of messages of one kind, padded with zeros to full size."""
 MAVLINK_FIELDS = field_maps("mavlink")
-"""Message to its fields; the values that the dialect declares to be invalid are missing, too."""
+"""Message -> its fields; values that the dialect declares as invalid are missing as well."""
 SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": []}
-"""The messages that make a row, the best first, and the fields whose values the row has from them."""
+"""Messages that can make the rows, the best first -> fields of the message that the row has."""
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED_VALUE_FLOAT = spec("NAMED_VALUE_FLOAT").id
 RAW_COLUMNS = {one.column: one.unit for one in SOURCES["MAG_RAW"]}
 COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
-"""Message to the number of the compass whose field it holds; of several for one, the first is read."""
+"""Message -> number of the compass whose field it holds; of several for one compass, the first is read."""
 AUTOPILOT = 1
 GIMBALS = {154, 171, 172, 173, 174, 175}
-"""Components whose attitude is their own, and not the vehicle's."""
+"""Gimbals: components that send their own attitude and not the vehicle's."""
 RESERVED_COLUMNS = {"time", *CHANNELS}
-"""Columns that a named value never is."""
+"""Columns that a named value never fills."""
 MAX_TELEMETRY_AGE_US = round(MAX_AGE * 1e6)
 SINGLE = 1e-7
-"""Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
+"""Relative error of a float32; a declared value that differs from the channel by more is not used."""
 SENSOR_ID, OTHER_TIME = "sensor_id", "_time"
-"""Field by which a column belongs to a sensor after the first; ending of the column with the times."""
+"""Field that assigns a column to a second or further sensor; ending of the column with its times."""
 
 
 class MessageField:
-    """How a column is read from the payloads of a message: ``factor * field + offset``, in `unit`."""
+    """Reader of one column from the payloads of a message: ``factor * field + offset``, in `unit`."""
 
     def __init__(self, source: FieldMap, offset: float = 0.0) -> None:
         name, index = split_index(source.field)
@@ -90,16 +90,16 @@ class MessageField:
         self._source = source._replace(missing=unknown)
 
     def values(self, payloads: Payloads) -> FloatArray:
-        """Return the values (n,) of the column in payloads (n, size); NaN where the sender knows none."""
+        """Return the values (n,) of the column in payloads (n, size); NaN where the sender has no value."""
         raw = payloads[:, self._start : self._start + self._layout.itemsize].copy().view(self._layout)[:, 0]
         return self._source.values(raw) + self.offset
 
 
 class DeclaredField(MessageField):
-    """A column that the log itself declares, by a ``MAG_COLUMN``.
+    """Reader of a column that the log itself declares by a ``MAG_COLUMN``.
 
-    `match` has the values that other fields of the message must have, as text; `component` is the only sender
-    that counts.
+    `match`: values, as text, that other fields of the message must have. `component`: the only sender that
+    counts, or None for any.
     """
 
     def __init__(self, declaration: Mapping[str, Any]) -> None:
@@ -113,11 +113,11 @@ class DeclaredField(MessageField):
 
     @property
     def is_named_value(self) -> bool:
-        """Return True if the column is a ``NAMED_VALUE_FLOAT`` of one name."""
+        """Return True if the column is a ``NAMED_VALUE_FLOAT`` that is selected by its name alone."""
         return self.message == NAMED_VALUE_FLOAT and self.match.keys() == {"name"}
 
     def matches(self, payloads: Payloads) -> BoolArray:
-        """Return which of the payloads (n, size) hold the column, (n,)."""
+        """Return a mask (n,) of the payloads (n, size) that hold the column."""
         found = np.ones(len(payloads), bool)
         for field, text in self._others:
             part = payloads[:, field.offset : field.offset + field.struct.size]
@@ -130,7 +130,7 @@ class DeclaredField(MessageField):
 TELEMETRY = {
     spec(message).id: [MessageField(one) for one in fields] for message, fields in MAVLINK_FIELDS.items()
 }
-"""Message id to the columns in the message."""
+"""Message id -> readers of the columns in the message."""
 SOURCE_FIELDS = {
     spec(message).id: [MessageField(one) for one in fields] for message, fields in SOURCES.items()
 }
@@ -146,11 +146,11 @@ NAMED_FIELD = MessageField(FieldMap("NAMED_VALUE_FLOAT", "value", "value", "1"))
 NAME_LETTERS = spec(NAMED_VALUE_FLOAT).fields["name"]
 RAW_FLAGS = MessageField(FieldMap("MAG_RAW", "flags", "flags", ""))
 READ_MESSAGES = [*TELEMETRY, *SOURCE_FIELDS, NAMED_VALUE_FLOAT, COLUMN, STEP, START, BYTES, SET, VALUE]
-"""Ids of the messages that are read, with those in which a log declares a column: at its start."""
+"""Ids of the messages that are always read; a log adds those in which it declares a column."""
 
 
 def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
-    """Return the columns (n,) of the rows that messages of one id make; those of a bridge have ``time``."""
+    """Return the columns (n,) in messages of an id that makes rows; a bridge's messages have ``time``."""
     columns = {one.column: one.values(payloads) for one in SOURCE_FIELDS[number]}
     if number not in SENSOR_IDS:
         return columns
@@ -167,27 +167,27 @@ def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
 
 
 class LogMessages(NamedTuple):
-    """Messages of one kind in the order of the log; the arrays are (n,)."""
+    """Messages of one kind in the order of the log; the arrays are (n,), the payloads (n, size)."""
 
     number: int
     at: IndexArray
-    """Place among the records of the log."""
+    """Index of the record in the log."""
     time_us: IndexArray
-    """Time stamp of the record."""
+    """Time stamp of the record, µs since 1970 UTC."""
     channel: IndexArray
-    """:class:`~magbridge.records.Channel`, in a bridge's own log."""
+    """:class:`~magbridge.records.Channel` of the record, in a bridge's own log."""
     system: IndexArray
     component: IndexArray
     payloads: Payloads
 
     def chosen(self, keep: BoolArray) -> LogMessages:
-        """Return the messages of a mask (n,)."""
+        """Return the messages that a mask (n,) selects."""
         arrays: list[Any] = [array[keep] for array in self[1:]]
         return LogMessages(self.number, *arrays)
 
     @property
     def is_of_main_sensor(self) -> BoolArray:
-        """Return which messages (n,) are not samples of a sensor after the first."""
+        """Return a mask (n,) that is False for samples of a second or further sensor."""
         if self.number not in SENSOR_IDS:
             return np.ones(len(self.at), bool)
         return np.asarray(self.payloads[:, SENSOR_IDS[self.number]] == 0)
@@ -206,7 +206,7 @@ class LogMessages(NamedTuple):
 Kinds = dict[int, LogMessages]
 """Messages by their id."""
 Update = tuple[LogMessages, FloatArray]
-"""Messages (n), and the values (n,) of a column in them."""
+"""Messages of one kind, and the values (n,) of a column in them."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
@@ -230,7 +230,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
 
 
 def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
-    """Return the messages of a log that are read, and the counts of its losses."""
+    """Return the messages of a log by id, and the counts of damaged bytes and places."""
     parts: dict[int, list[LogMessages]] = {}
     lost = {"bytes_skipped": 0, "damages": 0}
     wanted, before = {*READ_MESSAGES}, 0
@@ -253,7 +253,7 @@ def _messages(path: Path) -> tuple[Kinds, dict[str, int]]:
 
 
 def _messages_of(kinds: Kinds, number: int) -> LogMessages:
-    """Return the messages of one id, which may be none."""
+    """Return the messages with id `number`; empty if the log has none."""
     nothing = np.empty(0, np.int64)
     arrays: list[Any] = [*[nothing] * 5, np.empty((0, spec(number).size), np.uint8)]
     return kinds.get(number, LogMessages(number, *arrays))
@@ -265,10 +265,10 @@ def _joined(parts: Sequence[LogMessages]) -> LogMessages:
 
 
 class TelemetryLog:
-    """The messages of a log, and the source of each column.
+    """Messages of a log, with the source of each column.
 
-    `source` is the message that makes the rows, `ours` a bridge's own log, `attrs` its declared attributes,
-    `lost` its losses.
+    `source`: name of the message that makes the rows. `ours`: True for a bridge's own log. `is_plain`: True
+    for an autopilot's log without a bridge. `attrs`: declared attributes. `lost`: counts of damage.
     """
 
     def __init__(self, path: Path) -> None:
@@ -298,7 +298,7 @@ class TelemetryLog:
         self._add_named({one.match["name"] for one in declared if one.is_named_value})
 
     def _source_of(self, path: Path, kinds: Kinds) -> tuple[str, tuple[int, int]]:
-        """Return the message that makes the rows, and its most frequent sender."""
+        """Return the message that makes the rows, and its most frequent sender (system, component)."""
         for source in SOURCES:
             senders = _messages_of(kinds, spec(source).id).senders()
             # the autopilot's compass does not replace the instrument
@@ -307,7 +307,7 @@ class TelemetryLog:
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
 
     def _count_settings(self, kinds: Kinds) -> None:
-        """Count how often a station has set what the alignment computes with; the bridge confirms it."""
+        """Count the changes of alignment settings that a station requested and the bridge confirmed."""
         asked: dict[str, float] = {}
         stated = []
         for one in (_messages_of(kinds, SET), _messages_of(kinds, VALUE)):
@@ -322,18 +322,18 @@ class TelemetryLog:
                 self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
     def _declarations(self, messages: LogMessages) -> list[DeclaredField]:
-        """Return the columns that the log declares; its attributes are kept."""
+        """Return the columns that the log declares; store its declared attributes in `attrs`."""
         found: dict[str, DeclaredField] = {}
         for one in messages.decoded():
             if not one["message"]:
                 self.attrs[one["column"]] = one["unit"] or one["scale"]
                 continue
-            with suppress(KeyError, ValueError):  # of a dialect that we do not know
+            with suppress(KeyError, ValueError):  # a message or field that this dialect lacks
                 found[one["column"]] = DeclaredField(one)
         return [*found.values()]
 
     def compasses(self) -> list[LogCompass]:
-        """Return the compasses whose field messages of the sender hold: ``RAW_IMU`` has the first."""
+        """Return the compasses whose field the sender's messages hold, in the order of their numbers."""
         found = {}
         for message, number in COMPASS_NUMBERS.items():
             if number not in found and (n := len(self._samples(message).at)):
@@ -341,7 +341,7 @@ class TelemetryLog:
         return [found[number] for number in sorted(found)]
 
     def span_s(self) -> float:
-        """Return the s from the first to the last of the messages that make the rows."""
+        """Return the time from the first to the last message that makes a row, s."""
         time_us = self._samples(self.source).time_us
         return float(time_us[-1] - time_us[0]) / 1e6
 
@@ -351,10 +351,10 @@ class TelemetryLog:
         return found.chosen(found.component == self._component)
 
     def _telemetry(self, declared: set[str]) -> dict[str, str]:
-        """Add the values of :data:`TELEMETRY`; return the units of the columns that have one.
+        """Add the columns of :data:`TELEMETRY`; return the units of the columns that have a value.
 
-        Each message is taken from one component: the sender of the rows or the autopilot where they send it,
-        and hardly a gimbal.
+        Each message is read from one component: the sender of the rows, else the autopilot, else the most
+        frequent sender. Gimbals come last.
         """
         units: dict[str, str] = {}
         read = []
@@ -378,7 +378,7 @@ class TelemetryLog:
         return units
 
     def _columns_of_bridge(self) -> dict[str, str]:
-        """Return the units of the columns of a bridge's messages that have a value."""
+        """Return the units of the columns that have a value in a bridge's ``MAG_RAW`` or ``MAG_FIELD``."""
         raw = _messages_of(self._kinds, RAW)
         columns = source_columns(RAW, raw.payloads[raw.is_of_main_sensor])
         possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
@@ -404,7 +404,7 @@ class TelemetryLog:
     def _add_admitted(
         self, column: str, component: int | None, messages: LogMessages, values: FloatArray
     ) -> None:
-        """Add the values (n,) of a column: of several components that send it one counts, as live."""
+        """Add the values (n,) of a column from one of its senders, which is chosen as in the live bridge."""
         max_age_s = self.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)
         source = Source(AUTOPILOT, round(1e6 * max_age_s), component)
         senders = zip(messages.component.tolist(), messages.time_us.tolist(), strict=True)
@@ -412,7 +412,7 @@ class TelemetryLog:
         self._updates.setdefault(column, []).append((messages.chosen(admitted), values[admitted]))
 
     def _add_named(self, declared: set[str]) -> None:
-        """Add each ``NAMED_VALUE_FLOAT`` by its name, except those that the log has declared."""
+        """Add a column for each name of a ``NAMED_VALUE_FLOAT``, except the names in `declared`."""
         named = _messages_of(self._kinds, NAMED_VALUE_FLOAT)
         start = NAME_LETTERS.offset
         letters = named.payloads[:, start : start + NAME_LETTERS.struct.size]
@@ -435,7 +435,7 @@ class TelemetryLog:
             self._updates.setdefault(own, []).append((messages.chosen(here), values[here]))
 
     def table(self) -> tuple[FloatArray, dict[str, FloatArray], dict[str, str]]:
-        """Return the times (n,), s, the columns (n,), and their units."""
+        """Return the times (n,), s since 1970 UTC, the columns (n,) by name, and their units."""
         samples = self._samples(self.source)
         main = samples.is_of_main_sensor
         rows = samples.chosen(main)
@@ -463,7 +463,7 @@ class TelemetryLog:
         return time, columns, {name: self._units.get(name, "") for name in columns}
 
     def _to_step_us(self, places: IndexArray) -> IndexArray:
-        """Return by how much the clock was set after each place (n,), µs."""
+        """Return the sum of the clock steps after each record index in `places` (n,), µs (n,)."""
         passed = self._steps_us[np.searchsorted(self._steps_at, places, side="right")]
         return np.asarray(self._steps_us[-1] - passed)
 
@@ -488,7 +488,7 @@ class TelemetryLog:
         return found["time"]
 
     def _correct(self, rows: LogMessages, columns: dict[str, FloatArray]) -> None:
-        """Add each ``MAG_FIELD`` to the row before it, that of its reading, unless that has one already."""
+        """Add the values of each ``MAG_FIELD`` to the row before it, unless the row has a total field."""
         found = _messages_of(self._kinds, FIELD)
         found = found.chosen(found.is_of_main_sensor & ~np.isin(found.at, rows.at))
         if not len(found.at):
@@ -496,7 +496,7 @@ class TelemetryLog:
         row = np.searchsorted(rows.at, found.at, side="right") - 1
         values = source_columns(FIELD, found.payloads)
         is_free = (row >= 0) & np.isnan(columns["total_field"][row])
-        # of several, the first with a total field counts: it is written last
+        # of several for one row, the first with a total field counts: it is written last
         has_total = ~np.isnan(values["total_field"])
         order = np.concatenate(
             [np.flatnonzero(is_free & ~has_total), np.flatnonzero(is_free & has_total)[::-1]]
@@ -520,7 +520,7 @@ def _carried(rows: LogMessages, updates: Sequence[Update]) -> tuple[FloatArray, 
 
 
 def _bring_to_rows(time: FloatArray, columns: dict[str, FloatArray], names: Sequence[str]) -> None:
-    """Interpolate the readings of the sensors after the first to the rows' times (n,), s, in place."""
+    """Interpolate the readings of the second and further sensors to the rows' times (n,), s, in place."""
     for time_name in [name for name in names if name.endswith(OTHER_TIME)]:
         sampled, sensor = columns.pop(time_name), time_name.removesuffix(OTHER_TIME)
         times, first = np.unique(sampled[np.isfinite(sampled)], return_index=True)
