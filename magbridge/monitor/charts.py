@@ -1,4 +1,4 @@
-"""The panels of charts: total field, masses and temperature, track."""
+"""Draw the charts of the page: total field, masses and temperature, track."""
 
 from __future__ import annotations
 
@@ -22,41 +22,44 @@ from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
 from magbridge.monitor.widgets import GRID, Changes, card, nothing
 
 CHARTS = json.loads(files("magbridge.monitor").joinpath("charts.json").read_text(encoding="utf-8"))
-"""Options of ECharts by the kind of a chart. ECharts knows no variables of the page: the colours are seen by
-day and by night. An axis has no labels at its ends, where they would cover the round numbers next to them."""
+"""Options of ECharts by the kind of a chart. The colours suit a light and a dark page, as ECharts cannot read
+the page's style variables. An axis has no labels at its ends: they would cover its round numbers."""
 BREAK = 10.0
-"""Time without a sample that interrupts the curve, s, unless the interval before was a third as long."""
+"""Shortest gap that interrupts the curve, s; it must also exceed 3 times the interval before it."""
 ROOM, TAIL = 3.0, 0.02
-"""The axis covers the points without the fraction `TAIL` at either end, extended by `ROOM` times their range.
-A step of the field soon has more points than that fraction; a spike never has."""
+"""Limits of the value axis: it omits values more than `ROOM` ranges outside the range of the inner values.
+The inner values exclude the fraction `TAIL` at either end, so that a spike does not stretch the axis."""
 MIN_AXIS_RANGE = 1e-5
-"""Smallest range of the value: an axis is not shorter."""
+"""Smallest range of the value axis, as a fraction of its lower limit."""
 ASPECT = 4.0 / 3.0
-"""Width to height of the map: both of the chart and of its margins, so that a circle is one at any width."""
+"""Width over height of the map and of its margins, so that a circle on the ground is drawn as a circle."""
 MIN_MAP_WIDTH_M = 200.0
 """Smallest width of the map, m."""
 PIXELS = 600
-"""Pixels of the picture of a grid along its longer side, at most."""
+"""Largest number of pixels along the longer side of the picture of a grid."""
 SIDES = 48
-"""Corners of the polygon that is drawn for an ellipse."""
+"""Number of corners of the polygon that represents an ellipse."""
 KEYS = "; keys: plus and minus zoom, arrows pan, 0 shows all, S saves it as PNG"
 MAX_CHART_INTERVAL_S = 3.0
-"""Shortest time between two drawings of a chart of telemetry, s: a phone may have to draw many."""
+"""Shortest time between two updates of the telemetry charts, s; it limits the load of a phone."""
 
 
 def chart_options(kind: str, name: str) -> dict[str, Any]:
-    """Return the options of a chart of that kind, still empty; its picture is saved under the name."""
+    """Return the ECharts options of a chart without data; `name` is for the file of a saved picture."""
     options: dict[str, Any] = deepcopy(CHARTS[kind])
     options["toolbox"] = deepcopy(CHARTS["toolbox"])
     stem = "".join(c if c.isalnum() else "_" for c in f"magbridge {name}")
     options["toolbox"]["feature"]["saveAsImage"]["name"] = stem
-    if kind == "map":  # its axes keep their shape
+    if kind == "map":  # zooming would change the aspect of the map
         del options["toolbox"]["feature"]["dataZoom"]
     return options
 
 
 def drawn(points: Sequence[Point], tier: str) -> tuple[list[list[Any]], dict[str, float]]:
-    """Return the data of the four series, and the ends of the y axis; all empty without points."""
+    """Return the data of lower edge, band width, mean and spikes, and the limits of the y axis.
+
+    The lists and the limits are empty without points.
+    """
     if not points:
         return [[], [], [], []], {}
     ends = axis_range(points)
@@ -65,7 +68,7 @@ def drawn(points: Sequence[Point], tier: str) -> tuple[list[list[Any]], dict[str
 
 
 def curves(points: Sequence[Point], width: float) -> Iterator[list[tuple[float, ...]]]:
-    """Yield (ms, value) of the band's lower edge, its width and the mean; NaN where they are interrupted."""
+    """Yield (ms, value) of the 2-sigma band's lower edge, its width, and the mean; NaN marks a gap."""
     last, usual = points[0].time, 0.0
     for point in points:
         ms, gap = 1e3 * (point.time + 0.5 * width), point.time - last
@@ -78,7 +81,7 @@ def curves(points: Sequence[Point], width: float) -> Iterator[list[tuple[float, 
 
 
 def axis_range(points: Sequence[Point]) -> dict[str, float]:
-    """Return round ends of the axis: all of the curve but its spikes, and what fits of the band."""
+    """Return rounded limits of the y axis, which include the curve without spikes and its band if it fits."""
     values = sorted(point.mean for point in points)
     tail = ceil(TAIL * len(values)) if len(values) >= 10 else 0
     inner = values[tail : len(values) - tail]
@@ -86,14 +89,14 @@ def axis_range(points: Sequence[Point]) -> dict[str, float]:
     within = inner[0] - room, inner[-1] + room
     low = max(within[0], min(point.low for point in points))
     high = min(within[1], max(point.high for point in points))
-    if high - low < MIN_AXIS_RANGE * abs(low):  # a constant is not magnified
+    if high - low < MIN_AXIS_RANGE * abs(low):  # do not magnify rounding errors of a constant
         low, high = within
     step = 10.0 ** floor(log10(max(high - low, 1e-6)) - 0.5)
     return {"min": floor(low / step) * step, "max": ceil(high / step) * step}
 
 
 def spikes(points: Sequence[Point], min: float, max: float) -> list[dict[str, Any]]:  # noqa: A002 - ECharts' names
-    """Return a mark at the end of the axis for every point with a value beyond it."""
+    """Return a triangle at the limit of the axis for each point with a value outside `min` to `max`."""
     marks = []
     for point in points:
         if point.most > max:
@@ -107,20 +110,20 @@ def spikes(points: Sequence[Point], min: float, max: float) -> list[dict[str, An
 
 @dataclass(frozen=True)
 class Background:
-    """An anomaly grid as a picture."""
+    """Picture of an anomaly grid, for the background of the map."""
 
     box: tuple[float, float, float, float]
-    """West, south, east and north edge, deg."""
+    """West, south, east and north edge of the picture, deg."""
     picture: str
     """A PNG as a ``data:`` address; north is up."""
     span: float
-    """Anomaly at the darkest red, nT; the darkest blue is the negative of it."""
+    """Anomaly of the darkest red, nT; the darkest blue is the same value with a negative sign."""
 
 
 def read_background(path: Path) -> Background:
-    """Return the anomaly grid of a file as a picture.
+    """Read the anomaly grid of a file and return it as a picture.
 
-    FormatError: it is not a grid. MissingExtra: the analysis extra is not installed.
+    FormatError: the file is not a grid. MissingExtra: the analysis extra is not installed.
     """
     try:
         import numpy as np  # noqa: PLC0415 - most pages show no grid
@@ -146,9 +149,10 @@ def read_background(path: Path) -> Background:
 
 
 def ellipse(place: TrackPoint) -> list[tuple[float, float]]:
-    """Return the 2-sigma ellipse of a place as a polygon of (longitude, latitude), deg; empty if not known.
+    """Return the 2-sigma ellipse of a position as a polygon of (longitude, latitude), deg.
 
-    Its points are ``2 L (cos t, sin t)`` with Cholesky's factor L of the covariance, ``P = L L^T``.
+    The polygon is empty if the covariance is unknown. Its points are ``2 L (cos t, sin t)`` with the Cholesky
+    factor L of the covariance, ``P = L L^T``.
     """
     nn, ne, ee = place.covariance
     largest = nn + ee
@@ -167,7 +171,10 @@ def ellipse(place: TrackPoint) -> list[tuple[float, float]]:
 
 
 def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, float] | None:
-    """Return west, south, east, north (deg) around (longitude, latitude)s, in the shape of `ASPECT`."""
+    """Return west, south, east and north limits (deg) of a map of shape `ASPECT` around the positions.
+
+    `places` are (longitude, latitude), deg. The result is None without any place.
+    """
     points = list(places)
     if not points:
         return None
@@ -185,7 +192,10 @@ def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, 
 def series(
     reported: Iterable[TrackPoint], estimated: Iterable[TrackPoint], background: Background | None
 ) -> tuple[list[list[Any]], tuple[float, float, float, float] | None]:
-    """Return the data of the map's series (grid, two tracks, ellipse, last places), and its extent."""
+    """Return the data of the map's series, and the limits of the map (west, south, east, north), deg.
+
+    The series are the grid, the reported and the estimated track, the ellipse, and the last positions.
+    """
     own, by_field = list(reported), list(estimated)
     shape = ellipse(by_field[-1]) if by_field else []
     tracks = [_places(own), _places(by_field)]
@@ -207,12 +217,12 @@ def _places(track: Iterable[TrackPoint]) -> list[tuple[float, float]]:
 
 
 class Curve:
-    """A quantity over a window of time."""
+    """Chart of one quantity over a window of time."""
 
     def __init__(self, title: str, name: str, *, small: bool = False) -> None:
         self._changes = Changes()
         options = chart_options("curve", name)
-        if small:  # one of many: without a slider, and in any unit
+        if small:  # a small chart has no slider, and its tooltip no unit
             options["grid"] |= {"left": 56, "bottom": 24}
             options["tooltip"][":formatter"] = "magbridge.tip(3, '')"
             options["yAxis"]["splitNumber"] = 3
@@ -221,7 +231,7 @@ class Curve:
             self._chart = ui.echart(options).classes("w-full h-44" if small else "w-full h-80 md:h-[34rem]")
 
     def show(self, known: Series, tier: str) -> None:
-        """Draw the curve, if it has changed as far as a reader can see."""
+        """Draw the curve of a window (`tier`) if a new point has begun or the window has changed."""
         points = known.points(tier)
         if not self._changes.new("drawn", (tier, points and points[-1].time)):
             return
@@ -233,7 +243,7 @@ class Curve:
 
 
 def frame(title: str) -> ui.element:
-    """Make the frame of a chart that takes the focus and keys, with its name for those who do not see it."""
+    """Return the frame of a chart, which accepts focus and keys and gives screen readers the title."""
     box = ui.element().classes("w-full")
     box.props["tabindex"], box.props["role"], box.props["data-chart"] = 0, "img", ""
     box.props["aria-label"] = title + KEYS
@@ -241,7 +251,7 @@ def frame(title: str) -> ui.element:
 
 
 class TotalField:
-    """The curve of the total field, and the choice of the window for all charts."""
+    """Panel with the curve of the total field, and the switch that sets the window of all charts."""
 
     def __init__(self, tier: str, on_change: Any) -> None:
         with card("Total field, nT ± 2σ, UTC") as self.box:
@@ -252,12 +262,12 @@ class TotalField:
             self._curve = Curve("Total field", "total_field")
 
     def show(self, state: BridgeState, tier: str) -> None:
-        """Draw it."""
+        """Draw the total field of a bridge over the window `tier`."""
         self._curve.show(state.total, tier)
 
 
 class TelemetryChart:
-    """Three charts: positions of the masses, other named values of the vehicle, and the temperature."""
+    """Panel with one chart for each mass position, named value, further sensor and the temperature."""
 
     def __init__(self) -> None:
         self._changes, self._curves, self._drawn = Changes(), dict[str, Curve](), -MAX_CHART_INTERVAL_S
@@ -265,7 +275,7 @@ class TelemetryChart:
             self._box = ui.element().classes(f"{GRID} md:grid-cols-2 xl:grid-cols-3")
 
     def show(self, state: BridgeState, tier: str, now_s: float) -> None:
-        """Draw them, now and then."""
+        """Draw the charts, at most once in `MAX_CHART_INTERVAL_S` unless the window changes."""
         names = sorted(state.telemetry, key=lambda name: (name == TEMPERATURE_SERIES, name))
         if self._changes.new("names", names, self._box):
             self._drawn = now_s - MAX_CHART_INTERVAL_S
@@ -287,7 +297,7 @@ class TelemetryChart:
 
 
 class TrackMap:
-    """The track on the map; hidden while there is neither."""
+    """Panel with the map of the tracks; hidden while there are neither positions nor a grid."""
 
     def __init__(self, background: Background | None) -> None:
         self._changes, self._background = Changes(), background
@@ -299,7 +309,7 @@ class TrackMap:
             self._chart = ui.echart(chart_options("map", "track")).classes("w-full aspect-[4/3]")
 
     def show(self, state: BridgeState) -> None:
-        """Draw the track, if the vehicle has moved on."""
+        """Draw the tracks if a new position has been received."""
         added = state.reported_track.added, state.estimated.added
         self._box.set_visibility(bool(sum(added)) or self._background is not None)
         if not self._changes.new("track", added):

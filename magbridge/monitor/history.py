@@ -1,7 +1,7 @@
-"""Measurements, over minutes and over a day, in memory that does not grow.
+"""Store measurements, positions and alarms of minutes to a day in memory of limited size.
 
-A series is kept at several resolutions at once: each *tier* covers a window with points of one width, and
-each point keeps the outline of what fell into it, so that a spike of one sample is still there a day later.
+A series is stored at several resolutions. Each resolution (*tier*) covers a window of time with points of one
+width. Each point stores the range of its samples, so that a spike of one sample remains visible for a day.
 """
 
 from __future__ import annotations
@@ -12,18 +12,22 @@ from dataclasses import dataclass
 from math import inf, isfinite
 
 TIERS = {"10 min": (600.0, 1.0), "2 h": (7_200.0, 10.0), "24 h": (86_400.0, 120.0)}
-"""Window and width of a point, in s, by the name that the page gives the window."""
+"""Name of a window on the page -> length of the window and width of its points, s."""
 MAX_PLOTTED_VALUE = 1e12
-"""Larger values are kept as this: no field, and no sum of them overflows."""
+"""Limit to which larger values are clipped, so that their sums do not overflow."""
 LAST_YEAR = 4.1e9
 """Latest valid time (in 2100), s since 1970."""
 TRAIL = 2000
-"""Places that a trail keeps at most."""
+"""Largest number of positions that a trail stores."""
 
 
 @dataclass(slots=True)
 class Point:
-    """The samples of one width from `time` (s): sum, number, their range, and that of their 2-sigma bands."""
+    """Statistics of the samples of one time interval.
+
+    `time` is the start of the interval, s since 1970. `least` and `most` limit the samples, `low` and `high`
+    their 2-sigma bands.
+    """
 
     time: float
     sum: float = 0.0
@@ -39,14 +43,17 @@ class Point:
         return self.sum / self.count
 
     def add(self, value: float, two_sigma: float) -> None:
-        """Add a sample with its 2-sigma."""
+        """Add a sample and its 2-sigma uncertainty, in the unit of the series."""
         self.sum, self.count = self.sum + value, self.count + 1
         self.least, self.most = min(self.least, value), max(self.most, value)
         self.low, self.high = min(self.low, value - two_sigma), max(self.high, value + two_sigma)
 
 
 class Series:
-    """A quantity over time, at the resolutions of `TIERS`, with its latest value (NaN before the first)."""
+    """Time series of a quantity at the resolutions of `TIERS`.
+
+    `latest` is the last value (NaN before the first), `added` the number of values added.
+    """
 
     def __init__(self) -> None:
         self.latest, self.added = float("nan"), 0
@@ -55,9 +62,9 @@ class Series:
         }
 
     def add(self, time: float, value: float, two_sigma: float = 0.0) -> None:
-        """Add a value at `time`, s since 1970, with its 2-sigma; invalid numbers and times are ignored.
+        """Add a value at `time` (s since 1970) with its 2-sigma; ignore invalid numbers and times.
 
-        Where the clock was set back, later times are dropped.
+        If the clock was set back, remove the points that are later than `time`.
         """
         if not (isfinite(value + two_sigma) and 0.0 <= time < LAST_YEAR):
             return
@@ -76,14 +83,14 @@ class Series:
             tier[-1].add(value, two_sigma)
 
     def points(self, tier: str) -> list[Point]:
-        """Return the points of a tier within its window, in order of time."""
+        """Return the points within the window of a tier, in the order of time."""
         kept = self._tiers[tier]
         return [one for one in kept if one.time >= kept[-1].time - TIERS[tier][0]] if kept else []
 
 
 @dataclass(slots=True, frozen=True)
 class TrackPoint:
-    """A place, deg, and its covariance north-north, north-east, east-east, m² (zero where not known)."""
+    """Position of the vehicle, deg, and its covariance NN, NE, EE, m² (zero if unknown)."""
 
     latitude: float
     longitude: float
@@ -91,7 +98,11 @@ class TrackPoint:
 
 
 class Trail:
-    """Positions of a vehicle: at most `TRAIL`; a full trail drops every second position."""
+    """Track of a vehicle with at most `TRAIL` positions.
+
+    A full trail removes every second position and then stores fewer of the new ones. `latest` is the last
+    position, `added` the number of positions added.
+    """
 
     def __init__(self) -> None:
         self._places: list[TrackPoint] = []
@@ -100,7 +111,7 @@ class Trail:
         self.added = 0
 
     def add(self, place: TrackPoint) -> None:
-        """Add a place; invalid places are ignored."""
+        """Add a position; ignore a latitude or longitude outside its range."""
         if not (abs(place.latitude) <= 90.0 and abs(place.longitude) <= 180.0):
             return
         self.latest, self.added = place, self.added + 1
@@ -112,14 +123,14 @@ class Trail:
                 self._places, self._every = self._places[::2], 2 * self._every
 
     def __iter__(self) -> Iterator[TrackPoint]:
-        """Iterate over the places that are kept, and the latest."""
+        """Iterate over the stored positions, and then the latest position."""
         yield from self._places
         if self.latest is not None:
             yield self.latest
 
 
 MAX_ALARMS = 100
-"""Alarms that are kept at most; the oldest go first."""
+"""Largest number of stored alarms; the oldest are removed first."""
 ALARM_CAUSES = {
     "sensor": ("Sensor", "gap", "saturated", "offset_suspect", "lost:", "sensor"),
     "autopilot": ("Autopilot", "stale_telemetry", "link", "autopilot"),
@@ -129,11 +140,15 @@ ALARM_CAUSES = {
     "calibration": ("uncalibrated", "extrapolated", "calibration"),
     "navigation": ("navigation", "position"),
 }
-"""Cause of alarms to their keys, and to words in the STATUSTEXTs of the cause."""
+"""Cause of alarms -> keys of the alarms, and words in STATUSTEXTs, that belong to the cause."""
 
 
 def cause_of(key: str) -> str:
-    """Return the cause of an alarm: a key of :data:`ALARM_CAUSES`, or a text's words before the colon."""
+    """Return the cause of an alarm from its key.
+
+    The cause is a key of :data:`ALARM_CAUSES` if one matches. Else it is the words of a STATUSTEXT before its
+    first colon, or the key itself.
+    """
     kind, colon, text = key.partition(": ")
     words = text.split() if colon and kind == "text" else [key]
     for cause, names in ALARM_CAUSES.items():
@@ -144,74 +159,74 @@ def cause_of(key: str) -> str:
 
 @dataclass(slots=True)
 class Alarm:
-    """Something that began at `since` (s of the receiver's clock)."""
+    """Alarm about one condition or message; times are s of the receiver's monotonic clock."""
 
     key: str
     text: str
-    """`key`, `text`: Identifier, and text for a reader."""
+    """`key`, `text`: Identifier of the alarm, and its text on the page."""
     since: float
     last: float
-    """`since`, `last`: When the condition last began, and when it last held."""
+    """`since`, `last`: Time at which the condition last began, and at which it was last present, s."""
     active: bool = True
-    """The condition holds at present."""
+    """True while the condition is present."""
     count: int = 1
     """Number of times that the condition has begun."""
     acknowledged: bool = False
-    """Somebody has seen it since it last began."""
+    """True if a user has acknowledged the alarm since it last began."""
 
     @property
     def cause(self) -> str:
-        """The cause, by which alarms are grouped."""
+        """Cause of the alarm, by which the page groups alarms."""
         return cause_of(self.key)
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmGroup:
-    """The alarms of one cause, the newest first."""
+    """Alarms that have one cause, the newest first."""
 
     cause: str
     alarms: tuple[Alarm, ...]
 
     @property
     def text(self) -> str:
-        """Texts of the alarms, those of active alarms first."""
+        """Texts of the alarms, joined by semicolons; texts of active alarms come first."""
         ordered = sorted(self.alarms, key=lambda alarm: not alarm.active)
         return "; ".join(dict.fromkeys(alarm.text for alarm in ordered))
 
     @property
     def active(self) -> bool:
-        """At least one of them is active."""
+        """True if at least one alarm of the group is active."""
         return any(alarm.active for alarm in self.alarms)
 
     @property
     def acknowledged(self) -> bool:
-        """Somebody has seen all of them."""
+        """True if a user has acknowledged all alarms of the group."""
         return all(alarm.acknowledged for alarm in self.alarms)
 
     @property
     def started_s(self) -> float:
-        """Time at which the last of them began, s of the receiver's clock."""
+        """Time at which the newest alarm of the group began, s of the receiver's clock."""
         return self.alarms[0].since
 
     @property
     def count(self) -> int:
-        """The largest number of times that one of them has begun."""
+        """Number of times that the most frequent alarm of the group has begun."""
         return max(alarm.count for alarm in self.alarms)
 
 
 class Alarms:
-    """The alarms of one vehicle, the newest first."""
+    """Alarms of one vehicle."""
 
     def __init__(self) -> None:
         self._alarms: dict[str, Alarm] = {}
 
     def __iter__(self) -> Iterator[Alarm]:
-        """Iterate, the one that began last first."""
+        """Iterate over the alarms, the newest first."""
         return iter(sorted(self._alarms.values(), key=lambda alarm: alarm.since, reverse=True))
 
     @property
     def groups(self) -> list[AlarmGroup]:
-        """The alarms by their causes; the cause whose alarm began last comes first."""
+        """Alarms grouped by cause; the cause with the newest alarm comes first."""
         found: dict[str, list[Alarm]] = {}
         for alarm in self:
             found.setdefault(alarm.cause, []).append(alarm)
@@ -219,11 +234,11 @@ class Alarms:
 
     @property
     def unseen(self) -> int:
-        """Number of causes with an alarm that has not been acknowledged."""
+        """Number of causes that have an alarm without acknowledgement."""
         return len({alarm.cause for alarm in self._alarms.values() if not alarm.acknowledged})
 
     def update(self, conditions: Mapping[str, str], now_s: float) -> None:
-        """Update with all faults at `now_s`, its keys and its words; the other conditions are over."""
+        """Begin or update an alarm for each condition (key -> text) at `now_s`; end all other alarms."""
         for key, alarm in self._alarms.items():
             alarm.active = alarm.active and key in conditions
         for key, text in conditions.items():
@@ -234,17 +249,17 @@ class Alarms:
                 known.text, known.last = text, now_s
 
     def announce(self, key: str, text: str, now_s: float, *, active: bool = False) -> None:
-        """Begin an alarm, or restart it; one that is not `active` is an event, over at once."""
+        """Begin or restart an alarm at `now_s`; without `active`, it is an event that is over at once."""
         count = self._alarms.pop(key).count + 1 if key in self._alarms else 1
         self._alarms[key] = Alarm(key, text, now_s, now_s, active, count)
         while len(self._alarms) > MAX_ALARMS:
             del self._alarms[next(iter(self._alarms))]
 
     def withdraw(self, key: str) -> None:
-        """Remove an alarm whose text was only the beginning of a longer one."""
+        """Remove an alarm, because its text was only the first part of a longer STATUSTEXT."""
         self._alarms.pop(key, None)
 
     def acknowledge(self, cause: str | None = None) -> None:
-        """Record that somebody has seen the alarms of a cause; without one, all of them."""
+        """Record that a user has acknowledged the alarms of a cause, or all alarms if `cause` is None."""
         for one in self._alarms.values():
             one.acknowledged |= cause in {None, one.cause}

@@ -1,4 +1,4 @@
-"""The link, on a thread of its own: it feeds the state with messages and sends the state's requests."""
+"""Receive MAVLink messages of bridges in a thread, and send the requests of the page."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from magbridge.monitor.state import BridgeState
 from magbridge.monitor.words import conditions
 
 BRIDGES = {spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")}
-"""A component that sends one of these is a bridge."""
+"""Messages that identify their sender as a bridge, by id."""
 MAX_BRIDGES, BRIDGE_TIMEOUT_S = 8, 30.0
-"""Largest number of bridges, and time without a message after which a new bridge replaces one, s."""
+"""Largest number of bridges, and silence after which a new bridge replaces the most silent bridge, s."""
 CHECK_INTERVAL_S = 0.5
-"""Time between two checks for faults, s."""
+"""Time between two checks of the conditions that raise alarms, s."""
 
 
 class ReceivedBridges:
-    """The bridges received, by system and component in the order in which they were first heard."""
+    """States of all received bridges, by (system, component), in the order of their first messages."""
 
     def __init__(self) -> None:
         self.states: dict[tuple[int, int], BridgeState] = {}
@@ -45,7 +45,7 @@ class ReceivedBridges:
                 state.receive_other(message, now_s)
 
     def _room(self, now_s: float) -> bool:
-        """Make room for one more bridge; False where all known ones still send."""
+        """Return True if another bridge can be stored; if necessary, remove a bridge that no longer sends."""
         if len(self.states) < MAX_BRIDGES:
             return True
         silent, state = min(self.states.items(), key=lambda item: item[1].received_at)
@@ -55,7 +55,7 @@ class ReceivedBridges:
         return True
 
     def due(self, now_s: float) -> list[tuple[str, dict[str, Any]]]:
-        """Return the messages to send at `now_s`: our heartbeat, and requests not yet answered."""
+        """Return the messages to send at `now_s`: the heartbeat of the station, and unanswered requests."""
         requests: list[tuple[str, dict[str, Any]]] = []
         if now_s - self._beat >= 1.0:
             self._beat = now_s
@@ -69,19 +69,19 @@ class ReceivedBridges:
 
 
 ASLEEP = getattr(time, "CLOCK_BOOTTIME", None)
-"""Clock that also counts while the computer sleeps; None if the system has none."""
+"""Clock that also advances while the computer sleeps; None if the system does not have one."""
 
 
 def monotonic_s() -> float:
-    """Return s of a monotonic clock."""
+    """Return the time of a monotonic clock, s; where possible it includes the sleep of the computer."""
     return time.monotonic() if ASLEEP is None else time.clock_gettime(ASLEEP)
 
 
 class StationLink:
-    """Listens to `port`, as ground station 255:190, until the process ends.
+    """Link of the ground station 255:190 that reads and writes `port` until the process ends.
 
-    With a `key` of 32 bytes sent frames are signed, and frames not signed with it are refused. `fleet` is to
-    be used with `lock` held; `trouble` is why the port is not open, empty while it is.
+    With a `key` of 32 bytes, the link signs its frames and rejects frames without a valid signature. Hold
+    `lock` to access `fleet`. `trouble` is the fault of the port, empty if there is none.
     """
 
     def __init__(self, port: Port, key: bytes | None = None) -> None:
@@ -91,11 +91,14 @@ class StationLink:
 
     @property
     def refused(self) -> int:
-        """Number of frames without a valid signature."""
+        """Number of frames that were rejected for lack of a valid signature."""
         return self._signing.refused if self._signing else 0
 
     def start(self) -> None:
-        """Open the port and begin; raises :class:`PortError`."""
+        """Open the port and start the thread.
+
+        PortError: the port cannot be opened.
+        """
         self.port.open()
         Thread(target=self._listen, name="link", daemon=True).start()
 

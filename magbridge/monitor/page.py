@@ -1,4 +1,4 @@
-"""The page itself: its frame, which vehicle it shows, and when it is drawn again."""
+"""Build the page, select the vehicle that it shows, and update its panels."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ LIBRARIES = ("nicegui", "numpy", "msgspec", "pyserial")
 
 
 def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
-    """Return a ZIP file of versions, condition, status texts, alarms, parameters and the last samples.
+    """Return the ZIP file of a bug report: versions, health, texts, alarms, parameters, last samples.
 
-    `now_s` is of the receiver's clock; `link` is where the bridge was heard.
+    `now_s` is the time of the receiver's monotonic clock, s; `link` is the name of the receiving port.
     """
     wall = time.time() - now_s
 
@@ -96,7 +96,7 @@ Bridge = tuple[int, int]
 
 
 class Page:
-    """One browser's view of what the station has heard."""
+    """Page of one browser, which shows one of the bridges that the station receives."""
 
     def __init__(self, station: StationLink, background: Background | None = None) -> None:
         self._station, self._background = station, background
@@ -128,7 +128,7 @@ class Page:
             )
 
     def _choose(self, bridge: Bridge | None) -> None:
-        """Show another vehicle: everything is made again."""
+        """Show another bridge: build all panels of the page again."""
         self._bridge = bridge
         self._state = self._station.fleet.states.get(bridge) or BridgeState() if bridge else BridgeState()
         moment, state = monotonic_s(), self._state
@@ -180,7 +180,7 @@ class Page:
         self._track.show(state)
 
     def _offer(self, bridges: list[Bridge]) -> None:
-        """Show a choice of vehicles where there are several, with the number of unseen alarms."""
+        """Show a button for each of several bridges, with its number of unacknowledged alarms."""
         states = self._station.fleet.states
         unseen = [states[bridge].alarms.unseen for bridge in bridges]
         if (
@@ -214,7 +214,7 @@ class Page:
         flagged = state.flags.keys() - {"no_boresight"}
         self._stream.set_text(trouble or ("live, flagged" if flagged else "live"))
         self._stream.style(f"background: {RED if trouble else AMBER if flagged else GREEN}")
-        partly = "no field" in trouble or "no status" in trouble  # then the panels show which
+        partly = "no field" in trouble or "no status" in trouble  # the panels mark the missing stream
         gone = bool(trouble) and not partly
         self._body.style(f"{slanted(gone)}; filter: grayscale({int(gone)})")
 
@@ -223,7 +223,7 @@ class Page:
         return f"magbridge{vehicle}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
 
     def _snapshot(self) -> None:
-        """Send a script with which the browser saves all charts as one PNG."""
+        """Make the browser save all charts and the present values as one PNG."""
         with self._station.lock:
             figures = [f"{name}: {' '.join(texts)} nT" for name, texts in words.measured(self._state).items()]
             flags = ", ".join(self._state.flags) or "none"
@@ -233,7 +233,7 @@ class Page:
         ui.run_javascript(f"magbridge.snapshot({json.dumps(lines)}, {json.dumps(self._name() + '.png')})")
 
     def _report(self) -> None:
-        """Offer a bug report for download."""
+        """Send a bug report to the browser as a download."""
         with self._station.lock:
             data = bundle(self._state, monotonic_s(), self._station.port.name)
         ui.download.content(data, f"{self._name()}.zip", "application/zip")

@@ -1,4 +1,4 @@
-"""The panels of figures and words: field, flags, condition, position by the field, messages, parameters."""
+"""Show the panels of values and texts: field, flags, health, navigation, alarms, learning, parameters."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ TUNABLES = {
     one.name: one
     for one in (*alignment(Align()), *file_rate(), *learning(enabled=True), *rates(DEFAULT_RATES_HZ, LIMITS))
 }
-"""The parameters of a bridge, with the unit and range that a PARAM_VALUE does not carry."""
+"""Parameters of a bridge by name, with unit and range, which a PARAM_VALUE does not contain."""
 (AGE,) = telemetry_ages({"telemetry": Telemetry(message="", field="")})
-"""Any telemetry's largest age: which there is depends on the bridge."""
+"""Parameter of the largest telemetry age; it describes every MB_AGE_ parameter of a bridge."""
 
 
 class Figures:
-    """The field in nT."""
+    """Panel of the present field values, nT."""
 
     def __init__(self, state: BridgeState) -> None:
         with card("Field, nT ± 2σ") as self.box:
@@ -59,7 +59,7 @@ class Figures:
                 return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(f"{MUTED} tabular-nums")
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the present figures."""
+        """Show the values of the last MAG_FIELD, in italics if it is old."""
         for labels, texts in zip(self._labels, words.measured(state).values(), strict=True):
             for label, text in zip(labels, texts, strict=True):
                 label.set_text(text)
@@ -67,7 +67,7 @@ class Figures:
 
 
 class Flags:
-    """The present flags, and since when each is set."""
+    """Panel of the quality flags that are set, with the time since when."""
 
     def __init__(self) -> None:
         self._changes = Changes()
@@ -75,7 +75,7 @@ class Flags:
             self._box = ui.column().classes("gap-2")
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the present flags."""
+        """Show the flags that are set at `now_s`."""
         flags = {
             name: f"since {clock(t)}, {words.duration(now_s - t)}" for name, (t, _) in state.flags.items()
         }
@@ -92,7 +92,7 @@ class Flags:
 
 
 class Health:
-    """The bridge's condition and its losses."""
+    """Panels of the bridge's health and of its lost samples, frames and bytes."""
 
     def __init__(self, state: BridgeState, now_s: float) -> None:
         facts = list(words.health(state, now_s))
@@ -102,7 +102,7 @@ class Health:
             self._labels += [fact(name) for name in facts[8:]]
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the last status."""
+        """Show the last MAG_STATUS: faults in red, an old status in italics."""
         old = "no status" in words.silence(state, now_s)
         for label, (text, well) in zip(self._labels, words.health(state, now_s).values(), strict=True):
             label.set_text(text if state.status else "–")
@@ -112,7 +112,7 @@ class Health:
 
 
 class SensorPanel:
-    """The sensors of a bridge that has several; hidden otherwise."""
+    """Panel that compares the sensors of a bridge; hidden if the bridge has only one."""
 
     def __init__(self) -> None:
         self._changes = Changes()
@@ -120,7 +120,7 @@ class SensorPanel:
             self._table = ui.element().classes(f"{GRID} sm:grid-cols-2 lg:grid-cols-4 gap-x-8")
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show what each measures, and how far it differs from the first."""
+        """Show each sensor's total field, its difference from the first sensor, its line and its flags."""
         rows = words.sensor_rows(state, now_s)
         self._box.set_visibility(bool(rows))
         if not self._changes.new("rows", rows, self._table):
@@ -139,7 +139,7 @@ class SensorPanel:
 
 
 class NavigationPanel:
-    """The position filter's condition; hidden where there is none."""
+    """Panel of the position filter; hidden if the bridge does not navigate by the field."""
 
     def __init__(self, state: BridgeState, now_s: float) -> None:
         with (
@@ -156,7 +156,7 @@ class NavigationPanel:
 
 
 class Texts:
-    """The status texts of the bridge."""
+    """Panel of the STATUSTEXTs that the bridge has sent."""
 
     def __init__(self) -> None:
         self._changes = Changes()
@@ -182,7 +182,7 @@ class Texts:
 
 
 class ParameterPanel:
-    """The bridge's parameters, which can be set."""
+    """Panel in which a user reads and sets the parameters of the bridge."""
 
     def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
@@ -194,7 +194,7 @@ class ParameterPanel:
             self._box.props('tabindex=0 role=group aria-label="Parameters"')
 
     def show(self, state: BridgeState, _now_s: float) -> None:
-        """Show values and refusals."""
+        """Show the values of the parameters, and why the bridge rejected a requested value."""
         known = state.parameters
         if self._changes.new("names", sorted(known), self._box):
             with self._box:
@@ -220,17 +220,17 @@ class ParameterPanel:
     def _set(self, name: str) -> None:
         with self._station.lock:
             if name in self._state.parameters:
-                self._changes.forget(name)  # so that the answer is shown, even if it is the same as before
+                self._changes.forget(name)  # show the answer, even if it equals the previous answer
                 value = self._inputs[name].value
                 self._state.set(name, nan if value is None else value)
 
 
 REPEAT = 5.0
-"""Time between two sounds of an alarm that is not acknowledged, s."""
+"""Time between two sounds of an unacknowledged alarm, s."""
 
 
 class Row:
-    """The alarms of one cause. Its elements stay as long as they do, so that a click finds its button."""
+    """Row for the alarms of one cause; it is updated in place, so that a click finds its button."""
 
     def __init__(self, acknowledge: Callable[[], None]) -> None:
         self._acknowledge = acknowledge
@@ -241,7 +241,7 @@ class Row:
             self._seen: ui.button | None = None
 
     def show(self, alarm: AlarmGroup) -> None:
-        """Show text and times of the alarms; the button stays until somebody acknowledges them."""
+        """Show text and start of the alarms, and a button until a user acknowledges them."""
         color = RED if alarm.active else AMBER
         self.box.style(f"border-color: {'transparent' if alarm.acknowledged else color}")
         self._text.set_text(alarm.text)
@@ -262,7 +262,7 @@ class Row:
 
 
 class AlarmPanel:
-    """The alarms of one vehicle."""
+    """Panel of the alarms of one vehicle, with a sound for unacknowledged alarms."""
 
     def __init__(self, station: StationLink, state: BridgeState, *, sound: bool) -> None:
         self._station, self._state, self._changes = station, state, Changes()
@@ -279,11 +279,11 @@ class AlarmPanel:
 
     @property
     def sound(self) -> bool:
-        """True if this browser sounds."""
+        """True if the user has switched the sound on in this browser."""
         return bool(self._sound.value)
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the alarms; sound while one was not acknowledged."""
+        """Show the alarms; play a sound while an alarm is unacknowledged and the sound is on."""
         alarms = state.alarms.groups
         if state.alarms.unseen and self.sound and now_s - self._sounded >= REPEAT:
             self._sounded = now_s
@@ -311,7 +311,7 @@ class AlarmPanel:
             self._state.alarms.acknowledge(cause)
 
     def _switched(self) -> None:
-        if self.sound:  # a browser sounds only once its reader has done something
+        if self.sound:  # browsers play sound only after an action of the user
             ui.run_javascript("magbridge.beep()")
 
 
@@ -325,7 +325,7 @@ LEARNING_COMMANDS = {
 
 
 class LearningPanel:
-    """The state of learning of one bridge; hidden if it does not learn."""
+    """Panel of the online calibration (learning) of a bridge; hidden if the bridge does not learn."""
 
     def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
@@ -341,7 +341,7 @@ class LearningPanel:
             self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
 
     def show(self, state: BridgeState, _now_s: float) -> None:
-        """Show the last MAG_LEARNING."""
+        """Show the last MAG_LEARNING, and the error of the last command."""
         self._box.set_visibility(bool(state.learning))
         show_facts(self._labels, words.learnt(state))
         for one in self._buttons:
@@ -349,7 +349,7 @@ class LearningPanel:
         self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")
 
     def _confirm(self, name: str) -> None:
-        """Ask before a command is sent; before the learned calibration is accepted, state its worth."""
+        """Ask the user to confirm a command; for Accept, show how well the learned calibration predicts."""
         value, meaning = LEARNING_COMMANDS[name]
         text, good = words.learned_worth(self._state.learning) if name == ACCEPT else ("", True)
 
@@ -374,14 +374,14 @@ class LearningPanel:
 
 
 RADIUS = 80.0
-"""Radius of the circle in units of the picture, which is 200 wide."""
+"""Radius of the compass circle, in units of the picture, whose width is 200."""
 MAX_BAND_DEG = 180.0
-"""Half width of a band that is the whole circle, deg."""
+"""Half width from which the band of the heading is the whole circle, deg."""
 BLUE, GREY = "#3b82f6", "#778599"
 
 
 def current_heading(field: dict[str, Any]) -> tuple[float, float, str] | None:
-    """Return heading, 1-sigma (deg) and its reference; None where the last MAG_FIELD has no heading."""
+    """Return heading and 1-sigma (deg), and "true" or "magnetic"; None if `field` has no heading."""
     sigma = field.get("heading_sigma", 0.0)
     if not (isfinite(sigma) and sigma > 0.0):
         return None
@@ -392,7 +392,7 @@ def current_heading(field: dict[str, Any]) -> tuple[float, float, str] | None:
 
 
 def heading_text(field: dict[str, Any]) -> str:
-    """Return the heading with its 2-sigma in words."""
+    """Return the text of the heading, its reference and its 2-sigma, deg."""
     found = current_heading(field)
     if found is None:
         return "No heading: it needs a boresight and the autopilot's ATTITUDE"
@@ -401,9 +401,9 @@ def heading_text(field: dict[str, Any]) -> str:
 
 
 def rose_picture(field: dict[str, Any]) -> str:
-    """Return the rose as an SVG: letters, the band of two standard deviations, and a needle.
+    """Return the compass rose as an SVG with a needle and the 2-sigma band of the heading.
 
-    The picture is made of numbers and fixed text alone, so that no text of a sender gets into the page.
+    The picture contains only numbers and constant text, so that a sender cannot insert text into the page.
     """
     parts = [f'<circle r="{RADIUS}" fill="none" stroke="{GREY}" stroke-width="1.5"/>']
     for bearing in range(0, 360, 30):
@@ -422,13 +422,13 @@ def rose_picture(field: dict[str, Any]) -> str:
 
 
 def _line(bearing: float, inner: float, outer: float, style: str) -> str:
-    """Return a radial line between two radii at a bearing, deg."""
+    """Return the SVG of a radial line between two radii at a bearing, deg."""
     (x, y), (u, v) = _point(bearing, inner), _point(bearing, outer)
     return f'<line x1="{x}" y1="{y}" x2="{u}" y2="{v}" {style}/>'
 
 
 def _band(heading: float, half: float) -> str:
-    """Return the sector `half` deg either side of the heading."""
+    """Return the SVG of the sector of `half` deg on either side of the heading, deg."""
     style = f'fill="{BLUE}" fill-opacity="0.25"'
     if half >= MAX_BAND_DEG:
         return f'<circle r="{RADIUS}" {style}/>'
@@ -443,7 +443,7 @@ def _point(bearing: float, radius: float) -> tuple[float, float]:
 
 
 class CompassRose:
-    """The panel of the compass rose."""
+    """Panel of the compass rose with the heading."""
 
     def __init__(self) -> None:
         self._changes = Changes()

@@ -1,10 +1,9 @@
-"""Who may see the page, and set parameters from it: a guard before every request and every websocket.
+"""Check every request and websocket, so that only authorised users see the page and set parameters.
 
-A page on a loopback address is reached by users of the computer, but also by any website that they
-have open: it can send requests to ``localhost``, open a websocket to it (which no browser forbids), show the
-page in a frame, or have its own name resolve to 127.0.0.1 (DNS rebinding). The ``Host`` that a browser asks
-for and the ``Origin`` of a request distinguishes these. On any other address, everybody in the network
-comes that far, so there a token is required as well.
+A page on a loopback address is open to users of the computer, but also to any website in their browsers. A
+website can send requests to ``localhost``, open a websocket to it (browsers allow this), or show the page in
+a frame. Its name can also resolve to 127.0.0.1 (DNS rebinding). The headers ``Host`` and ``Origin`` identify
+such requests. On any other address, the whole network can reach the page, so a token is required as well.
 """
 
 from __future__ import annotations
@@ -41,14 +40,14 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Headers of every answer: the page loads nothing from other sites, and no site may frame it."""
+"""Headers of every response: the page loads nothing from other sites, and no site may frame it."""
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 MAX_COOKIE_CHARACTERS = 4096
-"""Characters of a cookie header that are looked at."""
+"""Number of characters of a cookie header that the guard parses."""
 
 
 def is_loopback(host: str) -> bool:
-    """Return True if an address to serve at is reached from this computer alone."""
+    """Return True if only this computer can reach a server at the address `host`."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -56,21 +55,21 @@ def is_loopback(host: str) -> bool:
 
 
 def new_token() -> str:
-    """Return a token that cannot be guessed: 128 bits from the operating system, fit for an address."""
+    """Return a random token of 128 bits from the operating system, in characters that a URL may contain."""
     return secrets.token_urlsafe(16)
 
 
 class Guard:
-    """ASGI middleware: refuses what does not come from the page itself.
+    """ASGI middleware that rejects requests that do not come from the page itself.
 
-    The page is served at `host` and `port`. A browser has to show the `token` once, as ``?token=`` in the
-    address; then a cookie remembers it. Empty: no token is required. A request is refused
+    The page is served at `host` and `port`. A browser sends the `token` once, as ``?token=`` in the address;
+    afterwards it sends a cookie. An empty `token` means that none is required. The guard rejects a request
 
-    * with 421 where ``Host`` is neither a name of this computer nor, where the page is served to others, an
-      address: a name that somebody else owns may resolve to us, an address cannot;
-    * with 403 where ``Origin`` is another site's, or the browser reports a request of another site
-      (``Sec-Fetch-Site``), except for following a link to the page;
-    * with 401 without the token.
+    * with 421 if ``Host`` is not a name of this computer. On a network address, an IP address is also
+      accepted, because a foreign name can resolve to this computer but an address cannot;
+    * with 403 if ``Origin`` or ``Sec-Fetch-Site`` names another site, except if the user follows a link to
+      the page;
+    * with 401 if the token is missing or wrong.
     """
 
     def __init__(self, app: App, host: str, port: int, token: str = "") -> None:
@@ -80,7 +79,7 @@ class Guard:
         self._cookie = f"magbridge_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or refuse it."""
+        """Pass a request on to the page, or reject it."""
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
@@ -97,13 +96,13 @@ class Guard:
         if refusal is None:
             await self._app(scope, receive, _with_headers(send))
         elif scope["type"] == "websocket":
-            await receive()  # its "connect"; closed before it was accepted, the answer is a 403
+            await receive()  # the "connect" event; closing before acceptance makes the response a 403
             await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
         else:
             await _answer(send, refusal[0], f"magbridge: {refusal[1]}\n".encode())
 
     def _refusal(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
-        """Return status and reason for a request that does not come from the page itself."""
+        """Return HTTP status and reason if a request comes from another site; None if from this page."""
         host = headers.get("host", "")
         if not self._is_this_page(host):
             return 421, "not a name of this page: use its address"
@@ -116,7 +115,7 @@ class Guard:
         return None
 
     def _is_this_page(self, host: str) -> bool:
-        """Return True if a Host header names this page."""
+        """Return True if a Host header has a name (and on a loopback address, the port) of this page."""
         parts = _parts(f"//{host}")
         if parts is None:
             return False
@@ -133,7 +132,7 @@ class Guard:
         return morsel is not None and _same(morsel.value, self._token)
 
     async def _admit(self, scope: Scope, send: Send) -> None:
-        """Remember the token in a cookie, and take it out of the address."""
+        """Redirect the browser to the address without the token, and set a cookie with the token."""
         query = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
         place = "/" + scope["path"].lstrip("/") + (f"?{urlencode(query)}" if query else "")
         cookie = f"{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/"
@@ -144,7 +143,7 @@ def _with_headers(send: Send) -> Send:
     async def sending(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":
             own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
-            # what socket.io allows to every site that asks is not given out
+            # omit the headers with which socket.io grants access to any site
             given = [
                 pair for pair in message["headers"] if not pair[0].lower().startswith(b"access-control-")
             ]
@@ -172,7 +171,7 @@ def _same_place(origin: str, host: str) -> bool:
 
 
 def _parts(url: str) -> tuple[str, int | None] | None:
-    """Return name and port of an address; None where it has none."""
+    """Return name and port of a URL, or None if the URL has no valid name or port."""
     try:
         parts = urlsplit(url)
         return ((parts.hostname or "").rstrip("."), parts.port) if parts.hostname else None

@@ -1,4 +1,4 @@
-"""The web server: where the page is, and who may come."""
+"""Start the web server of the page."""
 
 from __future__ import annotations
 
@@ -29,21 +29,23 @@ def serve(
     grid: Path | None = None,
     show: bool = False,
 ) -> None:
-    """Listen to `link` and serve the page at `host` and `port` until interrupted.
+    """Receive bridges on `link`, and serve the page at `host` and `port` until interrupted.
 
-    Where `host` is not of this computer alone, a token is required; it is in the address that is printed.
-    With a `key` of 32 bytes, messages are signed and unsigned frames refused. The anomaly `grid` is shown
-    beneath the track.
+    If other computers can reach `host`, a token is required; the printed address contains it. With a `key` of
+    32 bytes, messages are signed and frames without a valid signature rejected. The map shows the anomaly
+    `grid` beneath the track. With `show`, the page opens in the browser of this computer.
 
-    ConfigError, PortError: `link` is not an address, or it or the page's own port cannot be opened.
-    FormatError: `grid` is none.
+    ConfigError: `link` is not an address. PortError: `link` or the port of the page cannot be opened.
+    FormatError: `grid` is not a grid.
     """
     background = read_background(grid) if grid else None
     station = StationLink(open_link(link, baudrate, "magbridge monitor", "LINK"), key)
     ipv6 = ":" in host
     family, place = (socket.AF_INET6, f"[{host}]:{port}") if ipv6 else (socket.AF_INET, f"{host}:{port}")
     try:
-        socket.create_server((host, port), family=family).close()  # the web server itself would only log it
+        socket.create_server(
+            (host, port), family=family
+        ).close()  # fail here, because the web server would only log the error
     except OSError as error:
         raise PortError(place, error.strerror or str(error)) from error
     station.start()
@@ -55,7 +57,7 @@ def serve(
         print(f"warning: {warning}", file=sys.stderr)
     app.add_middleware(Guard, host=host, port=port, token=token)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
-    with suppress(KeyboardInterrupt):  # Ctrl-C is how it ends
+    with suppress(KeyboardInterrupt):  # Ctrl-C ends the server
         ui.run(
             partial(Page, station, background),
             host=host,

@@ -1,4 +1,4 @@
-"""Keep the state of one bridge from its messages, without port, clock or page."""
+"""Update the state of one bridge from its messages, independently of port, clock and page."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from magbridge.monitor.history import Alarms, Series, TrackPoint, Trail
 from magbridge.records import Quality
 
 FLAG_HOLD_TIME_S = 3.0
-"""Time for which a flag is shown after it was last set, s."""
+"""Time for which the page shows a flag after the last sample with the flag, s."""
 REQUEST_RETRY_S = 1.5
-"""Time after which a request without an answer is repeated, s."""
+"""Time after which an unanswered request is repeated, s."""
 WAITING = "no answer yet"
 MAX_SENSORS = 8
-"""Sensors of a bridge that are kept at most."""
+"""Largest number of sensors that are stored for a bridge."""
 MIN_COMPARISON_TIME_S = 1.0
-"""Largest time between two compared samples of two sensors, s, unless two sample intervals are longer."""
+"""Largest time difference of two sensors' samples for a comparison, s; or two sample intervals, if longer."""
 SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
-"""Largest numbers of samples, parameters and series of telemetry that are kept."""
+"""Largest numbers of samples, parameters and telemetry series that are stored."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
 """States of the position filter in which its position is valid."""
 COMMAND_PARAMETERS = {"MB_LEARN_CMD"}
-"""Parameters that go back to 0 once the request is done."""
+"""Parameters that are commands: the bridge resets them to 0 after it has executed the command."""
 FIX_2D = 2
-"""GPS_FIX_TYPE from which a receiver knows its place."""
+"""Lowest GPS_FIX_TYPE with a valid position."""
 TEMPERATURE_SERIES = "Temperature, °C"
-"""The series of the fluxgate's temperature, in addition to the telemetry."""
+"""Name of the series with the fluxgate's temperature."""
 
 
 class Text(NamedTuple):
-    """A text of the bridge: when it came (s), its MAV_SEVERITY, its words."""
+    """STATUSTEXT of the bridge: time of reception (s, receiver's clock), MAV_SEVERITY, text."""
 
     time: float
     severity: int
@@ -44,7 +44,11 @@ class Text(NamedTuple):
 
 @dataclass
 class RemoteParameter:
-    """A parameter: value last received, value requested (and when), and why the request was not granted."""
+    """Parameter of the bridge, and the state of a request to change it.
+
+    `value` is the last received value, `asked` the requested value (None without an open request), `when` the
+    time at which the request was last sent (s), and `error` the reason why the value was not set.
+    """
 
     index: int
     value: float
@@ -55,18 +59,18 @@ class RemoteParameter:
 
 @dataclass
 class SensorState:
-    """One sensor of a bridge: its last MAG_FIELD and MAG_SENSOR (empty before the first), and their times."""
+    """State of one sensor of a bridge: its last MAG_FIELD (`field`) and MAG_SENSOR (`report`), or empty."""
 
     number: int
     field: dict[str, Any] = dataclass_field(default_factory=dict)
     report: dict[str, Any] = dataclass_field(default_factory=dict)
     sampled: float = -inf
     interval: float = 0.0
-    """`sampled`, `interval`: When the last MAG_FIELD came, and s between the last two; 0 before two."""
+    """`sampled`, `interval`: Time of the last MAG_FIELD, and from the one before (0 if none), s."""
 
     @property
     def label(self) -> str:
-        """Name of the sensor in the configuration; its number until a MAG_SENSOR has come."""
+        """Name of the sensor in the configuration; its number before the first MAG_SENSOR."""
         return str(self.report.get("name", "")) or f"sensor {self.number}"
 
     def take(self, fields: dict[str, Any], now_s: float) -> None:
@@ -75,7 +79,10 @@ class SensorState:
         self.field, self.sampled = fields, now_s
 
     def difference(self, first: SensorState) -> tuple[float, float]:
-        """Return the total field minus that of the first sensor, and its 1-sigma, nT; NaN where not known."""
+        """Return the total field minus the first sensor's total field, and the 1-sigma, nT.
+
+        Both are NaN if a sample is missing or the time difference of the samples is too large.
+        """
         if not (self.field and first.field):
             return nan, nan
         apart_s = abs(self.field["time_usec"] - first.field["time_usec"]) * 1e-6
@@ -87,31 +94,32 @@ class SensorState:
 
 
 class BridgeState:
-    """All that a page shows of one bridge, by its system and component (None before any bridge was heard).
+    """State of one bridge, from which the page is drawn.
 
-    Times are the receiver's, s of a monotonic clock; -inf before the first message of a kind.
+    `bridge` is its MAVLink system and component; None before a bridge has been received. Times are s of the
+    receiver's monotonic clock; -inf before the first message of a kind.
     """
 
     def __init__(self, bridge: tuple[int, int] | None = None, sequence: int = -1) -> None:
         self.bridge = bridge
-        self.began = inf  # when its first message came
-        # when its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came
+        self.began = inf  # time of the first message
+        # time of the last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION
         self.received_at = self.sampled = self.reported = self.navigated = -inf
-        # s between its last two MAG_FIELDs, and MAG_STATUSes; 0 before the second
+        # time between the last two MAG_FIELDs, and MAG_STATUSes, s; 0 before the second
         self.interval = self.report_interval = 0.0
-        self.received = self.lost = 0  # messages, and those missing by their sequence numbers
+        self.received = self.lost = 0  # number of messages received, and missing by sequence number
         # the last MAG_FIELD, MAG_STATUS, MAG_NAVIGATION and MAG_LEARNING; empty before the first
         self.field: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
         self.navigation: dict[str, Any] = {}
         self.learning: dict[str, Any] = {}
         self.sensors: dict[int, SensorState] = {}
-        # flags of the first sensor, by their public names: since when, and when last set
+        # flags of the first sensor: name -> time since when it is set, and when it was last set
         self.flags: dict[str, tuple[float, float]] = {}
         self.samples: deque[dict[str, Any]] = deque(maxlen=SAMPLES)  # the last MAG_FIELDs
         # the total field, nT; the fluxgate's temperature, and named values such as the positions of masses
         self.total, self.telemetry = Series(), dict[str, Series]()
-        # positions by the field (MAG_NAVIGATION), and by the vehicle's own navigation
+        # positions of the position filter (MAG_NAVIGATION), and of the vehicle's own navigation
         self.estimated, self.reported_track = Trail(), Trail()
         self.alarms = Alarms()
         self.texts: deque[Text] = deque(maxlen=200)  # STATUSTEXTs, the newest first
@@ -131,7 +139,7 @@ class BridgeState:
     def receive(self, message: Message, now_s: float) -> None:
         """Process a message of the bridge received at `now_s`."""
         gap = (message.sequence - self._sequence - 1) % 256
-        self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
+        self.lost += gap if gap < 128 else 0  # a larger step means that a message arrived late
         self._sequence, self.received_at = message.sequence, now_s
         self.began = min(self.began, now_s)
         self.received += 1
@@ -144,7 +152,7 @@ class BridgeState:
             handle(message, now_s)
 
     def due(self, now_s: float) -> list[tuple[str, dict[str, Any]]]:
-        """Return the requests to send at `now_s`: those not yet answered."""
+        """Return the messages to send at `now_s`: requests of parameters that are not yet answered."""
         if self.bridge is None:
             return []
         requests: list[tuple[str, dict[str, Any]]] = []
@@ -163,13 +171,13 @@ class BridgeState:
         return requests
 
     def time(self, now_s: float) -> float:
-        """Return the bridge's own time, s since 1970, of a moment of the receiver's clock; NaN before any."""
+        """Convert a time of the receiver's clock to the bridge's, s since 1970; NaN before a MAG_FIELD."""
         return self.field["time_usec"] * 1e-6 + now_s - self.sampled if self.field else nan
 
     def set(self, name: str, value: float) -> None:
-        """Ask for another value of a parameter; the answer, or the refusal, appears in `parameters`."""
+        """Request a new value of a parameter; `parameters` receives the confirmed value or the error."""
         one = self.parameters[name]
-        if abs(value) < 1e38:  # what a REAL32 takes
+        if abs(value) < 1e38:  # the range of a REAL32
             one.asked, one.when, one.error = value, -inf, ""
         else:
             one.error = "expected a number"
@@ -200,7 +208,7 @@ class BridgeState:
             sensor.report = message.fields
 
     def _sensor_of(self, message: Message) -> SensorState | None:
-        """Return the sensor that a message is about; None where there are too many."""
+        """Return the sensor that a message names; None if it would exceed `MAX_SENSORS`."""
         number = message["sensor_id"]
         if number not in self.sensors and len(self.sensors) < MAX_SENSORS:
             self.sensors[number] = SensorState(number)
@@ -273,7 +281,7 @@ class BridgeState:
         if isclose(one.asked, value, rel_tol=1e-6) or (name in COMMAND_PARAMETERS and value == 0.0):
             one.error = ""
         elif one.error == WAITING:
-            return  # of a list that somebody asked for meanwhile; our request is repeated
+            return  # this value answers a list request of another station; repeat our request
         elif not one.error:
             one.error = f"{one.asked:.7g} was not taken"
         one.asked = None

@@ -1,4 +1,4 @@
-"""Small parts of which the page's panels are made, and its colours."""
+"""Make the elements that the panels of the page consist of, and define its colours."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
 [data-chart]:focus-visible {outline: 2px solid #3b82f6; outline-offset: 2px; border-radius: 4px}
 .q-header .q-btn, .q-header .q-toggle {color: white}
 """
-"""Colours by day and, where the browser asks for it, by night; the header is the same at both."""
+"""Style sheet with the colours of the light and the dark page; the browser selects one of the two."""
 INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--suspect)", "var(--bad)"
 FADED_COLOUR = "var(--faded)"
-"""Colour of old figures, which are also slanted; they stay legible."""
+"""Colour of old values, which are also in italics."""
 MUTED = "text-slate-600 dark:text-slate-400"
 GRID = "w-full grid gap-4 grid-cols-1"
 
 
 class Changes:
-    """Values that one browser shows, so that only changes are sent to it."""
+    """Values that one browser shows, by key, so that the server sends only changes."""
 
     def __init__(self) -> None:
         self._shown: dict[str, Any] = {}
 
     def new(self, key: str, value: Any, box: ui.element | None = None) -> bool:
-        """Return whether `value` is new; if so, empty the `box` that showed the old one."""
+        """Return True if `value` differs from the last value of `key`; in that case, clear `box`."""
         new = key not in self._shown or bool(self._shown[key] != value)
         self._shown[key] = value
         if new and box is not None:
@@ -41,48 +41,48 @@ class Changes:
         return new
 
     def forget(self, key: str) -> None:
-        """Show the next value even if it has not changed."""
+        """Treat the next value of `key` as new, even if it has not changed."""
         self._shown.pop(key, None)
 
 
 @contextmanager
 def card(title: str) -> Iterator[ui.card]:
-    """Make a card under a heading; elements made within are in it."""
+    """Make a card with a heading; elements that the caller makes in this context belong to the card."""
     with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg dark:bg-slate-800") as made:
         ui.label(title).classes(f"text-sm font-semibold {MUTED}").props("role=heading aria-level=2")
         yield made
 
 
 def fact(name: str) -> ui.label:
-    """Make a row of a name and a value, and return the value's label."""
+    """Make a row with a name and an empty value, and return the label of the value."""
     with ui.row().classes("w-full justify-between text-sm gap-x-2"):
         ui.label(name).classes(MUTED)
         return ui.label().classes("font-medium tabular-nums")
 
 
 def show_facts(labels: Iterable[ui.label], facts: Mapping[str, tuple[str, bool]]) -> None:
-    """Show the text of each fact, in red if it is not in order."""
+    """Set each label to the text of its fact, in red if the fact's flag is False."""
     for label, (text, is_well) in zip(labels, facts.values(), strict=True):
         label.set_text(text)
         label.style(f"color: {INK if is_well else RED}")
 
 
 def slanted(old: bool) -> str:
-    """Return the style of figures that may be `old`: not the present ones."""
+    """Return the CSS style of values: italics and a faded colour if they are `old`."""
     return f"font-style: {'italic' if old else 'normal'}; color: {FADED_COLOUR if old else INK}"
 
 
 def nothing(text: str = "None yet") -> ui.label:
-    """Show a placeholder for missing data."""
+    """Make a label with a placeholder for missing data, and return the label."""
     return ui.label(text).classes(f"text-sm {MUTED}")
 
 
 def button(text: str, order: Callable[[], None]) -> ui.button:
-    """Make a small button that gives an order."""
+    """Make a small button that calls `order` at a click, and return it."""
     made = ui.button(text, on_click=order).classes("!text-slate-700 dark:!text-slate-200")
     return made.props("dense no-caps outline size=md padding='3px 10px'")
 
 
 def clock(moment: float) -> str:
-    """Return the UTC of a moment on the station's clock."""
+    """Return the UTC (HH:MM:SS) of a time of the station's monotonic clock, s."""
     return time.strftime("%H:%M:%S", time.gmtime(time.time() - (monotonic_s() - moment)))

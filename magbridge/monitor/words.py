@@ -1,4 +1,4 @@
-"""The state in words and figures, as the page shows them."""
+"""Convert the state of a bridge to the texts that the page shows."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from magbridge.monitor.state import BridgeState
 from magbridge.records import Quality
 
 SILENT, SLOW = 3.0, 30.0
-"""Shortest reported silence, s: `SILENT` for the bridge, which sends every second; for field and status three
-of their intervals, at least `SILENT` and at most `SLOW`."""
+"""Silence after which a stream is reported as missing, s: `SILENT` for the whole bridge, which sends every
+second. For field and status it is three of their intervals, but at least `SILENT` and at most `SLOW`."""
 FLAG_TEXTS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the calibrated range",
@@ -37,15 +37,15 @@ FLAG_TEXTS = {
     "unexplained": "The calibration no longer explains the field",
 }
 ROUTINE = {"moving", "no_boresight", "late_join"}
-"""Flags that come and go, or stay, in a mission without faults: they are shown, and raise no alarm."""
+"""Flags that also occur in a mission without faults: the page shows them, but they raise no alarm."""
 STARTING = 15.0
-"""Time after its first message in which a bridge may still wait for its sensor and autopilot, s."""
+"""Time after the first message during which silence and port states raise no alarm, s."""
 MAX_ALARM_TIME_S = 4_102_444_800
 """Latest start of an alarm (in 2099), s since 1970."""
 NORMAL_95 = 1.96
-"""Half width of the 95 % interval of a normal variable, standard deviations."""
+"""Half width of the 95 % interval of a normal variable, in standard deviations."""
 MAX_PLAIN_NUMBER = 1e9
-"""No figure of the page is as large: larger ones are written with a power of ten."""
+"""Value from which a number is written with a power of ten."""
 LOSS_TEXTS = {
     "Samples lost at the sensor": "samples_lost",
     "Bad frames from the sensor": "sensor_frames_bad",
@@ -58,27 +58,25 @@ LOSS_TEXTS = {
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in the unit that suits it."""
+    """Return the text of a duration in s, min or h."""
     unit, size = next(((u, s) for u, s in (("h", 3600), ("min", 60)) if seconds >= 2 * s), ("s", 1))
     return f"{max(seconds, 0.0) / size:.0f} {unit}"
 
 
 def silence(state: BridgeState, now_s: float) -> str:
-    """Return the fault of the stream; an empty text while messages, field and status come."""
+    """Return which of messages, field and status are missing, and since when; empty if none is."""
     if _late(state.received_at, 0.0, now_s):
         return _unheard("nothing", state.received_at, now_s)
     missing = []
     if _late(state.sampled, state.interval, now_s):
         missing.append(_unheard("no field", state.sampled, now_s))
-    if state.status and _late(
-        state.reported, state.report_interval, now_s
-    ):  # a bridge need not send it at all
+    if state.status and _late(state.reported, state.report_interval, now_s):  # a bridge may omit the status
         missing.append(_unheard("no status", state.reported, now_s))
     return "; ".join(missing)
 
 
 def _late(received: float, interval: float, now_s: float) -> bool:
-    """Return True if more than a message or two of such an interval (s) have not come."""
+    """Return True if a stream is late: silent for 3 intervals (s), within `SILENT` and `SLOW`."""
     return now_s - received > max(SILENT, min(3 * interval, SLOW))
 
 
@@ -87,7 +85,7 @@ def _unheard(stream: str, received: float, now_s: float) -> str:
 
 
 def measured(state: BridgeState) -> dict[str, tuple[str, str]]:
-    """Return the field in nT: name of each quantity to its value and its 2-sigma, as texts."""
+    """Return the texts of the field: name of a quantity -> its value and its 2-sigma, nT."""
     get = state.field.get
     shown = {"Total field": _number(get("total_field", nan), ".2f", 2 * get("total_field_sigma", nan))}
     shown["Anomaly"] = _number(get("anomaly", nan), "+.2f")
@@ -97,22 +95,22 @@ def measured(state: BridgeState) -> dict[str, tuple[str, str]]:
 
 
 class SensorRow(NamedTuple):
-    """One sensor of several, in words: of a value also if it is in order."""
+    """Texts about one of several sensors; `agrees` is False if `difference` is significant."""
 
     name: str
     total: str
     """Total field ± 2 sigma, nT."""
     difference: str
-    """Total field minus the first sensor's ± 2 sigma, nT; a dash for the first."""
+    """Total field minus the first sensor's total field, ± 2 sigma, nT; a dash for the first sensor."""
     agrees: bool
     line: str
     is_well: bool
-    """`line`, `is_well`: State of its line with the rate of its samples, and if that is in order."""
+    """`line`, `is_well`: State of the sensor's port with its sample rate, and True if samples arrive."""
     flags: str
 
 
 def sensor_rows(state: BridgeState, now_s: float) -> list[SensorRow]:
-    """Return a row for each sensor of a bridge that has several; none for a single sensor."""
+    """Return a row for each sensor of a bridge with several sensors; an empty list for a single sensor."""
     if len(state.sensors) < 2:
         return []
     first = next(iter(state.sensors.values()))
@@ -140,8 +138,8 @@ def sensor_rows(state: BridgeState, now_s: float) -> list[SensorRow]:
 
 
 def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
-    """Return the bridge's condition: name of each item to its text, and whether it is in order."""
-    # of a field that no longer comes, neither latency nor age is the present one
+    """Return the health of the bridge: name of an item -> its text, and True if it is normal."""
+    # latency and telemetry age of an old field would mislead
     field = ({} if _late(state.sampled, state.interval, now_s) else state.field).get
     get = state.status.get
     sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
@@ -165,13 +163,13 @@ def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
             f"{_figure(state.lost)} of {_figure(state.lost + state.received)}",
             not state.lost,
         ),
-        # of a stream that is joined in the middle of a frame, some bytes are always skipped
+        # skipped bytes are normal: the bridge may join a stream in the middle of a frame
         **{name: (_figure(count), not count or name.startswith("Bytes")) for name, count in losses.items()},
     }
 
 
 def whereabouts(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
-    """Return the position filter's condition: name of each item to its text, and whether it is in order."""
+    """Return the state of the position filter: name of an item -> its text, and True if it is normal."""
     get = state.navigation.get
     mode = get("state", 0)
     nn, ne, ee = (get(f"covariance_{axes}", nan) for axes in ("nn", "ne", "ee"))
@@ -192,7 +190,7 @@ def whereabouts(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]
 
 
 def learnt(state: BridgeState) -> dict[str, tuple[str, bool]]:
-    """Return the items of the learning panel: name to text, and whether the value is normal."""
+    """Return the items of the learning panel: name -> text, and True if the value is normal."""
     get = state.learning.get
     causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
     since = time.gmtime(min(get("alarm_since", 0) * 1e-6, MAX_ALARM_TIME_S))
@@ -213,11 +211,11 @@ def learnt(state: BridgeState) -> dict[str, tuple[str, bool]]:
 
 
 def learned_worth(learning: dict[str, Any]) -> tuple[str, bool]:
-    """Return the error of an accepted calibration relative to the first, and whether it is better.
+    """Return a text that compares the learned calibration with the first, and True if it is better.
 
-    The text has the ratio of the errors of prediction with its 95 % interval. Errors of prediction are nearly
-    white, so that the logarithm of an RMS of n of them has the variance 1 / (2 n); the two count as
-    independent. n is the number of samples, at most the memory over which the bridge follows the errors.
+    The text states the ratio of their RMS prediction errors with its 95 % interval. Prediction errors are
+    nearly white, so the logarithm of the RMS of n errors has the variance 1 / (2 n). The two RMS are treated
+    as independent. n is the number of samples, limited to the memory of the bridge's RMS.
     """
     published, first = learning.get("calibration_id", 0), learning.get("first_calibration_id", 0)
     if published == first:
@@ -244,7 +242,7 @@ def _calibration(published: int, first: int) -> str:
 
 
 def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
-    """Return the conditions that need attention, key to text, for :meth:`Alarms.update`."""
+    """Return the conditions that raise an alarm, key -> text, for :meth:`.Alarms.update`."""
     wrong = {name: FLAG_TEXTS[name] for name in state.flags if name not in ROUTINE}
     starting = now_s - state.began < STARTING
     if (quiet := silence(state, now_s)) and not starting:
@@ -254,7 +252,7 @@ def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
         if state.status and not starting and text in {"silent", "lost", "failed"}:
             wrong[line] = f"{line}: {text}"
     for row, sensor in zip(sensor_rows(state, now_s), state.sensors.values(), strict=False):
-        if not sensor.number or starting:  # the first sensor has rows of its own above
+        if not sensor.number or starting:  # the first sensor is covered above
             continue
         if not row.is_well:
             wrong[f"sensor {sensor.number}"] = f"Sensor {row.name}: {row.line.split(',')[0]}"
@@ -266,18 +264,18 @@ def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
 
 
 def _word(states: type[IntEnum], value: int) -> str:
-    """Return the word for a state; a newer bridge may have one that is not known here."""
+    """Return the name of a state, or "state N" for a value that only a newer bridge knows."""
     known = {int(state): state.name.lower().replace("_", " ") for state in states}
     return known.get(value, f"state {value}")
 
 
 def _figure(value: float, form: str = ".0f", unit: str = "") -> str:
-    """Return a value with its unit, thousands separated; a dash if it is not known."""
+    """Return the text of a value with its unit and thousands separators; a dash if it is not finite."""
     return _number(value, form, unit=unit)[0]
 
 
 def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
-    """Return a value with its unit, thousands separated, and its 2-sigma; a dash and nothing if unknown."""
+    """Return the texts of a value with its unit, and of its 2-sigma; a dash and "" if not finite."""
     apart = form.replace(".", ",.")
     text, doubt = (
         plain.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
