@@ -1,11 +1,11 @@
-"""The live form of a calibration: one table, so that a sample costs a few microseconds.
+"""Calibration compiled into one table, with which correcting a sample takes a few microseconds.
 
 Notes
 -----
-With regressors ``phi(x)`` (the monomials, and what effects add) the nine coefficients are
-``theta = phi^T W``, and their covariance is ``sum_mn phi_m phi_n C_mn``, a sum over the *products* of
-regressors. Many products coincide (``x^2 . x`` and ``x . x^2``): 28 remain of 55 for a cubic in two
-positions. So both are one sum over products ``psi``::
+The regressors ``phi(x)`` are the monomials of the positions and the regressors of effects. The nine
+coefficients (six of A, three of T) are ``theta = phi^T W``. Their covariance ``sum_mn phi_m phi_n C_mn`` is a
+sum over the *products* of regressors. Many products coincide (``x^2 . x`` and ``x . x^2``): 28 remain of 55
+for a cubic in two positions. One matrix times these products ``psi`` therefore gives both::
 
     (theta, covariance of theta) = table psi
 
@@ -35,50 +35,51 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.residual import PAIRS
 
 TABLE_SUMS = 81
-"""Sums that the table gives: A' and T (12), then the 69 combinations of their covariance."""
+"""Number of sums that the table gives: A' and T (12), then 69 combinations of their covariance."""
 MAX_REGRESSOR = 1e100
-"""Beyond, the product with the table would overflow, and the total field is useless."""
+"""Largest regressor, in its own unit: beyond it the product with the table would overflow."""
 
 Prepared = tuple[list[Any], list[list[Any]]]
-"""What :func:`apply` needs at one set of positions: A' row by row, then T (12 numbers); and for each of V's
+"""Input of :func:`apply` at one set of positions: A' row by row, then T (12 numbers), and for each of V's
 six entries Q (6), L (3) and O (1)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
+"""Total field, its sigma, the corrected vector x, y, z, and the sigmas of x, y, z; all nT."""
 Linear = tuple[float, float, float, float, float, float, float, float, float]
-"""A's entries xx, yy, zz, xy, xz, yz; T's x, y, z."""
+"""A's entries xx, yy, zz, xy, xz, yz; then T's x, y, z in nT."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """A calibration compiled to what :mod:`.correct` needs."""
+    """Calibration compiled into the arrays with which :mod:`.correct` corrects samples."""
 
     centre: tuple[float, ...]
     scale: tuple[float, ...]
-    """`centre`, `scale`: Of each parameter."""
+    """`centre`, `scale`: Of each parameter p, in its unit; scaled positions are ``(p - centre) / scale``."""
     field: float
     """Reference field F_0, nT."""
     parents: tuple[tuple[int, int], ...]
     """Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``."""
     weights: FloatArray
-    """(m, 9): W, with ``A`` itself (not ``a``) in the first six; the rows of monomials, then those of
-    effects."""
+    """(m, 9): matrix W. Columns: the six entries of ``A`` itself (not ``a``), then T in nT. Rows: the
+    monomials, then the regressors of effects."""
     first: IndexArray
     second: IndexArray
-    """`first`, `second`, (q,): Product q is ``phi[first[q]] * phi[second[q]]``; the first m products are the
-    regressors themselves."""
+    """`first`, `second`, (q,): Product q is ``phi[first[q]] * phi[second[q]]``. The first m products equal
+    the regressors, because the constant is one of their factors."""
     table: FloatArray
-    """(81, q): Share of each product in each sum."""
+    """(81, q): Factor of each product in each sum."""
 
     def sums(self, phi: FloatArray) -> FloatArray:
-        """Return ``table psi`` (81, n) of many samples' regressors (m, n)."""
+        """Return the 81 sums ``table psi`` of n samples, (81, n), from their regressors (m, n)."""
         return np.asarray(self.table @ (phi[self.first] * phi[self.second]))
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
-        """Return the same 81 sums for one sample's regressors; NaN where a regressor is too large.
+        """Return the 81 sums ``table psi`` of one sample; all NaN if a regressor exceeds MAX_REGRESSOR.
 
-        Products are rounded and then added one after the other: a matrix product would round in an order
-        that depends on the processor, and a replay on another computer must give the same bytes.
+        The function adds the rounded products in a fixed order, so that a replay on another computer gives
+        the same bytes. The order in which a matrix product rounds depends on the processor.
         """
-        # A product of regressors beyond this overflows; NaN is flagged further on.
+        # A product of larger regressors overflows; the caller flags a sample with NaN.
         if max(phi) > MAX_REGRESSOR or min(phi) < -MAX_REGRESSOR:
             return [nan] * TABLE_SUMS
         psi = np.fromiter([phi[i] * phi[j] for i, j in self.pairs], float, len(self.pairs))
@@ -87,31 +88,31 @@ class Kernel:
 
     @cached_property
     def products(self) -> FloatArray:
-        """(q, 81) `table` with a row for each product."""
+        """Transpose of `table`, (q, 81): one contiguous row for each product."""
         return np.ascontiguousarray(self.table.T)
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
-        """`first` and `second` as pairs of Python integers, by which lists are indexed fastest."""
+        """`first` and `second` as pairs of Python integers, which index lists fastest."""
         return list(zip(self.first.tolist(), self.second.tolist(), strict=True))
 
     @property
     def position_weights(self) -> FloatArray:
-        """(m, 9) rows of W that belong to the m monomials."""
+        """Rows of W that belong to the m monomials, (m, 9)."""
         return self.weights[: len(self.parents) + 1]
 
     @property
     def rate_weights(self) -> FloatArray:
-        """(m, 9) those rows in nT at F_0: times the monomials' rates, they give the nine coefficients'."""
+        """`position_weights` with A times F_0, (m, 9): they turn the monomials' rates into rates in nT/s."""
         return np.asarray(self.position_weights * np.array([self.field] * 6 + [1.0] * 3))
 
     def monomials(self, values: Sequence[Any], unit: Any) -> list[Any]:
-        """Return the monomials of positions (floats or arrays), each as its parent times one position.
+        """Return the m monomials of the scaled positions, each a float or an array as the `values` are.
 
-        `values` may hold more channels than there are positions: those of effects, which follow, are ignored.
-        `unit` is the constant monomial: 1.0 or an array of ones.
+        `values`: the positions in the parameters' units and order. Further values, the channels of effects,
+        are ignored. `unit`: the constant monomial, 1.0 or an array of ones.
         """
-        # strict=False: the channels of effects are left aside
+        # strict=False: the channels of effects follow the positions and are ignored
         x = [
             (value - centre) / scale
             for value, centre, scale in zip(values, self.centre, self.scale, strict=False)
@@ -123,12 +124,12 @@ class Kernel:
         return phi
 
     def monomials_of(self, positions: FloatArray) -> FloatArray:
-        """Return (m, n) monomials of (n, k) positions."""
+        """Return the monomials (m, n) of n samples' positions (n, k), given in the parameters' units."""
         return np.stack(self.monomials(list(positions.T), np.ones(len(positions))))
 
 
 def linear(phi: list[float], weights: list[Linear]) -> Linear:
-    """Return A's six entries and T: the sums of regressors times weights, in this order."""
+    """Return A's six entries, then T (nT): the sums of monomials times their weights."""
     xx = yy = zz = xy = xz = yz = tx = ty = tz = 0.0
     for value, (a, b, c, d, e, f, g, h, i) in zip(phi, weights):  # noqa: B905 - the weights of effects are left aside
         xx += value * a
@@ -144,9 +145,10 @@ def linear(phi: list[float], weights: list[Linear]) -> Linear:
 
 
 def prepare(t: list[Any]) -> Prepared:
-    """Turn the table's 81 sums at one set of positions into what :func:`apply` needs there.
+    """Return the input of :func:`apply` at one set of positions, computed from the table's 81 sums there.
 
-    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
+    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``. The sums contain the
+    covariances ``S_a'T`` (of the entries of A' with T) and ``S_TT`` (of T).
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = t[0:9]
     # G = S_a'T A'^T: covariance of the entries of A' with T, turned into body axes.
@@ -170,7 +172,11 @@ def prepare(t: list[Any]) -> Prepared:
 
 
 def variances(dx: Any, dy: Any, dz: Any, V: list[list[Any]]) -> list[Any]:
-    """Return V's entries xx, yy, zz, xy, xz, yz, nT^2: ``Q_ij . (d d^T) + L_ij . d + O_ij``."""
+    """Return the corrected vector's covariance V, entries xx, yy, zz, xy, xz, yz, nT^2.
+
+    ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij``. `dx`, `dy`, `dz`: ``d = H_r - T``, nT. `V`: from
+    :func:`prepare`.
+    """
     exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
     return [
         q0 * exx + q1 * eyy + q2 * ezz + q3 * exy + q4 * exz + q5 * eyz + l0 * dx + l1 * dy + l2 * dz + o
@@ -186,15 +192,15 @@ def apply(
     omega: tuple[float, ...] | None,
     root: Callable[[Any], Any] = sqrt,
 ) -> Numbers:
-    """Correct one sample (or arrays of them); return total, its sigma, the vector, and the vector's sigmas.
+    """Correct one sample (or arrays of samples); return total field, its sigma, the vector and its sigmas.
 
     `hx`, `hy`, `hz` (n,): nT, raw channels of the sensor. `prepared`: from :func:`prepare`, for the
     positions of the samples. `omega`: xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None
-    without a boresight. `root`: square root: of one number, or ``np.sqrt`` where the samples are arrays.
+    without a boresight. `root`: square root function, ``np.sqrt`` if the samples are arrays.
 
     Notes
     -----
-    The equations stand at the top of the module.
+    The notes of the module give the equations.
     """
     (xx, xy, xz, yx, yy, yz, zx, zy, zz, tx, ty, tz), V = prepared
     # d = H_r - T and b = A' d

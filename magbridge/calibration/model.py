@@ -1,4 +1,4 @@
-"""The model: what a strapdown magnetometer among moving masses reads, and how to invert it.
+"""Model of the readings of a strapdown magnetometer among moving masses, and its inverse.
 
 Notes
 -----
@@ -7,17 +7,17 @@ The instrument reads ``H_r = D(p) H + T(p)``. The corrected field is::
     H_c = A(p) (H_r - T(p)),   |H_c| = H_e = |IGRF| + anomaly             (paper, eqs. 3, 4 and 7)
 
 The paper is Claus & Bachmayer 2016, Field and Service Robotics, doi:10.1007/978-3-319-27702-8_6. Its eq. 2
-puts the rotation M where it drops out of the magnitude; with its eq. 3 the corrected vector is in the
-ellipsoid's own axes. We take ``A = M S^-1 M^T``, **symmetric**: the same ellipsoid, six numbers, and a vector
-that stays in sensor axes (:func:`to_paper`). Each of the nine coefficients is a polynomial in the positions
-scaled to the range seen, ``x = (p - centre) / scale``. All are kept in nT: ``A = I + a / F_0``, with F_0 the
-field at calibration.
+places the rotation M so that it drops out of the magnitude; with its eq. 3 the corrected vector is in the
+ellipsoid's own axes. This module uses a **symmetric** ``A = M S^-1 M^T``: it describes the same ellipsoid
+with six numbers, and the corrected vector stays in sensor axes (:func:`to_paper`). Each of the nine
+coefficients (six of A, three of T) is a polynomial in the positions, scaled to the calibrated range: ``x = (p
+- centre) / scale``. All nine are in nT: ``A = I + a / F_0``, with F_0 the field at calibration.
 
-Compiled into the table of its :class:`~magbridge.calibration.kernel.Kernel`, the nine coefficients become
-twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the covariance V of the corrected vector
-``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic in d, and the table holds the
-covariance in just the combinations that V needs: 36 for the quadratic part Q, 27 for ``S_a'T``, 6 for
-``S_TT`` (with the sensor's own noise, which acts like T's).
+The table of the :class:`~magbridge.calibration.kernel.Kernel` holds twelve coefficients in body axes: ``A' =
+R A`` (nine, R the boresight) and T. The corrected vector is ``b = A' d`` with ``d = H_r - T``, and its error
+``db = dA' d - A' dT``. So its covariance V is quadratic in d. The table holds the combinations of covariances
+that V needs: 36 for the quadratic part Q, 27 for ``S_a'T``, 6 for ``S_TT``. The sensor's noise, which acts
+like an error of T, is part of ``S_TT``.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ __all__ = [
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 """Index of ``A[i, k]`` among the nine coefficients."""
 LEVEL_STEP_SIGMA = 0.01
-"""Of its 1-sigma, by which the level is raised to see what that does."""
+"""Step of the corrected field's mean in :meth:`Calibration.at_level`, as a fraction of ``level_sigma``."""
 
 
 def compile_kernel(calibration: Calibration) -> Kernel:
-    """Compile `calibration`; see the module's notes."""
+    """Return the calibration in the form with which samples are corrected; the module's notes explain it."""
     P, exponents = coefficient_tensor(calibration)
     row = {exponent: i for i, exponent in enumerate(exponents)}
     P[:, :, :6] /= calibration.reference.field
@@ -74,9 +74,9 @@ def compile_kernel(calibration: Calibration) -> Kernel:
 def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Exponents]]:
     """Return the contribution of each coefficient to each regressor's nine slots, and the monomials.
 
-    Returns `tensor` (K, m, 9): nT at F_0, as :class:`~magbridge.calibration.terms.Expansion`; the regressors
-    are the monomials, then those of the effects. Returns `exponents`: The monomials in the kernel's order:
-    each follows from one before it.
+    Returns `tensor` (K, m, 9), nT at F_0: coefficient k times ``tensor[k, r]`` adds to the slots of regressor
+    r. The regressors are the monomials, then those of the effects. Returns `exponents`: the monomials in the
+    kernel's order, each after its parent.
     """
     expansions = [term.expand(calibration.parameters) for term in calibration.terms]
     exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
@@ -96,13 +96,13 @@ def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Expon
 
 
 def _parent(exponent: Exponents) -> tuple[Exponents, int]:
-    """Return the monomial that is lower by one power of one position, and the index of that position."""
+    """Return the parent monomial, lower by one power of its last position, and that position's index."""
     k = max(i for i, power in enumerate(exponent) if power)
     return (*exponent[:k], exponent[k] - 1, *exponent[k + 1 :]), k
 
 
 def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponents]:
-    """Return `exponents` and all their parents, by degree: each follows from one before it."""
+    """Return `exponents` and all their parents, by degree, so that each parent precedes its children."""
     todo = [*exponents, (0,) * len(calibration.parameters)]
     closed: set[Exponents] = set()
     while todo:
@@ -115,7 +115,7 @@ def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponen
 
 
 def _body_axes(calibration: Calibration) -> FloatArray:
-    """Return the matrix (9, 12) from A's six entries and T to the nine of ``R A``, row by row, and T."""
+    """Return the matrix (9, 12) that turns A's six entries and T into the nine entries of ``R A`` and T."""
     R = np.eye(3) if calibration.boresight is None else calibration.boresight.matrix()
     B = np.zeros((9, 12))
     for i in range(3):
@@ -129,7 +129,7 @@ def _body_axes(calibration: Calibration) -> FloatArray:
 def _table(
     P: FloatArray, W: FloatArray, calibration: Calibration, exponents: list[Exponents]
 ) -> tuple[IndexArray, IndexArray, FloatArray]:
-    """Return the two regressors of each product, (q,) and (q,), and each product's share of the 81 sums."""
+    """Return the indices of each product's two regressors, (q,) and (q,), and the table as (q, 81)."""
     m, B = len(W), _body_axes(calibration)
     flat = (P @ B).reshape(len(P), -1)
     C = (flat.T @ calibration.covariance @ flat).reshape(m, 12, m, 12)
@@ -148,7 +148,7 @@ def _table(
     table[:m, :12] = W @ B
     for q, pairs in enumerate(products.values()):
         S = np.sum([C[i, :, j] + (C[j, :, i] if i != j else 0.0) for i, j in pairs], axis=0)
-        if q == 0:  # the sensor's noise adds to the reading just as an error of T does
+        if q == 0:  # the sensor's noise adds to the reading as an error of T does
             S[9:, 9:] += calibration.noise.sensor**2 * np.eye(3)
         table[q, 12:] = _combinations(S)
     first, second = np.array([pairs[0] for pairs in products.values()]).T
@@ -156,7 +156,10 @@ def _table(
 
 
 def _combinations(S: FloatArray) -> FloatArray:
-    """Return (69,): Q (V's six entries by the six products of d), ``S_a'T`` (9 x 3), ``S_TT`` (6)."""
+    """Return the 69 numbers that the table keeps of the covariance S (12, 12) of A' and T.
+
+    They are Q (V's six entries by the six products of d), ``S_a'T`` (9 x 3) and ``S_TT`` (6).
+    """
     Q = [
         S[3 * i + k, 3 * j + l] + (S[3 * i + l, 3 * j + k] if k != l else 0.0)
         for i, j in PAIRS
@@ -166,15 +169,17 @@ def _combinations(S: FloatArray) -> FloatArray:
 
 
 class CalibratedSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which instrument was calibrated, and in which of its power cycles (None: unknown)."""
+    """Identity of the calibrated instrument, and its anti-alias filter."""
 
     name: str = ""
+    """Name of the instrument; empty: unknown."""
     power_cycle: int | None = None
+    """Number of the power cycle in which the data were recorded; None: unknown."""
     filter_cutoff: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
-    """Cutoff frequency of the anti-alias filter that correcting undoes, Hz; 0: none."""
+    """Cutoff frequency (Hz) of the anti-alias filter whose effect the correction inverts; 0: no filter."""
 
     def may_be(self, name: str) -> bool:
-        """Return True if this may be the sensor of that name; either may be unknown (empty)."""
+        """Return True if `name` equals the sensor's name, or one of the two names is empty (unknown)."""
         return "" in (self.name, name) or self.name == name
 
 
@@ -182,46 +187,49 @@ UNKNOWN = CalibratedSensor()
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Noise of the samples: 1-sigma of each channel (nT), of the reference (nT), autocorrelation.
+    """Noise of the samples: a white part, and an AR(1) part.
 
-    A share `white` of the variance is white; the rest has, with the next sample's, `interval` s later, this
-    `autocorrelation`: AR(1), of the memory ``-interval / log(autocorrelation)`` s.
+    The correlation time of the AR(1) part is ``-interval / log(autocorrelation)``, in s.
     """
 
     sensor: Annotated[float, Meta(ge=0.0, le=1e15)]
     reference: float = 0.0
+    """`sensor`, `reference`: 1-sigma of each channel of the sensor, and of the reference field, nT."""
     autocorrelation: float = 0.0
+    """Correlation between successive samples of the AR(1) part."""
     interval: float = 0.0
+    """Time between successive samples, s."""
     white: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    """White fraction of the variance."""
 
 
 class Reference(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the magnitude was compared with: F_0 (nT), which model, and the site bias found (nT).
-
-    `bias_sigma` is how well the reference's level was known, `level_sigma` how well that of the corrected
-    field is: the part of its sigma that is common to all samples.
-    """
+    """Reference field with which the fit compared the magnitude of the corrected field."""
 
     field: Annotated[float, Meta(gt=0.0)]
+    """F_0, the field at calibration, nT."""
     model: str = ""
+    """Name of the field model."""
     bias: float = 0.0
+    """Constant bias of the reference at the site, as the fit found it, nT."""
     bias_sigma: float = 0.0
+    """Prior 1-sigma of this bias, nT."""
     level_sigma: float = 0.0
+    """Part of the corrected field's sigma that is common to all samples, nT."""
 
 
 class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The rotation from corrected sensor axes to body axes that a scalar fit leaves free.
-
-    `rotation` is a rotation vector (rad), `covariance` that of a small further rotation in body
-    axes (rad²). `tilt_sigma` is the 1-sigma of roll and of pitch in the runs of which it was found (deg).
-    """
+    """Rotation from corrected sensor axes to body axes, which a fit to the magnitude cannot determine."""
 
     rotation: tuple[float, float, float]
+    """Rotation vector, rad."""
     covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    """Covariance of the error, a small further rotation in body axes, rad²."""
     tilt_sigma: float = DEFAULT_TILT_SIGMA_DEG
+    """1-sigma of roll and of pitch in the runs that determined the rotation, deg."""
 
     def matrix(self) -> FloatArray:
-        """Return (3, 3) rotation matrix: Rodrigues' formula."""
+        """Return the rotation matrix (3, 3), by Rodrigues' formula."""
         # R = I + sinc(a) K + (1 - cos a)/a^2 K^2; 1 - cos a = 2 sin^2(a/2), so that both factors stay
         # finite at a = 0
         x, y, z = self.rotation
@@ -234,21 +242,21 @@ class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
 
 MIN_HALF_RANGE = {"depth": 10.0, "sensor_temperature": 2.0}
 
-"""Conditions that a fit records, and the least half range of each, m and degC: a calibration at one depth, or
-at one temperature, holds for this much more."""
+"""Conditions whose range a fit records, and the smallest half range of each (m, degC). A calibration at one
+depth or temperature is valid within this half range of it."""
 
 
 class CalibratedRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The range of a condition in the data of a fit that does not model its effect: depth, temperature."""
+    """Range of depth or sensor temperature in the data of a fit that does not model this condition."""
 
     name: str
     """A key of :data:`MIN_HALF_RANGE`."""
     low: float
     high: float
-    """`low`, `high`: The range seen, m (above the surface: 0) or degC."""
+    """`low`, `high`: Range in the data; depth in m (0 above the surface), temperature in degC."""
 
     def excess(self, value: float) -> float:
-        """Return how far a value lies outside the range, in half ranges; 0 inside, or where it is NaN."""
+        """Return the distance of a value from the range, in half ranges; 0 if it lies inside or is NaN."""
         # in half ranges from the middle: 1 is the edge
         half = max(0.5 * (self.high - self.low), MIN_HALF_RANGE[self.name])
         distance = abs(value - 0.5 * (self.low + self.high)) / half
@@ -256,24 +264,28 @@ class CalibratedRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One calibration run: number of samples, RMS residual (nT in the sensor's own units), mean positions."""
+    """Summary of one calibration run."""
 
     label: str
     samples: int
+    """Number of samples."""
     rms: float
+    """RMS of the residual, nT as the sensor measures (before the scale factors of A)."""
     parameters: tuple[float, ...]
+    """Mean value of each parameter, in its unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration with its uncertainty. It is immutable: a fit returns a new one."""
+    """Calibration of a vector magnetometer with its uncertainty; immutable."""
 
     parameters: tuple[Parameter, ...]
     terms: tuple[PositionTerm, ...]
     coefficients: FloatArray
-    """(K,) of the terms, then the effects, nT (a dipole's displacement: m; an effect's: see its class)."""
+    """(K,): Coefficients of the terms, then of the effects. The unit is nT, or m for a dipole's displacement;
+    the class of an effect states the unit of its coefficients."""
     covariance: FloatArray
-    """(K, K)."""
+    """(K, K): Covariance of the coefficients."""
     noise: Noise
     reference: Reference
     effects: tuple[Effect, ...] = ()
@@ -281,20 +293,20 @@ class Calibration:
     boresight: Boresight | None = None
     runs: tuple[Run, ...] = ()
     method: str = ""
-    """Which fit made it; ``"none"`` marks every sample as uncalibrated."""
+    """Name of the fitting method; with ``"none"`` every sample is flagged as uncalibrated."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """File -> SHA-256 of the inputs."""
+    """SHA-256 of each input file, by the file's name."""
     software: str = ""
-    """Version that made it."""
+    """Version of magbridge that made the calibration."""
     warnings: tuple[str, ...] = ()
-    """Why the data that it was fitted to do not support it; empty where they do."""
+    """Reasons why the data do not support the calibration; empty if they support it."""
     level: tuple[float, ...] = ()
-    """How the first coefficients move together where the level of the reference is off by 1-sigma (nT); empty
-    where that was known."""
+    """Change of the first coefficients (nT) when the mean of the corrected field rises by the reference's
+    ``level_sigma``; empty if the reference was known exactly."""
     sensors: tuple[ScalarSensor, ...] = ()
     """Scalar magnetometers in addition to the vector sensor."""
     conditions: tuple[CalibratedRange, ...] = ()
-    """Ranges of depth and temperature in the data that it was fitted to."""
+    """Ranges of depth and temperature in the data of the fit."""
 
     def __post_init__(self) -> None:
         # every term checks its own settings; then the vector must have one number for each coefficient
@@ -322,7 +334,7 @@ class Calibration:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Telemetry that correcting needs, in order: the parameters, then the channels of effects."""
+        """Names of the telemetry channels for the correction: parameters, then channels of effects."""
         names = [parameter.name for parameter in self.parameters]
         for effect in self.effects:
             names += [name for name in effect.channels() if name not in names]
@@ -330,16 +342,16 @@ class Calibration:
 
     @property
     def units(self) -> dict[str, str]:
-        """Unit of each parameter."""
+        """Unit of each parameter, by the parameter's name."""
         return {parameter.name: parameter.unit for parameter in self.parameters}
 
     @cached_property
     def kernel(self) -> Kernel:
-        """The calibration compiled for correcting samples, made once."""
+        """Compiled form of the calibration, with which samples are corrected; compiled at first use."""
         return compile_kernel(self)
 
     def without_effects(self) -> Calibration:
-        """Return the position terms alone, with their part of coefficients and covariance."""
+        """Return the calibration with its position terms, their coefficients and covariance only."""
         # position terms come first in the vector, effects after them
         own = slice(sum(term.size for term in self.terms))
         return replace(
@@ -348,18 +360,19 @@ class Calibration:
         )  # fmt: skip
 
     def at_level(self) -> Calibration:
-        """Return the calibration with its level, and all that follows, :data:`LEVEL_STEP_SIGMA` 1-sigma up.
+        """Return the calibration with its coefficients moved by :data:`LEVEL_STEP_SIGMA` times `level`.
 
-        A whole one may move the offset by 100 nT across the field: the total field is not linear in that.
+        A whole 1-sigma may move the offset by 100 nT across the field, and the total field is not linear in
+        such a step.
         """
-        # the level moves the first coefficients together, along one direction
+        # a change of the constant bias moves the first coefficients together, along one direction
         moved = self.coefficients.copy()
         many = min(len(moved), len(self.level))
         moved[:many] += LEVEL_STEP_SIGMA * np.asarray(self.level[:many])
         return replace(self, coefficients=moved)
 
     def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``A`` and ``T`` of the position terms.
+        """Return ``A`` and ``T`` by the position terms, without effects, at n sets of positions.
 
         Parameters
         ----------
@@ -378,7 +391,10 @@ class Calibration:
 
 
 def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) -> Calibration:
-    """Return the calibration that changes nothing; every sample is flagged ``uncalibrated``."""
+    """Return a calibration that leaves readings unchanged and flags every sample ``uncalibrated``.
+
+    `field`: F_0, nT.
+    """
     return Calibration(
         parameters=parameters,
         terms=(Polynomial(exponents=((0,) * len(parameters),)),),
@@ -391,9 +407,9 @@ def identity(parameters: tuple[Parameter, ...] = (), field: float = 50_000.0) ->
 
 
 def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
-    """Return rotation M (3, 3) and scale S (3,), nT, of a symmetric positive ``A``; `field` is H_e, nT.
+    """Return the paper's rotation M (3, 3) and scales S (3,), nT, of a symmetric positive ``A`` (3, 3).
 
-    The axes are ordered and signed so that M is as near to I as possible.
+    `field`: H_e, nT. The function orders and signs the axes so that M is as near to I as possible.
     """
     values, axes = np.linalg.eigh(A)
     order = max(permutations(range(3)), key=lambda p: sum(abs(axes[i, k]) for i, k in enumerate(p)))
@@ -405,7 +421,7 @@ def to_paper(A: FloatArray, field: float) -> tuple[FloatArray, FloatArray]:
 
 
 def facts(calibration: Calibration) -> dict[str, Any]:
-    """Return M, S and T (nT) of the terms, at the middle of each parameter's range, as plain values."""
+    """Return M, S (nT) and T (nT) without effects, at the centre of each parameter, as values for JSON."""
     middle = {parameter.name: parameter.centre for parameter in calibration.parameters}
     A, T = calibration.matrices(np.array([[*middle.values()]]))
     M, S = to_paper(A[0], calibration.reference.field)

@@ -1,9 +1,9 @@
-"""What a calibration is made of: terms, each adding to the nine coefficients of ``A`` and ``T``.
+"""Terms of a calibration; each adds to the nine coefficients of ``A`` and ``T``.
 
-A *position term* is a polynomial in the scaled actuator positions (:class:`Polynomial`, and
-:class:`~magbridge.calibration.dipole.Dipole`, which expands into one). An *effect* is anything
-else that moves the reading, with a state of its own where it needs one: see
-:mod:`magbridge.calibration.effects`. Adding a term is one class and one row in :data:`TERMS`.
+A *position term* is a polynomial in the scaled actuator positions (:class:`Polynomial`), or expands into one
+(:class:`~magbridge.calibration.dipole.Dipole`). An *effect* depends on another quantity, such as a
+temperature, and may have a state (:mod:`magbridge.calibration.effects`). A new term needs one class and one
+row in :data:`TERMS`.
 """
 
 from __future__ import annotations
@@ -31,18 +31,20 @@ __all__ = [
 
 Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
-"""One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""
+"""Function that takes a sample's time (µs), raw channels x, y, z (nT) and telemetry values, and returns the
+regressors of an effect."""
 
 MAX_ORDER = 30
-"""Highest total degree: beyond, powers are noise."""
+"""Largest total degree of a monomial."""
 Power = Annotated[int, Meta(ge=1, le=MAX_ORDER)]
 Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
-"""A divisor, in any unit."""
+"""Positive divisor, in any unit."""
 Position = Annotated[float, Meta(ge=-1e12, le=1e12)]
-"""Position of a mass, or value of another parameter, in any unit."""
+"""Position of a mass, or the value of another parameter, in any unit."""
 
 SLOTS = ("a_xx", "a_yy", "a_zz", "a_xy", "a_xz", "a_yz", "t_x", "t_y", "t_z")
-"""The nine coefficients: six of the symmetric ``A`` (as ``a = (A - I) F_0``, nT) and three of ``T`` (nT)."""
+"""Names of the nine coefficients: six of the symmetric ``A`` (as ``a = (A - I) F_0``) and three of ``T``; all
+in nT."""
 
 TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
@@ -57,30 +59,31 @@ TERMS: dict[str, str] = {
     "rate": "magbridge.calibration.effects:RateEffect",
     "response": "magbridge.calibration.effects:ResponseEffect",
 }
-"""Name in ``cal.json`` -> ``module:class``; others join by the entry point group ``magbridge.terms``."""
+"""Class of each kind of term, as ``module:class``, by its name in ``cal.json``. Plugins add further kinds
+through the entry point group ``magbridge.terms``."""
 
 
 class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A telemetry channel that moves a mass."""
+    """Telemetry channel that reports the position of a mass, or another input of the position terms."""
 
     name: str
     unit: str
     """`name`, `unit`: As in the deployment's columns."""
     low: Position
     high: Position
-    """`low`, `high`: The range that the calibration has seen."""
+    """`low`, `high`: Range of the values in the calibration data, in `unit`."""
     centre: Position
     scale: Annotated[float, Meta(gt=0.0, le=1e12)]
-    """`centre`, `scale`: ``x = (p - centre) / scale``."""
+    """`centre`, `scale`: In `unit`; the scaled position of a value p is ``x = (p - centre) / scale``."""
 
 
 class Expansion(msgspec.Struct, frozen=True):
-    """A position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``."""
+    """Position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``."""
 
     exponents: tuple[Exponents, ...]
-    """m monomials; one exponent for each parameter."""
+    """The m monomials, each with one exponent for each parameter."""
     columns: FloatArray
-    """(K, m, 9): What one unit of coefficient k adds to the nine :data:`SLOTS`, nT."""
+    """(K, m, 9): Contribution of one unit of coefficient k, times monomial m, to :data:`SLOTS`, nT."""
 
 
 class _Interface(msgspec.StructMeta, ABCMeta):
@@ -88,45 +91,50 @@ class _Interface(msgspec.StructMeta, ABCMeta):
 
 
 class Term(msgspec.Struct, metaclass=_Interface, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a term; its coefficients stand in the calibration's vector."""
+    """Settings of a term; the coefficient vector of the calibration holds its coefficients."""
 
     kind: ClassVar[str]
+    """Name of the class in ``cal.json``."""
 
     @property
     @abstractmethod
     def size(self) -> int:
-        """Number of coefficients."""
+        """Number of coefficients of the term."""
 
     def check(self, parameters: tuple[str, ...]) -> None:
-        """Raise CalibrationError where the settings do not fit the calibration's parameters."""
+        """Raise CalibrationError if the settings do not fit the calibration's `parameters` (their names)."""
 
 
 class PositionTerm(Term, frozen=True, kw_only=True):
-    """A term that depends on the positions alone: a polynomial in them, or expanded into one."""
+    """Term that depends on the positions only, and is or expands into a polynomial in them."""
 
     @abstractmethod
     def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:
-        """Return the term as a polynomial in the positions as `parameters` scale them."""
+        """Return the term as a polynomial in the positions scaled by the centre and scale of `parameters`."""
 
 
 class Polynomial(PositionTerm, frozen=True, kw_only=True):
-    """Each of the nine coefficients a polynomial in the scaled positions (paper, eq. 8).
+    """Term in which each of the nine slots is a polynomial in the scaled positions (paper, eq. 8).
 
-    Coefficient ``9 m + s`` multiplies monomial m in slot s.
+    The term's coefficient ``9 m + s`` multiplies monomial m in slot s.
     """
 
     kind: ClassVar[str] = "polynomial"
     exponents: tuple[Exponents, ...]
-    """The monomials; the constant one first."""
+    """Exponents of the monomials, the constant first."""
 
     @property
     def size(self) -> int:
-        """Nine for each monomial."""
+        """Number of coefficients of the term, nine for each monomial."""
         return 9 * len(self.exponents)
 
     def check(self, parameters: tuple[str, ...]) -> None:
-        """Require one exponent for each parameter, a total degree of at most 30, and no monomial twice."""
-        # a high power of a position beyond its range grows without bounds
+        """Raise CalibrationError if `exponents` are unusable.
+
+        Each monomial needs one exponent for each parameter and a total degree of at most 30, and may occur
+        once.
+        """
+        # a high power of a position outside its range grows without bounds
         for exponent in self.exponents:
             if len(exponent) != len(parameters) or min(exponent, default=0) < 0 or sum(exponent) > MAX_ORDER:
                 raise CalibrationError(
@@ -137,74 +145,77 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
             raise CalibrationError("exponents: a monomial stands there twice")
 
     def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:  # noqa: ARG002  (a dipole needs them)
-        """Return the polynomial as itself."""
+        """Return the monomials with columns that map each coefficient to its own slot and monomial."""
         # coefficient 9 m + s adds 1 to slot s of monomial m
         m = len(self.exponents)
         return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
 
 
 class LogSeries(NamedTuple):
-    """A log of n samples, as the array form of an effect takes it."""
+    """Log of n samples, as the method ``batch`` of an effect reads it."""
 
     time: FloatArray
-    """(n,), s since 1970 UTC, ascending."""
+    """(n,): Time of the samples, s since 1970 UTC, ascending."""
     reading: FloatArray
-    """(n, 3), nT, the raw axes."""
+    """(n, 3): Raw reading of the sensor, nT, sensor axes."""
     values: Mapping[str, FloatArray]
-    """(n,) each: Telemetry by name, the parameters first; NaN where it is not known."""
+    """(n,) each: Telemetry by channel name, the parameters first; NaN where it is unknown."""
     kernel: Kernel
-    """That of the calibration."""
+    """Compiled form of the calibration."""
 
     @property
     def time_us(self) -> FloatArray:
-        """(n,) µs, rounded as those of single samples are."""
+        """Time of the samples, (n,), µs since 1970 UTC, rounded to integers as for single samples."""
         return np.rint(self.time * 1e6)
 
     def part(self, rows: slice, names: Sequence[str]) -> LogSeries:
-        """Return these rows, with the telemetry of these names."""
+        """Return the samples of `rows`, with the telemetry channels `names` only."""
         values = {name: self.values[name][rows] for name in names}
         return LogSeries(self.time[rows], self.reading[rows], values, self.kernel)
 
 
 class Effect(Term, frozen=True, kw_only=True):
-    """A term that depends on something other than the positions: a temperature, a current, time.
+    """Term that depends on a quantity other than the positions: a temperature, a current, time.
 
-    It turns every sample into a few *regressors* (in a unit of its own); `columns` says what each
-    coefficient does with them. Their physics has two forms: :meth:`begin` computes them sample
-    by sample, and every correction uses it, so live and from a log it has the same bits;
-    :meth:`batch` computes those of a whole log at once, for simulation, comparison or fit. A NaN in
-    its channel must not spoil its state: hold the last value.
-
-    `cause`: what a diagnosis has added it for, as in ``findings.json``; empty where a fit or a person has.
+    An effect computes *regressors* from each sample; :meth:`columns` states how each coefficient maps them to
+    the slots. There are two ways to compute them. Corrections, live or of a log, use the function that
+    :meth:`begin` returns, sample by sample, so that both give the same bits. Simulation, comparison and fits
+    use :meth:`batch`, which computes the regressors of a whole log at once. While its channel is NaN, an
+    effect must use the last known value.
     """
 
     remembers: ClassVar[bool] = True
-    """True if regressors depend on earlier samples, too: then those of some rows need the whole log."""
+    """True if regressors depend on earlier samples too, so that some rows of a log need the whole log."""
     cause: str = ""
+    """Cause, as named in ``findings.json``, for which a diagnosis added the effect; empty if another source
+    added it."""
 
     def channels(self) -> tuple[str, ...]:
-        """Return the names of the channels that it needs: parameters or other columns of a log."""
+        """Return the names of the telemetry channels that the effect needs: parameters or other columns."""
         return ()
 
     @abstractmethod
     def columns(self, field: float) -> FloatArray:
-        """Return the contribution of coefficient k to each slot by regressor r, (K, r, 9); `field` is F_0."""
+        """Return the contribution (K, r, 9) of each coefficient, times each regressor, to the nine slots.
+
+        `field`: F_0, nT.
+        """
 
     @abstractmethod
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper with a fresh state, as at power-on.
+        """Return a function that computes the regressors sample by sample, with its state as at power-on.
 
         Parameters
         ----------
         channels : tuple of str
-            Names of the values that it will be given with each sample: the parameters come first.
+            Names of the telemetry values of each sample; the parameters come first.
         kernel : Kernel
-            That of the calibration.
+            Compiled form of the calibration.
         """
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return (r, n) regressors of a whole log, from a fresh state: by default those of :meth:`begin`."""
-        # The stepper is the definition; effects with a faster array form override this method.
+        """Return the regressors (r, n) of a whole log, with the state at its start as at power-on."""
+        # The function of begin() defines the regressors; effects with a faster array form override batch().
         step = self.begin(tuple(series.values), series.kernel)
         values = np.reshape([*series.values.values()], (-1, len(series.time))).T.tolist()
         times = series.time_us.astype(np.int64).tolist()
@@ -213,7 +224,7 @@ class Effect(Term, frozen=True, kw_only=True):
 
 
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
-    """Return all monomials of total degree up to `order`, cross terms included, the constant first."""
+    """Return all monomials of a number of `parameters` up to total degree `order`, the constant first."""
     return tuple(
         # each choice of `degree` parameters, with repetition, is one monomial
         tuple(picks.count(k) for k in range(parameters))
@@ -223,11 +234,11 @@ def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
 
 
 def term_class(kind: str) -> type[Term]:
-    """Look a term's class up by its name in :data:`TERMS` or among the entry points.
+    """Return the class of a kind of term, from :data:`TERMS` or from a plugin's entry point.
 
-    CalibrationError: neither has that name.
+    CalibrationError: no such kind exists.
     """
-    # classes are imported only when a file names them
+    # a class is imported only when a file names it
     found: Any
     if kind in TERMS:
         module, _, name = TERMS[kind].partition(":")
