@@ -1,1 +1,1 @@
-"""The bridge on the MAVLink side: a component without port or clock."""
+"""MAVLink component of the bridge; its callers supply the received bytes and the time."""

@@ -1,4 +1,4 @@
-"""The bridge as a MAVLink component: its answers and its periodic messages."""
+"""MAVLink component of the bridge: replies to requests, and periodic messages."""
 
 from __future__ import annotations
 
@@ -33,23 +33,24 @@ from magbridge.mavlink.messages import is_signed
 __all__ = ["TIMESYNC_US", "Component"]
 
 FIRST_DIALECT_ID = 60100
-"""The first message id of our dialect: no other component of the vehicle has these messages."""
+"""First message id of the bridge's dialect; no other component of the vehicle has these messages."""
 CALIBRATES = {MAV_CMD.PREFLIGHT_CALIBRATION, *(one for one in MAV_CMD if "MAG_CAL" in one.name)}
 ABOUT_MESSAGES = MAV_CMD.REQUEST_MESSAGE, MAV_CMD.SET_MESSAGE_INTERVAL, MAV_CMD.GET_MESSAGE_INTERVAL
 MAX_COMMAND_RATE = 100
-"""Commands of one sender that are executed within a second; more are rejected for the time being."""
+"""Most commands of one sender that are executed within a second; further commands are rejected
+temporarily."""
 SENDERS = 64
-"""Senders that are counted; in a second with more of them, the others count as one."""
+"""Most senders whose commands are counted separately within a second; all other senders share one count."""
 AUTOPILOT_VERSION, MESSAGE_INTERVAL = spec("AUTOPILOT_VERSION").id, spec("MESSAGE_INTERVAL").id
 
 
 class Commands:
-    """Answer COMMAND_LONG and COMMAND_INT.
+    """Handler of COMMAND_LONG and COMMAND_INT.
 
-    A command to component 0 is for any component that can execute it. The bridge then executes only what
-    concerns messages of its own dialect and never refuses, because a ground station would take the refusal
-    for the autopilot's. Calibration of the autopilot's own compass (DO_START_MAG_CAL and the like) is the
-    autopilot's business; a request to the bridge itself gets a STATUSTEXT on how ours is calibrated.
+    A command to component 0 is for any component that can execute it. Of these commands, the bridge executes
+    only those about messages of its own dialect. It ignores the rest, because a ground station would take a
+    rejection for the autopilot's. The bridge does not execute compass calibration (DO_START_MAG_CAL and
+    similar), but explains in a STATUSTEXT how its magnetometer is calibrated.
     """
 
     def __init__(self, component: Component) -> None:
@@ -101,7 +102,7 @@ class Commands:
         )
 
     def _is_flood(self, system: int, component: int) -> bool:
-        """Count a command; return whether its sender has sent too many within a second."""
+        """Count a command; return True if its sender has sent more than `MAX_COMMAND_RATE` in this second."""
         now_us = self._outbox.codec.now_us
         if now_us - self._second_us >= 1_000_000:
             self._second_us, self._asked = now_us, {}
@@ -178,13 +179,13 @@ CAPABILITIES = (
 
 
 class Reports:
-    """Send HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the description of the component.
+    """Sender of HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the messages that describe the component.
 
-    `version`: of the program, ``"0.1.0"``.
-    `condition`: returns the fields of MAG_STATUS that the link cannot know itself.
-    `speaking`: returns True if readings come from the sensor.
-    `calibration_id`: CRC-32 of the calibration's file; 0 is none.
-    `more`: functions that send the messages with the rate of MAG_STATUS.
+    `version`: version of the program, such as ``"0.1.0"``.
+    `condition`: returns the fields of MAG_STATUS that other parts of the bridge supply.
+    `speaking`: returns True if the sensor delivers readings.
+    `calibration_id`: CRC-32 of the calibration file; 0 without a calibration.
+    `more`: functions that are called after each MAG_STATUS, to send further messages at its rate.
     """
 
     def __init__(
@@ -201,12 +202,12 @@ class Reports:
         self.more: list[Callable[[], object]] = []
 
     def heartbeat(self) -> bool:
-        """Send HEARTBEAT: active while readings come from the sensor, else critical; return True."""
+        """Send HEARTBEAT, with state ACTIVE if the sensor delivers readings, else CRITICAL; return True."""
         self._outbox.put(HEARTBEAT_SPEC, ALIVE if self._speaking() else CRITICAL)
         return True
 
     def status(self) -> bool:
-        """Send MAG_STATUS and the messages of the same rate; return True."""
+        """Send MAG_STATUS, then the messages of `more`; return True."""
         codec, vehicle = self._component.codec, self._component.vehicle
         clock = vehicle.clock
         self._outbox.send(
@@ -265,7 +266,7 @@ class Reports:
 
     @property
     def sample_rate(self) -> float:
-        """Recent rate of the samples, Hz; NaN while unknown."""
+        """Recent rate of the sensor's samples, Hz; NaN while unknown."""
         rate: float = self._condition().get("sample_rate", nan)
         return rate
 
@@ -278,29 +279,32 @@ TIMESYNC = spec("TIMESYNC")
 SETUP_SIGNING = spec("SETUP_SIGNING").id.to_bytes(3, "little")
 TIMESYNC_US = 1_000_000
 MOST_REQUESTS = 64
-"""Requests for files that are kept while no station collects them."""
+"""Most requests for files that wait for the bridge; a further request displaces the oldest."""
 FILE_REQUESTS = ("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
 
 
 class Component:
-    """One MAVLink component, without port or clock: the same events give the same bytes.
+    """MAVLink component of the bridge, without port or clock: equal events give equal bytes.
 
-    `link`: ``[link]``: who we are, and whom we listen to.
-    `publish`: ``[publish]``: rates in Hz; a message that is not named is off.
-    `tunables`: what can be tuned besides the messages' rates.
-    `start_us`: event time of the start, in µs; a multiple of 4.
-    `calibration_id`: CRC-32 of the calibration's file; 0 is none.
-    `version`: of the program, ``"0.1.0"``.
-    `kept`: parameters that a station changed in an earlier run.
-    `status`: returns the fields of MAG_STATUS that the component cannot know itself (samples, log, sensor).
-    `speaking`: returns True if readings come from the sensor; else the heartbeat's state is critical.
+    `link`: section ``[link]``: ids of the vehicle, the bridge and the autopilot.
+    `publish`: section ``[publish]``: rates in Hz; a message without rate has the rate in `DEFAULT_RATES_HZ`,
+        or is off.
+    `tunables`: parameters in addition to the messages' rates.
+    `start_us`: event time of the start, in µs since 1970 UTC; a multiple of 4.
+    `signing`: keys of signed frames; None if the link is not signed.
+    `calibration_id`: CRC-32 of the calibration file; 0 without a calibration.
+    `version`: version of the program, such as ``"0.1.0"``.
+    `kept`: values of the parameters that a station changed in an earlier run, by name.
+    `status`: returns the fields of MAG_STATUS on the samples, the log and the sensor.
+    `speaking`: returns True if the sensor delivers readings; else the heartbeat's state is CRITICAL.
+    `streams`: needed rates of telemetry, see :func:`needed_rates`.
     `outbox`: messages to send.
-    `received`: everything that came, as frames for the log; the bridge empties it.
+    `received`: all received bytes as frames for the log; the bridge empties the list.
     `genuine`: the signed frames of the last :meth:`receive` that were accepted.
-    `file_requests`: requests for files; the bridge takes them out.
-    `metadata`: the files that describe the parameters, by path.
+    `file_requests`: requests for files; the bridge takes them out and replies.
+    `metadata`: contents of the files that describe the parameters, by path.
     `authority`, `parameters`, `parameter_service`, `message_rates`, `announcer`, `vehicle`, `publisher`,
-    `reports`: the services.
+    `reports`: services of the component.
     """
 
     def __init__(
@@ -357,7 +361,7 @@ class Component:
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
     def _open_handlers(self) -> dict[int, Callable[[Message], None]]:
-        """Return the handler of each message that is a request, an answer or a heartbeat."""
+        """Return the handlers of requests, replies and heartbeats, by message id."""
         service, command = self.parameter_service, self._if_ours(Commands(self).handle)
         return by_id(
             PARAM_REQUEST_LIST=self._if_ours(service.list),
@@ -372,7 +376,7 @@ class Component:
 
     @property
     def peer(self) -> tuple[int, int]:
-        """System and component of the autopilot."""
+        """System id and component id of the autopilot."""
         return self._link.system, self._link.autopilot
 
     def use_calibration(self, calibration_id: int) -> None:
@@ -380,7 +384,7 @@ class Component:
         self.publisher.calibration_id = self.reports.calibration_id = calibration_id
 
     def another_publisher(self, sensor_id: int, calibration_id: int) -> Publisher:
-        """Return the sender of another sensor's samples: MAG_RAW and MAG_FIELD with its id."""
+        """Return a publisher of a further sensor's samples, as MAG_RAW and MAG_FIELD with `sensor_id`."""
         rates = {name: self.message_rates.another(name) for name in ("MAG_RAW", "MAG_FIELD")}
         return Publisher(self.outbox, rates, calibration_id, sensor_id=sensor_id)
 
@@ -396,9 +400,9 @@ class Component:
         self.codec.now_us = t_us
 
     def receive(self, data: bytes, t_us: int) -> list[Message]:
-        """Process bytes from the link; return the messages that are telemetry of our vehicle.
+        """Process bytes received at `t_us` (µs); return the messages that are telemetry of our vehicle.
 
-        Requests are answered into the outbox. :meth:`advance` has been called for `t_us` before.
+        Replies to requests go to the outbox. The caller has called :meth:`advance` for `t_us` before.
         """
         self.codec.now_us = t_us
         ours = []
@@ -422,7 +426,7 @@ class Component:
         return ours
 
     def _report_refusals(self, message: Message) -> None:
-        """Announce each reason why frames are rejected once. Otherwise their sender would seem absent."""
+        """Send one STATUSTEXT for each reason why frames are rejected, since their sender seems absent."""
         if message.frame[7:10] == SETUP_SIGNING:
             text = f"key from {message.system}:{message.component} not taken: keys come from a file"
             self.announcer.state("key", text, MAV_SEVERITY.WARNING)
@@ -437,7 +441,10 @@ class Component:
         self._refusals_reported = len(refusals)
 
     def _report_clock(self) -> None:
-        """Report that the bridge's clock is days behind the autopilot's, which refuses its frames."""
+        """Send a STATUSTEXT if the bridge's clock is a day or more behind the autopilot's.
+
+        The bridge's signatures then follow the autopilot's time, because the autopilot rejects older ones.
+        """
         if self.codec.signing is not None and (days := self.codec.signing.followed_days) >= 1.0:
             text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
             self.announcer.state("signing clock", text, MAV_SEVERITY.WARNING)
@@ -459,7 +466,10 @@ class Component:
             self.parameter_service.greet((message.system, message.component))
 
     def _if_to_us_alone(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
-        """Return the handler of a service that the autopilot also offers: files and logs."""
+        """Return a handler that ignores messages whose target is not exactly this component.
+
+        The autopilot serves files and logs too, so a broadcast request for them is not for the bridge.
+        """
         us = self._link.system, self._link.component
         return lambda message: (
             handler(message) if (message["target_system"], message["target_component"]) == us else None

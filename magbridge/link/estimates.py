@@ -1,7 +1,7 @@
-"""Position fixes and headings in the messages and sentences that receivers read, by each receiver's source.
+"""Messages and NMEA sentences with position fixes and headings, in the form that each receiver expects.
 
-A comment at each field names what a receiver does with it, and the source file: ArduPilot's of
-December 2025 (headings: 856c2a1), PX4's of August 2026 (headings: bb59c63).
+Docstrings state how a receiver uses a field, and name its source file: ArduPilot's of December 2025
+(headings: 856c2a1), PX4's of August 2026 (headings: bb59c63).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ __all__ = [
 ]  # fmt: skip
 
 IGNORED_VARIANCE: Final = 1e4
-"""Variance of position, m², and of roll and pitch, rad², in a message of which the autopilot shall only use
-the yaw."""
+"""Variance of position (m²), roll and pitch (rad²) in a message of which the autopilot shall use only the
+yaw."""
 FULL_QUALITY: Final = 100
-"""ODOMETRY.quality, %."""
+"""Value of ODOMETRY.quality, %."""
 
 
 class Attitude(NamedTuple):
-    """Attitude of the vehicle at one time, with the heading that follows from the corrected field."""
+    """Attitude of the vehicle at one time, with the heading computed from the corrected field."""
 
     magnetic: float
     """Heading clockwise from magnetic north, deg; NaN where unknown."""
@@ -44,19 +44,19 @@ class Attitude(NamedTuple):
     """Declination, deg, east positive; NaN where unknown."""
     roll: float
     pitch: float
-    """`roll`, `pitch`: rad, by the autopilot."""
+    """`roll`, `pitch`: Angles from the autopilot, rad."""
     rates: tuple[float, float, float]
-    """Angular velocity about the body axes, rad/s, by the autopilot."""
+    """Angular velocity about the body axes, from the autopilot, rad/s."""
     tilt_sigma: float
     """Standard deviation of roll and of pitch, rad."""
 
 
 NO_ATTITUDE: Final = Attitude(nan, nan, inf, nan, nan, nan, (nan, nan, nan), inf)
-"""The attitude where the heading is unknown."""
+"""Attitude with an unknown heading."""
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return w, x, y, z of the rotation from body to north-east-down by three angles, rad (3-2-1)."""
+    """Return the quaternion w, x, y, z from body to north-east-down of Euler angles (3-2-1), rad."""
     sr, cr = sin(0.5 * roll), cos(0.5 * roll)
     sp, cp = sin(0.5 * pitch), cos(0.5 * pitch)
     sy, cy = sin(0.5 * yaw), cos(0.5 * yaw)
@@ -69,7 +69,7 @@ def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, flo
 
 
 def send_attitude(outbox: Outbox, attitude: Attitude, time_us: int) -> None:
-    """Send ATTITUDE_QUATERNION_COV; its covariance is that of roll, pitch and heading, rad²."""
+    """Send ATTITUDE_QUATERNION_COV with `attitude` and the covariance of roll, pitch and heading (rad²)."""
     tilt, turn = attitude.tilt_sigma**2, radians(attitude.sigma) ** 2
     roll_rate, pitch_rate, yaw_rate = attitude.rates
     outbox.send(
@@ -84,14 +84,14 @@ def send_attitude(outbox: Outbox, attitude: Attitude, time_us: int) -> None:
 
 
 def _pose(attitude: Attitude, stack: int) -> tuple[tuple[float, float, float], list[float]]:
-    """Return the position and the pose covariance with which an autopilot reads the heading's sigma.
+    """Return position and pose covariance from which the autopilot `stack` derives the heading's sigma.
 
     Notes
     -----
     ArduPilot (``GCS_Common.cpp``) computes ``cbrt(c15^2 + c18^2 + c20^2)`` and uses it as the standard
-    deviation in rad: sigma^1.5 as the only variance gives sigma. It needs a finite position, and does not use
-    the position unless ``EK3_SRCn_POSXY`` is 6. PX4 (``mavlink_receiver.cpp``) reads the variance in
-    entry 20, and takes a position that is NaN as none.
+    deviation in rad. So sigma^1.5 as the only variance gives sigma. It needs a finite position, and does not
+    use the position unless ``EK3_SRCn_POSXY`` is 6. PX4 (``mavlink_receiver.cpp``) reads the variance in
+    entry 20, and ignores a position of NaN.
     """
     sigma = radians(attitude.sigma)
     covariance = [0.0] * 21  # the upper triangle of x y z roll pitch yaw, row by row
@@ -109,7 +109,8 @@ def _pose(attitude: Attitude, stack: int) -> tuple[tuple[float, float, float], l
 def _odometry(outbox: Outbox, attitude: Attitude, time_us: int, stack: int) -> None:
     """Send the heading as ODOMETRY.
 
-    ArduPilot takes the frame LOCAL_FRD only; PX4 takes a yaw as from true north in LOCAL_NED only.
+    ArduPilot accepts only the frame LOCAL_FRD. PX4 interprets the yaw as relative to true north only in
+    LOCAL_NED.
     """
     position, covariance = _pose(attitude, stack)
     frame = MAV_FRAME.LOCAL_NED if stack == MAV_AUTOPILOT.PX4 else MAV_FRAME.LOCAL_FRD
@@ -126,7 +127,7 @@ def _send_odometry(
     covariance: list[float],
     resets: int = 0,
 ) -> None:
-    """Send an ODOMETRY without velocities: position (m), quaternion, and the pose's covariance."""
+    """Send ODOMETRY with position (m), quaternion `turn` and pose covariance, but without velocities."""
     x, y, z = position
     outbox.send(
         "ODOMETRY",
@@ -160,15 +161,15 @@ HEADING_SENDERS: Final[dict[str, Callable[[Outbox, Attitude, int, int], None]]] 
     "odometry": _odometry,
     "vision_position_estimate": _vision_position,
 }
-"""What ``[heading] send`` may name, and the function that sends the heading to an autopilot."""
+"""Values of ``[heading] send``, each with the function that sends the heading in that message."""
 
 
 def nmea_sentences(attitude: Attitude, utc_us: int) -> bytes:
     """Return the NMEA 0183 sentences HDG, HDT and PASHR of one attitude.
 
-    HDT and PASHR are left out where the declination is unknown.
+    HDT and PASHR are omitted if the declination is unknown.
 
-    `attitude`: with a known magnetic heading.
+    `attitude`: its magnetic heading must be known.
     `utc_us`: time of the attitude, µs since 1970 UTC.
     """
     variation = ","
@@ -191,77 +192,77 @@ def nmea_sentences(attitude: Attitude, utc_us: int) -> bytes:
 
 
 def _wrapped(angle: float, decimals: int) -> str:
-    """Return an angle (deg) as text below 360, also after rounding."""
+    """Return an angle (deg) as text, rounded to `decimals` and wrapped to at least 0 and less than 360."""
     return f"{round(angle, decimals) % 360.0:.{decimals}f}"
 
 
 SENSOR_ID = 1
-"""GLOBAL_POSITION_SENSOR.id; PX4 takes the one that ``EKF2_AGPn_ID`` names, and 0 is off."""
+"""Value of GLOBAL_POSITION_SENSOR.id; PX4 uses the messages whose id is ``EKF2_AGPn_ID`` (0: none)."""
 LATITUDE_LONGITUDE_ONLY = 0
-"""GLOBAL_POSITION_SENSOR.flags"""
+"""Value of GLOBAL_POSITION_SENSOR.flags: only latitude and longitude are valid."""
 OTHERS_VARIANCE = 1.0
-"""Variances of height (m²) and attitude (rad²) in an ODOMETRY; both are the autopilot's own."""
+"""Variance of height (m²) and attitude (rad²) in ODOMETRY, both of which come from the autopilot itself."""
 WALK = 1e-3
-"""(m/s)²/s: how fast the wind, or the velocity error, of an autopilot's filter is taken to walk."""
+"""Assumed random-walk density of the wind, or of the velocity error, in an autopilot's filter, (m/s)²/s."""
 
 
 class Pose(NamedTuple):
-    """Content of ODOMETRY in addition to the position, from the vehicle's telemetry."""
+    """Pose of the vehicle in the autopilot's local frame, for ODOMETRY."""
 
     north: float
     east: float
     down: float
-    """`north`, `east`, `down`: m, from the origin of the autopilot's local frame."""
+    """`north`, `east`, `down`: Position from the origin of the autopilot's local frame, m."""
     attitude: tuple[float, float, float, float]
     """Quaternion w, x, y, z from body to north-east-down."""
 
 
 class Fix(msgspec.Struct, frozen=True, gc=False):
-    """A position at the moment of sending, with its covariance."""
+    """Estimate of the vehicle's position at the time of sending, with its covariance."""
 
     time_us: int
-    """µs since 1970 UTC at which it holds: that of sending."""
+    """Time of the position and of sending, µs since 1970 UTC."""
     latitude: float
     longitude: float
-    """`latitude`, `longitude`: deg."""
+    """`latitude`, `longitude`: Position, deg."""
     covariance_nn: float
     covariance_ne: float
     covariance_ee: float
-    """`covariance_nn`, `covariance_ne`, `covariance_ee`: m²."""
+    """`covariance_nn`, `covariance_ne`, `covariance_ee`: Covariance of north and east, m²."""
     altitude: float = nan
-    """m above the sea; NaN where not known."""
+    """Altitude above mean sea level, m; NaN if unknown."""
     pose: Pose | None = None
-    """Where the message is in a local frame."""
+    """Pose in the autopilot's local frame; None unless the message needs it."""
     resets: int = 0
-    """How often the estimate has jumped."""
+    """Number of jumps of the estimate so far."""
 
     @property
     def sigma(self) -> float:
-        """1-sigma (m) on each axis of the circle with the area of the ellipse.
+        """Standard deviation per axis, m: the root of the mean variance of north and east.
 
-        Receivers know only circles. That of the worse axis would claim less than is known, by up to a third.
+        Receivers accept only one standard deviation for both axes.
         """
         return sqrt(0.5 * (self.covariance_nn + self.covariance_ee))
 
 
 def widened(fix: Fix, seconds: float) -> Fix:
-    """Return a fix that a filter may fuse as independent, `seconds` after the previous one.
+    """Return `fix` with its covariance inflated, for a filter that assumes independent errors.
+
+    `seconds`: time since the previous fix, s.
 
     Notes
     -----
-    The errors of successive fixes are correlated, but an autopilot's filter takes them for independent and
-    would soon claim to know the position better than the fixes do. Fixes of variance R, every dt, are to it
-    white noise of the density N = R dt. A filter whose velocity (or wind) walks with the density q (`WALK`),
-    fed with that, comes to the variance
+    The errors of successive fixes are correlated, but an autopilot's filter assumes that they are
+    independent. Its variance would soon be smaller than the variance of the fixes. For the filter, fixes of
+    variance R every dt are white noise of the density N = R dt. If the filter's velocity (or wind) is a
+    random walk of the density q (`WALK`), its position variance converges to
 
         P = √2 q^(1/4) N^(3/4)
 
     (steady state of the Riccati equation of a doubly integrated white noise). R is chosen so that P is the
-    fix's own variance σ²: R = (σ²/√2)^(4/3) q^(-1/3) / dt, and never less than σ². Seen from the filter, that
-    is an inflation by about the root of rate times correlation time, where the filter's own memory,
-    (N/q)^(1/4), a minute or two, is the shorter of the two times. P depends on q only by its fourth root: the
-    wind of ArduPilot walks with 5e-4 (``EK3_WIND_P_NSE``), PX4's with 2.5e-3 (``EKF2_WIND_NSD``), a velocity
-    from accelerometers with 1e-3.
+    fix's own variance σ²: R = (σ²/√2)^(4/3) q^(-1/3) / dt, and never less than σ². P depends on q only by its
+    fourth root. ArduPilot uses 5e-4 for the wind (``EK3_WIND_P_NSE``), PX4 2.5e-3 (``EKF2_WIND_NSD``); a
+    velocity from accelerometers has 1e-3.
     """
     variance = fix.sigma**2
     density = (variance / 2.0**0.5) ** (4.0 / 3.0) * WALK ** (-1.0 / 3.0)
@@ -275,17 +276,17 @@ def widened(fix: Fix, seconds: float) -> Fix:
 
 
 def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
-    """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE: the autopilot sets its position and answers.
+    """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE, with which the autopilot resets its position to the fix.
 
-    ArduPilot (``AP_NavEKF3_PosVelFusion.cpp``, setLatLng) moves it on by its own velocity over the age, which
-    is 0 here; PX4 (``EKF2.cpp``) insists that the age is a number.
+    ArduPilot (``AP_NavEKF3_PosVelFusion.cpp``, setLatLng) extrapolates the position by its velocity over the
+    age of the fix, which is 0 here. PX4 (``EKF2.cpp``) rejects an age of NaN.
     """
     outbox.send(
         "COMMAND_INT",
         command=MAV_CMD.EXTERNAL_POSITION_ESTIMATE,
         frame=MAV_FRAME.GLOBAL,
-        param1=fix.time_us * 1e-6 % 1e5,  # s, of our clock; a float holds no more
-        param2=0.0,  # s, age
+        param1=fix.time_us * 1e-6 % 1e5,  # time of the bridge's clock, s; modulo, to fit a float32
+        param2=0.0,  # age, s
         param3=fix.sigma,
         param4=nan,
         x=round(fix.latitude * 1e7),
@@ -299,8 +300,8 @@ def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> 
 def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
     """Send GLOBAL_POSITION_SENSOR, which PX4 fuses as an auxiliary position.
 
-    PX4 (``mavlink_receiver.cpp``, ``aux_global_position_control.cpp``) takes its arrival as its time, and a
-    sigma that is not a number as 1 m.
+    PX4 (``mavlink_receiver.cpp``, ``aux_global_position_control.cpp``) uses the time of arrival as the time
+    of the position, and replaces a sigma of NaN by 1 m.
     """
     outbox.send(
         "GLOBAL_POSITION_SENSOR",
@@ -321,11 +322,11 @@ def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> No
 
 
 def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # noqa: ARG001 - it has no target
-    """Send ODOMETRY in the autopilot's local frame, which is north-east-down in spite of its name.
+    """Send ODOMETRY in the frame LOCAL_FRD, whose axes are north-east-down in ArduPilot in spite of the name.
 
-    ArduPilot (``GCS_Common.cpp``, handle_odometry) takes these two frames only, needs the whole pose, and
-    computes ``cbrt(c0² + c6² + c11²)`` and ``cbrt(c15² + c18² + c20²)`` from the covariance: a number that is
-    none there is an internal error. It drops a velocity that is none.
+    ArduPilot (``GCS_Common.cpp``, handle_odometry) accepts only LOCAL_FRD with BODY_FRD, and needs the whole
+    pose. It computes ``cbrt(c0² + c6² + c11²)`` and ``cbrt(c15² + c18² + c20²)`` from the covariance, where a
+    NaN causes an internal error. It ignores a velocity of NaN.
     """
     assert fix.pose is not None
     north, east, down, attitude = fix.pose
@@ -338,25 +339,25 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
 
 
 class Kind(NamedTuple):
-    """Message of a fix, and how its receiver uses it."""
+    """Properties of one message type that can carry a position fix."""
 
     send: Callable[[Outbox, Fix, int, int], Any]
-    """Sends a :class:`Fix` to a system and component."""
+    """Function that sends a :class:`Fix` to a system id and component id."""
     rate: float
-    """Hz by default; 0 is with every update."""
+    """Default rate, Hz; 0 sends every update."""
     refused_by: dict[int, str]
-    """Autopilots that cannot use it, and what to set instead."""
+    """Autopilots (MAV_AUTOPILOT) that cannot use the message, each with an error text and the alternative."""
     fused: bool
-    """The receiver fuses it with its own position; else it puts its position there."""
+    """True if the receiver fuses the fix with its position, False if it resets its position to the fix."""
     local: bool = False
-    """It holds a :class:`Pose`."""
+    """True if the message contains a :class:`Pose`."""
     trusted_to: float = inf
-    """Sigma that ArduPilot uses instead of any larger one, m."""
+    """Largest standard deviation (m) that ArduPilot applies; it limits larger values to this one."""
     least: float = 0.0
-    """Hz below which the receiver takes the source for dead."""
+    """Rate (Hz) below which the receiver assumes that the source has failed."""
 
     def overrated(self, fix: Fix) -> bool:
-        """Return True if ArduPilot would state a smaller error than such fixes have at this rate."""
+        """Return True if ArduPilot would limit the inflated sigma of `fix` to a smaller value."""
         if self.trusted_to == inf:
             return False
         return widened(fix, 1.0 / max(self.rate, self.least)).sigma > self.trusted_to
@@ -373,7 +374,7 @@ FIX_MESSAGES: dict[str, Kind] = {
     "ODOMETRY": Kind(
         odometry,
         5.0,
-        # EKF2's EV position learns our offset as a bias, and drops messages 0.25 s late (ev_control.cpp)
+        # EKF2 takes the offset of an EV position for a bias, and drops messages 0.25 s late (ev_control.cpp)
         {MAV_AUTOPILOT.PX4: "PX4 makes a bias of ODOMETRY: use GLOBAL_POSITION_SENSOR"},
         fused=True,
         local=True,
@@ -381,4 +382,4 @@ FIX_MESSAGES: dict[str, Kind] = {
         least=4.0,  # AP_VisualOdom_Backend.cpp: unhealthy 300 ms after the last
     ),
 }
-"""What ``[navigation] fix`` may name."""
+"""Messages that ``[navigation] fix`` may name."""

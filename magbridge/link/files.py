@@ -1,8 +1,8 @@
-"""Files that a station may read and cannot write: metadata of the parameters, and logs.
+"""Read-only files for ground stations: metadata of the parameters, and logs.
 
-By MAVLink FTP (MAVLink guide, 'File Transfer Protocol') and, for logs, by LOG_REQUEST_*: requests in, replies
-out, without port and clock. A station asks for COMPONENT_METADATA, reads the general file that it names, and
-from there the file of the parameters (MAVLink guide, 'Component Metadata Protocol').
+Stations read files by MAVLink FTP (MAVLink guide, 'File Transfer Protocol'), and logs also by LOG_REQUEST_*.
+To find the metadata, a station requests COMPONENT_METADATA and reads the general file that this message
+names; the general file names the file of the parameters (MAVLink guide, 'Component Metadata Protocol').
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ __all__ = ["GENERAL", "FtpServer", "LogTransfer", "Tree", "crc32", "metadata_fil
 
 GENERAL, PARAMETERS = "/general.json", "/parameter.json"
 PARAMETER_TYPE = 1
-"""COMP_METADATA_TYPE_PARAMETER"""
+"""Value of COMP_METADATA_TYPE_PARAMETER."""
 GROUPS = {"publish": "Rates", "align": "Alignment", "telemetry": "Telemetry", "metadata_files": "Files"}
-"""By the first part of a parameter's key."""
+"""Group of parameters in a ground station, by the first part of the parameter's key."""
 MOST_PLACES = 7
 
 
 def crc32(data: bytes, initial: int = 0) -> int:
-    """Return the CRC-32 of MAVLink FTP: that of zlib without the inversions at begin and end."""
+    """Return the CRC-32 of MAVLink FTP, which is zlib's without the inversions of start value and result."""
     return zlib.crc32(data, initial ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def uri(component: int, path: str) -> str:
-    """Return the URI of a file of `component`."""
+    """Return the MAVLink FTP URI of the file at `path` on `component`."""
     return f"mftp://[;comp={component}]{path}"
 
 
 def metadata_files(parameters: Iterable[Tunable], component: int) -> Mapping[str, bytes]:
-    """Return the general file and that of the parameters, by path."""
+    """Return the contents of the general metadata file and of the parameter metadata file, by path."""
     rows = msgspec.json.encode({"version": 1, "parameters": [describe(row) for row in parameters]})
     kinds = [{"type": PARAMETER_TYPE, "uri": uri(component, PARAMETERS), "fileCrc": crc32(rows)}]
     general = msgspec.json.encode({"version": 1, "metadataTypes": kinds})
@@ -56,7 +56,7 @@ def metadata_files(parameters: Iterable[Tunable], component: int) -> Mapping[str
 
 
 def describe(row: Tunable) -> dict[str, object]:
-    """Return the metadata of one parameter by the schema of MAVLink."""
+    """Return the metadata of one parameter according to MAVLink's JSON schema for parameters."""
     smallest = min((abs(value) for value in (row.default, row.low) if value), default=1.0)
     return {
         "name": row.name,
@@ -76,23 +76,23 @@ def describe(row: Tunable) -> dict[str, object]:
 
 
 LOG = re.compile(r"(\d{8}T\d{6})Z_\d{4,}\.tlog")
-"""Names that the bridge gives its logs: its key or configuration may lie in the same folder."""
+"""Names of the bridge's logs; other files of the folder, such as a key, are not served."""
 LOGS = ("@MAV_LOG", "logs")
-"""The folder of the logs, as the MAVLink guide calls it and as people do."""
+"""Names of the log folder: the name in the MAVLink guide, and a readable alias."""
 
 
 class Entry(NamedTuple):
-    """A name in a folder, and its size in bytes; None is a folder."""
+    """Entry of a folder: its name, and its size in bytes, which is None for a folder."""
 
     name: str
     size: int | None
 
 
 class Tree:
-    """A read-only tree.
+    """Read-only tree of the files that stations can read.
 
-    `texts`: files of the root, ``/name``.
-    `logs`: the folder of the logs.
+    `texts`: contents of the files in the root folder, by path ``/name``.
+    `logs`: the folder of the logs on disk; None if logs are not served.
     """
 
     def __init__(self, texts: Mapping[str, bytes], logs: Path | None) -> None:
@@ -100,7 +100,7 @@ class Tree:
         self._logs = logs
 
     def entries(self, path: str) -> list[Entry]:
-        """Return the entries of a folder, in order; raises OSError if it does not exist."""
+        """Return the entries of a folder, in a fixed order; raise OSError if the folder does not exist."""
         match parts(path):
             case []:
                 texts = [Entry(name, len(text)) for name, text in self._texts.items()]
@@ -110,7 +110,7 @@ class Tree:
         raise FileNotFoundError(errno.ENOENT, path)
 
     def open(self, path: str) -> tuple[BinaryIO, int]:
-        """Return a file and its size in bytes; raises OSError where there is none."""
+        """Return the opened file at `path` and its size in bytes; raise OSError if it does not exist."""
         match parts(path):
             case [name] if name in self._texts:
                 return BytesIO(self._texts[name]), len(self._texts[name])
@@ -120,7 +120,7 @@ class Tree:
         raise FileNotFoundError(errno.ENOENT, path)
 
     def logs(self) -> list[Entry]:
-        """Return the logs, oldest first."""
+        """Return the entries of the log folder, oldest log first."""
         if self._logs is None or not self._logs.is_dir():
             return []
         with os.scandir(self._logs) as found:
@@ -133,7 +133,7 @@ class Tree:
 
 
 def parts(path: str) -> list[str]:
-    """Return the names along a path; raise OSError if it leads upward."""
+    """Return the names of folders and file in a path; raise OSError if the path contains ``..`` or NUL."""
     names = [name for name in path.split("/") if name not in ("", ".")]
     if ".." in names or "\0" in path:
         raise PermissionError(errno.EACCES, path)
@@ -141,7 +141,7 @@ def parts(path: str) -> list[str]:
 
 
 def began_s(name: str) -> int:
-    """Return the start of a log's run by the log's name, s since 1970."""
+    """Return the start time in the name of a log, s since 1970 UTC; 0 if the name is not a log's."""
     found = LOG.fullmatch(name)
     return int(datetime.strptime(found[1], "%Y%m%dT%H%M%S").replace(tzinfo=UTC).timestamp()) if found else 0
 
@@ -153,9 +153,9 @@ LAST_LOG_ID = 0xFFFF
 
 
 class LogTransfer:
-    """List logs and send their data.
+    """Replies to LOG_REQUEST_LIST and LOG_REQUEST_DATA.
 
-    Logs are numbered from 1, the oldest, as they were when they were last listed.
+    Log 1 is the oldest. The numbers are those of the last listing, even if logs were added since.
     """
 
     def __init__(self, tree: Tree) -> None:
@@ -163,7 +163,7 @@ class LogTransfer:
         self._logs: list[Entry] = []
 
     def entries(self, start: int, end: int) -> Iterator[tuple[Spec, bytes]]:
-        """Yield the LOG_ENTRY of each log from `start` to `end`; one with no logs where there are none."""
+        """Yield the LOG_ENTRY of each log from number `start` to `end`; without logs, one empty LOG_ENTRY."""
         with suppress(OSError):
             self._logs = self._tree.logs()[-LAST_LOG_ID:]
         count = len(self._logs)
@@ -175,9 +175,10 @@ class LogTransfer:
                 yield LOG_ENTRY, LOG_ENTRY.payload(**fields, time_utc=began_s(one.name))
 
     def data(self, number: int, offset: int, count: int) -> Iterator[tuple[Spec, bytes]]:
-        """Yield LOG_DATA from `offset` of a log; one that is not full, perhaps empty, ends the log.
+        """Yield the LOG_DATA messages with `count` bytes from `offset` of the log `number`.
 
-        An empty one is also the answer where there is no such log, or it cannot be read.
+        A message that is not full, perhaps empty, marks the end of the log. If the log does not exist or
+        cannot be read, yield one empty message.
         """
         if not self._logs:
             with suppress(OSError):
@@ -205,23 +206,23 @@ class LogTransfer:
 
 
 FTP_HEADER = Struct("<HBBBBBxI")
-"""Sequence, session, opcode, size, opcode replied to, whether the burst is complete, offset."""
+"""Layout of an FTP header: sequence, session, opcode, size, requested opcode, burst complete, offset."""
 DATA = 239
-"""Most bytes of data in a message."""
+"""Most bytes of file data in one FTP message."""
 SESSIONS, EACH = 16, 8
-"""Most files open at once, and most of one station."""
+"""Most files open at once in total, and of one station."""
 SESSION_TIMEOUT_S = 10.0
-"""s after its last request at which a session may be closed, when another is wanted."""
+"""Time since its last request after which a session may be closed to open another, s."""
 BURST = 256
-"""Most messages of a burst; the station then asks for the next."""
+"""Most messages of a burst; the station then requests the next burst."""
 FTP_BLOCK_BYTES = 1 << 20
 
 Sender = tuple[int, int]
-"""System and component."""
+"""System id and component id of a station."""
 
 
 class Opcode(IntEnum):
-    """Operation of a request, or the result in a reply."""
+    """Operation of an FTP request, or ACK or NAK in a reply."""
 
     NONE = 0
     TERMINATE = 1
@@ -236,11 +237,11 @@ class Opcode(IntEnum):
 
 
 WRITES = range(6, 14)
-"""Create, write, remove, make a folder, truncate, rename ..."""
+"""Opcodes of requests that would change files or folders; the server rejects them."""
 
 
 class Error(IntEnum):
-    """Reason why a request was refused."""
+    """Reason why an FTP request was rejected, as numbered by MAVLink."""
 
     FAIL_ERRNO = 2
     INVALID_SIZE = 3
@@ -253,7 +254,7 @@ class Error(IntEnum):
 
 
 class Refused(Exception):
-    """A refused request."""
+    """Rejection of an FTP request; `data` is the payload of the NAK."""
 
     def __init__(self, error: Error, number: int = 0) -> None:
         self.data = bytes((error, number & 0xFF)) if error is Error.FAIL_ERRNO else bytes((error,))
@@ -261,7 +262,7 @@ class Refused(Exception):
 
 
 class Request(NamedTuple):
-    """A parsed request."""
+    """Parsed FTP request."""
 
     sequence: int
     session: int
@@ -272,20 +273,20 @@ class Request(NamedTuple):
 
     @classmethod
     def from_payload(cls, payload: bytes) -> Request:
-        """Parse the payload of a FILE_TRANSFER_PROTOCOL."""
+        """Parse the payload of a FILE_TRANSFER_PROTOCOL message."""
         sequence, session, opcode, size, _, _, offset = FTP_HEADER.unpack_from(payload)
         return cls(sequence, session, opcode, size, offset, payload[FTP_HEADER.size : FTP_HEADER.size + DATA])
 
     @property
     def path(self) -> str:
-        """The path in its data."""
+        """Path of the file or folder, as the data of the request state it."""
         return self.data[: self.size].partition(b"\0")[0].decode("utf-8", "replace")
 
     def reply(
         self, opcode: Opcode, data: bytes = b"", *, later: int = 1, session: int | None = None,
         offset: int | None = None, complete: bool = False,
     ) -> bytes:  # fmt: skip
-        """Return the payload of a reply, the `later`-th to this request."""
+        """Return the payload of the reply number `later` (from 1) to this request."""
         header = FTP_HEADER.pack(
             (self.sequence + later) & 0xFFFF, self.session if session is None else session, opcode, len(data),
             self.opcode, complete, self.offset if offset is None else offset,
@@ -295,21 +296,22 @@ class Request(NamedTuple):
 
 @dataclass
 class Session:
-    """A file that a station has open, and when it was last used, s."""
+    """File that a station has open, and the time of its last use, s of the server's clock."""
 
     file: BinaryIO
     used: float
 
     def read(self, offset: int, size: int) -> bytes:
-        """Return bytes of the file; none beyond its end."""
+        """Return up to `size` bytes from `offset`; empty beyond the end of the file."""
         self.file.seek(offset)
         return self.file.read(size)
 
 
 class FtpServer:
-    """Answer the requests of all stations.
+    """MAVLink FTP server for all stations.
 
-    `now`: a clock in s, for sessions that are no longer used.
+    `tree`: the files that stations can read.
+    `now_s`: returns the time in s, with which the server finds unused sessions.
     """
 
     def __init__(self, tree: Tree, now_s: Callable[[], float]) -> None:
@@ -318,9 +320,9 @@ class FtpServer:
         self._last: dict[Sender, tuple[Request, bytes]] = {}
 
     def handle(self, sender: Sender, payload: bytes) -> Iterator[bytes]:
-        """Yield the payloads of the replies to a request: one, or a burst, read as it is taken.
+        """Yield the payloads of the replies to a request: one reply, or the replies of a burst.
 
-        A request that comes again, because its reply was lost, gets the same reply again and does nothing.
+        A repeated request gets the stored reply and is not executed again, because its reply may be lost.
         """
         request = Request.from_payload(payload)
         before, reply = self._last.get(sender, (None, b""))
@@ -346,13 +348,13 @@ class FtpServer:
 
     @staticmethod
     def refusal(reply: bytes) -> str:
-        """Return the reason of a refusal as text; empty for a grant and at the end of a file."""
+        """Return the reason of a NAK as text; empty for an ACK and for the end of a file."""
         if reply[3] != Opcode.NAK or reply[FTP_HEADER.size] == Error.END_OF_FILE:
             return ""
         return Error(reply[FTP_HEADER.size]).name.lower().replace("_", " ")
 
     def close(self) -> None:
-        """Close all files."""
+        """Close all open files."""
         for key in list(self._sessions):
             self._close(key)
 
@@ -414,7 +416,7 @@ class FtpServer:
         return request.reply(Opcode.ACK, total.to_bytes(4, "little"))
 
     def _burst(self, sender: Sender, request: Request) -> Iterator[bytes]:
-        """Yield the messages of a burst; it ends when its session does."""
+        """Yield the payloads of a burst of file data; the burst ends early if its session is closed."""
         self._check(request)
         session, size = self._session(sender, request), request.size or DATA
         block = session.read(request.offset, BURST * size)
@@ -447,7 +449,10 @@ class FtpServer:
         return session
 
     def _free(self, sender: Sender, wanted: int) -> int:
-        """Return the number of a new session, `wanted` if it is free; close the oldest if necessary."""
+        """Return a free session number of `sender`, preferably `wanted`; close an unused session if needed.
+
+        Refused: too many sessions are open, and each was used within `SESSION_TIMEOUT_S`.
+        """
         own = [key for key in self._sessions if key[0] == sender]
         crowd = own if len(own) >= EACH else list(self._sessions) if len(self._sessions) >= SESSIONS else []
         if crowd:

@@ -1,4 +1,4 @@
-"""Sending: the queue of frames, timers, rates and announcements.
+"""Queue of frames to send, timers, rate limits and STATUSTEXT messages.
 
 All times are event times in µs since 1970 UTC, so that a replay sends the same frames at the same times.
 """
@@ -15,22 +15,22 @@ from magbridge.mavlink.enums import MAV_SEVERITY
 __all__ = ["FOREVER", "Announcer", "Outbox", "Rate", "Timers", "period_us"]
 
 FOREVER = 1 << 62
-"""Deadline where no timer is set, µs."""
+"""Deadline if no timer is set, µs."""
 MAX_PERIOD_US = 1e15
-"""Longest period, µs (31 years): a lower rate has this one."""
+"""Longest period of a message, µs (31 years); a rate with a longer period gets this period."""
 STATUSTEXT_LENGTH = 50
 """Characters in one STATUSTEXT (definition of the message, common.xml)."""
 TEXTS_KEPT = 32
-"""Texts that are kept for stderr."""
+"""Most STATUSTEXTs that are stored for printing to stderr."""
 ANNOUNCEMENT_INTERVAL_US = 1_000_000
-"""µs between two announcements of a state that changes quickly; the latest is always announced."""
+"""Shortest time between two STATUSTEXTs on one state, µs; a change within it is sent when it ends."""
 
 
 class Outbox:
-    """Pack and queue the messages of the services; the bridge drains the queue.
+    """Queue of packed frames that the bridge shall send.
 
-    `codec`: its ``now_us`` is the event time that the next frame gets.
-    `frames`: event time in µs, frame; in the order in which to send.
+    `codec`: packs the messages; its ``now_us`` is the event time of the next frame.
+    `frames`: event time (µs) and bytes of each frame, in the order of sending.
     """
 
     def __init__(self, codec: Codec) -> None:
@@ -38,26 +38,26 @@ class Outbox:
         self.frames: list[tuple[int, bytes]] = []
 
     def send(self, _name: str, **fields: Any) -> None:
-        """Pack a message by name; a field that is not given is zero."""
+        """Pack a message by name and queue it; fields that are not given are zero."""
         self.frames.append((self.codec.now_us, self.codec.pack(_name, **fields)))
 
     def put(self, layout: Spec, payload: bytes) -> None:
-        """Send a packed payload (``layout.struct.pack(...)``): the fastest way."""
+        """Queue a message by its payload, packed with ``layout.struct.pack(...)``; faster than `send`."""
         self.frames.append((self.codec.now_us, self.codec.frame(layout, payload)))
 
     def drain(self) -> list[tuple[int, bytes]]:
-        """Return and clear the frames."""
+        """Return the queued frames and empty the queue."""
         frames, self.frames = self.frames, []
         return frames
 
 
 class Timers:
-    """Call the actions that are due, in the order of their deadlines.
+    """Named timers, which call their actions in the order of the deadlines.
 
-    The result depends only on the times given to :meth:`advance`, not on when it is called: a replay, which
-    calls it at other moments, fires the same timers at the same times.
+    Timers fire at their deadlines in event time, however often :meth:`advance` is called. A replay therefore
+    fires the same timers at the same event times.
 
-    `next_deadline`: µs at which the next timer fires; `FOREVER` where none is set.
+    `next_deadline`: event time (µs) at which the next timer fires; `FOREVER` if no timer is set.
     """
 
     def __init__(self) -> None:
@@ -67,27 +67,27 @@ class Timers:
         self.next_deadline = FOREVER
 
     def every(self, name: str, period_us: int, action: Callable[[int], object], first_us: int) -> None:
-        """Call ``action(deadline)`` at `first_us` and every `period_us` (a multiple of 4) from there."""
+        """Call ``action(deadline)`` at `first_us` and then every `period_us` (rounded down to 4 µs)."""
         self._set(name, first_us, max(period_us & ~3, 4), action)
 
     def run_once(self, name: str, time_us: int, action: Callable[[int], object]) -> None:
-        """Call ``action(time_us)`` once."""
+        """Call ``action(time_us)`` once, at `time_us`."""
         self._set(name, time_us, 0, action)
 
     def cancel(self, name: str) -> None:
-        """Remove a timer, if there is one."""
+        """Remove the timer `name`, if it exists."""
         self._deadlines.pop(name, None)
         if name == self._next:
             self._find_next()
 
     def delay(self, name: str, delay_us: int) -> None:
-        """Fire a timer, if there is one, later by `delay_us` (a multiple of 4)."""
+        """Delay the timer `name`, if it exists, by `delay_us`, rounded down to a multiple of 4."""
         if name in self._deadlines:
             self._deadlines[name] += delay_us & ~3
             self._find_next()
 
     def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
-        """Fire all timers that are due up to `t_us`, with ``begin(deadline)`` before each."""
+        """Fire all timers that are due up to `t_us` (µs); call ``begin(deadline)`` before each action."""
         while self.next_deadline <= t_us:
             name, deadline = self._next, self.next_deadline
             period, action = self._actions[name]
@@ -105,20 +105,20 @@ class Timers:
             self._find_next()
 
     def _find_next(self) -> None:
-        """Find the next timer; with equal deadlines, the one that was set first."""
+        """Find the next timer and its deadline; of equal deadlines, the timer that was set first is next."""
         self._next = min(self._deadlines, key=self._deadlines.__getitem__, default="")
         self.next_deadline = self._deadlines.get(self._next, FOREVER)
 
 
 def period_us(hertz: float) -> int:
-    """Return the µs between two messages at a rate above 0, which may be as low as 1e-300 Hz."""
+    """Return the period (µs) of a rate above 0, at most `MAX_PERIOD_US`."""
     return round(min(1e6 / hertz, MAX_PERIOD_US))
 
 
 class Rate:
-    """Thin a stream of samples to a rate, in event time and without drift.
+    """Rate limit of a stream of samples, in event time and without drift of the phase.
 
-    `hertz`: 1/s; 0 passes every sample, a negative rate none.
+    `hertz`: rate in Hz; 0 passes every sample, a negative rate passes none.
     """
 
     __slots__ = ("_next_us", "_period_us", "hertz")
@@ -127,17 +127,17 @@ class Rate:
         self.set(hertz)
 
     def set(self, hertz: float) -> None:
-        """Change the rate; the next sample is sent."""
+        """Change the rate to `hertz`; if it is positive, the next sample passes."""
         self.hertz = hertz
         self._period_us = period_us(hertz) if hertz > 0 else 0
         self._next_us = 0
 
     def due(self, t_us: int) -> bool:
-        """Return whether the sample at `t_us` is sent.
+        """Return True if the sample at `t_us` (µs) shall be sent.
 
-        Slots differ by one period, and a sample may be early by a quarter of a period, so that a stream with
-        jitter at exactly this rate passes completely. After a pause, or a step far back in time, the slots
-        start again at the sample.
+        Send times differ by one period, and a sample may be early by a quarter of a period. So a stream with
+        this rate passes completely in spite of jitter. After a pause of a period, or a step back by more than
+        two periods, the send times restart at the sample.
         """
         if self.hertz <= 0:
             return self.hertz == 0
@@ -153,9 +153,9 @@ class Rate:
 
 
 class Announcer:
-    """Send STATUSTEXT; the text of a state only if the state has changed.
+    """Sender of STATUSTEXT messages, which sends the text of a state only if the state has changed.
 
-    `texts`: the last texts sent; another thread may take them out and print them.
+    `texts`: severity and text of the latest messages; another thread may take them out and print them.
     """
 
     def __init__(self, outbox: Outbox, timers: Timers) -> None:
@@ -165,7 +165,7 @@ class Announcer:
         self._chunked_texts = 0
 
     def send_statustext(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        """Send `text`, in chunks where it is long; a character outside ASCII becomes a question mark."""
+        """Send `text`, in chunks of 50 bytes if it is longer; non-ASCII characters become question marks."""
         self.texts.append((severity, text))
         data = text.encode("ascii", "replace")
         chunks = [data[i : i + STATUSTEXT_LENGTH] for i in range(0, len(data), STATUSTEXT_LENGTH)]
@@ -183,15 +183,16 @@ class Announcer:
             )
 
     def forget(self, key: str) -> None:
-        """Forget the last announced state of `key`, so that the next one is announced."""
+        """Delete the last announced state of `key`, so that :meth:`state` announces the next state."""
         self._announced.pop(key, None)
 
     def state(
         self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, recurring: bool = False
     ) -> None:
-        """Announce that the state of `key` is now `text`, unless that was announced last.
+        """Send `text` as the new state of `key`, unless the last text sent for `key` was equal.
 
-        A `recurring` event is announced again, but not within `ANNOUNCEMENT_INTERVAL_US`.
+        If `recurring`, send an equal text again after `ANNOUNCEMENT_INTERVAL_US`. Send a text that changes
+        within this interval when the interval ends.
         """
         now_us = self._outbox.codec.now_us
         last_text, last_us = self._announced.get(key, ("", now_us - ANNOUNCEMENT_INTERVAL_US))

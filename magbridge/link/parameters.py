@@ -1,4 +1,4 @@
-"""What can be tuned over the link and by whom: rates and settings, and the parameter protocol."""
+"""Parameters that can be changed over the link, the senders that may change them, and MAVLink's protocol."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_COMPONENTS = 64
-"""Components whose kind is remembered."""
+"""Most components whose MAV_TYPE is stored; a further one displaces the oldest."""
 
 
 class Authority:
-    """Allow the autopilot and ground stations, and no other component, to change parameters and rates.
+    """Access rights: only the autopilot and ground stations may change parameters and rates.
 
-    A station is a sender with a heartbeat of that type. A sender of another system without a heartbeat is
-    taken for one, because small programs send none; another component of our own vehicle is not.
+    A ground station is a component with a HEARTBEAT of type GCS. A component of another system without a
+    heartbeat also counts as a station, because small programs send none. A component of our own vehicle
+    without a heartbeat does not.
 
-    `system`, `autopilot`: of our own vehicle.
+    `system`, `autopilot`: system id and autopilot's component id of our own vehicle.
     """
 
     def __init__(self, system: int, autopilot: int) -> None:
@@ -36,7 +37,7 @@ class Authority:
         self._kinds: dict[tuple[int, int], int] = {}
 
     def heartbeat(self, message: Message) -> bool:
-        """Record the type of a component; return True for a ground station."""
+        """Store the MAV_TYPE of the sender of a HEARTBEAT; return True for a ground station."""
         kind: int = message["type"]
         self._kinds.pop((message.system, message.component), None)
         self._kinds[message.system, message.component] = kind
@@ -45,7 +46,7 @@ class Authority:
         return kind == MAV_TYPE.GCS
 
     def may_change(self, message: Message) -> bool:
-        """Return True if its sender may change the bridge's settings."""
+        """Return True if the sender of `message` may change the bridge's settings."""
         who = message.system, message.component
         ours = message.system == self._system
         kind = self._kinds.get(who, None if ours else MAV_TYPE.GCS)
@@ -53,23 +54,23 @@ class Authority:
 
 
 class Tunable(msgspec.Struct, frozen=True):
-    """One parameter."""
+    """Definition of one parameter that can be changed over the link."""
 
     name: str
-    """On the link, at most 16 characters."""
+    """Name on the link, at most 16 characters."""
     key: str
-    """In the configuration."""
+    """Dotted key in the configuration."""
     default: float
     low: float
     high: float
-    """`default`, `low`, `high`: In `unit`; `low` and `high` are the limits, themselves allowed."""
+    """`default`, `low`, `high`: Default, smallest and largest value, in `unit`."""
     unit: str
     doc: str
-    """One line."""
+    """Description in one line."""
 
 
 def alignment(align: Align) -> list[Tunable]:
-    """Return the tunables of ``[align]``."""
+    """Return the parameters of the section ``[align]``."""
     earths = "the Earth's field about the main field"
     rows = (
         ("MB_FILT_DELAY", "filter_delay", 0, 60, "s", "delay of the anti-alias filter"),
@@ -87,13 +88,13 @@ def alignment(align: Align) -> list[Tunable]:
 
 
 def file_rate() -> list[Tunable]:
-    """Return the tunable for the rate at which files are sent."""
+    """Return the parameter for the rate at which files are sent, as a list of one."""
     doc = "at which files are sent to stations; 0 sends none"
     return [Tunable("MB_FILE_RATE", "files.rate", 250.0, 0, 10_000, "kB/s", doc)]
 
 
 def learning(enabled: bool) -> list[Tunable]:
-    """Return the tunables of ``[learning]``."""
+    """Return the parameters of the section ``[learning]``; `enabled` is the default of MB_LEARN."""
     rows = (
         ("MB_LEARN", "enabled", float(enabled), 1, "whether the calibration is learned in flight"),
         ("MB_LEARN_FREEZE", "freeze", 0.0, 1, "1: compare and raise alarms, but learn nothing"),
@@ -105,7 +106,7 @@ def learning(enabled: bool) -> list[Tunable]:
 
 
 def telemetry_ages(telemetry: Mapping[str, Telemetry]) -> list[Tunable]:
-    """Return one tunable for the ``max_age`` of each telemetry parameter."""
+    """Return one parameter for the ``max_age`` of each telemetry value."""
     rows: dict[str, Tunable] = {}
     for number, (name, what) in enumerate(telemetry.items()):
         short = f"MB_AGE_{name.upper()}"[:16]
@@ -123,7 +124,7 @@ def rate_name(message: str) -> str:
 
 
 def rates(defaults: Mapping[str, float], limits: Mapping[str, tuple[float, float]]) -> list[Tunable]:
-    """Return one tunable for the rate of each message of `limits`; one without a default is off."""
+    """Return one parameter for the rate (Hz) of each message in `limits`; without a default, it is off."""
     doc = "rate of {}; 0 with every sample, -1 off"
     return [
         Tunable(rate_name(of), f"publish.{of}", defaults.get(of, -1.0), low, high, "Hz", doc.format(of))
@@ -132,18 +133,18 @@ def rates(defaults: Mapping[str, float], limits: Mapping[str, tuple[float, float
 
 
 def real32(value: float) -> float:
-    """Return `value` rounded to float32, as a message carries it."""
+    """Return `value` rounded to float32, the type of a parameter in a message."""
     return float(unpack("<f", pack("<f", value))[0])
 
 
 class Parameters:
-    """The values of a table of tunables.
+    """Current values of the parameters.
 
-    A value that was never set is exactly the default, not rounded to float32, so that an untuned bridge
-    computes with the configuration's own numbers.
+    A value equal to the default is not rounded to float32, so that a bridge with unchanged parameters uses
+    exactly the numbers of the configuration.
 
-    `table`: by name, in order: the order gives the index on the link.
-    `revision`: grows with every change.
+    `table`: the definitions by name, in the order of the parameters' index on the link.
+    `revision`: number of changes so far.
     """
 
     def __init__(self, table: Iterable[Tunable]) -> None:
@@ -158,19 +159,19 @@ class Parameters:
         return self._values[name]
 
     def value_of(self, key: str) -> float:
-        """Return the value that the configuration calls `key`."""
+        """Return the value of the parameter with the configuration key `key`."""
         return self._values[self._names_of[key]]
 
     def changed(self) -> dict[str, float]:
-        """Return the values that differ from the defaults, by name; these are stored."""
+        """Return the values that differ from their defaults, by name; the bridge stores these values."""
         return {name: value for name, value in self._values.items() if value != self.table[name].default}
 
     def watch(self, watcher: Callable[[str], None]) -> None:
-        """Call ``watcher(name)`` at every later change, so that the value takes effect."""
+        """Register a function that is called with a parameter's name after every change of its value."""
         self._watchers.append(watcher)
 
     def set(self, name: str, value: float) -> bool:
-        """Set a value; return False and change nothing if it is not finite or out of range."""
+        """Set a value and return True; return False and change nothing if it is NaN or out of range."""
         row = self.table[name]
         if not isfinite(value) or abs(value) > 1e38:
             return False
@@ -186,24 +187,24 @@ class Parameters:
         return True
 
     def restore(self, values: Mapping[str, float]) -> list[str]:
-        """Set the stored values of an earlier run; return names that no longer exist or fit."""
+        """Set the values stored by an earlier run; return names that are unknown or have invalid values."""
         return [name for name, value in values.items() if name not in self.table or not self.set(name, value)]
 
 
 PACE_US = 20_000
-"""µs between the values of a list: 50 a second, which a slow radio can carry."""
+"""Time between two values when all parameters are sent, µs: 50 a second, which a slow radio can transmit."""
 LIST_INTERVAL_US = 10_000_000
-"""µs between two lists that no station requested."""
+"""Time after which the parameters are sent to a new station a second time, µs."""
 FORGOTTEN_US = 60_000_000
-"""µs without a heartbeat after which a station is new again."""
+"""Time without a heartbeat after which a station counts as new again, µs."""
 STATIONS = 16
-"""Stations that are remembered."""
+"""Most stations whose last heartbeat is stored."""
 
 
 class ParameterService:
-    """Answer PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; all values are REAL32.
+    """Handler of PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; all values are REAL32.
 
-    `authority`: knows who may set a parameter.
+    `authority`: decides which senders may set a parameter.
     """
 
     def __init__(
@@ -220,7 +221,7 @@ class ParameterService:
         self._stations: dict[tuple[int, int], int] = {}
 
     def send(self, name: str) -> None:
-        """Send the value of a parameter."""
+        """Send PARAM_VALUE with the current value of a parameter."""
         self._outbox.send(
             "PARAM_VALUE",
             param_id=name,
@@ -231,10 +232,10 @@ class ParameterService:
         )
 
     def greet(self, station: tuple[int, int]) -> None:
-        """Send all parameters to a new station, and again `REPEAT_US` later.
+        """Record a station's heartbeat; send a new station all parameters, now and `LIST_INTERVAL_US` later.
 
-        QGroundControl with an autopilot never asks another component for its parameters, and it forgets those
-        that it receives before it has the autopilot's.
+        If an autopilot is present, QGroundControl does not request the parameters of another component. It
+        also discards parameters that it receives before it has the autopilot's.
         """
         now_us = self._outbox.codec.now_us
         before_us = self._stations.pop(station, None)
@@ -253,7 +254,7 @@ class ParameterService:
             self._timers.run_once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
-        """Begin to send all parameters, one every `PACE_US`, after the rest of a list that is being sent."""
+        """Start to send all parameters, one every `PACE_US`; if a list is being sent, complete it first."""
         self._begin()
 
     def _begin(self) -> None:
@@ -272,17 +273,17 @@ class ParameterService:
             self._timers.cancel("parameters")
 
     def read(self, message: Message) -> None:
-        """Send the parameter of an index or a name; ignore a request for a parameter that does not exist."""
+        """Send the parameter of a request, which has an index or a name; ignore unknown parameters."""
         index = message["param_index"]
         names = self._parameters.names
         if index != -1 and message["target_component"] == 0:
-            return  # an index means another parameter in every component
+            return  # a broadcast: the same index is a different parameter in every component
         name = message["param_id"] if index == -1 else names[index] if 0 <= index < len(names) else ""
         if name in self._parameters.table:
             self.send(name)
 
     def write(self, message: Message) -> None:
-        """Set a parameter, and answer with the value that it has afterwards."""
+        """Set a parameter if the request is valid and permitted; reply with its value, changed or not."""
         name, value = message["param_id"], message["param_value"]
         row = self._parameters.table.get(name)
         if row is None:

@@ -1,4 +1,4 @@
-"""Messages of each sample, and the rates of all messages."""
+"""Messages that the bridge sends for each sample, and the rates of all its messages."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ RAW: Final = spec("MAG_RAW")
 FIELD_MESSAGE: Final = spec("MAG_FIELD")
 IMU: Final = spec("HIGHRES_IMU")
 IMU_FIELD: Final = Struct("<Q24x3f16xHB")
-"""HIGHRES_IMU without accelerations, rotations, pressures, altitude and temperature, which are zero."""
+"""Layout of a HIGHRES_IMU payload with time, field and flags; all other fields are zero bytes."""
 NAMED: Final = spec("NAMED_VALUE_FLOAT")
 VECTOR: Final = spec("DEBUG_VECT")
 MAGNETOMETER: Final = 0x1C0
-"""HIGHRES_IMU.fields_updated: xmag, ymag, zmag."""
+"""Value of HIGHRES_IMU.fields_updated: xmag, ymag and zmag are valid."""
 GAUSS_PER_NT: Final = 1e-5
-"""Gauss in 1 nT."""
+"""Conversion factor from nT to gauss."""
 MASK: Final = 0xFFFFFFFF
 RAW_SATURATED_FLAG: Final = int(MAG_RAW_FLAGS.SATURATED)
 COUNTS_FLAG: Final = int(MAG_RAW_FLAGS.COUNTS)
@@ -44,16 +44,18 @@ SEQUENCE: Final = int(MAG_RAW_FLAGS.SEQUENCE)
 POWER_CYCLE: Final = int(MAG_RAW_FLAGS.POWER_CYCLE)
 NO_COUNTS: Final = (0, 0, 0)
 NO_HEADING: Final = (0.0, 0.0, 0.0)
-"""The extension fields of MAG_FIELD without a heading: zeros at the end are not transmitted."""
+"""Extension fields of MAG_FIELD if the heading is unknown; MAVLink does not transmit zeros at the end."""
 
 
 class Publisher:
-    """Send each sample as the messages that are due.
+    """Sender of the messages of one sensor's samples.
 
-    `rates`: by message name; of those of `PUBLISHED`, the messages that are sent.
-    `calibration_id`: CRC-32 of the calibration's file; 0 is none.
-    `start_us`: µs, when the bridge started: NAMED_VALUE_FLOAT counts from there.
-    `sensor_id`: which sensor the samples are of.
+    `rates`: rate of each message, by name; messages of `PUBLISHED` without a rate are not sent.
+    `calibration_id`: CRC-32 of the calibration file; 0 without a calibration.
+    `start_us`: start of the bridge, µs since 1970 UTC; NAMED_VALUE_FLOAT states times since then.
+    `sensor_id`: number of the sensor in the messages.
+    `latest`: arguments of the last call of :meth:`publish`.
+    `samples`: number of samples so far.
     """
 
     def __init__(
@@ -75,12 +77,12 @@ class Publisher:
     def publish(
         self, sample: Sample, corrected: Corrected, anomaly: float = nan, attitude: Attitude = NO_ATTITUDE
     ) -> None:
-        """Send the messages that are due for a sample; ``outbox.codec.now_us`` is the time of sending.
+        """Send the messages whose rates are due for a sample, at the time ``outbox.codec.now_us``.
 
-        `sample`: as aligned.
-        `corrected`: what the calibration made of it.
-        `anomaly`: nT above the main field; NaN where the position is not known.
-        `attitude`: with the heading that follows from the corrected field.
+        `sample`: reading with the telemetry of its time.
+        `corrected`: the corrected field of the sample.
+        `anomaly`: total field minus the main field, nT; NaN if the position is unknown.
+        `attitude`: attitude with the heading computed from the corrected field.
         """
         self.latest = sample, corrected, anomaly, attitude
         self.samples += 1
@@ -102,7 +104,7 @@ class Publisher:
         self._outbox.put(RAW, self.raw_payload(sample))
 
     def raw_payload(self, sample: Sample) -> bytes:
-        """Return the payload of a sample's MAG_RAW."""
+        """Return the payload of MAG_RAW for a sample."""
         reading = sample.reading
         counts, sequence, cycle = reading.counts, reading.sequence, reading.power_cycle
         flags = RAW_SATURATED_FLAG if reading.saturated else 0
@@ -168,7 +170,7 @@ PUBLISHED: dict[str, str] = {
     "DEBUG_VECT": "_vector",
     "ATTITUDE_QUATERNION_COV": "_quaternion",
 }
-"""The messages that follow the samples, and which method of `Publisher` sends each."""
+"""Messages that can be sent with each sample, each with the method of `Publisher` that sends it."""
 
 
 LIMITS = {
@@ -178,18 +180,18 @@ LIMITS = {
     "MAG_LEARNING": (-1.0, 1000.0),
     **dict.fromkeys(PUBLISHED, (-1.0, 1000.0)),
 }
-"""The messages whose rate (Hz) can be set, and within which limits."""
+"""Messages whose rate can be set, each with the smallest and largest rate, Hz."""
 
 
 DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 
 
 MAX_MESSAGE_INTERVAL_US = 0x7FFFFFFF
-"""Longest interval that a MESSAGE_INTERVAL holds, µs (36 min)."""
+"""Largest interval in MESSAGE_INTERVAL, µs (36 min)."""
 
 
 def check_publish(publish: Mapping[str, float], path: Path) -> None:
-    """Check ``[publish]``.
+    """Check the section ``[publish]`` of the configuration `path`.
 
     ConfigError: a message that the bridge does not publish, or a rate out of range.
     """
@@ -204,9 +206,9 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
 
 
 class MessageRates:
-    """Rate of each message; each rate is also a parameter.
+    """Rates of all messages, kept equal to the parameters that set them.
 
-    `by_name`: the rates of the messages of the main sensor, and of reports.
+    `by_name`: rate of each message of the main sensor and of each report, by message name.
     """
 
     def __init__(self, parameters: Parameters, timers: Timers, codec: Codec) -> None:
@@ -217,18 +219,21 @@ class MessageRates:
         parameters.watch(self._changed)
 
     def another(self, name: str) -> Rate:
-        """Return one more rate of a message, with its own times: for the samples of another sensor."""
+        """Return a further rate limit of message `name`, for the samples of another sensor."""
         rate = Rate(self.by_name[name].hertz)
         self._rates.append((rate_name(name), rate))
         return rate
 
     def send_by_clock(self, name: str, report: Callable[[], object]) -> None:
-        """Send a message by the clock instead of with the samples; a rate of 0 is off."""
+        """Send message `name` by a timer that calls `report`; here a rate of 0 is off."""
         self._by_clock[rate_name(name)] = report
         self._changed(rate_name(name))
 
     def interval_us(self, number: int, sample_rate: float) -> int:
-        """Return a message's interval in µs; -1 off, 0 if it has no rate or an unknown `sample_rate`, Hz."""
+        """Return the interval (µs) of the message with id `number`; -1 if off, 0 if unknown.
+
+        A message that is sent with every sample has the interval of `sample_rate` (Hz).
+        """
         rate = self.by_name.get(spec(number).name) if number in MESSAGES else None
         if rate is None or rate.hertz < 0:
             return 0 if rate is None else -1
@@ -236,7 +241,10 @@ class MessageRates:
         return min(period_us(hertz), MAX_MESSAGE_INTERVAL_US) if hertz > 0 else 0
 
     def set(self, number: int, hertz: float | None) -> str:
-        """Set a message's rate (None: the default); return the parameter's name, empty if impossible."""
+        """Set the rate of the message with id `number`; None sets the default.
+
+        Return the name of the rate's parameter; empty if the message has no rate or `hertz` is out of range.
+        """
         name = spec(number).name if number in MESSAGES else ""
         if name not in LIMITS:
             return ""
@@ -245,7 +253,7 @@ class MessageRates:
         return parameter if self._parameters.set(parameter, value) else ""
 
     def _changed(self, parameter: str) -> None:
-        """Apply a changed parameter if it is the rate of a message."""
+        """Apply the new value of a parameter to the message whose rate it is, if any."""
         for name, rate in self._rates:
             if name == parameter and rate.hertz != self._parameters[parameter]:
                 rate.set(self._parameters[parameter])

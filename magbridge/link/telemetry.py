@@ -1,4 +1,4 @@
-"""Any field of any message as a parameter of the calibration; requests for the needed messages."""
+"""Extraction of the calibration's parameters from fields of messages, and requests for these messages."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ __all__ = [
 Value = tuple[str, float, int]
 ReadTime = Callable[[bytes], tuple[int, int]]
 YEAR_2001_US = 10**15
-"""64-bit time beyond which it counts from 1970 and not from the boot, µs."""
+"""Limit between times since boot and times since 1970 in a 64-bit field, µs."""
 
 
 class Extractor:
-    """Extract one parameter from one kind of message."""
+    """Reader of one parameter from the payloads of one message type."""
 
     __slots__ = ("field", "index", "match", "name", "offset", "scale", "texts")
 
@@ -47,7 +47,7 @@ class Extractor:
             )
             raise ConfigError(path, f"{key}.field", f"{wanted}, not {quantity.field!r}")
         self.match: list[tuple[Field, float]] = []
-        self.texts: list[tuple[int, bytes]] = []  # where they lie, and with the zero that ends them
+        self.texts: list[tuple[int, bytes]] = []  # offset in the payload, and text with its final zero
         for one, value in quantity.match.items():
             field = find(layout, one, path, f"{key}.match.{one}")
             if isinstance(value, str) != (field.code == "s"):
@@ -63,7 +63,7 @@ class Extractor:
                 self.match.append((field, value))
 
     def value(self, payload: bytes) -> float | None:
-        """Return the value; NaN if the sender does not know it, None if the message does not match."""
+        """Return the parameter's value; NaN if the field is marked as unknown, None if ``match`` fails."""
         for offset, text in self.texts:
             if not payload.startswith(text, offset):
                 return None
@@ -77,7 +77,10 @@ class Extractor:
 
 
 def find(layout: Spec, name: str, path: Path, key: str) -> Field:
-    """Return the field `name` of a message; the error for a name that it lacks lists those it has."""
+    """Return the field `name` of a message.
+
+    ConfigError: the message has no such field; the text lists its fields.
+    """
     try:
         return layout.fields[name]
     except KeyError:
@@ -86,12 +89,12 @@ def find(layout: Spec, name: str, path: Path, key: str) -> Field:
 
 
 class TelemetryMap:
-    """Extract the configured parameters from messages, with the time of each value.
+    """Reader of all configured parameters from messages, with the time of each value.
 
-    `telemetry`: ``[telemetry.NAME]`` of the configuration.
-    `autopilot`: component whose clock the ``VehicleClock`` knows.
-    `path`: the configuration, for errors.
-    `delays_us`: time in µs by which each parameter is late: to be subtracted from the time of its values.
+    `telemetry`: sections ``[telemetry.NAME]`` of the configuration, by name.
+    `autopilot`: id of the autopilot's component, whose clock the :class:`VehicleClock` estimates.
+    `path`: path of the configuration, for errors.
+    `delays_us`: delay of each parameter, µs, which the caller subtracts from the time of its values.
     ConfigError: a message or field that does not exist.
     """
 
@@ -114,10 +117,10 @@ class TelemetryMap:
             self._times[layout.id] = own_time(layout)
 
     def values(self, message: Message, t_us: int, clock: VehicleClock) -> list[Value]:
-        """Return ``(name, value, time in µs)`` of every parameter in `message`, received at `t_us`.
+        """Return ``(name, value, time in µs)`` of every parameter in `message`, received at `t_us` (µs).
 
-        The time is the message's own where it has one and the autopilot's clock is known, else `t_us`. A
-        value that the sender marks as not known is NaN.
+        The time is the time stamp of an autopilot's message, if the autopilot's clock is known; else `t_us`.
+        A value that the sender marks as unknown is NaN.
         """
         extractors = self._by_id.get(message.id)
         if extractors is None:
@@ -137,21 +140,21 @@ class TelemetryMap:
 
 
 def sent_us(read: ReadTime | None, payload: bytes, t_us: int, clock: VehicleClock) -> int:
-    """Return our time (µs) of the values in a payload of the autopilot that was received at `t_us`.
+    """Return the time (µs, bridge clock) of the values in an autopilot's payload received at `t_us`.
 
-    It is the message's own time, which `read` (of :func:`own_time`) returns, where the autopilot's clock is
-    known; else `t_us`.
+    `read` (from :func:`own_time`) returns the message's time stamp. If the message has none, or the
+    autopilot's clock is unknown, return `t_us`.
     """
     if read is None or not clock.known:
         return t_us
     vehicle_us, wrap_us = read(payload)
-    if vehicle_us <= 0 or vehicle_us > YEAR_2001_US:  # not filled in, or another clock than TIMESYNC's
+    if vehicle_us <= 0 or vehicle_us > YEAR_2001_US:  # not set, or a different clock from TIMESYNC's
         return t_us
     return clock.bridge_time(vehicle_us, t_us, wrap_us)
 
 
 def own_time(layout: Spec) -> ReadTime | None:
-    """Return a function that reads a message's own time and the µs after which it wraps, or None."""
+    """Return a function that reads a payload's time stamp and its wrap (µs); None without time stamp."""
     for name, unit_us in (("time_boot_ms", 1000), ("time_usec", 1)):
         field = layout.fields.get(name)
         if field is None:
@@ -164,10 +167,10 @@ def own_time(layout: Spec) -> ReadTime | None:
 
 MAX_ANGLE_RAD: Final = 2.0 * pi + 0.1
 MAX_DISTANCE_M: Final = 4e7
-"""The Earth's circumference, m."""
+"""Largest magnitude of a coordinate, m: the Earth's circumference."""
 MAX_VALID_SPEED_M_S: Final = 1e4
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
-"""1e-7 deg."""
+"""Largest magnitudes of latitude and longitude, 1e-7 deg."""
 
 REQUIRED: dict[int, dict[str, float]] = by_id(
     ATTITUDE={"roll": MAX_ANGLE_RAD, "pitch": MAX_ANGLE_RAD, "yaw": MAX_ANGLE_RAD},
@@ -175,7 +178,7 @@ REQUIRED: dict[int, dict[str, float]] = by_id(
     GPS_RAW_INT={"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
     GPS_GLOBAL_ORIGIN={"latitude": LATITUDE_E7, "longitude": LONGITUDE_E7},
 )
-"""Fields that must be numbers, and their largest magnitudes."""
+"""Message id -> fields that must not be NaN, with their largest valid magnitudes."""
 LIMITED: dict[int, dict[str, float]] = by_id(
     LOCAL_POSITION_NED={
         **dict.fromkeys(("x", "y", "z"), MAX_DISTANCE_M),
@@ -187,13 +190,13 @@ LIMITED: dict[int, dict[str, float]] = by_id(
     },
     VFR_HUD={"airspeed": MAX_VALID_SPEED_M_S, "groundspeed": MAX_VALID_SPEED_M_S},
 )
-"""Fields that may be NaN, which means unknown, and their largest magnitudes."""
+"""Message id -> fields that may be NaN (unknown), with their largest valid magnitudes."""
 MAX_QUATERNION: Final = 1.1
 ODOMETRY: Final = spec("ODOMETRY").id
 
 
 def is_possible(message: Message) -> bool:
-    """Return False if a message has an infinite, a missing or an impossible value in a field that is used."""
+    """Return False if a used field of a message is infinite, out of range, or NaN without permission."""
     for name, largest in REQUIRED.get(message.id, {}).items():
         if not abs(message[name]) <= largest:  # also NaN
             return False
@@ -210,31 +213,31 @@ def is_possible(message: Message) -> bool:
 
 
 AIRCRAFT: Final = frozenset((1, 2, 3, 4, 13, 14, 15, 19, 20, 21, 22, 23, 24, 25, 29, 35))
-"""MAV_TYPE of vehicles that turn by tens of degrees a second: fixed and rotary wings."""
+"""Values of MAV_TYPE for fixed-wing and rotary-wing aircraft, which turn by tens of degrees a second."""
 RATE_INTERVAL_US: Final = 10_000_000
-"""µs over which the bridge measures at which rate each message arrives."""
+"""Interval over which the bridge measures the rate of each message, µs."""
 ANSWER_US: Final = 2_000_000
-"""µs that the bridge waits for the answer to one request."""
+"""Time that the bridge waits for the reply to one request, µs."""
 MIN_RATE_FRACTION: Final = 0.7
-"""Fraction of the needed rate below which the bridge requests it. A higher rate, which another client may
-have requested, stays as it is."""
+"""Fraction of the needed rate below which the bridge requests the needed rate. The bridge never lowers a
+higher rate, which another client may have requested."""
 MAX_ATTEMPTS: Final = 3
-"""Requests of one message between two reboots of the autopilot."""
+"""Most requests of one message between two reboots of the autopilot."""
 UNREQUESTABLE: Final = frozenset(
     ("NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "DEBUG", "DEBUG_VECT", "DEBUG_FLOAT_ARRAY", "HEARTBEAT")
 )
-"""Messages that several programs send, each on its own schedule."""
+"""Messages whose rate the bridge does not request: several programs send them, each on its own schedule."""
 
 
 Stream = tuple[int, int]
-"""Component that sends a message, and the message's id."""
+"""Id of the component that sends a message, and id of the message."""
 
 
 def is_contradicted(status: Message) -> bool:
-    """Return True if an EKF_STATUS_REPORT or ESTIMATOR_STATUS shows that the angles are uncertain.
+    """Return True if an EKF_STATUS_REPORT or ESTIMATOR_STATUS shows that the attitude is unreliable.
 
-    An innovation of velocity, position or compass is beyond its limit: the filter contradicts a sensor. In a
-    real ArduPlane with a jammed receiver, heading and tilt were then wrong by 20 to 40 deg.
+    The attitude is unreliable if an innovation of velocity, position or compass exceeds its limit. In a real
+    ArduPlane with a jammed receiver, heading and tilt were then wrong by 20 to 40 deg.
     """
     return bool(max(status[name] for name in INNOVATION_RATIOS[status.id]) > 1.0)
 
@@ -242,13 +245,13 @@ def is_contradicted(status: Message) -> bool:
 def needed_rates(
     autopilot: int, telemetry: Iterable[Telemetry] = (), *, attitude: bool, navigation: bool
 ) -> dict[Stream, tuple[float, float]]:
-    """Return the needed rate (Hz) of each message, for an aircraft and for any other vehicle.
+    """Return the needed rates (Hz) of each message: for an aircraft, and for any other vehicle.
 
-    `autopilot`: its component.
-    `telemetry`: sources of the parameters of the calibration; one without a component is expected of the
-        autopilot.
-    `attitude`: the direction of the field is checked.
-    `navigation`: the bridge navigates.
+    `autopilot`: component id of the autopilot.
+    `telemetry`: sources of the calibration's parameters; the autopilot is expected to send a message whose
+        source has no component.
+    `attitude`: True if the bridge checks the direction of the field.
+    `navigation`: True if the bridge navigates.
     """
     rates = {
         (one.component or autopilot, spec(one.message).id): (5.0, 2.0)
@@ -260,20 +263,20 @@ def needed_rates(
         names["ATTITUDE"] = (10.0, 4.0)
     if navigation:
         names |= {"VFR_HUD": (5.0, 2.0), "GPS_RAW_INT": (2.0, 1.0), "EKF_STATUS_REPORT": (1.0, 1.0)}
-        names["EXTENDED_SYS_STATE"] = (1.0, 0.0)  # whether an aircraft stands on the ground
+        names["EXTENDED_SYS_STATE"] = (1.0, 0.0)  # states if an aircraft is on the ground
     return rates | {(autopilot, spec(name).id): pair for name, pair in names.items()}
 
 
 class StreamRequests:
-    """Measure the rate of each needed message, and request it from its sender if it arrives too rarely.
+    """Monitor of the rates of needed messages, which requests a message that arrives too rarely.
 
-    A message that the autopilot does not send and another component sends at the needed rate is not
-    requested.
+    If the autopilot does not send a message, but another component sends it at the needed rate, the bridge
+    does not request it.
 
-    `peer`: system and component of the autopilot.
-    `rates`: as :func:`needed_rates` returns them.
-    `outbox`, `timers`, `announcer`: those of the link.
-    `active`: false: rates are only measured.
+    `peer`: system id and component id of the autopilot.
+    `rates`: needed rates from :func:`needed_rates`.
+    `outbox`, `timers`, `announcer`: services of the link.
+    `active`: False to measure rates without requests.
     """
 
     def __init__(
@@ -289,7 +292,7 @@ class StreamRequests:
         self._active = active
         self._peer, self._outbox, self._timers, self._announcer = peer, outbox, timers, announcer
         self.needed = dict(rates)
-        """Sender and message -> rate in Hz at which it is needed on an aircraft, and on any other vehicle."""
+        """Sender and message -> needed rates: on an aircraft, and on any other vehicle, Hz."""
         self._numbers = {number for _, number in self.needed}
         self._received: Counter[Stream] = Counter()
         self._attempts: Counter[Stream] = Counter()
@@ -297,14 +300,14 @@ class StreamRequests:
         self._asked: Stream | None = None
         self._present = self._is_aircraft = False
         self.interval_us = RATE_INTERVAL_US
-        """µs over which rates are measured."""
+        """Interval over which rates are measured, µs."""
         self.measured: dict[str, float] = {}
-        """Rate in Hz at which each needed message arrived in the last interval."""
+        """Name of each needed message -> its rate in the last interval, Hz."""
         self.denied: dict[str, str] = {}
-        """Message that its sender does not send as requested -> the text that was announced."""
+        """Name of each message whose sender rejected the request -> text of the STATUSTEXT about it."""
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Count a message of the vehicle; handle the answer to a request."""
+        """Count a needed message, process a heartbeat of the autopilot, or handle the reply to a request."""
         autopilot = self._peer[1]
         if message.id == HEARTBEAT and message.component == autopilot:
             self._is_aircraft = message["type"] in AIRCRAFT
@@ -323,18 +326,18 @@ class StreamRequests:
             self._received[message.component, message.id] += 1
 
     def rebooted(self) -> None:
-        """Restart after a reboot of the autopilot, which has forgotten the requests."""
+        """Clear counts and attempts after a reboot of the autopilot, which loses the requested rates."""
         self._attempts.clear()
         self._received.clear()
         self.denied.clear()
 
     def rate_of(self, stream: Stream) -> float:
-        """Return the rate in Hz at which a message is needed."""
+        """Return the needed rate (Hz) of a message for the present type of vehicle."""
         return self.needed[stream][0 if self._is_aircraft else 1]
 
     def _look(self, _: int) -> None:
         """Queue requests for the messages that arrived too rarely since the last call."""
-        largest: Counter[int] = Counter()  # of each message that other components send, too
+        largest: Counter[int] = Counter()  # message id -> largest count from an unexpected component
         for (component, number), count in self._received.items():
             if (component, number) not in self.needed:
                 largest[number] = max(largest[number], count)
@@ -352,9 +355,9 @@ class StreamRequests:
             self._ask_next()
 
     def _ask_next(self) -> None:
-        """Send the next request; only one is pending, because an answer does not name its message."""
+        """Send the next request; only one may be pending, because COMMAND_ACK does not name the message."""
         self._asked = None
-        # a message of aircraft is not needed any more if the vehicle turns out to be another
+        # a message needed only on aircraft has a rate of 0 once another MAV_TYPE is received
         while self._queue and not self.rate_of(self._queue[0]) > 0.0:
             self._queue.popleft()
         if not self._queue:
@@ -373,7 +376,7 @@ class StreamRequests:
         self._timers.run_once("stream request", deadline, lambda _: self._ask_next())
 
     def _answered(self, result: int) -> None:
-        """Report a denial and continue with the next request."""
+        """Process the reply to the pending request: report a rejection, then send the next request."""
         assert self._asked is not None
         component, name = self._asked[0], spec(self._asked[1]).name
         if result not in (MAV_RESULT.ACCEPTED, MAV_RESULT.IN_PROGRESS):
@@ -389,20 +392,20 @@ class StreamRequests:
 
 HEARTBEAT: Final = spec("HEARTBEAT").id
 EKF_STATUS, PX4_STATUS = spec("EKF_STATUS_REPORT").id, spec("ESTIMATOR_STATUS").id
-"""Messages with the flags of the estimator: ArduPilot's and PX4's."""
+"""Ids of the messages with the state of the autopilot's estimator: ArduPilot's and PX4's."""
 INNOVATION_RATIOS: Final = {
     EKF_STATUS: ("velocity_variance", "pos_horiz_variance", "compass_variance"),
     PX4_STATUS: ("vel_ratio", "pos_horiz_ratio", "mag_ratio"),
 }
-"""Fields of these messages with the ratio of an innovation to its limit."""
+"""Id of an estimator message -> its fields with ratios of innovations to their limits."""
 ACK: Final = spec("COMMAND_ACK").id
 
 
 class Sources:
-    """Select one component as the source of each telemetry parameter, and report conflicts.
+    """Selection of one component as the source of each telemetry parameter, with reports of conflicts.
 
-    `telemetry`: ``[telemetry.NAME]`` of the configuration.
-    `system`, `autopilot`: of our own vehicle.
+    `telemetry`: sections ``[telemetry.NAME]`` of the configuration, by name.
+    `system`, `autopilot`: system id and autopilot's component id of our own vehicle.
     """
 
     def __init__(
@@ -415,7 +418,7 @@ class Sources:
         }
 
     def admit(self, name: str, component: int, time_us: int) -> bool:
-        """Return True if a value of the parameter `name` from `component` counts."""
+        """Return True if `component` is the source of the parameter `name` at `time_us` (µs)."""
         source = self._of[name]
         before = source.component
         if not source.admit(component, time_us):

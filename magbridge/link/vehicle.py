@@ -1,4 +1,4 @@
-"""State of the vehicle: its clock, its autopilot (present, rebooted, not unique), its missing frames."""
+"""Monitoring of the vehicle: clock offset, presence and reboots of the autopilot, lost frames."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ from magbridge.mavlink.messages import MESSAGES
 __all__ = ["VehicleClock", "VehicleState"]
 
 CLOCK_EXCHANGES = 32
-"""Latest exchanges that are used."""
+"""Number of the latest TIMESYNC exchanges in the fit."""
 JITTER_US = 200.0
-"""Uncertainty of even the fastest exchange, µs."""
+"""Standard deviation of the offset from the fastest exchange, µs."""
 STEP_US, DRIFT = 20_000, 500e-6
-"""µs, µs/µs: a clock was set if the offsets of two exchanges differ by more than half of both round trips,
-plus this step, plus this drift over the time between them."""
+"""Thresholds (µs, µs/µs) for a clock that was set: two offsets differ by more than half of both round trips,
+plus STEP_US, plus DRIFT times the time between the exchanges."""
 SPAN_US = 10_000_000
-"""µs that the exchanges must span before a drift is estimated."""
+"""Shortest time from the first to the last exchange for an estimate of the drift, µs."""
 PENDING = 8
 
 
 class VehicleClock:
-    """Estimate ``offset = vehicle clock - bridge clock`` and its drift.
+    """Estimate of the offset ``vehicle clock - bridge clock`` and its drift, from TIMESYNC exchanges.
+
+    `sigma`: standard deviation of the offset, s; NaN while unknown.
 
     Notes
     -----
     An exchange sent at ``ts``, answered with the vehicle's ``tc`` and received at ``tr`` gives
-    ``offset = tc - (ts + tr) / 2``, wrong by no more than half its round trip ``tr - ts``. The time by which
-    an exchange is slower than the fastest recent one was spent waiting, in an unknown direction. So a
-    straight line is fitted to the last exchanges with the weights ``1 / sigma^2``, where
-    ``sigma = JITTER + (rtt - min rtt) / 2`` (Cristian, 1989, uses the fastest alone).
+    ``offset = tc - (ts + tr) / 2``, with an error of at most half the round trip ``tr - ts``. An exchange
+    slower than the fastest recent one was delayed in an unknown direction. So a straight line is fitted to
+    the last exchanges with the weights ``1 / sigma^2``, where ``sigma = JITTER + (rtt - min rtt) / 2``
+    (Cristian, 1989, uses only the fastest exchange).
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the vehicle's clock restarted or was set."""
+        """Discard all exchanges and the estimate, because the vehicle's clock restarted or was set."""
         self._asked: deque[int] = deque(maxlen=PENDING)
         self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=CLOCK_EXCHANGES)
         self._base_us = self._middle_us = 0
@@ -51,21 +53,24 @@ class VehicleClock:
 
     @property
     def known(self) -> bool:
-        """Return True if there is an estimate."""
+        """True if the offset has been estimated."""
         return bool(self._exchanges)
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster than ours the vehicle's clock runs; NaN while unknown."""
+        """Rate error of the vehicle's clock against the bridge's, ppm, positive if fast; NaN if unknown."""
         return self._slope * 1e6 if self._slope else nan
 
     def ask(self, now_us: int) -> int:
-        """Return the ``ts1`` (ns) of a request sent now."""
+        """Record a TIMESYNC request sent at `now_us` (µs); return its field ``ts1`` (ns)."""
         self._asked.append(now_us * 1000)
         return now_us * 1000
 
     def answer(self, tc1: int, ts1: int, now_us: int) -> None:
-        """Process an answer (ns) received at `now_us`; ignore answers to other components."""
+        """Update the estimate with a TIMESYNC reply (`tc1`, `ts1` in ns) received at `now_us` (µs).
+
+        Ignore a reply whose `ts1` is not that of a pending request.
+        """
         if ts1 not in self._asked:
             return
         self._asked.remove(ts1)
@@ -101,15 +106,15 @@ class VehicleClock:
         self.sigma = sqrt(1.0 / s) * 1e-6
 
     def offset_us(self, t_us: int) -> float:
-        """Return the vehicle's clock minus ours at `t_us` (ours), in µs; 0 while unknown."""
+        """Return vehicle clock minus bridge clock (µs) at `t_us` of the bridge clock; 0 while unknown."""
         return self._base_us + (self._offset + self._slope * (t_us - self._middle_us))
 
     def bridge_time(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
-        """Return our time at which the vehicle's clock showed `vehicle_us`; at most `t_us`.
+        """Return the time of the bridge clock (µs) when the vehicle clock was `vehicle_us`; at most `t_us`.
 
-        `vehicle_us`: a time in a message.
-        `t_us`: when the message came.
-        `wrap_us`: µs after which the message's time field wraps to 0; 0: never.
+        `vehicle_us`: time stamp of a message, vehicle clock, µs.
+        `t_us`: time of reception, bridge clock, µs.
+        `wrap_us`: time after which the message's time field wraps to 0, µs; 0 if it never wraps.
         """
         offset_us = round(self.offset_us(t_us))
         if wrap_us:
@@ -118,20 +123,20 @@ class VehicleClock:
 
 
 LATE_FRAMES: Final = 64
-"""Frames by which one may come late and no longer count as lost."""
+"""Number of the latest sequence numbers in which a late frame is still removed from the lost frames."""
 ALL_FRAMES: Final = (1 << LATE_FRAMES) - 1
 LOSS_INTERVAL_US = 10_000_000
-"""µs over which a share is computed."""
+"""Interval over which the fraction of lost frames is computed, µs."""
 MANY, LEAST = 0.01, 3
-"""The share, and the number, of lost frames above which it is announced."""
+"""Limits for a report of lost frames in an interval: a fraction above MANY, and at least LEAST frames."""
 WATCHED: Final = 16
-"""Components that are watched."""
+"""Most components whose lost frames are counted."""
 
 
 class Numbers:
-    """The frames of one component.
+    """Counts of received and lost frames of one component, from its sequence numbers.
 
-    `received`, `lost`: frames that came, and those that are missing.
+    `received`, `lost`: number of frames received, and of frames missing so far.
     """
 
     __slots__ = ("_last", "_missing", "lost", "received")
@@ -142,7 +147,7 @@ class Numbers:
         self._missing = 0  # bit k: the frame k before the latest has not come
 
     def count(self, number: int) -> None:
-        """Count a frame. A late frame is no longer lost; a duplicate changes nothing."""
+        """Count the frame with sequence number `number`; a late frame no longer counts as lost."""
         self.received += 1
         ahead = (number - self._last + 128) % 256 - 128
         if -LATE_FRAMES < ahead <= 0:
@@ -150,16 +155,16 @@ class Numbers:
             self.lost -= late != 0
             self._missing ^= late
             return
-        # far behind: the sender restarted
+        # a number far behind the last means that the sender restarted
         self.lost += max(ahead - 1, 0)
         self._missing = (self._missing << ahead | (1 << ahead) - 2) & ALL_FRAMES if ahead > 0 else 0
         self._last = number
 
 
 class Losses:
-    """Count the lost frames of each component of one vehicle, and report components that lose many.
+    """Counts of lost frames of each component of one vehicle, with reports of components that lose many.
 
-    `announcer`, `timers`: the link's.
+    `announcer`, `timers`: services of the link.
     """
 
     def __init__(self, system: int, announcer: Announcer, timers: Timers) -> None:
@@ -168,7 +173,7 @@ class Losses:
         self._before: dict[int, tuple[int, int]] = {}
 
     def count(self, component: int, number: int, t_us: int) -> None:
-        """Record a frame's number."""
+        """Count a frame of `component` with sequence number `number`, received at `t_us` (µs)."""
         numbers = self._numbers.get(component)
         if numbers is None:
             if len(self._numbers) >= WATCHED:
@@ -189,7 +194,7 @@ class Losses:
             self._before[component] = numbers.received, numbers.lost
             received, lost = numbers.received - received, numbers.lost - lost
             if lost >= LEAST and lost > MANY * (received + lost):
-                # a router keeps back frames for other receivers
+                # a router may forward some frames only to other receivers
                 who = f"{self._system}:{component}"
                 text = f"{who}: over {MANY:.0%} of its frames missing, or for others"
                 self._announcer.state(f"losses {component}", text, MAV_SEVERITY.WARNING)
@@ -199,16 +204,16 @@ class Losses:
 
 HEARTBEAT: Final = spec("HEARTBEAT").id
 ABSENT_US = 5_000_000
-"""µs without a heartbeat after which the autopilot counts as gone."""
+"""Time without a heartbeat after which the autopilot counts as lost, µs."""
 BACK_MS: Final = 1_000
-"""ms by which ``time_boot_ms`` must go back to mean more than packets out of order."""
+"""Largest step back of ``time_boot_ms`` that packets out of order explain, ms."""
 BELIEVED = 3
-"""Messages in a row from a new boot clock before it is believed: a single one may just be late."""
+"""Messages in a row with a boot time far behind that mean a reboot; a single message may be late."""
 LEAP_MS: Final = 10_000
-"""ms by which ``time_boot_ms`` may run ahead of our clock, or lag behind other messages', before it counts as
-another autopilot's."""
+"""Largest lead of ``time_boot_ms`` over the bridge's clock, and largest lag behind other messages, that one
+autopilot explains, ms."""
 TWICE, CHANGES_US = 5, 10_000_000
-"""This many changes between two boot clocks within this many µs mean that there are two autopilots."""
+"""Number of changes between two boot clocks, and the time (µs) within which they mean two autopilots."""
 BOOT_TIMES: Final = {
     number: spec(number).fields["time_boot_ms"]
     for number, layout in MESSAGES.items()
@@ -217,11 +222,12 @@ BOOT_TIMES: Final = {
 
 
 class VehicleState:
-    """Watch the messages of the configured system.
+    """State of the configured vehicle, updated from its messages.
 
-    `clock`: reset when the autopilot reboots.
-    `reboots`: number of restarts of the boot clock.
-    `on_reboot`: called at each restart.
+    `clock`: estimate of the autopilot's clock; reset when the autopilot reboots.
+    `reboots`: number of reboots of the autopilot.
+    `on_reboot`: function that is called at each reboot.
+    `state`: presence of the autopilot: ABSENT, OK or LOST.
     """
 
     def __init__(
@@ -241,11 +247,11 @@ class VehicleState:
 
     @property
     def frames_lost(self) -> int:
-        """Number of frames missing by the autopilot's sequence numbers."""
+        """Number of lost frames of the autopilot, from its sequence numbers."""
         return self._losses.lost_frames(self.autopilot)
 
     def receive(self, message: Message, t_us: int) -> bool:
-        """Record a message; return True if it is telemetry of our vehicle."""
+        """Update the state with a message received at `t_us` (µs); return True if it is from our vehicle."""
         if message.system != self.system:
             self._other_sender(message)
             return False
@@ -263,12 +269,12 @@ class VehicleState:
         return True
 
     def count(self, message: Message, t_us: int) -> None:
-        """Count a frame of the vehicle with an unknown id or a refused signature."""
+        """Count a frame of the vehicle that has an unknown message id or was rejected."""
         if message.system == self.system and message.component != self.component:
             self._losses.count(message.component, message.sequence, t_us)
 
     def _other_sender(self, message: Message) -> None:
-        """Announce another vehicle on the link; a ground station is not a vehicle."""
+        """Send a STATUSTEXT if the heartbeat of another vehicle, not of a ground station, is on the link."""
         if message.id != HEARTBEAT:
             return
         if message["type"] != MAV_TYPE.GCS and message["autopilot"] != MAV_AUTOPILOT.INVALID:
@@ -290,14 +296,17 @@ class VehicleState:
         self._announcer.state("autopilot", f"{sender} is silent", MAV_SEVERITY.WARNING)
 
     def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
-        """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock."""
+        """Process the boot time of the message id `kind`, and detect a reboot or a second autopilot.
+
+        Late packets, and messages that are sent long after their time stamp, count as neither.
+        """
         ahead_ms = _elapsed_ms(boot_ms, self._boot_ms)
         goes_on = _elapsed_ms(boot_ms, self._stamps.setdefault(kind, boot_ms)) >= -BACK_MS
         if goes_on:
             self._stamps[kind] = boot_ms
         if self._boot_us and ahead_ms < -BACK_MS:
             if goes_on and ahead_ms > -LEAP_MS:
-                return  # of a kind that is sent long after it was stamped
+                return  # this message is always sent long after its time stamp
             self._behind += 1
             if self._behind < BELIEVED:
                 return
@@ -316,7 +325,7 @@ class VehicleState:
             self._boot_ms, self._boot_us = boot_ms, t_us
 
     def _change(self, t_us: int) -> None:
-        """Count alternations of the boot clock."""
+        """Count a change of the boot clock at `t_us`; report two autopilots after `TWICE` recent changes."""
         self._changes = [*(when for when in self._changes if t_us - when < CHANGES_US), t_us][-TWICE:]
         if len(self._changes) == TWICE:
             self._announcer.state(
@@ -325,5 +334,5 @@ class VehicleState:
 
 
 def _elapsed_ms(one_ms: int, other_ms: int) -> int:
-    """Return the ms from another boot time to one, signed: the wrap after 50 days is a step forward."""
+    """Return ``one_ms - other_ms`` of two boot times as a signed difference modulo 2^32 ms (50 days)."""
     return (one_ms - other_ms + (1 << 31)) % (1 << 32) - (1 << 31)
