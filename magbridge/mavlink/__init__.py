@@ -1,4 +1,4 @@
-"""MAVLink: messages as a table, frames, signatures, logs. No port, no clock, no global state."""
+"""MAVLink messages, frames, signatures and telemetry logs; without ports, clocks and global state."""
 
 from __future__ import annotations
 

@@ -1,19 +1,19 @@
-"""Bytes to messages and back, for one link, with signatures: without port, clock and global state.
+"""Conversion between bytes and messages of one link, with signatures.
 
 Notes
 -----
 The signature is a link id, a time stamp ``t`` (48 bit, units of 10 µs since 2015-01-01) and the first 6 bytes
 of ``SHA-256(key + frame + link id + t)`` (MAVLink guide, 'Message Signing').
 
-Each stream (system, component, link id) has floors of its own, and a stamp must lie above its floor: one for
-stamps that are at most a minute ahead of our clock, and one for stamps further ahead. So a clock that was
-wrong, its owner's or ours, refuses nothing once it is right again, and neither a key holder that lies about
-the time nor a restart of ours refuses other senders. A stamp counts only once its hash has proved right:
-otherwise one forged packet from the future would lock out every genuine one that follows, as it does in
-pymavlink 2.4.50.
+A time stamp must be later than the last accepted stamp of its stream (system, component, link id). Two last
+stamps are stored for each stream: one for stamps at most a minute ahead of our clock, and one for later
+stamps. So, once a wrong clock is corrected, stamps of the correct time are accepted again. A stamp is stored
+only if its hash is correct. Otherwise one forged packet with a future stamp would block every later genuine
+packet, as in pymavlink 2.4.50.
 
-The guide lets every stamp received raise our own. Here only the autopilot's do, which a computer without a
-clock of its own needs, and no further than `FOLLOW` ahead of a clock that has been set.
+According to the guide, every received stamp advances the receiver's own. Here only the autopilot's stamps do,
+which a computer without a battery-backed clock needs. They advance it by at most `FOLLOW` beyond a clock that
+has been set.
 """
 
 from __future__ import annotations
@@ -49,35 +49,35 @@ __all__ = [
 ]  # fmt: skip
 
 EPOCH_US = 1_420_070_400_000_000
-"""2015-01-01 in µs of UNIX time."""
+"""Origin of time stamps, 2015-01-01, in µs of UNIX time."""
 STAMPS_PER_SECOND = 100_000
-"""in units of 10 µs"""
+"""Time stamps count units of 10 µs."""
 MINUTE = 60 * STAMPS_PER_SECOND
 FOLLOW = 7 * 24 * 60 * MINUTE
-"""How far ahead of our clock the autopilot's stamps may take ours."""
+"""Largest lead over our clock to which the autopilot's stamps advance ours, in units of 10 µs."""
 SET = (1_672_531_200_000_000 - EPOCH_US) // 10
-"""2023-01-01: a clock that shows less was never set."""
+"""Time stamp of 2023-01-01; a clock that shows an earlier time was never set."""
 MAX_STAMP = (1 << 48) - 1
 STREAMS = 1024
-"""Most floors that are kept; of more, those of the streams heard first are forgotten."""
+"""Most streams whose last stamp is stored; a further stream displaces the oldest."""
 NOT_SIGNED = "not signed"
-"""Reason for the refusal of a frame without a signature."""
+"""Reason for the rejection of a frame without a signature."""
 FOLLOW_UNSET = 10 * 365 * 24 * 60 * MINUTE
-"""How far the autopilot's stamps may take ours in a run that has no stamp of an earlier run."""
+"""Limit in place of `FOLLOW` if no earlier run has stored a stamp, in units of 10 µs."""
 NEED_NO_SIGNATURE = frozenset({109})
-"""RADIO_STATUS: radios put it on the link, and they have no key."""
+"""Ids of messages accepted without signature: RADIO_STATUS, which radios without a key send."""
 
 Stream = tuple[int, int, int, bool, int]
-"""Link id, system, component, whether the stamps were ahead of our clock, and the last stamp accepted."""
+"""Link id, system, component, True for stamps over a minute ahead of our clock, and last accepted stamp."""
 
 
 def timestamp(t_us: int) -> int:
-    """Return the signing time stamp of a UNIX time in µs."""
+    """Return a UNIX time (µs) as a signing time stamp."""
     return min(max(t_us - EPOCH_US, 0) // 10, MAX_STAMP)
 
 
 def load_key(path: str | Path) -> bytes:
-    """Read a signing key: a file of 32 bytes.
+    """Return the signing key in a file of 32 bytes.
 
     FormatError: the file cannot be read or has another length.
     """
@@ -88,12 +88,12 @@ def load_key(path: str | Path) -> bytes:
 
 
 def readable_by_all(path: str | Path) -> bool:
-    """Return True if every user of this computer may read the key; raises OSError if the file is missing."""
+    """Return True if every user of this computer may read the file; raise OSError if it does not exist."""
     return bool(Path(path).stat().st_mode & 0o004)
 
 
 class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
-    """State of signing: pymavlink signs with it; it verifies, in event time.
+    """State of signing, with which pymavlink signs sent frames, and which verifies received frames.
 
     The verification replaces pymavlink's ``check_signature``, which stores a stamp before it has verified the
     hash (ArduPilot/pymavlink#961).
@@ -101,25 +101,25 @@ class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
     Parameters
     ----------
     key : bytes
-        32 bytes.
+        Key of 32 bytes.
     last : int
-        The last time stamp that the run before may have used, so that ours increase even if the clock was
+        Last time stamp that the previous run may have used, so that stamps increase even if the clock was
         set back.
     streams : iterable of Stream
-        The floors of the run before, as `streams` gave them.
+        Last accepted stamps of the previous run, from the property `streams`.
     follow : (int, int) or None
-        System and component whose stamps raise ours: the autopilot's.
+        System and component of the autopilot, whose stamps advance ours.
 
     Attributes
     ----------
     last : int
-        The last time stamp used in what we sent.
+        Last time stamp of a sent frame, or a later accepted stamp of the autopilot.
     followed_days : float
-        By how many days the autopilot's last stamp was ahead of our clock.
+        Lead of the autopilot's last stamp over our clock, days.
     refused : int
-        Frames that were unsigned, wrongly signed or old.
+        Number of frames rejected because they were unsigned, wrongly signed or old.
     refusals : dict of str to tuple of 2 int
-        Why frames were refused, and the first system and component whose frame was refused for that.
+        Reason of a rejection -> system and component of the first frame rejected for it.
     """
 
     def __init__(
@@ -136,28 +136,31 @@ class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
 
     @property
     def streams(self) -> list[Stream]:
-        """The floors, to be kept for the next run."""
+        """Last accepted stamp of each stream, for storage until the next run."""
         return [(*key, stamp) for key, stamp in self._floors.items()]
 
     def set_clock(self, t_us: int) -> None:
-        """Choose the stamp of the next frame that pymavlink signs, at the UNIX time `t_us` (µs)."""
+        """Set the stamp of the next frame that pymavlink signs, at the UNIX time `t_us` (µs)."""
         self.last = self.timestamp = min(max(self.last + 1, timestamp(t_us)), MAX_STAMP)
 
     def skip(self, count: int, t_us: int) -> None:
-        """Use up the stamps that signing `count` frames would: a replay does not have these frames."""
+        """Advance the stamp as if `count` frames were signed at `t_us` (µs), for a replay without them."""
         self.last = min(max(self.last + 1, timestamp(t_us)) + count - 1, MAX_STAMP)
 
     def reserved(self, t_us: int, margin: int) -> int:
-        """Return a stamp below which all stay that are used within the next `margin` (units of 10 µs).
+        """Return an upper limit of the stamps that are used within the next `margin` (units of 10 µs).
 
-        Stamps follow the clock, and count up by one a frame while they are ahead of it. The next run begins
-        here if this one does not end in good order; it would drift ahead of the clock, restart by restart,
-        if `margin` were simply added to the last stamp.
+        The next run begins at this limit if the present run ends without saving its last stamp. Stamps follow
+        the clock, and increase by one per frame while they are ahead of it. A limit of the last stamp plus
+        `margin` would move further ahead of the clock with every restart.
         """
         return min(max(self.last + STAMPS_PER_SECOND, timestamp(t_us) + margin), MAX_STAMP)
 
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
-        """Return True if a frame of the `stream` (system, component) is genuine and new."""
+        """Return True if a frame is correctly signed and new, or needs no signature; count a rejection.
+
+        `stream`: system and component of the sender. `number`: message id. `t_us`: UNIX time, µs.
+        """
         why = "" if number in NEED_NO_SIGNATURE else NOT_SIGNED
         if is_signed(frame):
             why = self._doubt(frame, stream, t_us)
@@ -167,13 +170,13 @@ class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
         return not why
 
     def _doubt(self, frame: bytes, stream: tuple[int, int], t_us: int) -> str:
-        """Return the fault of a signature; empty where it is genuine and new."""
+        """Return the fault of a frame's signature, empty for a correct and new one; store its time stamp."""
         if sha256(self._key + frame[:-6]).digest()[:6] != frame[-6:]:
             return "signed with another key"
         stamp, now = int.from_bytes(frame[-12:-6], "little"), timestamp(t_us)
         key = frame[-13], stream[0], stream[1], stamp > now + MINUTE
         floor = self._floors.get(key)
-        if floor is None and stamp <= now - MINUTE:  # it may be a recording that is sent again
+        if floor is None and stamp <= now - MINUTE:  # may be a replayed recording
             return "a time stamp behind our clock"
         if floor is not None and stamp <= floor:
             return "an old time stamp"
@@ -187,27 +190,27 @@ class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
 
 
 MAX_PENDING_BYTES: Final = 4096
-"""Most bytes that are kept without a whole frame; then they are skipped, even if a frame may have begun in
-them, so that memory stays bounded."""
+"""Most bytes that are stored until a frame is complete; the codec skips them if no frame completes within
+this number, to limit memory."""
 
 
 class Codec:
-    """MAVLink for one link, without global state, clock or port.
+    """Parser and packer of MAVLink frames for one link, without global state, clock or port.
 
     Parameters
     ----------
     system, component : int
-        Our own, in what we send.
+        Our system id and component id in sent frames.
     signing : Signing or None
-        With it, every frame sent is signed, and frames without a valid signature are refused.
+        If given, every sent frame is signed, and received frames without a valid signature are rejected.
 
     Attributes
     ----------
     now_us, utc_offset_us : int
-        Event time, which the caller sets before it parses or sends, and its offset to UNIX time: the change
-        of the host's clock since the start.
+        Event time (µs), which the caller sets before it parses or sends, and UNIX time minus event time
+        (µs): the steps of the host's clock since the start.
     frames, bytes_skipped : int
-        Messages accepted, bytes that belonged to no frame.
+        Number of accepted messages, and number of bytes that belonged to no frame.
     """
 
     def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
@@ -234,32 +237,32 @@ class Codec:
 
     @property
     def utc_us(self) -> int:
-        """UNIX time, for signatures and in messages."""
+        """UNIX time for signatures and time fields of messages, µs."""
         return self.now_us + self.utc_offset_us
 
     @property
     def pending(self) -> bytes:
-        """Bytes that came but are not yet in any message."""
+        """Received bytes of a frame that is not complete yet."""
         return self._rest
 
     def parse(self, data: bytes, *, final: bool = False) -> list[Message]:
-        """Process bytes as they come; return the messages that are complete with them.
+        """Parse received bytes; return the messages that they complete.
 
-        Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a
-        message of id `BAD_DATA` just before the message that ended them (or every `WINDOW` bytes), so
-        that a log which keeps every ``frame`` keeps every byte. A frame whose signature is not accepted
-        has the id `REFUSED`, as has one that carries a secret, which is not kept.
+        The messages do not depend on how the bytes are split into chunks. Bytes that belong to no frame are
+        returned as a message of id `BAD_DATA` before the next message, or every `MAX_PENDING_BYTES`. So a
+        log of every ``frame`` contains every byte. A frame without a valid signature has the id `REFUSED`. A
+        frame that contains a secret has this id, too, and a payload of zeros.
 
         Parameters
         ----------
         data : bytes
-            As they came.
+            Received bytes, which may begin or end within a frame.
         final : bool
-            No frame continues in the next bytes: remaining bytes belong to none.
+            True if no frame continues in later bytes, so that an incomplete frame is returned as `BAD_DATA`.
         """
         data = self._rest + data
         found: list[Message] = []
-        begin, at = 0, self._looked  # begin: end of the last frame; at: no frame begins before
+        begin, at = 0, self._looked  # begin: end of the last frame; at: no frame begins before this place
         while begin < len(data):
             stop = min(len(data), begin + MAX_PENDING_BYTES)
             start = find_magic(data, at, stop)
@@ -282,12 +285,12 @@ class Codec:
         return found
 
     def pack(self, _name: str, **fields: Any) -> bytes:
-        """Return the frame of a message; fields not named are zero."""
+        """Return the frame of the message `_name`; fields that are not given are zero."""
         layout = spec(_name)
         return self.frame(layout, layout.payload(**fields))
 
     def frame(self, layout: Spec, payload: bytes) -> bytes:
-        """Return the frame of a packed payload (``layout.struct.pack(...)``): the cheapest way to send."""
+        """Return the frame of a payload packed by ``layout.struct.pack(...)``; faster than :meth:`pack`."""
         if self.signing is not None:
             self.signing.set_clock(self.utc_us)
         packer = self._packers.get(layout.id)
@@ -302,7 +305,7 @@ class Codec:
         return Message(BAD_DATA, 0, 0, 0, b"", data, known=False)
 
     def skip(self, count: int) -> None:
-        """Go on as if `count` frames had been sent: a replay does not have these frames."""
+        """Advance sequence number and signing stamp as if `count` frames had been sent, for a replay."""
         self._mav.seq = self._mav.seq + count & 0xFF
         if self.signing:
             self.signing.skip(count, self.utc_us)
@@ -328,11 +331,11 @@ WRAPPED_BYTES = WRAPPER.fields["data"].count
 
 
 class FrameLogWriter:
-    """Turn the messages that a codec returned into frames for the log.
+    """Converter of the messages of a codec to frames for the log.
 
-    A log must be readable by any MAVLink tool and still hold every byte received. Frames are logged as they
-    are; bytes that belong to none are wrapped in MAG_LINK_BYTES. Where the parser needed bytes beyond the
-    frame that it returned, these bytes are logged as well, marked *ahead*: with them, the parser of a replay
+    A log must be readable by any MAVLink tool and contain every received byte. Frames are logged unchanged;
+    bytes that belong to no frame are wrapped in MAG_LINK_BYTES. If the parser needed bytes beyond the frames
+    that it returned, these bytes are logged, too, and marked *ahead*. With them, the parser of a replay
     returns the same messages at the same time.
     """
 
@@ -340,7 +343,10 @@ class FrameLogWriter:
         self._codec = Codec(system, component)
 
     def frames(self, messages: Iterable[Message], pending: bytes) -> list[bytes]:
-        """Return the frames to log for one call of :meth:`Codec.parse`, and the bytes pending after it."""
+        """Return the frames to log for the messages of one call of :meth:`Codec.parse`.
+
+        `pending`: value of :attr:`Codec.pending` after this call.
+        """
         frames: list[bytes] = []
         in_doubt = False
         for one in messages:
@@ -361,14 +367,14 @@ class FrameLogWriter:
 
 
 class FrameLogReader:
-    """Turn frames of a log into the bytes that were received, the inverse of :class:`FrameLogWriter`."""
+    """Converter of a log's frames to the bytes that were received, the inverse of :class:`FrameLogWriter`."""
 
     def __init__(self) -> None:
-        self._fed = 0  # bytes given out beyond the last record that was not ahead
-        self._seen = 0  # bytes of records ahead since then
+        self._fed = 0  # bytes returned beyond the last record that was not marked ahead
+        self._seen = 0  # bytes of records marked ahead since that record
 
     def data(self, frame: bytes) -> bytes:
-        """Return the bytes that `frame` adds to the stream."""
+        """Return the received bytes in `frame`, without those that an earlier call has returned."""
         one = message(frame)
         wrapped = one.id == WRAPPER.id
         data = one["data"][: one["length"]] if wrapped else frame

@@ -1,4 +1,4 @@
-"""The dialect as other programs take it: XML with all that it includes, and modules for pymavlink."""
+"""Export of the MAVLink dialect for other programs: XML files with their includes, and pymavlink modules."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["write_definitions"]
 
 DIALECT_XML = Path(__file__).with_name("magbridge.xml")
 WITH_ARDUPILOT = "magbridge_ardupilotmega.xml"
-"""For stations of ArduPilot, whose own messages are more than the common ones."""
+"""XML of the dialect with ArduPilot's messages in addition to the common ones, for its ground stations."""
 DIALECTS = {DIALECT_XML.name: "magbridge_dialect.py", WITH_ARDUPILOT: "magbridge_ardupilotmega.py"}
-"""The XML of each dialect, and its module; a module named magbridge would hide the package."""
+"""XML file of each dialect -> its Python module; a module named magbridge would hide the package."""
 BOTH = """<?xml version="1.0"?>
 <!-- ArduPilot's messages and those of magbridge. -->
 <mavlink>
@@ -27,12 +27,12 @@ BOTH = """<?xml version="1.0"?>
 
 
 def write_definitions(folder: Path) -> list[Path]:
-    """Write the XML of the dialect and of its includes, and a module for pymavlink of each dialect.
+    """Write the XML of each dialect and of its includes, and a pymavlink module of each dialect.
 
-    `folder`: it exists; files of these names in it are replaced.
-    Returns the dialects' XML and modules, without the included ones.
-    ImportError: pymavlink, which has the standard definitions and makes the modules, is not installed.
-    DataError: its generator made no module.
+    `folder`: existing folder; existing files with the names of written files are replaced.
+    Returns the paths of the dialects' XML files and modules, without the included XML files.
+    ImportError: pymavlink, which contains the standard definitions and the generator, is not installed.
+    DataError: pymavlink's generator wrote no module.
     """
     import pymavlink  # noqa: PLC0415 - the generator takes long to import
     from pymavlink.generator import mavgen, mavparse  # noqa: PLC0415
@@ -41,7 +41,7 @@ def write_definitions(folder: Path) -> list[Path]:
     shutil.copyfile(DIALECT_XML, folder / DIALECT_XML.name)
     (folder / WITH_ARDUPILOT).write_text(BOTH, encoding="utf-8")
     wanted = list(DIALECTS)
-    for name in wanted:  # grows by what each includes
+    for name in wanted:  # grows by the includes of each file
         if name not in DIALECTS:
             shutil.copyfile(shipped / name, folder / name)
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
@@ -54,7 +54,7 @@ def write_definitions(folder: Path) -> list[Path]:
         with (
             redirect_stdout(reported),
             redirect_stderr(reported),
-        ):  # mavgen tells of every file that it looks at
+        ):  # mavgen prints every file that it reads
             options = mavgen.Opts(str(module), wire_protocol="2.0", language="Python3", validate=False)
             done = mavgen.mavgen(options, [str(folder / name)])
         if not done or not module.exists():

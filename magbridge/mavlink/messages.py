@@ -1,8 +1,8 @@
 """Messages of pymavlink's dialect ``all`` and of magbridge: layouts, received messages, frames.
 
-pymavlink computes the checksums of frames and decodes them. Finding them replaces its ``parse_char``: after a
-wrong checksum, that method skips as many bytes as the header claimed, so that garbage that looks like a
-header swallows valid frames (ArduPilot/pymavlink#387).
+pymavlink computes checksums and decodes frames. This module finds the frames in a stream of bytes, in place
+of pymavlink's ``parse_char``. After a wrong checksum, ``parse_char`` skips as many bytes as the header
+states, so that garbage that looks like a header hides valid frames (ArduPilot/pymavlink#387).
 """
 
 from __future__ import annotations
@@ -32,36 +32,36 @@ __all__ = [
 ]  # fmt: skip
 
 BAD_DATA: Final = -1
-"""`Message.id` of bytes that belonged to no frame."""
+"""Value of `Message.id` for bytes that belong to no frame."""
 REFUSED: Final = -2
-"""`Message.id` of a frame whose signature is missing, wrong or old."""
+"""Value of `Message.id` for a frame whose signature is missing, wrong or old, or that contains a secret."""
 
 T = TypeVar("T")
 TURN_E7 = 3_600_000_000
-"""A full circle in 1e-7 deg."""
+"""Full circle, 1e-7 deg."""
 
 MESSAGES: Final[dict[int, Any]] = {**upstream.mavlink_map, **dialect.mavlink_map}
-"""Message id -> pymavlink's class of the message; ours and the few that the wheel lacks take precedence."""
+"""Message id -> pymavlink's class of the message; classes of our own dialect take precedence."""
 upstream.mavlink_map.update(dialect.mavlink_map)  # pymavlink's decoder takes the classes from there
 MESSAGE_IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
 """Message name -> id."""
 DECODER: Final = upstream.MAVLink(None)
-"""Decodes frames that were accepted; it holds no key and no buffer."""
+"""Decoder of accepted frames, without key and buffer."""
 
 
 class Field:
-    """One field of a message: where it is in the payload, and how it reads.
+    """Definition of one field of a message: its place in the payload and its type.
 
     Attributes
     ----------
     name, unit : str
-        As in the XML.
+        Name and unit in the dialect's XML.
     count : int
         Length of an array, 0 for a scalar.
     code : str
-        As in :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
+        Format character of :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
     invalid : int or None
-        The value that means "not known"; in a float field, NaN always does.
+        Value that means "not known"; in a float field, NaN always has this meaning.
     """
 
     __slots__ = ("code", "count", "invalid", "name", "offset", "struct", "unit")
@@ -77,35 +77,37 @@ class Field:
         self.struct = Struct(f"<{self.count}s" if packed_as_bytes else f"<{self.count or ''}{self.code}")
 
     def get(self, payload: bytes) -> Any:
-        """Return the value in a full-length `payload`: int, float, str (text), bytes or a tuple."""
+        """Return the field's value in a full-length `payload`: int, float, str (text), bytes or a tuple."""
         values = self.struct.unpack_from(payload, self.offset)
         if self.code == "s":
             return values[0].partition(b"\0")[0].decode("utf-8", "replace")
         return values if self.count and self.code != "B" else values[0]
 
     def put(self, value: Any) -> Any:
-        """Return `value` as :attr:`Spec.struct` takes it: a tuple for an array of numbers, else one."""
+        """Return `value` in the form to pack with :attr:`Spec.struct`; a tuple for an array of numbers."""
         if self.code == "s":
             return value.encode()[: self.count or 1] if isinstance(value, str) else value
         return tuple(value) if self.count and self.code != "B" else value
 
 
 class Spec:
-    """The layout of one message, as pymavlink's class of it declares it.
+    """Layout of one message, from pymavlink's class of the message.
 
     Attributes
     ----------
     id : int
+        Message id.
     name : str
+        Message name.
     extra : int
-        CRC_EXTRA, the last byte that the checksum covers: it differs between different layouts, so that a
-        receiver with another layout refuses the frame.
+        CRC_EXTRA, the last byte that the checksum covers. It depends on the layout, so that a receiver with
+        another layout rejects the frame.
     size : int
-        bytes of a full payload.
+        Number of bytes of a full payload.
     struct : Struct
-        Packs the full payload, fields in the order of the wire, arrays of bytes as bytes.
+        Format of the full payload, with fields in the order of the wire and arrays of bytes as bytes.
     fields : dict of str to Field
-        In the order of the wire.
+        Field name -> definition, in the order of the wire.
     """
 
     def __init__(self, number: int) -> None:
@@ -124,11 +126,11 @@ class Spec:
         self.struct = Struct(form)
         zeros = bytes(self.size)
         self._defaults = {name: field.get(zeros) for name, field in self.fields.items()}
-        # not one number: texts and arrays
+        # fields that are not a single number: texts and arrays
         self._uneven = [field for field in self.fields.values() if field.count or field.code == "s"]
 
     def payload(self, **fields: Any) -> bytes:
-        """Pack `fields` by name; those not named are zero.
+        """Return the packed payload with the values of `fields` by name; fields not given are zero.
 
         Raises
         ------
@@ -152,30 +154,32 @@ class Spec:
 
 @cache
 def spec(message: int | str) -> Spec:
-    """Return the layout of a message, by id or name; KeyError: no such message."""
+    """Return the layout of a message, by id or name; KeyError: the message does not exist."""
     return Spec(message) if isinstance(message, int) else spec(MESSAGE_IDS[message])
 
 
 def by_id(**of: T) -> dict[int, T]:
-    """Return values that are named after messages, by the messages' ids; KeyError: no such message."""
+    """Return the values of keyword arguments, named after messages, by message id; KeyError: unknown name."""
     return {spec(name).id: value for name, value in of.items()}
 
 
 class Message:
-    """A received message. pymavlink decodes it when a field is first read: ``message["roll"]``.
+    """Received message, whose fields are read by name: ``message["roll"]``.
+
+    pymavlink decodes the frame when a field is first read.
 
     Attributes
     ----------
     id : int
-        Message id; `BAD_DATA` and `REFUSED` for bytes and frames that are not to be read.
+        Message id; `BAD_DATA` for bytes without a frame, `REFUSED` for a rejected frame.
     system, component, sequence : int
-        The sender's.
+        System id, component id and sequence number of the sender.
     payload : bytes
-        Zeros that the sender cut off are put back.
+        Payload, with the final zeros that MAVLink 2 does not transmit.
     frame : bytes
-        The whole frame as it came.
+        All received bytes of the frame.
     known : bool
-        The message is in the dialect, and its checksum was right.
+        True if the message is in the dialect and its checksum is correct.
     """
 
     __slots__ = ("_decoded", "component", "frame", "id", "known", "payload", "sequence", "system")
@@ -196,14 +200,14 @@ class Message:
 
     @property
     def name(self) -> str:
-        """The message's name; ``UNKNOWN_<id>`` where the dialect lacks it."""
+        """Name of the message; ``UNKNOWN_<id>`` if the message is not in the dialect."""
         if self.known:
             return spec(self.id).name
         return {BAD_DATA: "BAD_DATA", REFUSED: "REFUSED"}.get(self.id, f"UNKNOWN_{self.id}")
 
     @property
     def fields(self) -> dict[str, Any]:
-        """All fields by name, in the order of the wire; empty where the message is not known."""
+        """Values of all fields by name, in the order of the wire; empty if the message is not known."""
         return {name: self[name] for name in spec(self.id).fields} if self.known else {}
 
     def __getitem__(self, name: str) -> Any:
@@ -227,7 +231,7 @@ class Message:
 
 
 def split_index(field: str) -> tuple[str, int | None]:
-    """Split ``"actuator[2]"`` into name and index; the index is None where there is none."""
+    """Split ``"actuator[2]"`` into name and index; the index of ``"actuator"`` is None."""
     match = re.fullmatch(r"(\w+)(?:\[(\d+)\])?", field)
     if match is None:
         return field, None
@@ -235,7 +239,7 @@ def split_index(field: str) -> tuple[str, int | None]:
 
 
 def east_e7(longitude: float) -> int:
-    """Return a longitude (deg, of any turn) in 1e-7 deg, -180 to 180: beyond 214, 32 bits overflow."""
+    """Return a longitude (deg, any range) in 1e-7 deg, wrapped to -180 to 180 deg so that it fits 32 bits."""
     return (round(longitude * 1e7) + TURN_E7 // 2) % TURN_E7 - TURN_E7 // 2
 
 
@@ -243,27 +247,27 @@ V1: Final = PROTOCOL_MARKER_V1
 V2: Final = PROTOCOL_MARKER_V2
 SIGNED: Final = MAVLINK_IFLAG_SIGNED
 SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
-"""Length of a signature, bytes: link id, 6 of time stamp, 6 of hash."""
+"""Length of a signature, bytes: 1 of link id, 6 of time stamp, 6 of hash."""
 NOT_A_FRAME: Final = 0
 NEEDS_MORE: Final = -1
 MAX_MESSAGE_ID: Final = 0xFFFF
-"""The last message id that a message outside the dialect may have."""
+"""Largest message id that is accepted of a message outside the dialect."""
 EXTRA: Final = {number: bytes((layout.crc_extra,)) for number, layout in MESSAGES.items()}
-"""CRC_EXTRA of each message, the last byte that its checksum covers."""
+"""Message id -> CRC_EXTRA, the last byte that the message's checksum covers."""
 
 
 def checksum(data: bytes, extra: bytes) -> int:
-    """Return the checksum of a frame's bytes after the magic byte, and of its CRC_EXTRA."""
+    """Return the checksum of `data`, a frame's bytes after the magic byte, followed by its CRC_EXTRA."""
     crc: int = x25crc(data + extra).crc
     return crc
 
 
 def find_magic(data: bytes, start: int, stop: int) -> int:
-    """Return where the first magic byte of ``data[start:stop]`` is; `stop` where there is none.
+    """Return the position in `data` of the first magic byte from `start` on; `stop` if none is before `stop`.
 
     A regular expression would take a hundred times as long for a long run of other bytes.
     """
-    if start < stop and (data[start] == V2 or data[start] == V1):  # as almost always: right after a frame
+    if start < stop and (data[start] == V2 or data[start] == V1):  # the usual case: right after a frame
         return start
     v2 = data.find(V2, start, stop)
     end = v2 if v2 >= 0 else stop
@@ -272,21 +276,21 @@ def find_magic(data: bytes, start: int, stop: int) -> int:
 
 
 def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
-    """Return where the frame ends that begins at ``data[start]``.
+    """Return the position in `data` where the frame that begins at ``data[start]`` ends.
 
-    The checksum of a message outside the dialect cannot be checked; it is believed when its header is
-    plausible and another frame begins at its end, or when it ends with the data. A random
-    header hardly ever is plausible, so that garbage does not delay the frames behind it.
+    The checksum of a message outside the dialect cannot be checked. Such a frame is accepted if its header is
+    plausible and another frame begins at its end, or the data end there. A random header is rarely plausible,
+    so that garbage does not delay later frames.
 
-    `data`: bytes received; ``data[start]`` is a magic byte.
-    `start`, `stop`: look at no more than ``data[start:stop]``.
-    `last`: nothing comes after `stop`.
-    Returns the end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the bytes from `stop` on are needed to decide.
+    `data`: received bytes; ``data[start]`` is a magic byte.
+    `start`, `stop`: only ``data[start:stop]`` is used.
+    `last`: True if no bytes follow `stop`.
+    Returns the end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the decision needs the bytes from `stop` on.
     """
     available = stop - start
     header = 10 if data[start] == V2 else 6
     flags = data[start + 2] if header == 10 and available > 2 else 0
-    # an incompatibility flag that we do not know: by the standard, not to be read
+    # the standard demands that a frame with an unknown incompatibility flag is dropped
     if flags > SIGNED or available < header:
         return NOT_A_FRAME if flags > SIGNED else NEEDS_MORE
     number = data[start + 5] if header == 6 else _number(data, start)
@@ -306,7 +310,7 @@ def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
 
 
 def message(frame: bytes) -> Message:
-    """Parse a frame that :func:`frame_end` has accepted."""
+    """Return the message in a frame that :func:`frame_end` has accepted."""
     header = 10 if frame[0] == V2 else 6
     number = frame[5] if header == 6 else _number(frame, 0)
     payload = frame[header : header + frame[1]]
@@ -331,8 +335,8 @@ def _number(data: bytes, start: int) -> int:
 SECRET = frozenset(
     spec(name).id for name in ("SETUP_SIGNING", "AUTH_KEY", "CHANGE_OPERATOR_CONTROL", "WIFI_CONFIG_AP")
 )
-"""Ids of the messages with a key, a passkey or a password in them. The bridge accepts none over the link, so
-that a log or the memory keeps only the fact that they came."""
+"""Ids of the messages that contain a key, a passkey or a password. The bridge rejects them and replaces their
+payload by zeros, so that no log contains a secret."""
 SECRET_HEADER = re.compile(
     rb"\xfd.{6}(?:" + b"|".join(re.escape(number.to_bytes(3, "little")) for number in SECRET) + rb")",
     re.DOTALL,
@@ -340,7 +344,7 @@ SECRET_HEADER = re.compile(
 
 
 def without_secret(frame: bytes) -> bytes:
-    """Return a frame of such a message with zeros for its payload, and the checksum that belongs to it."""
+    """Return the frame of a message in `SECRET` with a payload of zeros and the matching checksum."""
     header = 10 if frame[0] == V2 else 6
     number = int.from_bytes(frame[7:10], "little") if header == 10 else frame[5]
     body = frame[1:header] + bytes(frame[1])
@@ -350,7 +354,7 @@ def without_secret(frame: bytes) -> bytes:
 
 
 def without_secrets(data: bytes) -> bytes:
-    """Return bytes that are not a whole frame, with zeros wherever the payload of such a message may be."""
+    """Return bytes of incomplete frames, with zeros wherever the payload of a message in `SECRET` may be."""
     for match in SECRET_HEADER.finditer(data):
         begin = match.end()
         end = min(begin + data[match.start() + 1], len(data))
@@ -359,24 +363,25 @@ def without_secrets(data: bytes) -> bytes:
 
 
 class Source:
-    """Lets one value come from one component at a time: live, and when a bridge's log is read.
+    """Selection of one component as the source of a value, on a live link and in a bridge's log.
 
-    That is the `wanted` one; else the first heard, but the autopilot goes before all others, and another
-    takes its place when nothing has come for longer than `patience_us`.
+    The source is the component `wanted`, if given. Otherwise it is the first component that sends the value.
+    The autopilot replaces any other source; another component replaces a source that has sent nothing for
+    longer than `patience_us`.
 
     Parameters
     ----------
     autopilot : int
-        Component of the autopilot.
+        Component id of the autopilot.
     patience_us : int
-        µs.
+        Time without a value after which another component may become the source, µs.
     wanted : int or None
-        The only component that counts.
+        Component id of the only accepted source; None to select it as described.
 
     Attributes
     ----------
     component : int or None
-        Where the last value came from.
+        Component id of the present source; None before the first value.
     """
 
     __slots__ = ("_autopilot", "_patience_us", "_received_us", "component", "wanted")
@@ -387,7 +392,7 @@ class Source:
         self._received_us = 0
 
     def admit(self, component: int, time_us: int) -> bool:
-        """Return True if a value from `component` at `time_us` (µs) counts."""
+        """Update the source by a value from `component` at `time_us` (µs); return True if accepted."""
         if component != self.component:
             if self.wanted is not None:
                 if component != self.wanted:

@@ -1,9 +1,9 @@
-"""Telemetry logs: each record an 8-byte big-endian time stamp (µs of UNIX time) and one MAVLink frame.
+"""Telemetry logs, whose records are an 8-byte big-endian time stamp (µs of UNIX time) and one MAVLink frame.
 
-A record counts when its frame's checksum is right (for a message outside the dialect: when another record
-follows it) and its stamp lies before 2112. :func:`blocks` returns many records at once, as arrays: every
-place where a record may begin is tried, and of those with a right checksum the first that begins after the
-last is taken. :class:`LogReader` yields the same records one by one.
+A record is valid if its stamp is before 2112 and the checksum of its frame is correct. If its message is not
+in the dialect, a further record must follow instead. :func:`blocks` yields many records at once, as arrays.
+It tests every place where a record may begin, and each time takes the first valid record after the previous
+one. :class:`LogReader` yields the same records one by one.
 """
 
 from __future__ import annotations
@@ -35,42 +35,42 @@ __all__ = ["LogReader", "RecordBlock", "TlogRecord", "blocks", "pack_record", "p
 
 TLOG_STAMP: Final = Struct(">Q")
 LATEST: Final = 1 << 52
-"""Stamp of the year 2112, µs; a later one is damage."""
+"""Stamp of the year 2112, µs; a later stamp is damaged."""
 BLOCK_BYTES: Final = 1 << 22
-"""Bytes read at a time."""
+"""Number of bytes that are read from the file at a time."""
 MAX_RECORD_BYTES = 8 + 10 + 255 + 2 + SIGNATURE + 9
-"""Bytes of the longest record, and of what shows that another follows."""
+"""Length of the longest record and of the next record up to its magic byte, bytes."""
 RECORD_LAYOUT = np.dtype([("stamp", ">u8"), ("head", "u1", 10)])
 KNOWN_LENGTHS = np.full(1 << 16, -1, dtype=np.int64)
 KNOWN_LENGTHS[[number for number in EXTRA if number < len(KNOWN_LENGTHS)]] = [
     EXTRA[number][0] for number in EXTRA if number < len(KNOWN_LENGTHS)
 ]
-"""CRC_EXTRA of each message in the dialect, -1 of the others."""
+"""CRC_EXTRA of each message in the dialect, by message id, (65536,); -1 for other ids."""
 
 
 class TlogRecord(msgspec.Struct, frozen=True, gc=False):
-    """One record of a log."""
+    """One record of a telemetry log."""
 
     time_us: int
-    """µs of UNIX time; a multiple of 4."""
+    """Time of the record, µs of UNIX time; a multiple of 4."""
     channel: int
-    """The stamp's low two bits: :class:`magbridge.records.Channel` in our logs, a link number elsewhere."""
+    """Low two bits of the stamp: :class:`magbridge.records.Channel` in our logs, else a link number."""
     frame: bytes
-    """The MAVLink frame."""
+    """MAVLink frame of the record."""
 
     @property
     def message(self) -> Message:
-        """The parsed frame."""
+        """Message in the record's frame."""
         return message(self.frame)
 
 
 def pack_record(time_us: int, channel: int, frame: bytes) -> bytes:
-    """Return the bytes of a record; `time_us` loses its low two bits to the channel."""
+    """Return the bytes of a record; `channel` replaces the low two bits of `time_us`."""
     return TLOG_STAMP.pack(time_us & ~3 | channel) + frame
 
 
 def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
-    """Return the bytes of records: time, channel and frame of each."""
+    """Return the bytes of records, each given as time (µs), channel and frame."""
     pieces: list[bytes] = []
     for time_us, channel, frame in records:
         pieces.append(TLOG_STAMP.pack(time_us & ~3 | channel))
@@ -79,7 +79,7 @@ def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
 
 
 class RecordBlock(NamedTuple):
-    """Records that follow each other."""
+    """Consecutive records of a log, as arrays over the records, (n,)."""
 
     data: bytes
     time_us: IndexArray
@@ -87,19 +87,19 @@ class RecordBlock(NamedTuple):
     number: IndexArray
     system: IndexArray
     component: IndexArray
-    """`time_us`, `channel`, `number`, `system`, `component`, (n,): The stamp and its low two bits, the
-    message's id, and its sender."""
+    """`time_us`, `channel`, `number`, `system`, `component`, (n,): Time (µs) and channel, message id, and
+    system id and component id of the sender."""
     frame: IndexArray
     payload: IndexArray
     end: IndexArray
-    """`frame`, `payload`, `end`, (n,): Where in `data` the frame and the payload begin, and where the payload
-    ends."""
+    """`frame`, `payload`, `end`, (n,): Positions in `data` where the frame begins, and where the payload
+    begins and ends."""
     bytes_skipped: int
     damages: int
-    """`bytes_skipped`, `damages`: Bytes between them that belong to no record, and the places."""
+    """`bytes_skipped`, `damages`: Number of bytes that belong to no record, and of places with such bytes."""
 
     def payloads(self, records: IndexArray) -> NDArray[np.uint8]:
-        """Return the payloads (n, size) of records of one message, with the zeros that were cut off."""
+        """Return the payloads (n, size) of `records`, indices (n,) of one message id, padded with zeros."""
         size = spec(int(self.number[records[0]])).size
         start, length = self.payload[records], self.end[records] - self.payload[records]
         at = np.arange(size)
@@ -109,19 +109,19 @@ class RecordBlock(NamedTuple):
         return taken
 
     def record(self, k: int) -> TlogRecord:
-        """Return one record."""
+        """Return the record with index `k`."""
         start, end = int(self.frame[k]), int(self.end[k]) + 2
         signed = self.data[start] == V2 and self.data[start + 2] & SIGNED
         frame = self.data[start : end + (SIGNATURE if signed else 0)]
         return TlogRecord(int(self.time_us[k]), int(self.channel[k]), frame)
 
     def message(self, k: int) -> Message:
-        """Return one record's message."""
+        """Return the message of the record with index `k`."""
         return self.record(k).message
 
 
 def blocks(file: BinaryIO, block_bytes: int = BLOCK_BYTES) -> Iterator[RecordBlock]:
-    """Yield the records of a log, read `block_bytes` at a time; memory does not grow with the file."""
+    """Yield the records of a log in blocks of about `block_bytes`; memory does not grow with the file."""
     data, broken, last = b"", False, False
     while not last:
         chunk = file.read(block_bytes)
@@ -133,21 +133,21 @@ def blocks(file: BinaryIO, block_bytes: int = BLOCK_BYTES) -> Iterator[RecordBlo
 
 
 class LogReader:
-    """Reads the records of a log one by one and skips damaged bytes.
+    """Iterator over the records of a log, which skips damaged bytes.
 
     Parameters
     ----------
     file : binary file
-        Read from where it stands to its end.
+        File, which is read from its present position to its end.
     block_bytes : int
-        Bytes read at a time; few where only the first records are wanted.
+        Number of bytes that are read at a time; a small number suits a caller that needs few records.
 
     Attributes
     ----------
     records : int
-        Records read so far.
+        Number of records read so far.
     bytes_skipped : int
-        Bytes that belonged to no record, in the blocks read so far.
+        Number of bytes that belonged to no record, in the blocks read so far.
     damages : int
         Number of places with such bytes.
     """
@@ -166,12 +166,15 @@ class LogReader:
 
 
 def _block(data: bytes, broken: bool, *, last: bool) -> tuple[RecordBlock, int, bool]:
-    """Return the records in `data`, where the undecided ones begin, and whether that is damage."""
+    """Return the records in `data`, the position of the undecided rest, and True if `data` end in damage.
+
+    `broken`: True if the bytes before `data` were damaged. `last`: True if no bytes follow.
+    """
     stop = len(data) if last else max(len(data) - MAX_RECORD_BYTES, 0)
     start, found = _candidates(data, stop)
     ends = found.pop("stop")
     taken, at, skipped, damages = [], 0, 0, 0
-    # where each record is followed by another, they are taken all at once
+    # records that follow each other without a gap are taken all at once
     joins = np.append(start[1:] == ends[:-1], False)
     breaks, starts = np.flatnonzero(~joins).tolist(), start.tolist()
     k = 0
@@ -192,9 +195,12 @@ def _block(data: bytes, broken: bool, *, last: bool) -> tuple[RecordBlock, int, 
 
 
 def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArray]]:
-    """Return where records begin whose frames are right, and what they are; some lie within others."""
+    """Return the positions (n,) of valid records that begin before `stop`, and their fields as arrays (n,).
+
+    Records may overlap, because a frame's payload may contain bytes that look like a record.
+    """
     raw = np.frombuffer(data, np.uint8)
-    # a stamp before 2112 has twelve bits of zeros
+    # a stamp before 2112 begins with twelve zero bits
     n = max(min(stop, len(raw) - 16), 0)
     magic = raw[8 : 8 + n]
     start = np.flatnonzero(((magic == V2) | (magic == V1)) & (raw[:n] == 0) & (raw[1 : n + 1] < 0x10))
@@ -219,7 +225,7 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     good = np.zeros(len(start), dtype=bool)
     at = body_end[known]
     good[known] = crc == (raw[at].astype(np.int64) | raw[at + 1].astype(np.int64) << 8)
-    # outside the dialect: believed where another follows
+    # a record of a message outside the dialect is accepted if another record follows
     unknown = np.flatnonzero(fits & (extra < 0) & two & (header[:, 3] == 0) & (number <= MAX_MESSAGE_ID))
     after = end[unknown] + 8
     follows = np.isin(raw[np.minimum(after, len(raw) - 1)], (V1, V2)) & (after < len(raw))
