@@ -1,10 +1,10 @@
-"""Check corrected samples: can they be the Earth's field, and does the calibration still hold.
+"""Check whether corrected samples can be the Earth's field, and whether the calibration still holds.
 
 :class:`HealthMonitor` runs :mod:`.checks` (repeated readings, the main field), :mod:`.scatter` (noise),
 :mod:`.trend` (outliers and jumps) and :mod:`.consistency` (dependence on attitude, temperature and masses);
-:class:`DirectionCheck` needs the autopilot's attitude. A check is cheap, uses only the times of events, and
-returns flags and a variance. The package uses ``estimation`` and knows neither logs nor MAVLink. Start with
-:mod:`.monitor`.
+:class:`DirectionCheck` needs the autopilot's attitude. A check is cheap, uses the times of the samples
+as its only clock, and returns flags and a variance. The package does not depend on logs or MAVLink. Start
+with :mod:`.monitor`.
 """
 
 from magbridge.health.checks import Messages

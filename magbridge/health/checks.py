@@ -1,16 +1,16 @@
-r"""Check single readings: do channels repeat, and can the total field be the Earth's.
+r"""Check single readings for stuck channels, and for a total field that cannot be the Earth's.
 
-A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. It is
-learned for each channel alone, and for all three together. For all three, p is at least what the noise gives:
-normal noise of standard deviation :math:`\sigma`, in steps of q, repeats a channel's reading with the
+A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. The check
+learns p for each channel, and for all three together. For all three, the noise gives a lower bound of p:
+normal noise of standard deviation :math:`\sigma`, in steps of q, repeats one channel's reading with the
 probability :math:`q / (2 \sqrt\pi \sigma)`.
 
-The Earth's total field is the sum of the main field and the crustal field. The main field alone is off by 145
-nT (1-sigma over the Earth, crustal field and disturbances included: the error model of Chulliat et al. 2020,
-*The US/UK World Magnetic Model for 2020-2025*), or by ``align.reference_sigma``. A total field further off
-than :data:`MAX_LEVEL_SIGMA` is not the Earth's. Without a position, it is compared with the extremes on the
-Earth. The reference bounds every error: while the field is more than :data:`FAR_SIGMA` off, sigma includes
-the difference, until it is less than :data:`NEAR_SIGMA`.
+The Earth's total field is the sum of the main field and the crustal field. It differs from the main field by
+145 nT (1-sigma over the Earth, with disturbances: the error model of Chulliat et al. 2020, *The US/UK World
+Magnetic Model for 2020-2025*), or by the configured ``align.reference_sigma``. A total field that differs by
+more than :data:`MAX_LEVEL_SIGMA` is not the Earth's. If no position is known, the limits are the extremes on
+the Earth. Sigma includes the difference once it exceeds :data:`FAR_SIGMA`, until it is below
+:data:`NEAR_SIGMA`.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 
 
 class Messages:
-    """Messages for the operator, each kind once: `lines` has those since the caller last emptied it."""
+    """Messages for the operator, each kind once; the caller empties `lines` after sending them."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
         self._kinds: set[str] = set()
 
     def report(self, kind: str, text: str) -> None:
-        """Add a message, unless there was one of this kind."""
+        """Add a message, unless one of this kind was added before."""
         if kind not in self._kinds:
             self._kinds.add(kind)
             self.lines.append(text)
 
 
 LEARNING_SAMPLES: Final = 256
-"""Samples over which the fraction of repeated readings is learned."""
+"""Time constant, in samples, of the average fraction of repeated readings."""
 MAX_PROBABILITY: Final = 1e-9
-"""Probability of a run of repeated readings that a healthy channel does not show."""
+"""Probability of a run of repeated readings below which the channel counts as stuck."""
 MIN_STUCK_FRACTION: Final = 1e-3
 MIN_RUN: Final = 4
 MIN_COMMON_RUN: Final = 3
@@ -49,7 +49,7 @@ AXIS_LETTERS: Final = "xyz"
 
 
 class Repetition:
-    """Repetitions of one reading: how many in a row, and how often they occur."""
+    """Statistics of a channel's repeated readings: length of the present run, and average fraction."""
 
     __slots__ = ("fraction", "last", "limit", "run")
 
@@ -64,7 +64,10 @@ class Repetition:
         self.fraction += (MIN_STUCK_FRACTION - self.fraction) / LEARNING_SAMPLES
 
     def repeat(self, probability: float, min_run: int) -> bool:
-        """Record a repetition; return True if a healthy channel does not repeat its reading so often."""
+        """Record a repetition; return True if a run so long is too unlikely for a healthy channel.
+
+        `probability` is a lower bound of the probability of one repetition.
+        """
         self.run += 1
         if self.run >= min_run and self.run * log(max(self.fraction, probability)) < log(MAX_PROBABILITY):
             return True
@@ -74,7 +77,7 @@ class Repetition:
 
 
 class RepetitionCheck:
-    """Check whether the three channels repeat their readings."""
+    """Check of the three channels for stuck readings."""
 
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
@@ -89,9 +92,9 @@ class RepetitionCheck:
         return self._common.run > 0
 
     def is_stuck(self, raw: Vector, scatter: Scatter) -> bool:
-        """Return True if channels repeat their reading, or read a limit at which they were once stuck.
+        """Return True if a channel is stuck, or reads a limit at which it was stuck before.
 
-        `raw` is the reading, nT; `scatter` has measured the white noise.
+        `raw` is the reading, nT; `scatter` gives the measured white noise.
         """
         x_axis, y_axis, z_axis = self._axes
         x, y, z = raw
@@ -113,7 +116,7 @@ class RepetitionCheck:
         return stuck
 
     def _repeat_all(self, white_sigma: float) -> bool:
-        """Record a reading that repeats on all axes; return True if that is a fault."""
+        """Record a reading that repeats on all axes; return True if the run of repetitions is a fault."""
         # probability that one channel repeats: step of the readings over sigma, as in the module
         axis_probability = min(self._step / (2.0 * sqrt(pi) * max(white_sigma, 1e-9)), 1.0)
         if not self._common.repeat(axis_probability**3, MIN_COMMON_RUN):
@@ -122,7 +125,7 @@ class RepetitionCheck:
         return True
 
     def _repeat(self, number: int, axis: Repetition, value: float) -> bool:
-        """Record a reading that repeats on one axis; return True if that is a fault."""
+        """Record a reading that repeats on one axis; return True if the run of repetitions is a fault."""
         # a value at which the axis was stuck before is a limit: no probability is needed
         if abs(value) == axis.limit:
             axis.run += 1
@@ -138,22 +141,23 @@ class RepetitionCheck:
 MAX_LEVEL_SIGMA: Final = 5.0
 FAR_SIGMA: Final = 3.0
 NEAR_SIGMA: Final = 1.0
-"""Sigmas of the total field about the main field."""
+"""Thresholds of the difference between total field and main field, in sigmas: fault, begin and end of a wider
+sigma."""
 MIN_FIELD_NT: Final = 17_000.0
 MAX_FIELD_NT: Final = 72_000.0
-"""The main field's extremes on the Earth, 22,000 and 67,000 nT, with crustal fields."""
+"""Limits of the Earth's total field, nT: the main field has 22,000 to 67,000 nT, plus crustal fields."""
 MIN_WRONG_SAMPLES: Final = 3
 MIN_WRONG_US: Final = 8_000_000
-"""Samples and time after which a wrong field is not a burst of bad readings."""
+"""Number of samples, and time (µs), after which a wrong field is not just a burst of bad readings."""
 LEVEL_HOLD_US: Final = 3_600_000_000
-"""Time for which a wrong field that is over is remembered."""
+"""Time for which samples stay flagged after a wrong field has ended, µs."""
 
 
 class LevelCheck:
-    """Compare the total field with the main field.
+    """Check of the total field against the main field.
 
-    `is_wrong` is True if the last sample's total field is not the Earth's. Because of that, samples are
-    flagged until the time `until_us`, µs.
+    `is_wrong` is True if the last sample's total field cannot be the Earth's. After a longer fault, samples
+    are flagged until the time `until_us`, µs.
     """
 
     def __init__(self, messages: Messages) -> None:
@@ -166,9 +170,9 @@ class LevelCheck:
     def check(
         self, time_us: int, total: float, sigma: float, reference: float, reference_sigma: float, steady: bool
     ) -> float:
-        """Set :attr:`is_wrong`; return the variance (nT²) of a field that is far off.
+        """Set :attr:`is_wrong`; return the squared difference (nT²) from the main field while it is large.
 
-        Only a sample of `steady` masses can end that.
+        Return 0 otherwise. Only a sample with masses at rest (`steady`) can end a large difference.
         """
         if isnan(reference):
             self._record(time_us, total, reference, not MIN_FIELD_NT < total < MAX_FIELD_NT)
@@ -177,7 +181,7 @@ class LevelCheck:
         # normalised square of the difference from the main field
         squared = difference * difference / (reference_sigma * reference_sigma + sigma * sigma)
         self._record(time_us, total, reference, squared > MAX_LEVEL_SIGMA * MAX_LEVEL_SIGMA)
-        # two thresholds: begin at FAR_SIGMA, end at NEAR_SIGMA
+        # hysteresis: begin at FAR_SIGMA, end at NEAR_SIGMA
         if self._is_far and steady:
             self._is_far = squared > NEAR_SIGMA * NEAR_SIGMA
         self._is_far = self._is_far or squared > FAR_SIGMA * FAR_SIGMA

@@ -1,15 +1,15 @@
 r"""Compare the total fields of two sensors of one vehicle, and find which of them is wrong.
 
-Both measure the same field, so their difference d has the variance :math:`s_1^2 + s_2^2` of their own sigmas.
-Where it is larger by far, and for long, one of them is wrong: the one whose own samples are flagged, else
-the one that the main field contradicts. The field F of the Earth is normal about the main field R, with the
-standard deviation :math:`\sigma_R`. If sensor 1 is wrong, the other one measures F, and vice versa. The log
-ratio of the two hypotheses is
+Both sensors measure the same field, so their difference d has the variance :math:`s_1^2 + s_2^2` of their
+sigmas. If d is much larger for long, one sensor is wrong: the sensor whose samples are flagged, or else the
+sensor that the main field contradicts. The Earth's field F is normal about the main field R, with the
+standard deviation :math:`\sigma_R`. If sensor 1 is wrong, sensor 2 measures F, and vice versa. The log ratio
+of 'sensor 1 is wrong' over 'sensor 2 is wrong' is
 
 .. math:: \frac{(F_1 - R)^2}{2 (\sigma_R^2 + s_1^2)} - \frac{(F_2 - R)^2}{2 (\sigma_R^2 + s_2^2)}
 
 The variance that neither sigma explains, :math:`d^2 - s_1^2 - s_2^2`, is added to that of the wrong sensor,
-or to both where the evidence does not distinguish them.
+or to both sensors' if the evidence does not show which is wrong.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from magbridge.records import Quality
 
 MIN_COMPARED: Final = 5
 MIN_DISAGREEMENT_US: Final = 1_000_000
-"""Comparisons in a row, and time, after which a disagreement is reported; so many that agree end it."""
+"""Number of consecutive comparisons, and time (µs), that begin or end a disagreement."""
 BLAME_LOG_RATIO: Final = 3.0
-"""Log ratio from which the main field decides which sensor is wrong: odds of 20 to 1."""
+"""Log ratio above which the main field decides which sensor is wrong: odds of 20 to 1."""
 MAX_INTERVAL_US: Final = 10_000_000
-"""µs between two samples of a sensor, across which its field is not interpolated."""
+"""Longest interval between two samples of a sensor over which its field is interpolated, µs."""
 DOUBTFUL: Final = int(
     Quality.IMPLAUSIBLE | Quality.SATURATED | Quality.OFFSET_SUSPECT | Quality.STALE_TELEMETRY
 )
-"""Flags by which a sensor shows that it is the wrong one."""
+"""Flags that mark a sample as faulty without the other sensor."""
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 
 
 class ComparedSample(NamedTuple):
-    """A sample of one of the sensors."""
+    """Sample of one of the two sensors, as the comparison uses it."""
 
     time_us: int
     total: float
@@ -43,16 +43,16 @@ class ComparedSample(NamedTuple):
     sigma: float
     """1-sigma of the total field, nT."""
     reference: float
-    """Total field of the main-field model there, nT; NaN where unknown."""
+    """Total field of the main-field model at the sample, nT; NaN if unknown."""
     is_doubtful: bool
-    """Whether the sample's own flags show a fault."""
+    """True if the sample's own flags show a fault."""
 
 
 class SensorComparison:
-    """Compare the samples of two sensors as they come; `names` is what messages call the sensors.
+    """Comparison of the total fields of two sensors, sample by sample; messages use the sensors' `names`.
 
-    `message` is the last change, for the operator; the caller empties it. `is_wrong` is True while the
-    sensors disagree, and `blamed` (0 or 1) is the one that is wrong, or None if that is not known.
+    `message` tells the operator the last change of the state; the caller empties it. `is_wrong` is True while
+    the sensors disagree. `blamed` (0 or 1) is the index of the wrong sensor, or None if unknown.
     """
 
     def __init__(self, names: tuple[str, str]) -> None:
@@ -73,11 +73,11 @@ class SensorComparison:
         main_field: tuple[float, float],
         quality: int,
     ) -> tuple[float, int]:
-        """Compare a sample; return the variance (nT²) and the flags to add to it.
+        """Compare a sample with the other sensor's; return the variance (nT²) and the flags to add to it.
 
-        `side` (0 or 1) is the sensor; `total_field` is the total field and its 1-sigma, nT; `main_field` the
-        main field, NaN where unknown, and the 1-sigma of the Earth's field about it, nT; `quality` the
-        sample's :class:`~magbridge.records.Quality` bits.
+        `side` (0 or 1) is the sensor's index, `total_field` the total field with its 1-sigma (nT).
+        `main_field` is the main field (NaN if unknown) with the 1-sigma of the Earth's field about it (nT).
+        `quality` has the sample's :class:`~magbridge.records.Quality` bits.
         """
         total, sigma = total_field
         if isfinite(total + sigma):
@@ -89,7 +89,7 @@ class SensorComparison:
         return self._excess, IMPLAUSIBLE if self.is_wrong and self.blamed == side else 0
 
     def _compare(self, side: int, reference_sigma: float) -> None:
-        """Compare the other sensor's last sample with this one's field at that time."""
+        """Compare the other sensor's last sample with the field of sensor `side` at the same time."""
         before, after, other = self._previous[side], self._last[side], self._last[1 - side]
         if before is None or after is None or other is None:
             return
@@ -100,7 +100,7 @@ class SensorComparison:
         fraction = (other.time_us - before.time_us) / step_us
         total = before.total + fraction * (after.total - before.total)
         difference = total - other.total
-        # variance of the difference, were both sigmas right
+        # variance of the difference if both sigmas are right
         expected = after.sigma**2 + other.sigma**2
         # beyond the sigmas, or during a disagreement: the variance that neither sigma explains
         disagrees = difference * difference > DISAGREEMENT_SIGMA**2 * expected
@@ -113,7 +113,7 @@ class SensorComparison:
             self._report(abs(difference))
 
     def _count(self, disagrees: bool, time_us: int) -> None:
-        """Begin or end a disagreement that lasts."""
+        """Begin or end the disagreement, once enough consecutive comparisons support the change."""
         # a state changes only after several comparisons in a row
         if disagrees == self.is_wrong:
             self._run = 0
@@ -131,7 +131,7 @@ class SensorComparison:
             self._reported: int | None = -1
 
     def _blame(self, pair: tuple[ComparedSample, ComparedSample], reference_sigma: float) -> None:
-        """Decide which sensor is wrong; a decision stands until there is evidence against it."""
+        """Decide which sensor is wrong; keep the last decision unless the evidence contradicts it."""
         first, second = pair
         if first.is_doubtful != second.is_doubtful:
             self.blamed = 0 if first.is_doubtful else 1

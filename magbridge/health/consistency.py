@@ -9,16 +9,16 @@ by
 - :math:`u_x^2 a_x + u_y^2 a_y + u_x u_y a_{xy}` (gain),
 - :math:`a\, \partial F / \partial p` (telemetry of a mass p).
 
-A Kalman filter predicts the total field from the crustal field along the track alone
-(:mod:`magbridge.estimation.track_process`); :mod:`magbridge.estimation.sequential` tests its innovations for
+A Kalman filter predicts the total field from a model of the crustal field along the track
+(:mod:`magbridge.estimation.track_process`). :mod:`magbridge.estimation.sequential` tests the innovations for
 each of these errors.
 
-The calibration's own uncertainty is part of the null hypothesis. With the effect f of a unit error, an
-error of amplitude :math:`N(0, a^2 I)` changes the total field by the variance
-:math:`a^2\, \mathrm{tr\, Var}(f)` over the samples; their mean is hidden by the reference's level, except
-where masses move. The null hypothesis has an offset, a gain or a mass's telemetry with the amplitude a for
-which that is the mean variance that the calibration states. After an alarm, sigma includes the estimated
-error of the present sample and its uncertainty, weighted over the onsets and errors that fit.
+The calibration's own uncertainty is part of the null hypothesis. Let f be the effect of a unit error on the
+total field. An error of amplitude :math:`N(0, a^2 I)` then adds the variance
+:math:`a^2\, \mathrm{tr\, Var}(f)` over the samples. The unknown constant error of the reference hides the
+mean of f, except for masses. The null hypothesis allows errors of offset, gain or mass telemetry with the
+amplitude a at which this variance equals the mean variance stated by the calibration. During an alarm, sigma
+includes the estimated error of the present sample, averaged over the errors and onsets that fit.
 """
 
 from __future__ import annotations
@@ -41,56 +41,56 @@ from magbridge.records import Vector
 MIN_INTERVAL_S: Final = 1.0
 MAX_INTERVAL_S: Final = 4.0
 INTERVAL_M: Final = 25.0
-"""Time and distance from one sample to the next that is tested."""
+"""Interval between two tested samples: shortest and longest time (s), and preferred distance (m)."""
 CRUST_SIGMA_NT: Final = 145.0
 CONSTANT_SIGMA_NT: Final = 1000.0
 MAX_GAP_S: Final = 600.0
-"""Pause after which the crustal field is not known any more."""
+"""Pause between tested samples above which the elapsed time is limited to 1e5 s."""
 OFFSET_NT: Final = 20.0
 DRIFT_NT_PER_H: Final = 10.0
 PER_DEGREE_NT: Final = 1.0
 GAIN_NT: Final = 60.0
 MASS_FRACTION: Final = 0.03
-"""1-sigma of each error: of offset, drift and temperature for an axis, of gain in the Earth's field, of
-telemetry as a fraction of the calibrated range."""
+"""Prior 1-sigma of each error: of an axis's offset, drift and temperature effect, of the gain (nT in the
+Earth's field), and of a mass's telemetry (fraction of the calibrated range)."""
 RETENTION_SAMPLES: Final = 2000.0
-"""Tested samples over which evidence is forgotten."""
+"""Time constant, in tested samples, of the exponential forgetting of evidence."""
 CONSISTENCY_ALARM_LOG_RATIO: Final = 15.0
-"""L above which an alarm begins: by chance once in a million tested samples at most, if the crustal field and
-the calibration's error are as modelled."""
+"""Log-likelihood ratio L above which an alarm begins: by chance at most once in a million tested samples, if
+the crustal field and the calibration's error are as modelled."""
 NOISE_DOF: Final = 8.0
-"""Degrees of freedom with which the noise of the innovations is known."""
+"""Degrees of freedom of the prior for the scale of the innovations' variance."""
 MIN_ERROR_SIGMA: Final = 1.0
-"""Size of an error, in sigmas of the total field, from which it is an alarm."""
+"""Smallest RMS effect of an error that raises an alarm, in sigmas of the total field."""
 CLEAR_LOG_RATIO: Final = 4.0
-"""L below which an alarm ends."""
+"""Log-likelihood ratio L below which an alarm ends."""
 COMPETING_LOG_RATIO: Final = 5.0
-"""Distance from the largest L within which an error and an onset count."""
+"""Largest difference from the maximum of L at which an error and onset still fit."""
 MAX_PENDING: Final = 64
 MAX_CONSISTENT_SIGMA: Final = 5.0
 AGREEING: Final = 3
-"""An innovation beyond so many sigmas is ignored, unless it is the third in a row."""
+"""Innovations above MAX_CONSISTENT_SIGMA sigmas are ignored as outliers, until AGREEING come in a row."""
 STRAIGHT_CHANGE: Final = 0.05
-"""Change of the unit vector within which the attitude is the same."""
+"""Change of each component of the unit vector up to which the attitude counts as unchanged."""
 MIN_STRAIGHT_SAMPLES: Final = 8
-"""Samples of one attitude from which the roughness is known."""
+"""Number of samples without a turn after which the crustal field's roughness counts as known."""
 ADAPTATION: Final = 0.02
 MAX_CONSISTENCY_SQUARE: Final = 4.0
 MAX_LOG_ROUGHNESS: Final = 5.0
-"""How the logarithm of the crust's roughness follows a normalised squared innovation; its bounds."""
+"""Gain from a normalised squared innovation to the crustal field's log roughness; upper bounds of both."""
 ERROR_KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
 MIN_EFFECT_NT: Final = 1e-6
-"""Smallest 1-sigma of an effect, nT."""
+"""Lower bound of an effect's standard deviation in a division, nT."""
 
 
 class TestedSample(NamedTuple):
-    """A sample to test.
+    """Corrected sample that the consistency check tests.
 
-    `time_us` is µs, `unit` the direction of the corrected field, `anomaly` the corrected total field less the
-    main field where that is known (nT), `sigma` the part of its 1-sigma that is not common to all samples
-    (nT), `temperature` that of the sensor (degC; NaN where it is not known), `mass_changes` the change of the
-    total field where each mass moves by :data:`MASS_FRACTION` of its range (nT), `speed` that at which the
-    crustal field is crossed (m/s), and `course` the vehicle's (rad; NaN where it is not known).
+    `time_us` is the time (µs), `unit` the direction of the corrected field. `anomaly` is the corrected total
+    field minus the main field, or the total field itself if no main field is known (nT). `sigma` is the part
+    of its 1-sigma that is not common to all samples (nT), `temperature` the sensor's (degC; NaN if unknown).
+    `mass_changes` is the change of the total field if each mass moves by :data:`MASS_FRACTION` of its range
+    (nT), `speed` the speed across the crustal field (m/s), `course` the vehicle's (rad; NaN if unknown).
     """
 
     time_us: int
@@ -104,9 +104,9 @@ class TestedSample(NamedTuple):
 
 
 class ConsistencyCheck:
-    """Test the total field for dependence on attitude, temperature, time and mass positions.
+    """Test of the total field for dependence on attitude, temperature, time and mass positions.
 
-    `noise` is the calibration's noise model, `masses` the number of mass positions that it depends on.
+    `noise` is the calibration's noise model, `masses` the number of mass positions that the calibration uses.
     `is_wrong` is True during an alarm.
     """
 
@@ -118,7 +118,7 @@ class ConsistencyCheck:
         )  # fmt: skip
         self._noise2 = noise.sensor**2
         self._masses = masses
-        # offset and gain act as they are; temperature and drift by their change since the onset
+        # temperature effect and drift act by their change since the onset, offset and gain in full
         since_onset = [False, True, True, False] + [False] * masses
         self._test = SequentialTest(since_onset, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
         self._log_roughness, self._straight_samples = 0.0, 0
@@ -126,7 +126,7 @@ class ConsistencyCheck:
         self.restart()
 
     def restart(self) -> None:
-        """Discard all evidence, as with another calibration."""
+        """Discard all evidence and the filter's state, for example after a change of the calibration."""
         self._filter = KalmanFilter(np.zeros(TRACK_STATES), self._process.initial)
         self._test.restart()
         self._time_us, self._due_us, self._level = 0, 0, 0.0
@@ -140,7 +140,7 @@ class ConsistencyCheck:
         self.is_wrong = False
 
     def forget_crust(self) -> None:
-        """Discard evidence and roughness, of a vehicle that moves much faster than before."""
+        """Discard all evidence and the estimated roughness: the vehicle has become much faster."""
         self.restart()
         self._log_roughness, self._straight_samples = 0.0, 0
 
@@ -150,7 +150,7 @@ class ConsistencyCheck:
         return bool(self._pending)
 
     def is_due(self, time_us: int, trend: TrendCheck) -> bool:
-        """Return True if it is time to test a sample of a vehicle whose speed follows from the trend."""
+        """Return True if a new sample is due, at an interval that depends on the trend's crossing speed."""
         elapsed_us = time_us - self._due_us
         if 0 <= elapsed_us < 0.99e6 * MIN_INTERVAL_S:  # at any speed
             return False
@@ -160,17 +160,17 @@ class ConsistencyCheck:
         return not 0 <= elapsed_us < 0.99e6 * interval
 
     def add(self, sample: TestedSample) -> None:
-        """Add a sample; it is tested once newer telemetry has come."""
+        """Store a sample, which waits for its test until newer telemetry has come."""
         self._due_us = sample.time_us
         self._pending.append(sample)
 
     def drop(self, since_us: int) -> None:
-        """Discard samples after `since_us`, when a motion may have begun."""
+        """Discard the waiting samples after `since_us` (µs), because a mass may have moved since then."""
         while self._pending and self._pending[-1].time_us > since_us:
             self._pending.pop()
 
     def confirm(self, reported_us: int) -> None:
-        """Test the samples that were taken before the telemetry of `reported_us`."""
+        """Test the waiting samples that are not newer than the telemetry of the time `reported_us`, µs."""
         while self._pending and self._pending[0].time_us <= reported_us:
             self._test_sample(self._pending.popleft())
 
@@ -178,7 +178,7 @@ class ConsistencyCheck:
         """Predict the total field of a sample, test the innovation, and update the filter."""
         time_us, unit, total, sigma, temperature, mass_changes, speed, course = sample
         seconds = 1e-6 * (time_us - self._time_us)
-        # after a gap the crustal field is another one; a clock that goes back restarts all
+        # the first sample, and a clock that goes back, restart the check
         if not 0.0 < seconds < MAX_GAP_S:
             if self._time_us == 0 or seconds < 0.0:
                 self.restart()
@@ -189,7 +189,7 @@ class ConsistencyCheck:
             self._temperature = temperature
         turn, self._course = course - self._course, course
         metres = speed * exp(self._log_roughness / 3.0) * seconds
-        # time update of the crustal field, and of what the filter has absorbed of each error
+        # time update of the crustal field, and of the part of each error that the filter has absorbed
         F, Q = self._process.transition(metres, seconds, turn if isfinite(turn) else 0.0)
         self._filter.predict(F, Q)
         absorbed = self._test.absorbed
@@ -210,7 +210,7 @@ class ConsistencyCheck:
         self._decide(largest, sigma)
 
     def _learn_roughness(self, squared: float, unit: FloatArray) -> None:
-        """Update the crustal field's curvature from the innovations while the attitude stays the same."""
+        """Adapt the crustal field's roughness to a normalised squared residual, unless the vehicle turns."""
         # straight legs alone: at a turn, an error of the calibration looks like roughness
         turned = float(np.abs(unit - self._last_unit).max())
         self._last_unit = unit
@@ -220,9 +220,10 @@ class ConsistencyCheck:
             self._log_roughness = min(max(self._log_roughness, -MAX_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
 
     def _null(self, effects: FloatArray, systematic: float) -> FloatArray:
-        """Return the 1-sigma amplitude (kinds,) that the calibration's own uncertainty allows.
+        """Return each error's 1-sigma amplitude (kinds,) under the null hypothesis, in units of its prior.
 
-        `effects` (kinds, 3) are those of the present sample, `systematic` the calibration's variance, nT².
+        `effects` (kinds, 3) are from :meth:`_effects`; `systematic` is the variance of the sample's total
+        field that the calibration's uncertainty causes, nT².
         """
         # running moments of the samples that the evidence comes from
         self._tested = min(self._tested + 1, int(RETENTION_SAMPLES))
@@ -239,7 +240,7 @@ class ConsistencyCheck:
         return np.minimum(np.sqrt(allowed), 1.0)
 
     def _effects(self, u: FloatArray, mass_changes: FloatArray) -> FloatArray:
-        """Return the change of the total field with one unit of each kind's regressor, (kinds, 3), nT."""
+        """Return the effect (kinds, 3) of each error's prior 1-sigma on the total field, nT."""
         effects = np.zeros((4 + self._masses, 3))
         # effects of the module, in the unit of each error
         effects[:3] = np.outer([OFFSET_NT, PER_DEGREE_NT, DRIFT_NT_PER_H], u)
@@ -248,7 +249,7 @@ class ConsistencyCheck:
         return effects
 
     def _decide(self, largest: float, sigma: float) -> None:
-        """Begin or end an alarm, and weigh the errors that fit."""
+        """Begin or end an alarm by the largest L, and set the variance to add while the alarm lasts."""
         test = self._test
         rows, weights = test.competing(COMPETING_LOG_RATIO)
         size = test.rms(rows[0])
@@ -271,5 +272,5 @@ class ConsistencyCheck:
         self._messages.report("consistency", text)
 
     def variance(self) -> float:
-        """Return the variance (nT²) to add to that of samples like the last one that was tested."""
+        """Return the variance (nT²) that an alarm adds to the total field; 0 without an alarm."""
         return self._variance

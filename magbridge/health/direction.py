@@ -1,9 +1,10 @@
 """Check the direction of the corrected vector against the main field, given the vehicle's attitude.
 
-The total field does not show a wrong mounting, two exchanged axes or one of wrong sign. The direction does:
-with the unit vector *d* that is down in body axes, ``sin I = b·d / |b|`` is the field's inclination, which
-needs no heading; and the levelled vector's heading from magnetic north, ``m = atan2(-b·s, b·f)``, f and s
-forward and starboard in the horizontal plane, gives the declination ``D = yaw - m``.
+The total field does not show a wrong mounting, two exchanged axes or an axis of wrong sign. The direction
+does. With the corrected vector *b* and the unit vector *d* that points down, both in body axes, the
+inclination I follows from ``sin I = b·d / |b|``. The unit vectors *f* and *s* point forward and starboard in
+the horizontal plane. The heading from magnetic north, ``m = atan2(-b·s, b·f)``, gives the declination
+``D = yaw - m``.
 
 Roll and pitch come from gravity, and have errors of a degree or two: an inclination error above
 :data:`INCLINED` is flagged. The heading of an autopilot may come from a compass near the same iron, or be
@@ -20,24 +21,28 @@ from magbridge.health.checks import Messages
 from magbridge.records import Quality
 
 INCLINED: Final = radians(10.0)
-"""Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), crust."""
+"""Inclination error that is flagged, rad: five sigmas of 2 deg. The attitude has 1.5 deg, the boresight 1,
+the main field 0.2 (Chulliat et al. 2020, table 14), the crustal field the rest."""
 MAX_HEADING_ERROR: Final = radians(60.0)
-"""Five sigmas of a compass that is off by 12 deg."""
+"""Heading difference that is reported, rad: five sigmas of a compass with an error of 12 deg."""
 MIN_HORIZONTAL_FRACTION: Final = 0.2
-"""Share of the field that is horizontal, below which no heading is read from it."""
+"""Smallest horizontal fraction of the field at which the check compares headings."""
 EVERY_US: Final = 1_000_000
-"""Time from one check to the next, µs: a mounting does not change from sample to sample."""
+"""Interval between checks, µs: a mounting does not change from sample to sample."""
 MAX_DIRECTION_AGE_US: Final = 5_000_000
-"""Age of an attitude, µs, up to which it is used."""
+"""Largest age of an attitude that a check uses, µs."""
 MIN_DIFFERING_CHECKS: Final = 8
-"""Number of checks in a row that differ until it counts: a manoeuvre is over by then."""
+"""Number of consecutive differing checks that make a fault: a manoeuvre is over by then."""
 LONG_US: Final = 3_600_000_000
-"""Time for which a disagreement is remembered, µs: at some headings a reversed axis looks right."""
+"""Time for which a fault stays in force, µs: at some headings a reversed axis looks right."""
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 
 
 class DirectionCheck:
-    """Check the vector at intervals; `flags` are the :class:`~magbridge.records.Quality` bits of the last."""
+    """Periodic check of the corrected vector's direction.
+
+    `flags` are the :class:`~magbridge.records.Quality` bits that the last check set.
+    """
 
     def __init__(self, messages: Messages | None = None) -> None:
         self.flags = 0
@@ -57,14 +62,14 @@ class DirectionCheck:
             self._roll, self._pitch, self._yaw, self._attitude_us = roll, pitch, yaw, time_us
 
     def expect(self, north: float, east: float, downward: float) -> None:
-        """Set the main field at the vehicle, any unit; NaN if it is not known."""
+        """Set the components of the main field at the vehicle, in any unit; NaN if unknown."""
         self._inclination = atan2(downward, sqrt(north * north + east * east))
         self._declination = atan2(east, north)
 
     def check(self, time_us: int, x: float, y: float, z: float) -> float:
-        """Judge a corrected vector: set :attr:`flags`, return the variance (nT²) to add to each component's.
+        """Check a corrected vector, set :attr:`flags`, and return the variance (nT²) to add on each axis.
 
-        `time_us` is µs; `x`, `y` and `z` are nT, body axes.
+        `time_us` is the time (µs); `x`, `y` and `z` are the vector in body axes (nT).
         """
         if time_us < self._next_us and self._next_us - time_us <= EVERY_US:
             return self._variance
@@ -84,9 +89,7 @@ class DirectionCheck:
         # horizontal share of the field: near the pole there is no heading
         level = min(cos(inclination), cos(self._inclination))
         self._judge(time_us, tilt, turn if level > MIN_HORIZONTAL_FRACTION else 0.0)
-        if (
-            self._tilted >= MIN_DIFFERING_CHECKS or self._turned >= MIN_DIFFERING_CHECKS
-        ):  # the chord between both directions
+        if self._tilted >= MIN_DIFFERING_CHECKS or self._turned >= MIN_DIFFERING_CHECKS:
             # chord between two unit vectors, from the differences in inclination and heading
             horizontal = 2.0 * level * sin(0.5 * turn)
             chord = field * field * (4.0 * sin(0.5 * tilt) ** 2 + horizontal * horizontal)
@@ -96,7 +99,10 @@ class DirectionCheck:
         return self._variance
 
     def _judge(self, time_us: int, tilt: float, turn: float) -> None:
-        """Count the checks that differ, by `tilt` in inclination and by `turn` in heading, rad."""
+        """Count consecutive checks with a large inclination error `tilt` or heading error `turn`, rad.
+
+        Report a fault after :data:`MIN_DIFFERING_CHECKS` of them; an inclination fault also sets the flags.
+        """
         self._tilted = self._tilted + 1 if abs(tilt) > INCLINED else 0
         self._turned = self._turned + 1 if abs(turn) > MAX_HEADING_ERROR else 0
         if self._tilted >= MIN_DIFFERING_CHECKS:

@@ -1,4 +1,4 @@
-"""Check one corrected sample after the other, by all checks that need no attitude from the autopilot."""
+"""Run on each corrected sample all checks that need no attitude from the autopilot."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from magbridge.health.trend import TrendCheck
 from magbridge.records import Quality, Vector
 
 SUPPOSED_SPEED: Final = 30.0
-"""Speed until it is known, m/s."""
+"""Vehicle speed assumed until two positions give a speed, m/s."""
 MAX_AGE_S: Final = 60.0
-"""Age of telemetry after which a sample is tested without waiting for newer telemetry."""
+"""Longest time for which a sample waits for newer telemetry before the consistency test, s."""
 
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 UNSTEADY: Final = int(Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
-"""Flags of a sample by which no trend is followed."""
+"""Flags of a sample that the trend and consistency checks skip."""
 
 
 class HealthMonitor:
-    """Check sample after sample.
+    """Monitor that checks the corrected samples of one sensor, one after the other.
 
     Parameters
     ----------
     noise : Noise
         The calibration's noise model.
     messages : Messages, optional
-        Receives the messages.
+        Collects the messages for the operator.
     level : float
-        Part of every sample's sigma that is common to all samples, nT.
+        1-sigma of the total-field error that all samples have in common, nT.
     masses : int
-        Number of positions that the calibration depends on.
+        Number of mass positions that the calibration depends on.
 
     Attributes
     ----------
     flags : int
         :class:`~magbridge.records.Quality` bits of the last sample.
     is_fault : bool
-        Whether the last sample is an outlier, comes from a faulty sensor, or is not the Earth's field.
+        True if the last sample is an outlier, comes from a faulty sensor, or is not the Earth's field.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class HealthMonitor:
         self._unit: Vector = (0.0, 0.0, 0.0)
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> None:
-        """Record the vehicle's position, deg; the speed separates noise from crustal field."""
+        """Record the vehicle's position (deg), from which the checks derive the speed and the course."""
         if self._position is None:
             self._trend.set_speed(SUPPOSED_SPEED)
         elif (latitude, longitude) != self._position:
@@ -78,7 +78,7 @@ class HealthMonitor:
                 self._consistency.forget_crust()
 
     def begin_motion(self, since_us: int) -> None:
-        """Record that telemetry reports a motion, which may have begun after `since_us`."""
+        """Undo checks of samples after `since_us` (µs), because a motion began that is reported only now."""
         self._trend.retract(since_us)
         self._consistency.drop(since_us)
 
@@ -94,13 +94,13 @@ class HealthMonitor:
         age: float,
         mass_changes: Callable[[], Sequence[float]],
     ) -> float:
-        """Check a sample: set :attr:`flags`, return the variance (nT²) to add to the field's.
+        """Check a sample, set :attr:`flags`, and return the variance (nT²) that the checks add.
 
-        `raw` and `field` are the reading and the corrected vector, `total_field` the corrected total field
-        and its 1-sigma, nT; `quality` has the flags so far. `main_field` is NaN where the position is not
-        known, with the 1-sigma of the Earth's field about it, nT. `temperature` is that of the sensor (degC;
-        NaN where it is not known), `age` that of the oldest telemetry (s). `mass_changes` returns by how much
-        the total field changes where each mass moves, see :class:`.consistency.TestedSample`.
+        `raw` and `field` are the reading and the corrected vector (nT), `total_field` is the corrected total
+        field with its 1-sigma (nT), `quality` has the sample's flags so far. `main_field` is the main field
+        (NaN if the position is unknown) with the 1-sigma of the Earth's field about it (nT). `temperature`
+        is the sensor's (degC; NaN if unknown), `age` the age of the oldest telemetry (s). `mass_changes`
+        returns the effect of each mass's motion, see :class:`.consistency.TestedSample`.
         """
         self.flags = 0
         self.is_fault = True
@@ -133,7 +133,7 @@ class HealthMonitor:
         if self.is_fault or trend.is_away:
             self.flags = IMPLAUSIBLE
         consistency = self._consistency
-        # consistency: samples at rest that no other check has flagged
+        # the consistency check uses samples at rest that no other check has flagged
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, trend):
             anomaly = total - reference + self._reference_steps.total if isfinite(reference) else total
             changes, course, speed = tuple(mass_changes()), self._course.angle, trend.crossing_speed
@@ -144,7 +144,10 @@ class HealthMonitor:
         return variance + self._scatter.excess() + consistency.variance()
 
     def explain(self, difference: float, *, jumps: bool) -> None:
-        """Record that another calibration changes the total field by `difference`, nT."""
+        """Adapt the checks to a new calibration, which changes the total field by `difference` (nT).
+
+        `difference` is NaN if unknown. If `jumps`, the new calibration explains all past jumps.
+        """
         if difference == difference:  # noqa: PLR0124 - NaN
             self._trend.explain(difference)
             self._scatter.explain(difference)

@@ -1,19 +1,20 @@
-r"""Estimate how much the total field scatters, at several lags, beyond what the crustal field can do.
+r"""Estimate the noise of the total field at several lags, beyond variations that the crustal field can cause.
 
-The median of second differences :math:`F(t) - 2 F(t - T) + F(t - 2T)` changes little with a jump or a ramp.
-From sample to sample it measures white noise. A disturbance of the period P adds :math:`4 \sin^2(\pi T / P)`
-times its amplitude: little at a lag T of a tenth of P, all of it at a third. The crustal field limits T: a
-wave of length L, passed at the speed v, adds :math:`(2 \pi v T / L)^2`, which is 2 % where v T is
-:data:`TRAVEL_M` and L is 500 m. That much is subtracted. (The Allan variance shows in the same way at each
-interval the noise there: Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
+A jump or a ramp hardly changes the median of the second differences
+:math:`F(t) - 2 F(t - T) + F(t - 2T)`. At a lag T of one sample, it measures white noise. A disturbance of
+the period P adds :math:`4 \sin^2(\pi T / P)` times its amplitude: 0.4 times at T = P/10, 3 times at
+T = P/3. The crustal field limits T: a wave of length L, passed at the speed v, adds
+:math:`(2 \pi v T / L)^2` times its amplitude. The factor is 2 % if v T is :data:`TRAVEL_M` and L is 500 m.
+The estimate subtracts this part. (The Allan variance, too, measures the noise at each interval: Allan 1966,
+*Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
 
 The calibration's noise model (a white fraction w, the rest an AR(1) process of autocorrelation
 :math:`\rho(T)`) has second differences of variance
 
 .. math:: V(T) = \sigma^2 \left( 6 w + (1 - w)(6 - 8 \rho(T) + 2 \rho(2T)) \right)
 
-The largest ratio of the measured variance to V(T) is the factor by which the whole noise, its slow part
-included, has grown: sigma grows by that factor.
+The largest ratio of the measured variance to V(T) is the factor by which the variance of the whole noise,
+including its slow part, has grown. The samples' variance grows accordingly.
 """
 
 from __future__ import annotations
@@ -26,64 +27,65 @@ from magbridge.field.geodesy import separation
 from magbridge.health.checks import Messages
 
 MIN_NOISE_NT: Final = 0.1
-"""No fluxgate's noise is lower."""
+"""Lower bound of the sensor noise, nT, 1-sigma: no fluxgate has less."""
 MEDIAN_FACTOR: Final = 1.02
-"""Factor by which a sample moves the median of the second differences."""
+"""Factor of one step by which a sample moves the estimated median of the second differences."""
 RUN_SAMPLES: Final = 6
 MAX_STEPS: Final = 12
-"""Samples in a row on one side of the median before its steps grow, and the largest number of steps: twenty
-times the noise is learned in half the samples, and white noise is taken for more no more often."""
+"""Number of consecutive samples on one side of the median before a sample moves it by several steps, and the
+largest number of steps. Twentyfold noise is then learned in half the samples, without more false alarms."""
 RARE_RATIO: Final = 4.0
-"""Ratio to the median that counts as three samples: one in 140 of white noise is as large."""
+"""Ratio to the median above which a difference counts as three samples: one in 140 of white noise."""
 START_STEPS: Final = 60
-"""The n-th step is at least this number over n steps: at the start the noise is learned in a few samples."""
+"""Smallest number of steps by which the n-th sample moves the median, times n, for a fast start."""
 MIN_COUNT: Final = 5
 UNCERTAINTY: Final = 4.0
-"""Second differences from which their median is used; after n of them it may be 1 + UNCERTAINTY / n times as
-far off as later."""
+"""Number of second differences from which their median is used. After n of them, the tolerance for its error
+is the factor 1 + UNCERTAINTY / n."""
 MEDIAN_TO_SIGMA: Final = 1.0 / 0.6745
-"""1-sigma over the median of a normal variable's absolute value."""
+"""Ratio of 1-sigma to the median absolute value of a normal variable."""
 SECOND_DIFFERENCE: Final = 6.0
-"""Variance of second differences of white noise over its own variance."""
+"""Ratio of the variance of white noise's second differences to the variance of the noise."""
 INNOVATION: Final = 4.0 / 3.0
-"""Variance of an innovation from a level with gain 1/2 over that of white noise."""
+"""Ratio of the innovation variance of a level filter with gain 1/2 to the variance of its white noise."""
 FLOOR: Final = 1.125
-"""Smallest variance of an innovation, over that by the noise model."""
+"""Smallest variance of an innovation, as a multiple of the noise model's."""
 MAX_QUIET_RATIO: Final = 2.5
-"""Ratio of the noise to the calibration's from which it is added to sigma, until it is half of that."""
+"""Ratio of the measured noise to the calibration's above which sigma is widened, until it has halved."""
 REPORTED_RATIO: Final = 5.0
+"""Ratio above which the operator receives a message."""
 SCATTER_LAGS: Final = (1, 2, 4, 8)
 STORED: Final = 2 * SCATTER_LAGS[-1] + 1
-"""Lags in intervals, of which the longest lag has eight, and samples stored for them."""
+"""Lags, in eighths of the longest lag, and number of samples stored for them."""
 TRAVEL_M: Final = 12.0
-"""Distance that a vehicle covers within the longest lag, at most."""
+"""Largest distance that the vehicle may cover within a lag, m."""
 CRUST_NT: Final = 2.2
-"""Median of second differences that a crustal field of 145 nT and 500 m makes within that distance."""
+"""Median second difference of a crustal field of 145 nT and 500 m wavelength over TRAVEL_M, nT."""
 MAX_LAG_US: Final = 32_000_000
-"""Longest lag: a vehicle that does not move is passed by the field's variations."""
+"""Longest lag, µs: it limits the effect of the field's variations with time on a vehicle at rest."""
 FIRST_INTERVAL_US: Final = 8_000_000
 SPEED_INTERVAL_US: Final = 60_000_000
-"""Time over which the speed is measured, at least: for the first time, and later."""
+"""Shortest times over which the first and each later speed is measured, µs."""
 SPEED_CHECK_US: Final = 500_000
 ACCELERATION: Final = 2.0
 MIN_FASTER_M: Final = 20.0
 MIN_FASTER_M_S: Final = 2.0
-"""A vehicle that has become faster by this factor, over this distance and above this speed, is checked so
-often for that, and has another speed at once, as an aircraft at its take-off."""
+"""Interval (µs) of checks for a higher speed, such as at take-off, and the conditions to adopt it at
+once: growth by this factor, over this distance (m) and above this speed (m/s)."""
 
 
 class MedianDifference:
-    """The median of second differences at one lag, nT."""
+    """Running median of the absolute second differences at one lag, nT."""
 
     __slots__ = ("count", "is_rising", "median", "run")
 
     def __init__(self) -> None:
         self.median = 0.0
         self.count = 0
-        self.run, self.is_rising = 0, False  # on one side of the median
+        self.run, self.is_rising = 0, False  # consecutive samples on one side of the median
 
     def update(self, difference: float) -> None:
-        """Update the median with a second difference's absolute value, nT."""
+        """Update the median with the absolute value of a second difference, nT."""
         # stochastic approximation of the median: equal steps up and down in its logarithm
         rising = difference > self.median
         weight = 3 if difference > RARE_RATIO * self.median else 1
@@ -101,10 +103,10 @@ class MedianDifference:
 
 
 class Scatter:
-    """Estimate the noise of a total field, beyond the calibration's noise model.
+    """Estimator of the total field's noise, and of its excess over the calibration's noise model.
 
-    `variance` is that of an innovation from one sample to the next (nT²), at least that of the calibration's
-    noise model; `speed` is the vehicle's, m/s, or NaN while it is not known.
+    `variance` is the variance of an innovation from one sample to the next (nT²), at least that of the noise
+    model. `speed` is the vehicle's speed (m/s; NaN while unknown).
     """
 
     def __init__(self, noise: Noise, messages: Messages) -> None:
@@ -128,7 +130,7 @@ class Scatter:
         self._faster = 0  # positions in a row that show a higher speed
 
     def begin(self, variance: float) -> None:
-        """Set the variance (nT²) that an innovation may have at first."""
+        """Initialise the estimates from the variance of an innovation, nT²."""
         self.variance = variance
         median = (variance / INNOVATION * SECOND_DIFFERENCE) ** 0.5 / MEDIAN_TO_SIGMA
         for differences in (self._next, *self._lagged):
@@ -136,11 +138,11 @@ class Scatter:
 
     @property
     def white_sigma(self) -> float:
-        """1-sigma of the white noise as measured, nT."""
+        """Measured 1-sigma of the white noise, nT."""
         return sqrt(self._next.variance / SECOND_DIFFERENCE)
 
     def _expected(self, lag_us: int) -> float:
-        """Return the variance of second differences at a lag by the noise model, nT²."""
+        """Return the variance V(T) of second differences by the noise model at the lag `lag_us`, nT²."""
         noise = self._noise
         white = noise.white if noise.autocorrelation > 0.0 and noise.interval > 0.0 else 1.0
         slow = 0.0
@@ -153,7 +155,7 @@ class Scatter:
         return float(max(variance, SECOND_DIFFERENCE * MIN_NOISE_NT**2))
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> bool:
-        """Record the position, deg; return True if it has changed the speed, which limits the lags."""
+        """Record the position (deg); return True if it gave a new speed, which limits the lags."""
         if 0 <= time_us - self._checked_us < SPEED_CHECK_US:
             return False
         self._checked_us = time_us
@@ -162,7 +164,7 @@ class Scatter:
         north, east = separation(self._latitude, self._longitude, latitude, longitude)
         step_us = time_us - self._position_us
         distance = (north * north + east * east) ** 0.5
-        # a clock that goes back tells no speed
+        # a clock that goes back gives no speed
         speed = distance / (1e-6 * step_us) if step_us > 0 else nan
         faster = max(ACCELERATION * self.speed, MIN_FASTER_M_S)  # NaN while no speed is known
         is_faster = speed > faster and distance > MIN_FASTER_M
@@ -172,12 +174,12 @@ class Scatter:
         self._latitude, self._longitude, self._position_us = latitude, longitude, time_us
         if speed != speed:  # noqa: PLR0124 - faster than a call
             return False
-        # a faster vehicle shows twice; once is a jump of the position
+        # two positions confirm a higher speed; a single one may be a jump of the position
         self._faster = self._faster + 1 if is_faster else 0
         if self._faster == 1:
             return False
         if is_faster:
-            # differences that were taken at the lower speed may be the crustal field's
+            # the lags of the lower speed would measure the crustal field
             self._lagged = tuple(MedianDifference() for _ in SCATTER_LAGS)
             self.begin(self.variance)
         self.speed = speed
@@ -185,7 +187,7 @@ class Scatter:
         return True
 
     def follow(self, time_us: int, total: float) -> None:
-        """Update the noise with a sample's total field, nT."""
+        """Update the noise estimates with a sample's total field, nT."""
         difference = abs(total - 2.0 * self._last + self._last_but_one)
         self._last_but_one, self._last = self._last, total
         if difference == difference:  # noqa: PLR0124 - faster than a call
@@ -201,7 +203,7 @@ class Scatter:
 
     def _store(self, time_us: int, total: float) -> None:
         """Store a sample, and update the medians with the second differences that end at it."""
-        # ring buffer of samples, eight to the longest lag
+        # ring buffer with eight samples in the longest lag
         self._place = place = (self._place + 1) % STORED
         self._fields[place], self._times[place] = total, time_us
         self._ratio = 0.0
@@ -224,13 +226,13 @@ class Scatter:
                 self._ratio = max(self._ratio, excess / self._expected(late_us))
 
     def explain(self, difference: float) -> None:
-        """Record that another calibration changes the total field by `difference`, nT."""
+        """Shift the stored total fields by `difference` (nT), the effect of a new calibration."""
         self._last += difference
         self._last_but_one += difference
         self._fields = [field + difference for field in self._fields]
 
     def excess(self) -> float:
-        """Return the variance (nT²) that more noise than the calibration's adds."""
+        """Return the variance (nT²) to add for noise above the calibration's, or 0 if there is none."""
         if not self._is_known or self._next.count < MIN_COUNT:
             return 0.0
         # the factor by which the whole noise has grown, with a hysteresis of two

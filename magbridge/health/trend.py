@@ -8,16 +8,16 @@ Kirubarajan 2001, *Estimation with Applications to Tracking and Navigation*, sec
           Q = q \begin{pmatrix} T^3/3 & T^2/2 \\ T^2/2 & T \end{pmatrix} + \sigma^2 |\Delta u|\, e_1 e_1^T
 
 A crustal field of standard deviation :math:`\sigma_c` and correlation length :math:`\ell` (Matern, smoothness
-3/2), crossed at the speed v, has :math:`q = 4 (\sqrt 3 v / \ell)^3 \sigma_c^2`. From there q follows the
-normalised innovations, so that the rate of change at any speed is part of the model. The second term is what
-the calibration's own error changes where the direction of the field turns by :math:`|\Delta u|`.
+3/2), crossed at the speed v, has :math:`q = 4 (\sqrt 3 v / \ell)^3 \sigma_c^2`. This value is the lower
+bound of q, which adapts to the normalised innovations. The second term of Q models the change of the
+calibration's error while the direction of the field turns by :math:`|\Delta u|`.
 
 A sample whose innovation exceeds :data:`GATE_SIGMA` is an outlier (section 5.4 of the same book). Three
-outliers that agree with each other are a jump. Samples after a jump are flagged while the sum of jumps is not
-zero, and sigma is the largest of them. It is kept for a while after the field has come back.
+outliers that agree with each other are a jump. Samples after a jump are flagged until the sum of the jumps is
+zero again. Sigma includes the largest jump, also for a while after the field has returned.
 
-Telemetry reports a motion after it has begun. When it does, the filter returns to its state at the last
-report before the motion, so that what the motion did until then is not a jump.
+Telemetry reports a motion after the motion has begun. The filter then returns to its state before the motion,
+so that it does not count the effect of the motion as a jump.
 """
 
 from __future__ import annotations
@@ -30,43 +30,47 @@ from magbridge.health.checks import Messages
 from magbridge.health.scatter import Scatter
 
 GATE_SIGMA: Final = 7.0
-"""Sigmas of an innovation; 5.5 would be one false alarm a month, were the noise Gaussian."""
+"""Innovation above which a sample is an outlier, in sigmas. Gaussian noise exceeds 5.5 once a month."""
 GATE: Final = GATE_SIGMA * GATE_SIGMA
 CRUST_SIGMA_NT: Final = 145.0
 CRUST_LENGTH_M: Final = 1000.0
 CURVATURE_PER_SPEED_CUBED: Final = 4.0 * (3.0**0.5 / CRUST_LENGTH_M) ** 3 * CRUST_SIGMA_NT**2
-"""nT²/m³: q is this times the speed cubed."""
+"""Ratio of q to the cube of the speed for a crustal field, nT²/m³."""
 MIN_INTENSITY: Final = 1e-4
-"""nT²/s³, q where the speed is not known: a slope of 0.05 nT/s that is forgotten within half a minute."""
+"""Value of q while the speed is unknown, nT²/s³: the slope changes by 0.05 nT/s in half a minute."""
 SLOPE_NT_PER_S: Final = 0.5
-"""1-sigma of the slope at the start."""
+"""Initial 1-sigma of the slope, nT/s."""
 ADAPTATION: Final = 0.02
-"""By how much log q follows one normalised squared innovation."""
+"""Gain of the adaptation of log q to a normalised squared innovation."""
 MAX_TREND_SQUARE: Final = 16.0
-"""Normalised squared innovation that counts, at most."""
+"""Upper bound of the normalised squared innovation that adapts q."""
 AGREEING: Final = 3
-"""Outliers that agree with each other are a jump; so many samples establish the trend at the start."""
+"""Number of agreeing outliers that are a jump, and of accepted samples that establish a new trend."""
 ESTABLISHED_SAMPLES: Final = 256
-"""Samples from which q is known without a speed."""
+"""Number of accepted samples after which q counts as known although the speed is unknown."""
 LARGE_CHANGE: Final = 2.0
-"""Change of log q that another speed makes."""
+"""Decrease of the lower bound of log q, by a new speed, above which log q restarts near the bound."""
 SPIKE_DECAY: Final = 0.3
 BURST_DECAY: Final = 0.8
 BURST_SAMPLES: Final = 8
-"""Fraction of an outlier's square that is added to the variance of the next sample. An outlier within so many
-samples of another is rather noise than a spike: the next sample is as bad."""
+"""Fraction of an outlier's square that is added to the next sample's variance: after a spike, and in a burst.
+Outliers less than BURST_SAMPLES samples apart are a burst."""
 LASTING_US: Final = 120_000_000
-"""Duration after which a jump is not transient."""
+"""Duration above which a jump counts as lasting, µs."""
 TREND_HOLD_US: Final = 60_000_000
 MAX_HOLD_US: Final = 3_600_000_000
 MAX_MOTION_HOLD_US: Final = 86_400_000_000
-"""Time for which sigma remembers a jump that came back: at first, at most, and at most after motions."""
+"""Time for which sigma includes a jump that has ended, µs: initial, largest, largest after motions."""
 CHECKPOINT_US: Final = 1_000_000
 CHECKPOINTS: Final = 64
 
 
 class TrendState(NamedTuple):
-    """Level (nT), slope (nT/s), their covariance, and the jumps so far, after a sample."""
+    """State of the trend filter: level (nT), slope (nT/s), their covariance, and the jumps so far.
+
+    The jumps have the sum `jump_sum` (nT) since the field left its level at `since_us` (µs). Sigma includes
+    the largest jump, `largest` (nT), until `until_us` (µs).
+    """
 
     time_us: int
     level: float
@@ -82,10 +86,10 @@ class TrendState(NamedTuple):
 
 
 class TrendCheck:
-    """Follow the total field and find outliers and jumps; `scatter` gives the noise of the samples.
+    """Filter of the total field's trend that finds outliers and jumps; `scatter` estimates the noise.
 
     `is_outlier` is True if the last sample is an outlier, `has_moved` if a mass may have moved since the last
-    sample, `is_away` if the field has jumped and not come back.
+    sample, `is_away` if the field has jumped and not returned.
     """
 
     def __init__(self, scatter: Scatter, messages: Messages) -> None:
@@ -98,7 +102,7 @@ class TrendCheck:
         self._min_log_q = log(MIN_INTENSITY)
         self._has_speed = False
         self._slope_variance = SLOPE_NT_PER_S**2
-        self._before = nan  # level before a sample that only time or a motion made acceptable
+        self._before = nan  # prediction, if only a turn or a motion made the last sample acceptable
         self._accepted = 0
         self._unrest, self._decay, self._quiet = 0.0, SPIKE_DECAY, BURST_SAMPLES
         self._candidate, self._agreed, self._candidate_us = nan, 0, 0
@@ -110,23 +114,23 @@ class TrendCheck:
 
     @property
     def crossing_speed(self) -> float:
-        """Speed (m/s) at which a vehicle would cross a crustal field that changes as this one does."""
+        """Speed (m/s) at which a typical crustal field would change as fast as the total field does."""
         return float((exp(max(self._log_q, self._min_log_q)) / CURVATURE_PER_SPEED_CUBED) ** (1.0 / 3.0))
 
     def set_speed(self, speed: float) -> None:
-        """Record the vehicle's speed, m/s."""
+        """Set the lower bound of q, and the slope's variance, for the vehicle's speed, m/s."""
         floor = log(max(CURVATURE_PER_SPEED_CUBED * min(speed, 300.0) ** 3, 0.1 * MIN_INTENSITY))
-        if floor < self._min_log_q - LARGE_CHANGE:  # nothing was learned under the speed supposed so far
+        if floor < self._min_log_q - LARGE_CHANGE:  # the assumed speed was too high
             self._log_q = floor + LARGE_CHANGE
         self._min_log_q, self._has_speed = floor, True
         self._slope_variance = max(SLOPE_NT_PER_S, 3.0**0.5 * CRUST_SIGMA_NT / CRUST_LENGTH_M * speed) ** 2
 
     def check(self, time_us: int, total: float, sigma: float, turned: float, *, learn: bool) -> float:
-        """Follow the trend; return the variance (nT²) to add to that of a sample that is an outlier.
+        """Update the trend with a sample; return the variance (nT²) that outliers add to the sample.
 
         `total` and `sigma` are the corrected total field and the part of its 1-sigma that is not common to
         all samples, nT; `turned` is the change of the field's direction since the last sample, rad. Without
-        `learn`, the sample cannot be another level of the field.
+        `learn`, the sample cannot begin a trend or be part of a jump.
         """
         self.is_outlier = False
         scatter, now = self._scatter, self._now
@@ -151,9 +155,9 @@ class TrendCheck:
         S = p_level + noise
         e = total - level
         scatter.follow(time_us, total)
-        # the jumps so far stay as they are; _replace would take twice as long
+        # now[6:] keeps the jumps so far; _replace would take twice as long
         if e * e <= GATE * S:
-            # accepted only because of a turn or a motion: it may yet be an outlier
+            # a sample accepted only because of a turn or a motion may still be an outlier
             self._before = level if e * e > GATE * (p_still + noise) else nan
             # Kalman gain and update of level and slope
             k_level, k_slope = p_level / S, p_cross / S
@@ -182,9 +186,9 @@ class TrendCheck:
         return e * e
 
     def _accept(self, state: TrendState, square: float, sigma: float, noise: float) -> float:
-        """Record a sample that the filter was updated with; return what past outliers add, nT².
+        """Record an accepted sample; return the variance that past outliers add, nT².
 
-        `square` is the normalised square of its innovation.
+        `state` is the filter's state after the sample, `square` the normalised square of its innovation.
         """
         self._accepted += 1
         self._agreed = 0
@@ -203,10 +207,10 @@ class TrendCheck:
         self._log_q = max(self._log_q + ADAPTATION * (square - 1.0), self._min_log_q)
 
     def _begin(self, time_us: int, level: float, sigma: float, noise: float) -> None:
-        """Begin a trend at a level, nT; the jumps so far and the slope stay."""
+        """Restart the trend at a level (nT), but keep its slope and the jumps so far."""
         if self._now is None:
             self._now = TrendState(time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, 0, 0)
-        # another level: its slope is not known
+        # the slope at the new level is unknown
         p_slope = max(self._now.p_slope, self._slope_variance)
         self._now = self._now._replace(
             time_us=time_us, level=level, p_level=noise, p_cross=0.0, p_slope=p_slope
@@ -214,7 +218,7 @@ class TrendCheck:
         self._sigma, self.has_moved = sigma, False
 
     def _agree(self, time_us: int, total: float, sigma: float, S: float, noise: float) -> None:
-        """Record an outlier, which may be of another level."""
+        """Record an outlier; if enough outliers agree, record a jump and restart the trend there."""
         # outliers that agree with each other are a new level
         difference = total - self._candidate
         if self._agreed and difference * difference <= GATE * S:
@@ -225,13 +229,13 @@ class TrendCheck:
         if self._agreed == AGREEING:
             assert self._now is not None
             back = self._candidate - self._before
-            if not back * back <= GATE * S:  # else the last sample that was accepted was the outlier
+            if not back * back <= GATE * S:  # else the last accepted sample was the outlier
                 self._jump(time_us, self._candidate - self._now.level, noise)
             self._begin(time_us, self._candidate, sigma, noise)
             self._agreed = 0
 
     def retract(self, since_us: int) -> None:
-        """Return to the state before `since_us`, after which a motion began that is reported only now."""
+        """Restore the state before `since_us` (µs), because a motion began that is reported only now."""
         while self._checkpoints and self._checkpoints[-1].time_us > since_us:
             self._checkpoints.pop()
         if self._checkpoints and self._now is not None and self._now.time_us > since_us:
@@ -240,7 +244,7 @@ class TrendCheck:
         self.has_moved = True
 
     def explain(self, difference: float) -> None:
-        """Record that another calibration changes the total field by `difference`, nT."""
+        """Shift the level by `difference` (nT), by which a new calibration changes the total field."""
         if self._now is not None:
             self._now = self._now._replace(level=self._now.level + difference)
         self._candidate += difference
@@ -249,12 +253,12 @@ class TrendCheck:
     # -- jumps ---------------------------------------------------------------------------------------------
 
     def _jump(self, time_us: int, jump: float, noise: float) -> None:
-        """Record that the level has jumped, nT."""
+        """Record a `jump` of the level (nT), and decide for how long sigma includes it."""
         now = self._now
         assert now is not None
         largest_zero, by_motion = GATE * noise, self.has_moved
         since_us, until_us = now.since_us, now.until_us
-        # the time since the field left its level decides how long sigma remembers it
+        # the time since the field left its level decides how long sigma includes the jump
         if now.jump_sum * now.jump_sum <= largest_zero:
             since_us = time_us
         elif time_us - since_us > LASTING_US:
@@ -263,7 +267,7 @@ class TrendCheck:
         # a jump that repeats the sum so far: the return was missed, at a motion or a turn
         if jump * now.jump_sum > largest_zero and (jump - now.jump_sum) ** 2 <= 2.0 * largest_zero:
             total = jump
-        # jumps at motions come with every motion, so that they are remembered for longer
+        # a jump at a motion recurs at the next motion, so sigma includes it for longer
         hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
         self._now = now._replace(
@@ -280,12 +284,12 @@ class TrendCheck:
             self._messages.report("jump", f"field jumps by {jump:+.0f} nT, which no telemetry explains")
 
     def jump_variance(self, time_us: int) -> float:
-        """Set :attr:`is_away`; return the variance (nT²) that the jumps add."""
+        """Set :attr:`is_away`; return the variance (nT²) that past jumps add to a sample."""
         self.is_away = False
         now = self._now
         if now is None or not now.jumps:
             return 0.0
-        # the sum of the jumps is zero again, up to the noise
+        # the field has returned if the sum of the jumps is zero up to the noise
         self.is_away = now.jump_sum * now.jump_sum > GATE * self._scatter.variance
         if not self.is_away and time_us >= now.until_us:
             self._now = now._replace(jump_sum=0.0, largest=0.0)
@@ -293,7 +297,7 @@ class TrendCheck:
         return now.largest * now.largest
 
     def forget(self) -> None:
-        """Discard the jumps: another calibration, or the evidence since, explains them."""
+        """Forget all jumps, because a new calibration explains them."""
         if self._now is not None:
             self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=0)
         self._checkpoints.clear()
