@@ -1,13 +1,13 @@
-"""ArduPilot's log as columns: binary by numpy, or as text, from the log's own format (``FMT``) records.
+"""Read the records of an ArduPilot log, binary or text, by the log's own format records (``FMT``).
 
-A record is the bytes A3 95, the number of its kind, and that kind's fields, as an ``FMT`` record describes
-them: there is neither a length nor a checksum. So a record is believed where it joins another: where it
-begins right after one that is believed, or another header follows right after its end. Bytes that join
-nothing are damage, and are counted. A record whose end lies beyond the beginning of a chain was cut short,
-and is damage too. Records are found in a few passes over all bytes at once.
+A binary record is the bytes A3 95, the number of its kind, and the fields that an ``FMT`` record describes.
+It has neither a length nor a checksum. So the reader accepts a record only if it adjoins another: it begins
+at the end of an accepted record, or another header follows at its end. All other bytes are damage and are
+counted. A record that reaches beyond the start of the next chain was truncated and is damage as well. Numpy
+finds the records in a few passes over all bytes.
 
-The text form (``.log``, as Mission Planner and ``mavlogdump.py`` write it) has a record in each line, with
-values in the unit of the field. Lines without a record are counted.
+The text form (``.log``, as Mission Planner and ``mavlogdump.py`` write it) has one record a line, with values
+in the unit of the field. Lines without a record are counted.
 
 References
 ----------
@@ -32,39 +32,39 @@ Bytes = NDArray[np.uint8]
 FMT = 128
 RECORD_HEADER_BYTES = 3
 PASS = 1 << 24
-"""Bytes in which headers are searched at once."""
+"""Bytes that are searched for headers at a time."""
 LETTERS = {
     "b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8",
     "g": "<f2", "f": "<f4", "d": "<f8", "n": "S4", "N": "S16", "Z": "S64", "a": "V64",
     "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4",
 }  # fmt: skip
 OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
-"""Letters of fields that hold the value times this."""
+"""Letter of a field's type -> factor by which the stored number exceeds the value."""
 FORMAT_LAYOUT = np.dtype([("", "u1", RECORD_HEADER_BYTES),
                           *zip(("type", "length", "name", "letters", "columns"),
                                            ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
 
 
 class Records(NamedTuple):
-    """The records of one kind."""
+    """Records of one kind."""
 
     at: IndexArray
-    """(n,): Where each stands in the file, increasing: its byte, or its line."""
+    """(n,): Position of each record in the file, increasing: its first byte, or its line in a text."""
     fields: dict[str, FloatArray]
-    """(n,) each: In the unit of the field."""
+    """Numbers by field, (n,) each, in the unit of the field."""
     texts: dict[str, list[str]]
-    """The fields of letters."""
+    """Texts by field, n each."""
 
 
 class Flash(NamedTuple):
-    """The records read from a log."""
+    """Records read from a log."""
 
     records: dict[str, Records]
     """By the name of the kind."""
     letters: dict[tuple[str, str], str]
-    """Kind and field to the letter of its type."""
+    """Kind and field -> letter of the field's type."""
     skipped: int
-    """Bytes, or lines, that belonged to no record."""
+    """Number of bytes, or lines, that do not belong to a record."""
 
 
 class _Kind(NamedTuple):
@@ -79,7 +79,7 @@ class _Kind(NamedTuple):
 
 
 def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
-    """Return the records of the `wanted` kinds, and of each the wanted fields."""
+    """Return the records of a binary log; `wanted` lists the kinds to read, and the fields of each."""
     data = np.memmap(path, dtype=np.uint8, mode="r")
     found = []
     for start in range(0, data.size - 2, PASS):
@@ -110,7 +110,7 @@ def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
 
 
 def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
-    """Return the descriptions of the log in the order of the file, without contradictory ones."""
+    """Return the kinds of record that a log describes, in file order, without contradictory descriptions."""
     at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
     at = at[data[at + 2] == FMT]
     kinds = []
@@ -127,7 +127,7 @@ def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
 
 
 def _spans(kinds: list[_Kind]) -> Iterator[tuple[_Kind, int, int]]:
-    """Yield each description with the bytes of the file between which it holds: to that of another layout."""
+    """Yield each description with the range of bytes in which it holds, up to a new layout of the kind."""
     for number in sorted({kind.number for kind in kinds}):
         mine = [kind for kind in kinds if kind.number == number]
         new = [mine[0], *(b for a, b in pairwise(mine) if a[2:] != b[2:])]
@@ -136,7 +136,7 @@ def _spans(kinds: list[_Kind]) -> Iterator[tuple[_Kind, int, int]]:
 
 
 def _lengths(data: Bytes, headers: IndexArray, kinds: list[_Kind]) -> IndexArray:
-    """Return the length of the record that each header begins; 0 where its kind is not described."""
+    """Return the length (n,), bytes, of the record that each header begins; 0 for an undescribed kind."""
     numbers = data[headers + 2]
     spans = list(_spans(kinds))
     table = np.zeros(256, dtype=np.intp)
@@ -151,13 +151,13 @@ def _lengths(data: Bytes, headers: IndexArray, kinds: list[_Kind]) -> IndexArray
 
 
 def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
-    """Return the indices of the accepted records among those that may begin at `starts`."""
+    """Return the indices of accepted records among candidates from byte `starts` (n,) to byte `ends` (n,)."""
     n = len(starts)
     if not n:
         return np.empty(0, dtype=np.intp)
     joins = np.append(ends[:-1] == starts[1:], False)
     breaks = np.flatnonzero(~joins)
-    after = np.searchsorted(starts, ends[breaks])  # the first header not inside
+    after = np.searchsorted(starts, ends[breaks])  # first header that is not inside the record
     meets = np.append(starts, -1)[after] == ends[breaks]
     joins[breaks] = meets | (ends[breaks] == size)
     joined, at_breaks = np.flatnonzero(joins).tolist(), breaks.tolist()
@@ -205,7 +205,7 @@ def _decoded(data: Bytes, kind: _Kind, starts: IndexArray, wanted: Collection[st
 
 
 def _joined(first: Records, second: Records) -> Records:
-    """Return the records of a kind that was described again, as one: the fields that both have."""
+    """Return two sets of records of one kind, which was described twice, as one with their common fields."""
     return Records(
         np.concatenate([first.at, second.at]),
         {name: np.concatenate([first.fields[name], second.fields[name]])
@@ -215,7 +215,7 @@ def _joined(first: Records, second: Records) -> Records:
 
 
 def number_of(text: str) -> float:
-    """Return the number of a text; NaN for another text, which is damaged."""
+    """Return the number in a text; NaN if the text is damaged."""
     try:
         return float(text)
     except ValueError:
@@ -226,7 +226,7 @@ TEXT_TYPES = frozenset("nNZaM")
 
 
 def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
-    """Return the records of the `wanted` kinds, and of each the wanted fields."""
+    """Return the records of a text log; `wanted` lists the kinds to read, and the fields of each."""
     described: dict[str, tuple[str, tuple[str, ...]]] = {}
     lines: dict[str, list[list[str]]] = {}
     at: dict[str, list[int]] = {}

@@ -1,4 +1,4 @@
-"""A deployment in memory: build and join ``xarray.Dataset`` objects on ``time``, also from data frames."""
+"""Build, join and describe deployments in memory: ``xarray.Dataset`` objects on ``time``."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from magbridge.records import Quality
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""
 SETTINGS = "align.", "telemetry."
-"""What the names of the numbers begin with by which a bridge corrected, as its log declares them."""
+"""Prefixes of the attributes with a bridge's settings, as its log declares them."""
 CHANGES_SETTING = "align.changes"
-"""Setting that counts how often a setting was changed in the course of the log; the others are of its
-start."""
+"""Attribute that counts the changes of settings during a log; the other settings are those of its start."""
 COUNTERS = {
     "bytes_skipped": ("byte skipped", "bytes skipped"),
     "damages": ("damaged place", "damaged places"),
@@ -35,19 +34,19 @@ COUNTERS = {
     "rows_outside": ("row outside the vehicle's logs", "rows outside the vehicle's logs"),
     "values_dropped": ("impossible value dropped", "impossible values dropped"),
 }
-"""Attributes that count what reading skipped, with singular and plural. They are summed over pieces, and are
-not copied to a file that is written."""
+"""Attributes that count skipped data, with singular and plural. They are summed over pieces and not written
+to files."""
 GUESSED_ATTRIBUTE = "guessed"
-"""Attribute that says what a file left open and was taken for granted; it goes the way of the counts, too."""
+"""Attribute with the assumptions under which a file was read; like the counts, it is not written to files."""
 HISTORY_ATTRIBUTE = "history"
-"""Attribute that keeps assumptions in files that are written, a line for each."""
+"""Attribute that keeps the assumptions in written files, a line for each."""
 LOSSES_ATTRIBUTE = "losses"
-"""Attribute that names the losses, a line for each file and column. It goes the way of the counts."""
+"""Attribute that names the losses, a line for each file and column; it is not written to files."""
 NOTES = "notes"
-"""Attribute with a line for each choice that reading made: which of several compasses, a name, a unit."""
+"""Attribute with a line for each choice of the reader: one of several compasses, a name, a unit."""
 
 
-# xarray imports hundreds of modules with its first data set: here, and not in every child that reads a file
+# xarray imports hundreds of modules with its first data set: do so here, and not in every child process
 xr.Dataset({"first": ("time", np.zeros(1))})
 
 
@@ -72,7 +71,7 @@ def deployment(
     units : mapping of str to str, optional
         Declared unit of a column; a column of the table is converted to the table's unit.
     attrs : mapping, optional
-        Attributes of the whole, as ``heading_reference``.
+        Attributes of the deployment, as ``heading_reference``.
     long_names : mapping of str to str, optional
         Meaning of columns that are not in the table.
 
@@ -113,14 +112,14 @@ def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
 
 
 def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
-    """Yield a deployment in memory in pieces of at most `rows` rows; the first has the counts."""
+    """Yield a deployment in memory in pieces of at most `rows` rows; only the first keeps the counts."""
     for start in range(0, dataset.sizes["time"], rows):
         part = dataset.isel(time=slice(start, start + rows))
         yield uncounted(part) if start else part
 
 
 def shifted(dataset: xr.Dataset, seconds: float) -> xr.Dataset:
-    """Return a deployment with later times, also those of the channels."""
+    """Return the deployment with `seconds` added to its times, also to the times of the channels."""
     moved = dataset.assign_coords(time=dataset["time"].copy(data=dataset["time"].values + seconds))
     channels = [name for name in CHANNEL_TIMES if name in moved]
     return moved.assign({name: moved[name].copy(data=moved[name].values + seconds) for name in channels})
@@ -139,8 +138,8 @@ def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> 
 def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     """Return several deployments as one, sorted in time, with NaN where a part lacks a column.
 
-    Of rows with the same time the first part's is kept, its NaNs filled from the later ones, and the others
-    are counted. FormatError: two parts disagree on what headings or times refer to, or on a unit.
+    If rows have the same time, the first part's row is kept. The others fill its NaNs and are counted.
+    FormatError: two parts disagree on a unit, or on the reference of headings or times.
     """
     if len(parts) == 1:
         return parts[0]
@@ -162,7 +161,7 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
 
 
 def merged(dataset: xr.Dataset) -> xr.Dataset:
-    """Return a deployment sorted in time with one row for each time: the first, NaNs filled from later."""
+    """Return the deployment sorted in time; rows with equal times become the first, its NaNs filled."""
     time = dataset["time"]
     times, group = np.unique(time.values, return_inverse=True)
     values = {name: column.values for name, column in dataset.data_vars.items()}
@@ -175,7 +174,7 @@ def merged(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[str] = ()) -> xr.Dataset:
-    """Return the deployment with its :data:`COUNTERS` raised by `counts`, and `lines` that name them."""
+    """Return the deployment with :data:`COUNTERS` raised by `counts` and `lines` added to its losses."""
     raised: dict[str, int | str] = {}
     for name, count in counts.items():
         if count:
@@ -186,7 +185,7 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
 
 
 def with_guesses(path: Path, attrs: Mapping[str, Any], guesses: Sequence[str]) -> dict[str, Any]:
-    """Return attributes with the assumptions under which a file was read, also as a line of history."""
+    """Return the attributes with `guesses`, the assumptions under which a file was read, also as history."""
     if not guesses:
         return dict(attrs)
     note = "; ".join(guesses)
@@ -210,7 +209,7 @@ def plain_attrs(attrs: Mapping[Any, Any]) -> dict[str, str | int | float]:
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the deployment without :data:`COUNTERS`, :data:`LOSSES_ATTRIBUTE` and :data:`NOTES`."""
+    """Return the deployment without the attributes of reading: counts, losses, guesses and notes."""
     bare = dataset.copy(deep=False)
     counted = {GUESSED_ATTRIBUTE, LOSSES_ATTRIBUTE, NOTES, *COUNTERS}
     bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in counted}
@@ -218,23 +217,23 @@ def uncounted(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
-    """Return the :data:`COUNTERS` of a deployment, summed over its pieces; those that are 0 are left out."""
+    """Return the :data:`COUNTERS` that are not 0, summed over the attributes of a deployment's `pieces`."""
     counts = {name: sum(int(attrs.get(name, 0)) for attrs in pieces) for name in COUNTERS}
     return {name: count for name, count in counts.items() if count}
 
 
 def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
-    """Return the lines that name the losses in the pieces of a deployment."""
+    """Return the lines that name the losses, from the attributes of a deployment's `pieces`."""
     return [line for attrs in pieces for line in str(attrs.get(LOSSES_ATTRIBUTE, "")).splitlines()]
 
 
 def noted(*pieces: Mapping[str, Any]) -> list[str]:
-    """Return notes for the user on how the pieces of a deployment were read."""
+    """Return the reader's notes for the user, from the attributes of a deployment's `pieces`."""
     return [line for attrs in pieces for line in str(attrs.get(NOTES, "")).splitlines()]
 
 
 def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
-    """Return the attributes of several deployments as one; parts without headings do not say what these mean.
+    """Return the joined attributes of deployments; only parts with headings define ``heading_reference``.
 
     FormatError: two parts disagree on an attribute that changes what values mean.
     """
@@ -269,22 +268,22 @@ FRAME_NAME = "the data frame"
 
 
 def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **attrs: Any) -> xr.Dataset:
-    """Return a data frame as a deployment; every function that accepts a log accepts it.
+    """Return a data frame as a deployment, for every function that accepts a log.
 
     Parameters
     ----------
     frame : DataFrame
-        A column of ours is called as ours; others are telemetry. A heading may hold a unit: ``mag_x [uT]``.
-        Time is the column ``time`` or the index: moments (UTC where they do not say), or s since 1970.
+        Columns with other than standard names are telemetry. A heading may hold a unit: ``mag_x [uT]``. The
+        column ``time`` or the index has the times: timestamps (UTC if without zone), or s since 1970.
     units : mapping of str to str, optional
-        Units of columns; those of our table are converted to the table's.
+        Units of columns; standard columns are converted to their standard unit.
     **attrs
-        Of the whole, as ``heading_reference="magnetic"``.
+        Attributes of the deployment, as ``heading_reference="magnetic"``.
 
     Raises
     ------
     FormatError
-        It has no time; a column does not hold numbers; a unit does not fit.
+        The frame has no time, a column does not hold numbers, or a unit does not fit.
     """
     named = dict(split(str(name)) for name in frame.columns)
     frame = frame.set_axis(list(named), axis=1)
@@ -300,7 +299,7 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
 
 
 def to_frame(log: xr.Dataset) -> pd.DataFrame:
-    """Return a deployment as a data frame, indexed by moments in UTC; units are in ``frame.attrs``."""
+    """Return a deployment as a data frame, indexed by UTC timestamps; units are in ``frame.attrs``."""
     log = in_seconds(log)
     frame = log.to_dataframe()
     frame.index = pd.to_datetime(log["time"].to_numpy(), unit="s", utc=True).rename("time")
@@ -309,7 +308,7 @@ def to_frame(log: xr.Dataset) -> pd.DataFrame:
 
 
 def _seconds(time: pd.Series) -> Any:
-    """Return moments as s since 1970 UTC; numbers are such already."""
+    """Return timestamps (n,) as s since 1970 UTC, and numbers unchanged."""
     if pd.api.types.is_numeric_dtype(time):
         return time.to_numpy(float)
     moments = pd.to_datetime(time, utc=True)

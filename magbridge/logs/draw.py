@@ -1,4 +1,4 @@
-"""A picture of a corrected log."""
+"""Draw charts of a corrected log."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from magbridge.pictures import save
 from magbridge.records import Quality
 
 DRAWN_SAMPLES = 20_000
-"""Samples drawn; more only make a blot."""
+"""Largest number of samples drawn; more would overlap."""
 LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_field_sigma": "1-sigma, nT"}
 
 
 def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
-    """Draw what ``magbridge correct`` writes as PNG, PDF or SVG.
+    """Draw a log that ``magbridge correct`` wrote as PNG, PDF or SVG.
 
-    It is the total field with its 2-sigma band, the anomaly where there is one, and flagged samples.
+    The panels show the total field and, if known, the anomaly with their 2-sigma bands, and the 1-sigma.
 
     WriteError: the file cannot be written.
     """

@@ -1,9 +1,9 @@
-"""The layout of a text file, from its first lines.
+"""Find the layout of a text file from its first lines.
 
 Comments (``#``, ``%``, ``//``) and lines of a preamble come first, then the headings, perhaps a row of units,
 then the rows. A heading may itself be a comment. A file without headings is read where its columns are
 declared by their numbers: ``column_1`` is the first. The separator is the one by which headings and rows have
-the same number of fields; decimal commas are known by cells like ``-12,5``.
+the same number of fields; decimal commas are recognised by cells like ``-12,5``.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from magbridge.logs.mapping import CELL_NUMBER, ColumnMapping, declared_by_maker
 from magbridge.wording import counted
 
 Rows = Sequence[Sequence[str]]
-"""The cells of some rows."""
+"""Cells of rows, row by row."""
 LAYOUT_LINES = 200
-"""Lines at the start of a file by which its layout is found."""
+"""Number of lines at the start of a file from which its layout is found."""
 MAX_COLUMNS = 4_096
 """Largest number of columns that is read."""
 ATTRIBUTE_LINE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
@@ -34,70 +34,70 @@ is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE)
 survey."""
 SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
-"""Stands for any number of blanks between fields."""
+"""Separator that stands for any number of blanks between fields."""
 NMEA_HEADING = "GgaSentence"
-"""Heading of the first field that may hold separators of its own."""
+"""Heading of the first field whose content may include separators."""
 DECIMAL_COMMA = re.compile(r"[-+]?(\d{1,3}(\.\d{3})+|\d+),\d+([eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+\.\d*")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of a file."""
+    """Layout of a text file: its separators, columns, times and assumptions."""
 
     separator: str = ","
     decimal: str = "."
-    """`separator`, `decimal`: Between fields (:data:`BLANKS` for any number of blanks), and in a number."""
+    """`separator`, `decimal`: Sign between fields (:data:`BLANKS` for any number of blanks), decimal sign."""
     names: tuple[str, ...] = ()
-    """One for each field, ours where it is known; '' for a field that is not read."""
+    """Name of each field, the standard name if known; '' for a field that is not read."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Name -> unit, where one is declared."""
+    """Name -> unit, for columns whose unit the file or a declaration states."""
     headings: tuple[str, ...] = ()
-    """As the file has them."""
+    """Headings as the file has them."""
     declared: ColumnMapping = field(default_factory=ColumnMapping)
-    """What the user says of the columns, or their maker."""
+    """Declarations of the user and of the instrument's maker."""
     stamp: tuple[int, ...] = ()
-    """Which fields are the time, joined by blanks: one, or date and time of day ..."""
+    """Indices of the fields that form the time, joined by blanks: one, or date and time of day ..."""
     by_hour: bool = False
-    """The time of day is written as HHMM.mmm."""
+    """True if the time of day is written as HHMM.mmm."""
     calendar: tuple[int, ...] = ()
-    """Fields that give date and time of day next to a time that may count from a boot."""
+    """Indices of fields with date and time of day, in addition to a time that may count from a boot."""
     validity: tuple[Validity, ...] = ()
-    """Columns that state which values are valid."""
+    """Rules by which columns state which values are valid."""
     hemispheres: Mapping[str, int] = field(default_factory=dict)
-    """``latitude``, ``longitude`` -> which field has N or S, E or W."""
+    """``latitude``, ``longitude`` -> index of the field with N or S, E or W."""
     open_ended: bool = False
-    """Rows may have more fields, which are not read."""
+    """True if rows may have further fields, which are not read."""
     row: int = 1
     """Number of the line with the headings, from 1."""
     first: int = 0
-    """Which of the lines is the first row, counted from 0."""
+    """Index of the line with the first row, from 0."""
     rate: float | None = None
-    """Rows a second, of a file that has no column of times."""
+    """Rows per second, for a file without a column of times."""
     attrs: Mapping[str, str | float] = field(default_factory=dict)
-    """What the comments declare."""
+    """Attributes that the comments declare."""
     fill: float = nan
     """The number that stands for a missing value."""
     foreign: bool = True
-    """Not written by this program: without metadata next to it."""
+    """True if magbridge did not write the file: it has no metadata."""
     guesses: tuple[str, ...] = ()
-    """What the file does not say and was taken for granted."""
+    """Assumptions about facts that the file does not state."""
 
     @property
     def column_units(self) -> dict[str, str]:
-        """Units of the columns without that of the time, which is a form."""
+        """Units of all columns except the time, whose unit is a format."""
         return {name: unit for name, unit in self.units.items() if name != "time"}
 
     def guessing(self, *guesses: str) -> Layout:
-        """Return the layout with more assumptions."""
+        """Return the layout with further assumptions."""
         return replace(self, guesses=(*self.guesses, *guesses))
 
     def with_units(self, units: Mapping[str, str]) -> Layout:
-        """Return the layout with other units of some columns."""
+        """Return the layout with the given units of some columns."""
         return replace(self, units={**self.units, **units})
 
     def number(self, cell: str) -> str:
-        """Return a cell with a decimal point."""
+        """Return a cell with a decimal point instead of the layout's decimal sign."""
         return cell.replace(",", ".") if self.decimal == "," else cell
 
 
@@ -120,7 +120,7 @@ def header_of(
 ) -> tuple[Layout, list[str], list[list[str]]]:
     """Return the layout with its headings, the units in a row under them, and the cells of the first rows.
 
-    FormatError: no headings, or too many.
+    FormatError: no headings, or too many columns.
     """
     comments, attrs, fill = _comments(path, lines)
     body = rows_among(lines[comments:])
@@ -177,9 +177,9 @@ def _mostly_digits(row: Sequence[str]) -> bool:
 
 
 def _comments(path: Path, lines: Sequence[str]) -> tuple[int, dict[str, str | float], float]:
-    """Return the number of comments above the headings, what they declare, and the code of missing values.
+    """Return the number of comment lines above the headings, their attributes, and the missing-value code.
 
-    The code is NaN where they do not say. FormatError: a setting that is not a number.
+    The code is NaN if no comment declares it. FormatError: a setting that is not a number.
     """
     attrs: dict[str, str | float] = {}
     fill = nan
@@ -233,7 +233,7 @@ def _preamble(lines: Sequence[str], separator: str) -> int:
 def _headings_elsewhere(
     path: Path, lines: Sequence[str], comments: int, start: int, separator: str, declared: ColumnMapping
 ) -> tuple[int, list[str]]:
-    """Return position and text of headings in a comment above the rows, or as declared."""
+    """Return line index and cells of headings in a comment, or ``column_1 ...`` if so declared."""
     width = _count(lines[start], separator)
     for k in reversed(range(comments)):
         headings = cells(lines[k].lstrip("#%/ "), separator)
@@ -249,7 +249,7 @@ def _headings_elsewhere(
 
 
 def _units_row(line: str, separator: str) -> list[str]:
-    """Return the units in a line that has units and no numbers; none for another line."""
+    """Return the units in a line that has units and no numbers; an empty list for another line."""
     row = cells(line, separator)
     if any(cell and CELL_NUMBER.fullmatch(cell) for cell in row) or not any(map(is_unit, row)):
         return []

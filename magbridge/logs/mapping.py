@@ -1,12 +1,11 @@
-"""Columns of other programs under our names: headings, units, and what user and maker declare of them.
+"""Map columns of other programs to standard names and units, by their headings or by declarations.
 
-A user declares columns by ``--column`` and ``columns.toml``; ``makers.toml`` has the same for instruments and
-autopilots whose makers state what the columns mean. PX4's topics as ``ulog2csv`` writes them are in
+A user declares columns by ``--column`` and ``columns.toml``. ``makers.toml`` declares the columns of
+instruments and autopilots as their makers document them. PX4's topics as ``ulog2csv`` writes them are in
 microseconds since the boot and in gauss (PX4, msg/SensorMag.msg, msg/VehicleMagnetometer.msg). Geometrics'
 MagMap writes the month first. DatCon's ``offsetTime`` counts seconds from the start of a DJI flight.
 MagArrow's compass has its x to the right, its y aft and its z down (Geometrics, MagArrow user manual, 'Data
-Format'); ``Mag`` is its caesium magnetometer. Other columns are known by names that many programs give them
-(:func:`aliases`).
+Format'); ``Mag`` is its caesium magnetometer. :func:`aliases` recognises other columns by common names.
 """
 
 from __future__ import annotations
@@ -36,42 +35,42 @@ CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|
 WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)) ?([a-zA-Z°µ%/]+)")
 """A cell that is a number with its unit."""
 NAMES = load_toml(Path(__file__).with_name("names.toml"))
-"""How other programs call columns and units."""
+"""Names of columns and units in other programs."""
 KNOWN_UNITS = {*NT_PER_UNIT, *(column.units for column in COLUMNS.values()), *NAMES["units"].split()} - {"1"}
-"""Units by which a row of units under the headings is known."""
+"""Units by which a row of units under the headings is recognised."""
 AXES = "x", "y", "z"
 PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
 VECTORS = NAMES["vectors"].split()
-"""What the three axes are called elsewhere, with neither capitals nor punctuation."""
+"""Patterns of the three axes' names in other programs, in lower case without punctuation."""
 ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
-"""What they end in, behind the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
+"""Name of an axis after the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
 ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
-"""Our name -> names in other programs, the surest first."""
+"""Standard name -> names in other programs, the least ambiguous first."""
 TOWED = NAMES["towed"].split()
-"""Words before a position that say that it is the towed sensor's, not the ship's."""
+"""Words before the name of a position that mark it as the towed sensor's, not the ship's."""
 PREFIXED_NAME = re.compile(
     rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
 )
-"""Words that may stand before and behind the names of a place and an attitude."""
+"""Name of a position or an angle, with the words that may stand before and after it."""
 MAX_SENSORS = 8
 """Largest number of a further vector sensor in one file."""
 
 
 class ColumnSource(Table, frozen=True, rename={"heading": "from"}):
-    """``[columns.NAME]`` of a mapping file: where the column NAME comes from.
+    """Source of the column NAME in a log, as ``[columns.NAME]`` of a mapping file declares it.
 
-    The value is ``scale * theirs + offset``, in `unit`.
+    The column's value is ``scale * number + offset`` in `unit`, for a number in the log.
     """
 
     heading: str | None = None
-    """Their name of the column (key ``from``), as the file has it; by default our own."""
+    """Heading of the source in the log (key ``from``); by default NAME."""
     unit: str | None = None
     """Unit after scaling; of ``time`` also excel, julian, mjd, gps, matlab, iso, or a strptime pattern."""
     scale: float = 1.0
     offset: float = 0.0
-    """`scale`, `offset`: By which their number becomes one in `unit`."""
+    """`scale`, `offset`: Conversion of the log's number to `unit`."""
     valid: str | None = None
-    """Their name of a column that is 0 where a value is missing."""
+    """Heading of another column that is 0 where the value is missing."""
 
     def __post_init__(self) -> None:
         if not (isfinite(self.scale) and self.scale and isfinite(self.offset)):
@@ -79,19 +78,19 @@ class ColumnSource(Table, frozen=True, rename={"heading": "from"}):
 
 
 class ColumnMapping(Table, frozen=True):
-    """A mapping file, ``columns.toml``, whole."""
+    """Content of a mapping file, ``columns.toml``."""
 
     columns: dict[str, ColumnSource] = msgspec.field(default_factory=dict)
-    """Our name of a column -> its :class:`ColumnSource`."""
+    """Standard name of a column -> its :class:`ColumnSource`."""
     heading_reference: Literal["true", "magnetic"] | None = None
-    """What headings refer to."""
+    """North to which headings refer."""
     fill_value: float | None = None
     """The number that stands for a missing value."""
     separator: str | None = None
     decimal: Literal[".", ","] | None = None
     """`separator`, `decimal`: Characters of a text file; found in its first lines if not given."""
     zone: str | None = None
-    """Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given."""
+    """Time zone (``Europe/Berlin``) of times that do not state a zone; UTC if not given."""
 
     def __post_init__(self) -> None:
         if self.separator is not None and (len(self.separator) != 1 or self.separator in '"\r\n'):
@@ -104,22 +103,22 @@ class ColumnMapping(Table, frozen=True):
 
 @dataclass(frozen=True)
 class Options:
-    """How logs are to be read."""
+    """The user's options for reading logs."""
 
     strict: bool = False
-    """A log of which anything would be dropped is refused."""
+    """True to reject a log if anything would be dropped from it."""
     date: float | None = None
-    """s since 1970 UTC of the boot, for logs whose times count from it."""
+    """Time of the boot, s since 1970 UTC, for logs whose times count from the boot."""
     compass: str | None = None
-    """Number (from 0) or device id of the compass to use, of several; None: the one that was in use."""
+    """Number (from 0) or device id of the compass to use; None for the compass that the vehicle used."""
     sensor_log: tuple[Path, ...] = ()
     """Logs of a sensor with its own logger, whose rows get the telemetry of the vehicle's logs."""
     clock_offset_s: float = 0.0
-    """Added to the times of a sensor's own log, s."""
+    """Offset that is added to the times of a sensor's own log, s."""
     column: tuple[str, ...] = ()
-    """Columns under our names, each ``NAME="THEIRS [unit]"``."""
+    """Declarations of single columns, each ``NAME="THEIRS [unit]"``."""
     columns: Path | None = None
-    """A mapping file (:class:`magbridge.logs.mapping.ColumnMapping`), which does so for a whole file."""
+    """Mapping file (:class:`magbridge.logs.mapping.ColumnMapping`) that declares all columns of a log."""
 
     @cached_property
     def declared(self) -> ColumnMapping:
@@ -128,7 +127,7 @@ class Options:
 
 
 def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:
-    """Return the declarations of a ``columns.toml``, and of ``--column``, which overrule it."""
+    """Return the declarations of a ``columns.toml``, overruled by those of ``--column``."""
     declaration = ColumnMapping()
     if file:
         table = load_toml(file)
@@ -145,7 +144,7 @@ def _named(text: str) -> tuple[str, ColumnSource]:
 
 
 def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
-    """Rename the columns of a deployment as declared, for formats with column names of their own."""
+    """Return the deployment with columns renamed and scaled as declared, for formats with fixed names."""
     from magbridge.columns import require  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import deployment  # noqa: PLC0415
 
@@ -164,7 +163,7 @@ def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
 
 
 def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, str]:
-    """Return the name of the column of `source`, and its declared unit."""
+    """Return the name that the source of column `name` has in the deployment, and its declared unit."""
     theirs = source.heading or name
     if theirs in dataset:
         return theirs, source.unit or ""
@@ -173,7 +172,7 @@ def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, 
 
 
 class Maker(Table, frozen=True):
-    """What the maker of an instrument states: headings by which its files are known, and the columns."""
+    """Columns of an instrument as its maker documents them, and the headings that identify its files."""
 
     headings: frozenset[str]
     columns: dict[str, ColumnSource]
@@ -185,7 +184,7 @@ def _makers() -> dict[str, Maker]:
 
 
 def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple[str, ColumnMapping]:
-    """Return an instrument's name ("" for an unknown one) and the declarations of its maker and the user."""
+    """Return the instrument's name ("" if unknown), and its maker's declarations overruled by the user's."""
     names = {heading.replace(" ", "") for heading in headings}
     for name, maker in _makers().items():
         if maker.headings <= names:
@@ -197,12 +196,12 @@ def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple
 def split(heading: str) -> tuple[str, str]:
     """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``, ``Bx, uT``.
 
-    Without a unit it is empty; a number in brackets, as in ``magADC[0]``, is an index.
+    The unit is "" for a heading without one; a number in brackets, as in ``magADC[0]``, is an index.
     """
     match = HEADING.fullmatch(heading.strip())
     assert match is not None
     name, unit = match["name"].strip(), match["square"] or match["round"] or ""
-    if not name:  # nothing but brackets is a name after all
+    if not name:  # a heading that is only brackets is a name
         return heading.strip(), ""
     if not unit:
         for sign in "/_,":
@@ -224,7 +223,7 @@ def is_unit(text: str) -> bool:
 
 
 def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
-    """Return a mapping from position to our name for columns with a known other name.
+    """Return index -> standard name of the columns that have a common other name.
 
     The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
     units of a magnetic field, with names that differ only in x, y and z, are the axes.
@@ -250,7 +249,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
         found |= pair
     inner = [match[2] if (match := PREFIXED_NAME.fullmatch(word)) else "" for word in words]
     for name in COLUMNS:
-        if name in names or name in pair.values() or name == "quality":  # a foreign one is not our flags
+        if name in names or name in pair.values() or name == "quality":  # a foreign column has other flags
             continue
         aliases_of = [name.replace("_", ""), *ALIASES.get(name, [])]
         places = [only(word) for word in aliases_of]
@@ -263,9 +262,9 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
 
 
 def _position(words: Sequence[str]) -> dict[int, str]:
-    """Return the positions of latitude and longitude among bare names, both from columns with similar names.
+    """Return index -> name of latitude and longitude in `words`, two names with equal prefix and ending.
 
-    A towed sensor's position comes before one without such words, and that before any other.
+    A towed sensor's position is preferred to a position without prefix, and that to any other.
     """
     pairs: dict[tuple[str, str], dict[str, int]] = {}
     for k, word in enumerate(words):
@@ -281,7 +280,7 @@ def _position(words: Sequence[str]) -> dict[int, str]:
 
 
 def _ending_alike(words: Sequence[str]) -> dict[int, str]:
-    """Return the positions of the three axes among bare names that end in them, if no others do.
+    """Return index -> name of the three axes in `words` by the endings of these, if they are unambiguous.
 
     If the names of several sensors differ by a number, the axes are those of the lowest number.
     """
@@ -297,7 +296,7 @@ def _ending_alike(words: Sequence[str]) -> dict[int, str]:
 
 
 def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str, int]) -> dict[int, str]:
-    """Return the positions of the axes of further sensors, named as the first with another number."""
+    """Return index -> name of the axes of further sensors, named as the first sensor with another number."""
     if not all(f"mag_{axis}" in first for axis in AXES):
         return {}
     found: dict[int, str] = {}
@@ -314,7 +313,7 @@ def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str
 
 
 def _numberings(number: int) -> list[Callable[[str], str]]:
-    """Return the ways in which the name of an axis of sensor `number` is made from that of the first."""
+    """Return functions that turn the name of an axis of the first sensor into one of sensor `number`."""
     return [
         # b1x, imu0magx: the last 0 or 1 counts
         lambda word: re.sub(r"([01])(\D*)$", lambda m: f"{int(m[1]) + number - 1}{m[2]}", word),
@@ -324,7 +323,7 @@ def _numberings(number: int) -> list[Callable[[str], str]]:
 
 
 def _axes(words: Sequence[str], units: Sequence[str]) -> dict[int, str]:
-    """Return the positions of the three axes among bare names, if their units say that they are."""
+    """Return index -> name of the three axes, if just three `words` have units of a magnetic field."""
     fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and words[k]]
     letters = {words[k][-1]: k for k in fields} if len(fields) == len(AXES) else {}
     alike = len({words[k][:-1] for k in fields}) == 1

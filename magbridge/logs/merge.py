@@ -1,12 +1,12 @@
-"""Bring several logs together: a stream sorted in time, and a vehicle's telemetry at a sensor's times.
+"""Merge several logs to one sorted in time, or add a vehicle's telemetry to the log of a sensor.
 
-A fluxgate with a logger of its own records the field, but neither attitude nor position; the vehicle's logs
-have these, on another time base. The sensor's rows stay as they are. A column of the vehicle on a circle
+A fluxgate with its own logger records the field, but neither attitude nor position; the vehicle's logs have
+both, on another time base. The sensor's rows remain unchanged. A column of the vehicle on a circle
 (heading, roll, longitude) is interpolated along the shorter arc; one with few integer values (a switch, a
 mode, a counter of dives) is held until its next value; any other is interpolated linearly.
 
-A column has no value in a gap: an interval longer than `MIN_GAP_S` and than `GAP_INTERVALS` of its usual
-intervals. Rows outside the vehicle's logs, and rows in gaps of these logs, stay and are counted.
+A column is NaN in a gap: an interval longer than `MIN_GAP_S` and than `GAP_INTERVALS` median intervals of the
+column. Rows outside the vehicle's logs, and rows in gaps of these logs, remain and are counted.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from magbridge.logs.fields import CIRCLES, latest, linear
 
 Open = Callable[[int], Iterator[xr.Dataset]]
 MAX_BUFFERED_BYTES = 1 << 28
-"""Bytes of first pieces that are kept while the others are opened: those of small logs, all."""
+"""Largest size of the first pieces that are kept while further logs are opened, bytes."""
 MIN_GAP_S = 30.0
 """Shortest gap between two values of a column, s, across which it is not interpolated."""
 GAP_INTERVALS = 4.0
-"""Shortest gap in median intervals of the column, for columns that are updated rarely."""
+"""Shortest gap in median intervals of a column, for columns that are updated rarely."""
 MAX_STATES = 8
-"""Largest number of different integers in a column that is taken for a switch, and held."""
+"""Largest number of different integers in a column that is held like a switch, not interpolated."""
 SCALAR_COLUMN, POSITION = "total_field", {"latitude", "longitude"}
 MAGNETIC_COLUMNS = {name for name, column in COLUMNS.items() if column.units == "nT"}
 
@@ -54,9 +54,9 @@ def merge(
 ) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
-    Each log is opened for its first piece, which gives its start and its columns. It is held whole from the
-    time at which the stream has reached its start to that at which it has reached its end. A log without a
-    piece is left out. A sensor's own logs and the vehicle's are all held (:func:`combine`).
+    The first piece of each log gives its start and its columns. A log is in memory from its start until the
+    merged rows reach the start of the next log. Empty logs are left out. If sensors' own logs are combined
+    with a vehicle's (:func:`combine`), all logs are in memory. `named`, `clock_offset_s`: as there.
     """
     firsts: list[xr.Dataset] = []
     opened: list[Callable[[], Iterator[xr.Dataset]]] = []
@@ -101,10 +101,10 @@ def merge(
 
 
 def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: float) -> list[xr.Dataset]:
-    """Return the sensors' logs among `logs` with the vehicle's telemetry, and the logs that have both.
+    """Return the sensors' own logs with the vehicle's telemetry, and the logs that need no telemetry.
 
-    `named` are those that the user calls a sensor's log; `clock_offset_s` is added to the sensors' times, s.
-    FormatError: no time in common, or times of which only one kind counts from 1970.
+    `named`: True for each log that the user declares as a sensor's. `clock_offset_s`: added to the sensors'
+    times, s. FormatError: no time in common, or only the times of one kind of log count from 1970.
     """
     sensors, vehicles = _sensor_logs(logs, named)
     if not sensors:
@@ -134,10 +134,10 @@ def refuse_offset(clock_offset_s: float) -> None:
 
 
 def _sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[list[int], list[int]]:
-    """Return the indices of the sensors' own logs, and of the vehicle's; both empty where there are not both.
+    """Return the indices of the sensors' own logs and of the vehicle's logs; both empty if a kind is missing.
 
-    `named` are those that the user calls a sensor's log. If none: a log with the field and without a position
-    is a sensor's, a log without any magnetic column is the vehicle's. FormatError: a named log has no field.
+    `named`: True for each log that the user declares as a sensor's. If none is, a log with field but without
+    position is a sensor's, and a log without magnetic column a vehicle's. FormatError: a named log lacks it.
     """
     if any(named):
         sensors = [k for k, is_named in enumerate(named) if is_named]
@@ -158,7 +158,7 @@ def _has_field(log: xr.Dataset) -> bool:
 
 
 def _with_telemetry(sensor: xr.Dataset, vehicle: xr.Dataset, *, is_first: bool) -> xr.Dataset:
-    """Return a sensor's log with the columns of the vehicle; the first has the vehicle's losses, too."""
+    """Return a sensor's log with the vehicle's columns and, for the first log, the vehicle's losses."""
     time, known = sensor["time"].to_numpy(), vehicle["time"].to_numpy()
     if set(CHANNELS) <= set(sensor.data_vars):
         vehicle = further(vehicle)
@@ -180,7 +180,7 @@ def _with_telemetry(sensor: xr.Dataset, vehicle: xr.Dataset, *, is_first: bool) 
 def _note(source: str, vehicle: xr.Dataset, covered: FloatArray, clock_offset_s: float) -> str:
     """Return a note on how the sensors' logs `source` and the vehicle's were combined.
 
-    `covered` (n,) are the sensors' times, s, within the vehicle's. FormatError: there are none.
+    `covered` (n,): the sensors' times, s, within the vehicle's. FormatError: it is empty.
     """
     names = str(vehicle.attrs.get("source", "the vehicle's logs")).split(", ")
     called = " and ".join(names) if len(names) < 3 else f"{names[0]} to {names[-1]} ({len(names)} logs)"
@@ -199,7 +199,7 @@ def _note(source: str, vehicle: xr.Dataset, covered: FloatArray, clock_offset_s:
 
 
 def _on_clock_of(vehicle: xr.Dataset, sensor: xr.Dataset, offset_s: float) -> xr.Dataset:
-    """Return a sensor's log on the vehicle's clock, that is `offset_s` later."""
+    """Return a sensor's log with `offset_s` added, on the vehicle's clock; FormatError: one lacks UTC."""
     from_boot, vehicle_from_boot = counts_from_boot(sensor), counts_from_boot(vehicle)
     if offset_s:
         sensor = shifted(sensor, offset_s)
@@ -216,7 +216,7 @@ def _on_clock_of(vehicle: xr.Dataset, sensor: xr.Dataset, offset_s: float) -> xr
 
 
 def _interpolated(target: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:
-    """Return a column (m,) with times (m,), s, at the times `target` (n,), s, by the rule for its kind."""
+    """Return values (m,) at `time` (m,), s, brought to `target` (n,), s: states held, others interpolated."""
     known = np.isfinite(values)
     time, values = time[known], values[known]
     distinct = np.unique(values)
@@ -227,7 +227,7 @@ def _interpolated(target: FloatArray, time: FloatArray, name: str, values: Float
 
 
 def _max_gap(time: FloatArray) -> float:
-    """Return the longest interval, s, of times (m,), s, that is not a gap."""
+    """Return the longest interval between times (m,), s, that does not count as a gap, s."""
     steps = np.diff(time)
     return max(MIN_GAP_S, GAP_INTERVALS * float(np.median(steps)) if len(steps) else 0.0)
 

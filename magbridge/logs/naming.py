@@ -304,7 +304,7 @@ def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
 
 
 def with_total(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with ``total_field``, if just one column has a scalar sensor's name and size."""
+    """Return the layout with ``total_field``, if one column has a scalar's name and the Earth's magnitude."""
     if not layout.foreign or "total_field" in layout.names:
         return layout
     pattern = SCALAR_NAME if set(CHANNELS) <= set(layout.names) else TOTAL_NAME

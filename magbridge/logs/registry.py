@@ -1,17 +1,16 @@
 """The table of formats: the module of each format, and how a file is recognised.
 
-A file is what its first bytes say; its suffix counts only where they say nothing (CSV, or a log that begins
-with damage). Text files may be compressed by gzip, bzip2 or xz. A package adds a format with an entry point
-in the group ``magbridge.formats``: the suffix without its dot, and the module (``examples/format`` is such a
-package).
+The first bytes of a file determine its format. The suffix counts only if they are inconclusive (CSV, or a log
+that begins with damage). Text files may be compressed by gzip, bzip2 or xz. Another package adds a format
+with an entry point in the group ``magbridge.formats``: the suffix without its dot, and the module. The folder
+``examples/format`` has an example.
 
-A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
-:class:`~magbridge.logs.mapping.Options` make a difference to it. It yields deployments of at most `rows` rows
-in the order of the file, or pairs of a deployment and the numbers of its rows in the file; it raises
-FormatError for a file that it cannot read. Faults in their times and values are found by
-:mod:`magbridge.logs.checks`. A format that can be written also has ``FileWriter(path)`` with
-``append(dataset, first=...)`` and ``close()``; where its file has no room for attributes, also ``metadata``,
-bytes that are written next to it.
+The module of a format has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` if it uses
+:class:`~magbridge.logs.mapping.Options`. This function yields deployments of at most `rows` rows in the order
+of the file, or pairs of a deployment and its row numbers. It raises FormatError for a file that it cannot
+read. :mod:`magbridge.logs.checks` finds faults in times and values. A format that can be written also has
+``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``. If its files cannot hold attributes,
+the writer's ``metadata`` are the bytes of a separate metadata file.
 """
 
 from __future__ import annotations
@@ -34,38 +33,38 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
-"""Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
+"""Suffix of a Slocum's science file -> suffix of its flight file; if both exist, both are read."""
 LEADS = {**FLIGHT, ".log": ".eng"}
-"""Suffix of a file that is read with another of its name, to that of the other."""
+"""Suffix of a file that is read with another file of the same name -> suffix of the other file."""
 PACKED = ".gz", ".bz2", ".xz"
-"""Suffixes before which another tells what the file is."""
+"""Suffixes of compressed files; the suffix before them states the format."""
 SIGNATURE_BYTES = 4096
-"""Bytes at the beginning of a file by which it is recognised."""
+"""Number of bytes at the beginning of a file by which its format is recognised."""
 
 
 class Format(NamedTuple):
-    """A format that files are in."""
+    """File format: its module, and the properties by which its files are recognised and read."""
 
     module: str
     suffixes: tuple[str, ...]
     signature: bytes | None = None
-    """Regular expression that the first bytes of a file match; None: by its suffix only."""
+    """Regular expression that matches the first bytes of a file; None if only the suffix counts."""
     writes: bool = False
     writer: str = "FileWriter"
-    """Class of the module that writes it."""
+    """Class in the module that writes files."""
     guarded: bool = False
-    """True if another library reads it, which damage may hang or crash: it is read in a child process."""
+    """True to read files in a child process, because damage may hang or crash the library that reads them."""
     compasses: bool = False
-    """True if it handles the compass that the options ask for; else the columns are renamed."""
+    """True if the module applies the option for the compass; else the columns are renamed afterwards."""
     maps_columns: bool = False
-    """True if it handles the columns that the options declare; else they are renamed."""
+    """True if the module applies declared columns; else the columns are renamed afterwards."""
     packed: bool = False
-    """True if it may be compressed as a whole."""
+    """True if its files may be compressed."""
     plugin: EntryPoint | None = None
-    """Where another package brings it."""
+    """Entry point of a format in another package; None for a built-in format."""
 
     def load(self) -> Any:
-        """Return the module; PluginError: another package's cannot be imported, or has no ``chunks``."""
+        """Return the module; PluginError: another package's module cannot be imported or lacks ``chunks``."""
         if self.plugin is None:
             return import_module(self.module)
         module = load(self.plugin)
@@ -123,7 +122,7 @@ FORMATS: dict[str, Format] = {
         packed=True,
     ),
 }
-"""Name to format; the first whose signature matches reads the file."""
+"""Name -> format; the first format whose signature matches reads the file."""
 UNREADABLE = {
     rb"PK\x03\x04|\xd0\xcf\x11\xe0": "a spreadsheet, or an archive: save it as CSV, or unpack it",
     rb"\x28\xb5\x2f\xfd|7z\xbc\xaf|\x1f\x9d|\x1f\x8b|BZh|\xfd7zXZ": "it is compressed: unpack it first",
@@ -133,7 +132,7 @@ UNREADABLE = {
     rb"\s*(?!\{[^\n]*\}\s*\n\s*\{)[{\[]\s*[\"{\[]": "JSON: save it as CSV, or as one object a line (.jsonl)",
     rb"[A-Z]{3} [A-Z]{3}\d{4} \d{3} \d\d [A-Z]{4} ": "INTERMAGNET's IMF: ask for IAGA-2002",
 }
-"""First bytes of files that are not logs, or not read -> what they are, and the remedy."""
+"""First bytes of files that cannot be read -> kind of file, and remedy."""
 
 
 @cache
@@ -149,7 +148,7 @@ def _plugins() -> dict[str, Format]:
 
 
 def _writes(point: EntryPoint) -> bool:
-    """Return True if a package's format can be written; a faulty one is reported when it is read."""
+    """Return True if another package's format can be written, False also if its module fails to load."""
     try:
         return hasattr(load(point), "FileWriter")
     except PluginError:
@@ -157,7 +156,7 @@ def _writes(point: EntryPoint) -> bool:
 
 
 def suffixes(*, write: bool = False) -> list[str]:
-    """Return the endings of the file names that can be read, or written."""
+    """Return the suffixes of files that can be read, or if `write`, that can be written."""
     formats = [*FORMATS.values(), *_plugins().values()]
     return sorted({suffix for one in formats for suffix in one.suffixes if one.writes or not write})
 
@@ -213,13 +212,13 @@ def metadata_path(path: Path) -> Path:
 
 
 PACKERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open}
-"""First bytes -> how it is unpacked."""
+"""First bytes of a compressed file -> function that opens it."""
 DECOMPRESSION_ERRORS = EOFError, zlib.error, lzma.LZMAError
-"""Errors of damaged ones, in addition to OSError."""
+"""Errors that damaged compressed files cause, in addition to OSError."""
 
 
 def opened(path: Path) -> IO[bytes]:
-    """Open a file to read its bytes, unpacked."""
+    """Open a file to read its bytes, decompressed if it is compressed."""
     with path.open("rb") as file:
         start = file.read(6)
     unpack = next((unpack for mark, unpack in PACKERS.items() if start.startswith(mark)), Path.open)

@@ -1,13 +1,13 @@
-"""Slocum: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ..., as text ``.dba``.
+"""Read Slocum logs: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, packed ``.dcd``, text ``.dba``.
 
-A row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
+Each row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
 The flight and the science file of one name are read together. The list of sensors is read from the file
 ``<crc>.cac`` in the folder of the file, or in a folder ``cac`` or ``cache`` there or above. A science file
-begins with the sensors' start values, 0 degC at 0 bar, which are not measured: they are left out.
+begins with start values of the CTD, 0 degC and 0 bar. They are not measurements and are left out.
 
-Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
-of its own, so there is no ``mag_x``. Header and list of sensors are checked first: dbdreader never ends on a
-header that is cut off.
+Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer,
+so the deployment has no ``mag_x``. The header and the list of sensors are checked first, because dbdreader
+does not terminate on a truncated header.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from magbridge.logs.registry import FLIGHT
 
 TAG = re.compile(rb"(\w+):\s*(.*)")
 SENSOR_LINE = re.compile(rb"s:\s+[TF]\s+-?\d+\s+-?\d+\s+[1248]\s+[!-~]+\s+[!-~]+\s*")
-"""``s: T 0 0 4 m_roll rad``: whether it is logged, two indices, bytes, name, unit."""
+"""Line of a sensor, as ``s: T 0 0 4 m_roll rad``: logged or not, two indices, bytes, name, unit."""
 MAX_HEADER_BYTES = 1 << 16
-"""Bytes, more than any header has."""
+"""Bytes that are read to find the header; no header is longer."""
 CACHES = ".", "cac", "cache", "../cac", "../cache"
-"""Folders, seen from a file's, in which its list of sensors may be."""
+"""Folders, relative to the folder of a file, in which its list of sensors may be."""
 MAX_SENSOR_GAP_S = 300.0
-"""s between two updates of a sensor across which nothing is interpolated."""
+"""Longest interval between two updates of a sensor that is interpolated, s."""
 Tracks = dict[str, Track]
-"""By sensor: its times and values."""
+"""Sensor -> times and values of its updates."""
 CTD_SENSORS = "sci_water_temp", "sci_water_pressure"
 ASCII_HEADER = re.compile(rb"\w+:.*")
-"""A line of the header of what ``dbd2asc`` wrote; below it are names, units, sizes, and a cycle a line."""
+"""Header line of a ``dbd2asc`` text; names, units, sizes, and a line for each cycle follow the header."""
 CLOCK_SENSORS = b"m_present_time", b"sci_m_present_time"
 FILL = 69_696_969.0
-"""Code of a position that was never known, deg and min."""
+"""Code of an unknown position, degrees and minutes written together."""
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
 SLOCUM_FIELDS = field_maps("slocum")[""]
 SENSORS = [one.field for one in SLOCUM_FIELDS]
@@ -72,7 +72,7 @@ dbdreader = _import()
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the flight file, with its science file where there is one, in pieces."""
+    """Yield a flight and a science file of one name, or one of them, in pieces of at most `rows` rows."""
     flight: Path | None = path
     science = None
     if other := (SCIENCE | FLIGHT).get(path.suffix.lower()):
@@ -92,7 +92,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _measured(tracks: Tracks) -> Tracks:
-    """Return the tracks of a science file without the CTD's zeros, which stand before its first sample."""
+    """Return the tracks of a science file without the CTD's start values, which are all 0 at one time."""
     ctd = {name: tracks[name] for name in CTD_SENSORS if name in tracks}
     unset = [when[value == 0.0] for when, value in ctd.values()]
     if not unset:
@@ -106,16 +106,16 @@ def _measured(tracks: Tracks) -> Tracks:
 
 
 def _read(path: Path | None) -> Tracks:
-    """Return time and values of each of :data:`SLOCUM_FIELDS` in the file, at its updates."""
+    """Return the times and values of the updates of each sensor in :data:`SLOCUM_FIELDS` that a file has."""
     if path is None:
         return {}
     with path.open("rb") as file:
         if b"DBD_ASC" in file.readline():
             return _read_ascii(path)
     lists = _check_header(path)
-    # dbdreader writes the list of sensors where it looks for it
+    # dbdreader writes the list of sensors to the folder in which it looks for the list
     with tempfile.TemporaryDirectory() as scratch:
-        for cache in reversed(lists):  # of two, the one nearest to the file stays
+        for cache in reversed(lists):  # of two lists, the nearest to the file remains
             link = Path(scratch, cache.name.lower())
             link.unlink(missing_ok=True)
             link.symlink_to(cache.resolve())
@@ -158,7 +158,7 @@ def _read_ascii(path: Path) -> Tracks:
 
 
 def _check_header(path: Path) -> list[Path]:
-    """Check the header of a file, and the list of its sensors; return where that may be."""
+    """Check the header of a file and the list of its sensors; return the paths that may hold the list."""
     with path.open("rb") as file:
         lines = file.read(MAX_HEADER_BYTES).split(b"\n")
     if not lines[0].startswith(b"dbd_label:"):

@@ -6,19 +6,19 @@ are converted. Before the header there may be lines such as ``# heading_referenc
 ``# fill_value = -9999`` where that number stands for a missing value. ``quality`` holds the names of the
 flags, separated by spaces. Numbers are written with as many digits as it takes to read back the same float64.
 
-A written file begins with the header, as other programs expect; attributes stand next to it, in the file that
-W3C's *TableNotes Vocabulary for Tabular Data* gives to ``NAME.csv``: ``NAME.csv-metadata.json``. What would
-change a value's meaning stands in the file itself: ``heading [deg magnetic]``.
+A written file begins with the header, as other programs expect. Its attributes are in
+``NAME.csv-metadata.json``, as W3C's *Metadata Vocabulary for Tabular Data* specifies. A magnetic heading is
+also stated in the file itself: ``heading [deg magnetic]``.
 
-Files of other programs are read by :mod:`.layout` (separator, decimal commas, headings, units) and
-:mod:`.clocks` (times). Assumptions are in the attributes ``guessed`` and ``history``;
-:class:`~magbridge.logs.mapping.Options` declare instead.
+For files of other programs, :mod:`.layout` finds separator, decimal commas, headings and units, and
+:mod:`.clocks` the times. The attributes ``guessed`` and ``history`` state the assumptions. The user can
+replace them by declarations (:class:`~magbridge.logs.mapping.Options`).
 
-Lines without headings: MotionCal (PJRC) takes nine numbers a line, ``Raw:`` and the counts of accelerometer,
-gyroscope and magnetometer; the last three are in 0.1 uT. Adafruit's sketches add ``Uni:`` with the same in
-m/s2, rad/s and uT, which has more digits and is read where it is there. Neither has a time: their senders
-write a hundred lines a second. JSON lines, an object a line, and the sentences of a Marine Magnetics Explorer
-(``*26.331/10:00:00.0 F:50000.123 S:150 D:+003.0m ...``) become a table with headings.
+Captures without headings become a table with headings. A line for MotionCal (PJRC) is ``Raw:`` and nine
+counts: accelerometer, gyroscope and magnetometer (0.1 uT). Adafruit's sketches add ``Uni:`` lines in m/s2,
+rad/s and uT, which have more digits and are preferred. Neither line has a time; the senders write a hundred
+lines a second. Other captures are JSON lines (an object a line) and the sentences of a Marine Magnetics
+Explorer: ``*26.331/10:00:00.0 F:50000.123 S:150 D:+003.0m ...``.
 
 References
 ----------
@@ -59,25 +59,25 @@ from magbridge.records import Quality
 
 DEFAULTS = Options()
 FURTHER = 3_000
-"""Lines behind the first ones by whose values units are found."""
+"""Number of further lines, after the first ones, whose values help to find units."""
 MAX_LINE_CHARACTERS = 1 << 20
 """Characters of the longest line that is read whole."""
 MAX_QUOTED_CHARACTERS = 1000
-"""Characters that are kept of a longer one: a row that is dropped, and counted."""
+"""Characters that are kept of a longer line, which is then dropped and counted as a row."""
 FIRST_NAMED_LINE = 1e6
-"""Number of the first survey line with a label that is not a number."""
+"""Number given to the first survey line whose label is not a number."""
 LOOKED_AT, LINE = 1 << 16, 256
-"""Bytes by which the encoding is found, and of the first line, which holds no zero in a text."""
+"""Bytes that are read to find the encoding, and bytes of the first line that are searched for zeros."""
 
 
 class TableNotes(msgspec.Struct):
-    """Notes of a table, by W3C's vocabulary, which are read again."""
+    """Metadata of a table in W3C's vocabulary: the part that the reader uses."""
 
     notes: list[dict[str, str | float]]
 
 
 def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file in pieces, each with the numbers of its rows."""
+    """Yield the file in pieces of at most `rows` rows, each with the line numbers of its rows."""
     encoding, guess = _encoding(path)
     with io.TextIOWrapper(opened(path), encoding) as file:
         try:
@@ -87,7 +87,7 @@ def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple
 
 
 def _encoding(path: Path) -> tuple[str, list[str]]:
-    """Return the encoding of a text file, and the guesses made."""
+    """Return the encoding of a text file, and the assumption about it, if any; FormatError: it is binary."""
     with opened(path) as file:
         start = file.read(LOOKED_AT)
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -109,7 +109,7 @@ def _encoding(path: Path) -> tuple[str, list[str]]:
 def _chunks(
     path: Path, file: TextIO, rows: int, options: Options, guess: list[str]
 ) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the rows, each piece with the numbers of its lines."""
+    """Yield the rows of an open file in pieces, each with the line numbers of its rows."""
     lines = _lines(file)
     header = list(islice(lines, LAYOUT_LINES))
     declared, added = options.declared, 0
@@ -142,11 +142,11 @@ def _chunks(
 def layout_of(
     path: Path, lines: Sequence[str], further: Sequence[str], declared: ColumnMapping, *, foreign: bool
 ) -> tuple[Layout, Rows]:
-    """Return the layout of the file that begins with these lines, and the cells of its first rows.
+    """Return the layout of the file that begins with `lines`, and the cells of its first rows.
 
-    `further` are lines behind them, by whose values units are found; `foreign`: without metadata next to it.
+    `further`: the following lines, whose values help to find units. `foreign`: True without a metadata file.
 
-    FormatError: no headings, two of one name, or a declared column that is not there.
+    FormatError: no headings, two equal names, or a declared column is missing.
     """
     layout, units, rows = header_of(path, lines, declared, foreign=foreign)
     layout = name_columns(path, layout, units, rows)
@@ -159,7 +159,7 @@ def layout_of(
 
 
 def _lines(file: TextIO) -> Iterator[str]:
-    """Yield the lines; only the beginning of an endless one, such as zeros after a crash."""
+    """Yield the lines of a file; of a very long line, such as zeros after a crash, only the beginning."""
     while line := file.readline(MAX_LINE_CHARACTERS):
         if len(line) == MAX_LINE_CHARACTERS:
             rest = line
@@ -170,9 +170,9 @@ def _lines(file: TextIO) -> Iterator[str]:
 
 
 class _LineMarks:
-    """Lines such as ``LINE 100`` and ``TIE 9000``, which Geosoft writes before the rows of a survey line.
+    """Marks such as ``LINE 100`` and ``TIE 9000``, which Geosoft writes before the rows of a survey line.
 
-    `rows` has the number of each mark's row.
+    `rows`: line number of each mark in the file.
     """
 
     def __init__(self, preamble: Sequence[str]) -> None:
@@ -183,7 +183,7 @@ class _LineMarks:
             self.passes(0, line)
 
     def passes(self, row: int, line: str) -> bool:
-        """Return True if a line is not a row of the table; keep the mark of a survey line."""
+        """Return True if a line is a comment or a mark, and not a row; store the mark and its line number."""
         if not is_remark(line):
             return False
         if line[0] not in "#%/":
@@ -191,7 +191,7 @@ class _LineMarks:
             number = re.sub(r"^(LINE|TIE)[\s:]*L?", "", text)
             label = float(number) if re.fullmatch(r"\d+(\.\d*)?|NAN", number) else nan
             taken = (isnan(label) and number != "NAN") or label in self._known.values()
-            # A label that is not a number, or that another line has, is counted from a million.
+            # A label that is not a number, or that another line has, gets a number from a million on.
             self._known.setdefault(text, FIRST_NAMED_LINE + len(self._known) if taken else label)
             self.rows.append(row)
             self._labels.append(self._known[text])
@@ -203,34 +203,34 @@ class _LineMarks:
 
 
 CAPTURE_TIME = ColumnSource(heading="row [100 Hz]")
-"""MotionCal's senders write a hundred lines a second, without times."""
+"""Assumed time of a capture for MotionCal: its senders write a hundred lines a second, without times."""
 CAPTURE_LINE = re.compile(
     r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*"
 )
 OTHER_PREFIXES = "Uni:", "Ori:", "Cal1:", "Cal2:"
-"""What else these senders write."""
+"""Beginnings of other lines from MotionCal's senders."""
 COUNT = {"Raw": 0.1 * NT_PER_UNIT["uT"], "Uni": NT_PER_UNIT["uT"]}
-"""nT in one unit of the magnetometer's numbers."""
+"""Kind of line -> nT in one unit of its magnetometer values."""
 EXPLORER = re.compile(
     r"\*(?P<year>\d\d)\.(?P<day>\d{3})/(?P<clock>[\d:.]+) F:(?P<field>[\d.]+)"
     r"(?: S:(?P<signal>[-+\d.]+))?(?: D:(?P<depth>[-+\d.]+)m)?(?: A:(?P<altitude>[-+\d.]+)m)?.*"
 )
-"""A sentence: year and day of the year, time, field in nT, signal strength, depth and altitude in m."""
+"""Sentence: year, day of the year, time, field in nT, signal strength, depth and altitude in m."""
 EXPLORER_HEADINGS = ["time", "total_field [nT]", "signal", "depth [m]", "altitude [m]"]
 MIN_LINE_FRACTION = 0.5
-"""Least fraction of the first lines that are of a form."""
+"""Fraction of the first lines above which a form of lines is recognised."""
 
 
 class Capture(NamedTuple):
-    """Lines without headings that become a table."""
+    """Conversion of lines without headings to a table."""
 
     headings: list[str]
     cells: Callable[[str], list[object]]
-    """Returns the cells of a line: none of one of another kind, one of a damaged one, which is dropped."""
+    """Function that returns the cells of a line: no cell for a line to skip, one cell for a damaged line."""
     guess: str = ""
 
     def table(self, lines: Iterable[str]) -> Iterator[str]:
-        """Yield the lines of the table."""
+        """Yield the lines of the table as CSV, the headings first."""
         rows = (self.cells(line.strip()) for line in lines if line.strip())
         for row in chain([list[object](self.headings)], rows):
             if row:
@@ -240,7 +240,7 @@ class Capture(NamedTuple):
 
 
 def _capture(header: Sequence[str]) -> Capture | None:
-    """Return the kind of capture that begins with these lines; None for other text."""
+    """Return the conversion for a capture that begins with these lines; None for other text."""
     lines = [line.strip() for line in header if line.strip()]
     kinds = [match[1] for line in lines if (match := CAPTURE_LINE.fullmatch(line))]
     if kinds and len(kinds) >= len(header) / 4:
@@ -285,7 +285,7 @@ def _json_cells(names: Sequence[str], line: str) -> list[object]:
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one; `metadata` is written next to it."""
+    """Writer of successive deployments with the columns of the first; `metadata` is for a separate file."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
@@ -293,7 +293,7 @@ class FileWriter:
         self.metadata = b""
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows, and before the first ones the header."""
+        """Write the rows; if `first`, write the header before."""
         if first:
             headings = ["time"]
             for name in map(str, dataset.data_vars):
@@ -307,7 +307,7 @@ class FileWriter:
         self._csv.writerows(self.texts(dataset))
 
     def texts(self, dataset: xr.Dataset) -> list[tuple[str, ...]]:
-        """Return the cells of the rows."""
+        """Return the cells of each row as text."""
         columns = [_texts("time", dataset["time"].values)]
         columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]
         return list(zip(*columns, strict=True))
@@ -330,7 +330,7 @@ def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
 
 
 def _attributes(path: Path) -> dict[str, str | float]:
-    """Return the attributes in the metadata next to a table."""
+    """Return the attributes in the metadata file of a table; empty without this file."""
     sidecar = metadata_path(path)
     if not sidecar.is_file():
         return {}
@@ -347,10 +347,10 @@ def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> l
 
 
 class GeosoftWriter(FileWriter):
-    """Write Geosoft's XYZ: headings in a comment, ``LINE 100`` before a survey line's rows, ``*`` for NaN."""
+    """Writer of Geosoft's XYZ: headings in a comment, ``LINE 100`` before a survey line, ``*`` for NaN."""
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows, before each survey line its mark, and before the first ones the headings."""
+        """Write the rows, with a mark before each survey line; if `first`, write the headings before."""
         lines = dataset["line"].to_numpy().tolist() if "line" in dataset else []
         table = dataset.drop_vars("line", errors="ignore")
         if first:
