@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-# on matrices this narrow threads only wait for each other, and for those of a second worker
+# BLAS threads slow such narrow matrices down, more so if several pytest workers run
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
@@ -19,16 +19,16 @@ from hypothesis import settings
 
 from magbridge.parts import OptionalParts
 
-# the same examples every time, and none fails because the machine is busy
+# generate the same examples in every run, and fail none because the machine is busy
 settings.register_profile("magbridge", deadline=None, derandomize=True)
 settings.load_profile("magbridge")
 
 MAX_ID_LENGTH = 80
-"""Characters of a parameter that may be part of a test's id."""
+"""Maximum number of characters of a text that becomes part of a test's id."""
 
 
 def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
-    """Return the parameter's name for bytes and long texts; pytest adds the index."""
+    """Return the argument's name as the id of bytes and long texts; pytest appends the index."""
     if isinstance(val, bytes) or (isinstance(val, str) and len(val) > MAX_ID_LENGTH):
         return argname
     return None
@@ -36,7 +36,7 @@ def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
 
 @pytest.fixture(scope="session", autouse=True)
 def exceptions_pass_through() -> Iterator[None]:
-    """Switch off the net under the live path's optional parts, so that it hides no fault from a test."""
+    """Propagate exceptions of the live path's optional parts, so that a test sees them."""
     OptionalParts.propagate = True
     yield
     OptionalParts.propagate = False
@@ -44,7 +44,7 @@ def exceptions_pass_through() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def signals_are_heard() -> Iterator[None]:
-    """A background job ignores Ctrl-C, one under nohup a closed terminal, and so does all that they start."""
+    """Restore the handlers of SIGINT and SIGHUP, which a background job ignores and its children inherit."""
     wanted: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
     before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
     yield
@@ -54,7 +54,7 @@ def signals_are_heard() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """Folder of measured data, kept outside the project."""
+    """Return the folder of measured data, which is outside the repository; skip the test if it is missing."""
     for candidate in (
         os.environ.get("MAGBRIDGE_REAL_DATA", ""),
         Path(__file__).parents[2] / "shared" / "data",
@@ -66,7 +66,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def cases() -> Path:
-    """Folder of inputs on which the program once failed, next to the measured data."""
+    """Return the folder of inputs on which the program once failed; skip the test if it is missing."""
     folder = Path(__file__).parents[2] / "shared" / "cases"
     if not folder.is_dir():
         pytest.skip("no failing inputs in ../shared/cases")
@@ -75,13 +75,13 @@ def cases() -> Path:
 
 @pytest.fixture(scope="session")
 def peer() -> ModuleType:
-    """Our dialect as a ground station has it: classes that pymavlink's mavgen makes from our XML."""
+    """Return the message classes that pymavlink's mavgen generates from the project's XML dialect."""
     return classes()
 
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder in which a command runs: empty."""
+    """Change to an empty folder and return it."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -1,7 +1,7 @@
-"""A third-party cause for ``magbridge diagnose``: something that is switched on and off has a field.
+"""A third-party cause for ``magbridge diagnose``: the field of a device that is switched on and off.
 
-A cause is one class, whose `candidates` are hypotheses. Each is an effect that the live correction knows too
-(here a `ChannelEffect`), so the finding can be corrected live. The entry point names an instance.
+A cause is a class whose `candidates` returns hypotheses. Each hypothesis wraps an effect of the live
+correction (here a `ChannelEffect`), so the bridge can correct a finding. The entry point names an instance.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from magbridge.diagnose.columns import Candidate, of_effect
 from magbridge.diagnose.problem import Problem
 
 SIZE = 50.0
-"""nT, a plausible size (1-sigma): a pair of leads half a metre away that carries some amperes."""
+"""Prior standard deviation of the field, nT: two leads half a metre away that carry a few amperes."""
 
 
 class HeaterField(Cause):
-    """Put forward a loop of leads: ``T += b s(t)`` (Biot and Savart), s the switch, on or off."""
+    """Hypothesis that a loop of leads adds ``b s(t)`` to the offset T (Biot and Savart); s is the switch."""
 
     name = "heater_field"
     meaning = "something that is switched on and off makes a field"
@@ -26,12 +26,12 @@ class HeaterField(Cause):
     disambiguation = "switch it by hand at one attitude"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return an offset that follows each channel of two values."""
+        """Return a candidate for each channel with exactly two values: an offset proportional to it."""
         made = []
         for name, series in problem.survey.channels.items():
             values = series.values
             if np.unique(values).size != 2:
-                continue  # no switch
+                continue  # the channel is not a switch
 
             def phi(rows: slice, values: np.ndarray = values) -> np.ndarray:
                 return values[None, rows]

@@ -1,7 +1,7 @@
-"""``counts``: an instrument that sends lines such as ``M 16204 -5013 49187``.
+"""Driver ``counts`` for an instrument that sends lines such as ``M 16204 -5013 49187``.
 
-A driver is a parser: it takes bytes and returns readings. It never touches the port, so a test feeds it
-bytes, and a replay feeds it those of a log.
+A driver is a parser: it takes bytes and returns readings. It never opens the port, so a test or a replay
+can feed it recorded bytes.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ LONGEST = 64
 
 
 class CountsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of ``[sensor.options]``; ``magbridge drivers counts`` shows them."""
+    """Options of the driver in ``[sensor.options]``; ``magbridge drivers counts`` lists them."""
 
     nt_per_count: Annotated[float, msgspec.Meta(gt=0)] = 1.0
-    """nT per count."""
+    """Scale of all three channels, nT per count."""
     full_scale: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Counts at which a channel saturates; 0 where it does not."""
+    """Absolute value at which a channel saturates, counts; 0 for a channel that never saturates."""
 
 
 class Counts(Driver):
-    """Parser of the lines; the bytes may come in any pieces."""
+    """Parser of the instrument's lines; it accepts bytes in pieces of any length."""
 
     Options: ClassVar = CountsOptions
 
@@ -43,21 +43,21 @@ class Counts(Driver):
 
     @property
     def bytes_skipped(self) -> int:
-        """Bytes that belonged to no line."""
+        """Number of bytes that were not part of a valid line."""
         return self._skipped
 
     @property
     def frames_bad(self) -> int:
-        """Lines that held no reading."""
+        """Number of lines that could not be parsed as a reading."""
         return self._bad
 
     def start(self) -> tuple[bytes, ...]:
-        """Forget half a line of before; this instrument needs no command to begin."""
+        """Discard a partial line and return the start commands, of which this instrument needs none."""
         self._rest = b""
         return ()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse bytes in any pieces; return the readings that they complete."""
+        """Parse bytes in pieces of any length; return the readings of the lines that they complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST:  # noise without an end of a line
             self._skipped += len(self._rest)
@@ -65,7 +65,7 @@ class Counts(Driver):
         return [reading for line in lines if (reading := self._reading(line))]
 
     def _reading(self, line: bytes) -> Reading | None:
-        """Return the reading in a line, or count the line as bad."""
+        """Return the reading of a line, or count the line as bad and return None."""
         try:
             mark, x, y, z = line.split()
             counts = (int(x), int(y), int(z))

@@ -1,12 +1,12 @@
-"""``.survey``: a made-up logger's file, a record a line, with its battery's position in millimetres.
+"""Reader of ``.survey``, an invented log format: one record per line, with the battery's position in mm.
 
 For example::
 
     # tow 12
     2026-05-01T10:00:00Z; 48.31; -57.93; 16204.1; -5013.0; 49187.5; 12.4
 
-A format is a module with ``chunks``. Impossible values and times need no care here: magbridge drops, counts
-and names them. What cannot be read is a ``FormatError`` with the row.
+A format is a module with a function ``chunks``. The module need not check for impossible values and times:
+magbridge drops and reports them. A line that cannot be parsed raises a ``FormatError`` with its row.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _record(path: Path, row: int, line: str) -> tuple[float, ...]:
-    """Return the time (s since 1970 UTC) and the numbers of a line."""
+    """Return the time (s since 1970 UTC) and the six values of a line, in the units of `UNITS`."""
     when, *cells = line.split(";")
     try:
         numbers = [datetime.fromisoformat(when.strip()).timestamp(), *map(float, cells)]

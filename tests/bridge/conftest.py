@@ -1,4 +1,4 @@
-"""Fixtures of the fault tests: bridges on the bench, and the table of the results."""
+"""Fixtures of the fault tests: bridges with a simulated sensor and autopilot, and the table of results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROWS: list[tuple[str, str, str, str]] = []
 
 @pytest.fixture(scope="module")
 def table() -> Iterator[Callable[[str, str, str, str], None]]:
-    """Collect rows of the table of faults; MAGBRIDGE_FAULTS names its file (with ``-n 0``)."""
+    """Yield a function that adds a row to the table of faults, in the file MAGBRIDGE_FAULTS."""
 
     def row(fault: str, meanwhile: str, well: str, lost: str) -> None:
         ROWS.append((fault, meanwhile, well, lost))
@@ -34,7 +34,7 @@ def table() -> Iterator[Callable[[str, str, str, str], None]]:
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """One bridge for all tests of a module."""
+    """Yield a running bridge that all tests of a module share."""
     made = Rig(tmp_path_factory.mktemp("rig"))
     made.start()
     yield made
@@ -43,7 +43,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 @pytest.fixture
 def make_rig(tmp_path: Path) -> Iterator[Callable[..., Rig]]:
-    """Make bridges that end with the test."""
+    """Yield a function that makes a bridge; the fixture closes all of them after the test."""
     made: list[Rig] = []
 
     def make(*arguments: Any, **settings: Any) -> Rig:

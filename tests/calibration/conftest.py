@@ -1,4 +1,4 @@
-"""Gliders, each made once."""
+"""Fixture of the calibration tests: a cached function that makes a simulated glider."""
 
 from __future__ import annotations
 

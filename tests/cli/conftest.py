@@ -1,4 +1,4 @@
-"""A deployment and a calibration for every command."""
+"""Fixtures of the command-line tests: the file of a simulated deployment, and its calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tests of a diagnosis share."""
+"""Fixtures of the diagnosis tests."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from magbridge.diagnose.survey import load_survey
 
 @pytest.fixture(scope="session")
 def problem() -> Problem:
-    """The demo's survey against the calibration of its own runs."""
+    """Return the problem of the demo's survey with the calibration from the demo's own calibration runs."""
     return pose(load_survey([demo().survey], demo().calibration), demo().calibration)
 
 
 @pytest.fixture(scope="session")
 def listed(problem: Problem) -> list[Description]:
-    """Return its descriptions without a name, given noise alone."""
+    """Return the descriptions of the demo's residuals that name no cause, for a fit of noise only."""
     return descriptions(problem, fit_joint(problem, [], 1))
 
 
 @pytest.fixture(scope="session")
 def clear() -> Diagnosis:
-    """A current's field that is named alone, in two hours where the study has six."""
+    """Return a diagnosis that identifies a current's field unambiguously, from 2 h of the study's vehicle."""
     hours, deployment.HOURS = deployment.HOURS, 2.0
     deployment.vehicle.cache_clear()
     here = deployment.Background.of(deployment.vehicle(0), 24, "white")

@@ -1,4 +1,4 @@
-"""Small files of the names that the documentation uses."""
+"""Fixtures of the documentation tests: small files with the names that the pages use."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def survey_and_runs(made: Path, tmp_path: Path) -> Path:
-    """A folder with runs.nc, survey.nc, glider.nc, grid.nc and cal.json."""
+    """Return a folder that holds runs.nc, flight.nc, survey.nc, glider.nc, grid.nc and cal.json."""
     for file in made.iterdir():
         shutil.copy(file, tmp_path)
     return tmp_path

@@ -1,4 +1,4 @@
-"""A fleet of two small vehicles, flown once."""
+"""Fixtures of the fleet tests: the simulated logs of two vehicles, and their processed catalogue."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magbridge.fleet.register import jobs
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with a fleet.toml and its logs."""
+    """Return a folder with a fleet.toml and the logs that it lists."""
     folder = tmp_path_factory.mktemp("fleet")
     for vehicle, name, number in ((1, "one/first", 0), (1, "one/second", 1), (2, "two/first", 0)):
         fly(folder / f"{name}.nc", vehicle, number)
@@ -26,7 +26,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def done(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
-    """The fleet's catalogue, processed by two workers, one of which is killed on the way."""
+    """Return the fleet's catalogue after two workers processed it, one of which was killed and replaced."""
     catalogue = catalogue_of(tmp_path_factory.mktemp("done"), flown)
     with client_of("", 2, "2 GiB") as client:
         victim = next(iter(client.run(os.getpid).values()))

@@ -1,4 +1,4 @@
-"""Checks that all tests of faults have in common."""
+"""Checks and limits that the fault tests share."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from rig import Rig
 from magbridge.mavlink import Codec
 
 Row = Callable[[str, str, str, str], None]
-"""Takes a row of the table of faults."""
+"""Function that adds a row to the table of faults: fault, output meanwhile, recovery time and losses."""
 NOISE = np.random.default_rng(1).integers(0, 256, 4000, dtype=np.uint8).tobytes()
 
 
 def seconds(value: float) -> str:
-    """Return a time as the table tells it."""
+    """Return a duration (s) as the table of faults prints it."""
     return f"{value:.2f} s"
 
 
 def soon(limit: float) -> float:
-    """Return how long what takes `limit` (s) on a quiet machine may take on this one, as busy as it is."""
+    """Return the time limit (s) on this machine for an action that takes `limit` (s) on an idle machine."""
     return 2.0 * limit * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def replays(rig: Rig) -> None:
-    """Stop the bridge; its replayed log publishes the same bytes, and has the received frames in order."""
+    """Stop the bridge; assert that its replayed log gives the same bytes and holds the received frames."""
     assert rig.stop() == 0
     recorded, published = rig.replay()
     assert recorded.damages == 0
@@ -41,7 +41,7 @@ def replays(rig: Rig) -> None:
 
 
 def first_difference(one: bytes | bytearray, other: bytes | bytearray) -> tuple[object, object] | None:
-    """Return the first two messages in which two streams differ."""
+    """Return the fields of the first pair of messages in which two streams differ; None if there is none."""
     pairs = zip_longest(*(Codec(0, 0).parse(bytes(stream)) for stream in (one, other)))
     different = ((this and this.fields, that and that.fields) for this, that in pairs if this != that)
     return next(different, None)

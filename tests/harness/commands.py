@@ -1,4 +1,4 @@
-"""A command as a user types it: its output, or the one line of its error message."""
+"""Run a command as a user types it, and return its output or the line of its error message."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ __all__ = ["Command", "Output"]
 
 
 class Output(NamedTuple):
-    """What a command printed."""
+    """Text that a command printed to stdout and stderr."""
 
     out: str
     err: str
 
 
 class Command:
-    """Runs ``magbridge`` in this process."""
+    """Runner of ``magbridge`` commands in the process of the test."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
 
     def __call__(self, *arguments: object, code: int = 0) -> Output:
-        """Run a command that must end with `code`; return its output."""
+        """Run a command, assert that its exit code is `code`, and return its output."""
         assert main([str(argument) for argument in arguments]) == code
         return Output(*self._capsys.readouterr())
 
     def refuses(self, *arguments: object, code: int = 1) -> str:
-        """Run a command that must refuse with `code`; return its one line."""
+        """Run a command, assert that it fails with `code` and one line on stderr, and return that line."""
         texts = self(*arguments, code=code).err
         assert texts.count("\n") == 1, texts
         assert texts.startswith("magbridge: ")

@@ -1,4 +1,4 @@
-"""A private PostgreSQL server without a port, where the system has one installed."""
+"""A temporary PostgreSQL server without a TCP port, if PostgreSQL is installed."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 OWNER = "postgres"
-"""Who runs it where we are root, as whom it refuses to run."""
+"""User that runs the server if the tests run as root, because PostgreSQL does not start as root."""
 
 
 def program(name: str) -> str | None:
-    """Return where a program of the newest PostgreSQL is."""
+    """Return the path of a program of the newest installed PostgreSQL, or None if there is none."""
     found = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"), key=lambda path: path.parts[-3])
     return str(found[-1]) if found else shutil.which(name)
 
 
 @contextmanager
 def server() -> Iterator[str]:
-    """Run a server; yield the URL of its database. There must be :func:`program` of initdb and pg_ctl."""
+    """Run a server and yield the URL of its database; :func:`program` must find initdb and pg_ctl."""
     root = os.geteuid() == 0
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # short: a socket's path is
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # a short path, for a socket
         if root:
             shutil.chown(folder, OWNER)
 

@@ -1,4 +1,4 @@
-"""The demonstration's simulated deployments and their calibrations, each made once in a process."""
+"""The simulated deployments of the demo and their calibrations, each made once in a process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MASSES = ("battpos", "ballast")
 
 
 class Demo(NamedTuple):
-    """A calibration by a deployment's own runs, its survey, and the runs; do not change the arrays."""
+    """Calibration runs and survey of a simulated deployment, and the calibration from the runs; read only."""
 
     calibration: Calibration
     survey: xr.Dataset
@@ -28,13 +28,13 @@ class Demo(NamedTuple):
 
 
 def demo_log(seed: int = 5) -> xr.Dataset:
-    """Return a copy of the whole deployment."""
+    """Return a copy of the whole simulated deployment."""
     return _simulated(seed).copy(deep=True)
 
 
 @cache
 def demo(seed: int = 2) -> Demo:
-    """Calibrate a deployment by its runs, with the instrument's filter undone."""
+    """Return a simulated deployment and the calibration from its runs, without the instrument's filter."""
     parts = segments(_simulated(seed))
     learned = unfiltered(observations(parts["calibration"], MASSES), load("demo").instrument.corner)
     return Demo(fit(learned, "auto").calibration, parts["survey"], parts["calibration"])

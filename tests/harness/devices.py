@@ -1,4 +1,4 @@
-"""What stands at the two ends of a bridge on the bench: a fluxgate on a pty, an autopilot on a socket."""
+"""Simulated devices at the two ends of a bridge: a fluxgate on a pty and an autopilot on a socket or pty."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from sitl.fluxgate import open_encoder
 
 SENSOR_HZ, TELEMETRY_HZ, BEAT_HZ = 50, 20, 2
 TRUTH = (20_000.0, 1_000.0, 40_000.0)
-"""nT, what the fluxgate stands in."""
+"""Field at the fluxgate, nT in sensor axes."""
 TURN = 0.002
-"""s between two looks at everything."""
+"""Time between two polls of the sensor and the autopilot, s."""
 
 
 def open_line(name: Path) -> tuple[int, int]:
-    """Make a serial line whose far end is a device called `name`; return the descriptors of both ends."""
+    """Make a pty and link its far end as the device `name`; return the descriptors of both ends."""
     near, far = pty.openpty()
     tty.setraw(far)
     os.set_blocking(near, False)
@@ -35,7 +35,7 @@ def open_line(name: Path) -> tuple[int, int]:
 
 
 class Fluxgate:
-    """An instrument on a pty, found under a name that can change as those of USB adapters do.
+    """Simulated fluxgate on a pty whose device name can change, as that of a USB adapter does.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Fluxgate:
         self._sent = 0
 
     def plug(self, name: str = "ttyUSB0", *, powered_anew: bool = False) -> None:
-        """Plug it in."""
+        """Connect the fluxgate as the device `name`; restart its clock if it is `powered_anew`."""
         self._name = self.folder / name
         self._master, self._slave = open_line(self._name)
         if powered_anew:
@@ -65,7 +65,7 @@ class Fluxgate:
             self._on, self._sent = time.monotonic(), 0
 
     def unplug(self, *, after: int = 0) -> None:
-        """Pull it out, `after` so many bytes of a frame."""
+        """Disconnect the fluxgate after it sent the first `after` bytes of a frame."""
         self.write(self._frame()[:after])
         deadline = time.monotonic() + 5.0
         # a pty forwards with a delay, and FIONREAD does not count its buffer
@@ -79,13 +79,13 @@ class Fluxgate:
         self._master = -1
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the line; a reader may be missing."""
+        """Write bytes to the pty; drop them if its buffer is full or the fluxgate is disconnected."""
         if self._master >= 0:
             with suppress(BlockingIOError):
                 os.write(self._master, data)
 
     def turn(self) -> None:
-        """Send the readings that are due; they are taken whether anybody listens or not."""
+        """Send the readings that are due; drop them if `speaks` is False."""
         due = int((time.monotonic() - self._on) * self._hz)
         while self._sent < due:
             frame = self._frame()
@@ -101,40 +101,40 @@ class Fluxgate:
 
 
 class SerialEnd:
-    """One end of a serial line, spoken to as a socket is; the other end is a device called `name`."""
+    """One end of a serial line, with the methods of a socket; the other end is the device `name`."""
 
     def __init__(self, name: Path) -> None:
         self._name = name
         self._master, self._slave = open_line(name)
 
     def sendall(self, data: bytes) -> None:
-        """Put bytes on the line."""
+        """Write bytes to the line."""
         os.write(self._master, data)
 
     def recvfrom(self, size: int) -> tuple[bytes, None]:
-        """Read bytes from the line."""
+        """Read at most `size` bytes from the line; the sender's address is always None."""
         return os.read(self._master, size), None
 
     def close(self) -> None:
-        """Pull it out."""
+        """Remove the device and close both ends."""
         self._name.unlink()
         os.close(self._slave)
         os.close(self._master)
 
 
 class Autopilot:
-    """System 1, component 1, at the far end of the link."""
+    """Simulated autopilot (system 1, component 1) at the far end of the bridge's link."""
 
     def __init__(self, url: str, codec: Codec) -> None:
         self.codec = codec
         self.position: Callable[[float], float] = lambda _: 0.5
-        """Position of the battery at a time (s, monotonic)."""
+        """Position of the battery (in) as a function of the time (s, monotonic)."""
         self.answers = True
-        """True if it answers TIMESYNC."""
+        """True if the autopilot replies to TIMESYNC."""
         self.reported: list[float] = []
-        """When it sent telemetry (s, monotonic)."""
+        """Times at which the autopilot sent telemetry, s, monotonic."""
         self._retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
-        """What the link makes of a telemetry frame."""
+        """Function that returns the frames that the link delivers for a telemetry frame."""
         self._kind, _, self._at = url.partition(":")
         self._ear = Codec(0, 0)
         self._booted = self._beat = self._due = time.monotonic()
@@ -154,12 +154,12 @@ class Autopilot:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where a socket is."""
+        """Host and port of the link's URL."""
         host, _, port = self._at.rpartition(":")
         return host, int(port)
 
     def up(self) -> None:
-        """Open its end of the link."""
+        """Open the autopilot's end of the link."""
         if self._kind == "serial":
             self._line = SerialEnd(Path(self._at))
             return
@@ -178,23 +178,23 @@ class Autopilot:
             self._peer = self.address
 
     def down(self) -> None:
-        """Close its end of the link."""
+        """Close the autopilot's end of the link."""
         for one in (self._line, self._listener):
             if one is not None:
                 one.close()
         self._line = self._listener = None
 
     def reboot(self) -> None:
-        """Restart its clock."""
+        """Set the autopilot's clock to zero."""
         self._booted, self._boot_ms = time.monotonic(), 0
 
     @property
     def boot_us(self) -> int:
-        """Its own clock."""
+        """Time since boot by the autopilot's clock, µs."""
         return self._boot_ms * 1000 + int((time.monotonic() - self._booted) * 1e6)
 
     def send(self, data: bytes) -> None:
-        """Put bytes on the link."""
+        """Send bytes; drop them if the link is closed or its buffer is full."""
         if self._line is None:
             return
         with suppress(BlockingIOError, ConnectionRefusedError, BrokenPipeError, ConnectionResetError):
@@ -204,23 +204,23 @@ class Autopilot:
                 self._line.sendto(data, self._peer)
 
     def pack(self, name: str, /, **fields: object) -> bytes:
-        """Return a frame, signed as of now where it signs."""
+        """Return the frame of a message, signed with the present time if the autopilot has a key."""
         self.codec.now_us = time.time_ns() // 1000
         return self.codec.pack(name, **fields)
 
     def send_message(self, name: str, /, **fields: object) -> None:
-        """Send a message."""
+        """Send the message `name` with these fields."""
         self.send(self.pack(name, **fields))
 
     def telemetry(self, value: float | None = None, *, behind_us: int = 0) -> bytes:
-        """Return a frame of telemetry."""
+        """Return the frame of the battery's position (in), with a timestamp `behind_us` before now."""
         value = self.position(time.monotonic()) if value is None else value
         return self.pack(
             "NAMED_VALUE_FLOAT", time_boot_ms=(self.boot_us - behind_us) // 1000, value=value, name="battpos"
         )
 
     def turn(self) -> Iterator[Message]:
-        """Send the due messages; yield the received ones."""
+        """Send the heartbeat and telemetry that are due; yield the received messages."""
         now = time.monotonic()
         if self._listener is not None and self._line is None:
             with suppress(BlockingIOError):

@@ -1,4 +1,4 @@
-"""A full disk: the limit of a file's size stands for its end, and the reason told is the system's own."""
+"""Simulate a full disk with the limit of a file's size; the error message is that of the operating system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ArduPilot's logs made here: what a test says of records, as bytes or as text."""
+"""Write ArduPilot dataflash logs from the records that a test lists, as bytes or as text."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KINDS = {
 
 
 def described(number: int, length: int, name: str, letters: str, fields: str) -> bytes:
-    """Return an ``FMT`` record."""
+    """Return the ``FMT`` record that describes the records of one kind."""
     body = Struct("<BB4s16s64s").pack(number, length, name.encode(), letters.encode(), fields.encode())
     return b"\xa3\x95\x80" + body
 
@@ -49,7 +49,7 @@ class Log:
             self.lines.append(f"FMT, {number}, {length}, {name}, {letters}, {fields}")
 
     def record(self, name: str, *values: Any) -> bytes:
-        """Return the bytes of a record; numbers are in the unit of the field."""
+        """Return the bytes of a record; `values` are in the units of its fields."""
         number, letters, _ = self.kinds[name]
         raw: Sequence[Any] = [
             round(value * SCALES[one]) if one in SCALES else value.encode() if one in "nNZ" else value
@@ -58,12 +58,12 @@ class Log:
         return b"\xa3\x95" + bytes([number]) + self.structs[name].pack(*raw)
 
     def write_message(self, name: str, *values: Any) -> None:
-        """Append a record."""
+        """Append a record of the kind `name` to `data` and to `lines`."""
         self.data += self.record(name, *values)
         self.lines.append(", ".join([name, *map(str, values)]))
 
     def fix(self, us: int, utc: float, status: int = 3) -> None:
-        """Append a GPS fix; `utc` is s since 1970."""
+        """Append a GPS fix at `us` (µs since boot); `utc` is s since 1970."""
         gps = utc + 18 - 315_964_800
         self.write_message(
             "GPS", us, status, round(gps % 604_800 * 1000), int(gps // 604_800), 9, 1.0, 45.0, -63.0
@@ -72,5 +72,5 @@ class Log:
     def mag(
         self, us: int, number: int, field: Sequence[int], health: int = 1, offsets: Sequence[int] = ()
     ) -> None:
-        """Append a sample (mG) of a compass; `offsets` are three offsets and three of the motors."""
+        """Append a sample (mG) of a compass; `offsets` are three sensor offsets, then three motor offsets."""
         self.write_message("MAG", us, number, *field, *(offsets or (0,) * 6), health, us & 0xFFFFFFFF)

@@ -23,7 +23,7 @@ def _glider(vehicle: int) -> Glider:
 
 
 def fly(path: Path, vehicle: int, number: int, start: float | None = None, sensor: str = "") -> Path:
-    """Write a vehicle's calibration runs, one moving mass; each deployment has an offset of its own."""
+    """Write calibration runs of a vehicle with one mass; each deployment draws an offset (5 nT, 1-sigma)."""
     runs = _glider(vehicle).runs
     rows = np.arange(0, len(runs), 2)
     rng = np.random.default_rng([vehicle, number])
@@ -39,13 +39,13 @@ def fly(path: Path, vehicle: int, number: int, start: float | None = None, senso
 
 
 def catalogue_of(folder: Path, flown: Path) -> Catalogue:
-    """Return a new catalogue with the vehicles and logs of a folder's fleet.toml."""
+    """Return a new catalogue in `folder` with the vehicles and logs of the fleet.toml in `flown`."""
     assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", str(folder / "fleet")]) == 0
     return Catalogue(folder / "fleet")
 
 
 def content(catalogue: Catalogue) -> dict[str, list[Row]]:
-    """Return all that a catalogue holds."""
+    """Return the rows of each table of a catalogue."""
     return {table: catalogue.rows(table) for table in CATALOGUE_TABLES}
 
 

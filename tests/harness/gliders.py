@@ -1,4 +1,4 @@
-"""Random gliders: moving dipoles, the paper's Table 1 for calibration, a survey with other roll and pitch."""
+"""Random gliders with moving dipoles: calibration runs (Table 1 of the paper) and a survey."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ MASSES = {0: (), 1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "bal
 
 @dataclass(frozen=True)
 class Glider:
-    """A vehicle that is known, its calibration runs and its survey, with and without noise."""
+    """Simulated vehicle with known parameters, its calibration runs and its survey."""
 
     vehicle: Vehicle
     runs: Observations
     survey: Observations
     quiet: np.ndarray
-    """(n, 3) the survey's channels without noise."""
+    """Readings of the survey without noise, (n, 3) in nT."""
 
 
 Gliders = Callable[..., Glider]
-"""``glider(seed, masses, noise, memory)``; the same call gives the same glider."""
+"""Function ``glider(seed, masses, noise, memory)`` that returns the same glider for the same arguments."""
 
 
 def make(seed: int, masses: int = 2, noise: float = 1.0, memory: float = 0.0) -> Glider:

@@ -1,4 +1,4 @@
-"""One anomaly map, written as each format that other programs write."""
+"""Write one anomaly map in each third-party format that magbridge reads."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 LON, LAT = np.linspace(10.0, 10.5, 11), np.linspace(54.0, 54.4, 9)
 GEOTIFF_TAGS = (33550, 12), (33922, 12), (34735, 3), (42113, 2)
-"""Tags of pixel scale, tie point, keys and the number of a hole, each with its TIFF type."""
+"""GeoTIFF tags of pixel scale, tie point, keys and no-data value, each with its TIFF type."""
 MAP = 30 * np.sin(np.meshgrid(LON, LAT)[0] * 9) + 100 * (np.meshgrid(LON, LAT)[1] - 54)
 
 
@@ -44,7 +44,7 @@ def surfer_7(path: Path, rotation: float = 0.0, blank: float = 1.70141e38) -> No
 
 
 def esri(path: Path) -> None:
-    """Write the map as an ESRI ASCII grid, by the centre of its first cell."""
+    """Write the map as an ESRI ASCII grid whose header states the centre of the lower-left cell."""
     first_lines = (
         f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\n"
     )
@@ -52,7 +52,7 @@ def esri(path: Path) -> None:
 
 
 def esri_corner(path: Path) -> None:
-    """Write the map as an ESRI ASCII grid, by the corner of its first cell."""
+    """Write the map as an ESRI ASCII grid whose header states the corner of the lower-left cell."""
     corner = f"XLLCORNER {LON[0] - 0.025}\nYLLCORNER {LAT[0] - 0.025}"
     path.write_text(f"NCOLS {LON.size}\nNROWS {LAT.size}\n{corner}\nCELLSIZE 0.05\n{lines(MAP[::-1])}")
 
@@ -65,7 +65,7 @@ def table(
     *,
     height: bool = False,
 ) -> None:
-    """Write the map as a table with a `header` line, its rows in random order."""
+    """Write the map as text columns below a `header` line, with the rows in random order."""
     x, y = np.meshgrid(LON, LAT)
     heights = [np.linspace(100.0, 140.0, MAP.size)] if height else []
     rows = np.column_stack([x.ravel(), y.ravel(), *heights, MAP.ravel() * scale])
@@ -74,7 +74,7 @@ def table(
 
 
 def geotiff(path: Path, **others: object) -> None:
-    """Write the map as a GeoTIFF; `others` replaces tags."""
+    """Write the map as a GeoTIFF; `others` replaces values of tags by name."""
     tags = ImageFileDirectory_v2()
     wanted = {
         "scale": (0.05, 0.05, 0.0),

@@ -1,4 +1,4 @@
-"""A bridge's MAVLink side and a ground station, joined by real bytes."""
+"""Connect the bridge's MAVLink component to a ground station by encoded frames, without ports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SECOND = 1_000_000
 
 
 class Line:
-    """Two ends of one link: the component, and pymavlink as station (255:190) or autopilot (1:1)."""
+    """Link between the component, and pymavlink as ground station (255:190) or autopilot (1:1)."""
 
     def __init__(self, peer: ModuleType, **options: Any) -> None:
         self.peer = peer
@@ -32,14 +32,14 @@ class Line:
         self.station = peer.MAVLink(None, 255, 190)
         self.autopilot = Codec(1, 1)
         self.sent: list[tuple[int, bytes]] = []
-        self.asked = 0  # the command of the last request
+        self.asked = 0  # number of the last command sent
 
     @staticmethod
     def only(messages: list[Any], name: str) -> list[Any]:
         return [message for message in messages if message.get_type() == name]
 
     def to(self, seconds: float) -> list[Any]:
-        """Advance the time to `seconds` after the start; return the messages to the station."""
+        """Advance the time to `seconds` after the start; return the messages that the station receives."""
         self.now = START + round(seconds * SECOND)
         self.component.advance(self.now)
         return self.receive()
@@ -54,12 +54,12 @@ class Line:
         return received
 
     def send_message(self, name: str, /, *args: Any, **fields: Any) -> list[Any]:
-        """Send a message of the station; return the messages back to it."""
+        """Send a message from the station; return the messages that the station receives."""
         message = getattr(self.peer, f"MAVLink_{name.lower()}_message")(*args, **fields)
         return self.give(message.pack(self.station))
 
     def fly(self, name: str, **fields: Any) -> list[Any]:
-        """Send a message of the autopilot; return the messages to the station."""
+        """Send a message from the autopilot; return the messages that the station receives."""
         return self.give(self.autopilot.pack(name, **fields))
 
     def give(self, data: bytes) -> list[Any]:
@@ -75,4 +75,4 @@ class Line:
 
 
 MakeLine = Callable[..., Line]
-"""``make_link(**options)``: a line whose component is set up with these options."""
+"""Function ``make_link(**options)`` that returns a line whose component has these options."""

@@ -1,4 +1,4 @@
-"""How fast this computer is just now: limits on processor time are multiples of a fixed piece of work."""
+"""Measure processor time in units of a fixed loop, so that limits hold on slow and fast computers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["cost"]
 
 
 def cost(work: Callable[[], object]) -> float:
-    """Return the processor time of some work, in units of a loop of 100,000 additions."""
+    """Return the processor time of `work`, in units of a loop of 100,000 additions."""
     units = []
     for part in (_loop, _loop, work, _loop):
         begun = time.process_time()

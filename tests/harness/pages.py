@@ -1,4 +1,4 @@
-"""The documentation's pages, and the blocks of code in them."""
+"""Read the pages of the documentation and their code blocks."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ PAGES = sorted(
 FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 
 SHELL = re.compile(r"(#.*\n)*(magbridge [a-z]|python|pip |sudo |head |\.venv)")
-"""How a block begins that holds commands without saying so."""
+"""Beginning of a code block that holds shell commands but states no language."""
 
 
 class Block(NamedTuple):
-    """A fenced block: its page from the root, the line of the page, its language and text."""
+    """Fenced code block: page (path from the root), first line on the page, language and text."""
 
     page: str
     line: int
@@ -33,7 +33,7 @@ class Block(NamedTuple):
 
 
 def blocks(*languages: str) -> list[Block]:
-    """Return the blocks of all pages in these languages."""
+    """Return the code blocks of all pages in the given languages."""
     return [one for page in PAGES for one in _blocks(page) if one.language in languages]
 
 
@@ -48,7 +48,7 @@ def _blocks(page: Path) -> Iterator[Block]:
 
 
 def commands(block: Block) -> Iterator[list[str]]:
-    """Yield the commands in a block of shell, each as its words; comments and variables are left out."""
+    """Yield the words of each command in a shell block, without comments and environment variables."""
     for line in block.text.replace("\\\n", " ").splitlines():
         for part in re.split(r" (?:&&|\|) ", line):
             words = shlex.split(part, comments=True)

@@ -1,4 +1,4 @@
-"""A vehicle over hills of the field, for tests of bridge and autopilot in closed loop."""
+"""Tracks over a field with anomalies, for tests of bridge and autopilot in closed loop."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from magbridge.navigate import NavigationOptions
 PLACE = (49.5, -57.9)
 START = 1_780_000_000.0
 LOST, BACK, LAST = 60.0, 840.0, 900.0
-"""s: GPS is lost, and comes back; the end."""
+"""Times at which GPS is lost, GPS returns and the track ends, s after the start."""
 AIRCRAFT = NavigationOptions(
     start_sigma=50.0, current_sigma=4.0, current_time=3600.0, bias_sigma=2.0, map_sigma=2.0, interval=5.0
 )
-"""Options for a plane, with a wind of 4 m/s."""
+"""Navigation options for a plane in a wind of 4 m/s (1-sigma)."""
 OPTIONS = NavigationOptions(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
 
 
 @cache
 def hills(seed: int = 4) -> AnomalyGrid:
-    """Return waves of 80 to 300 m and 50 nT, over 6 km."""
+    """Return a map of 6 km by 6 km with 12 random waves of 15 nT and 80 to 300 m per radian."""
     rng = np.random.default_rng(seed)
     per_latitude, per_longitude = metres_per_degree(PLACE[0])
     along = np.arange(-3000.0, 3001.0, 20.0)
@@ -41,7 +41,7 @@ def hills(seed: int = 4) -> AnomalyGrid:
 
 @cache
 def passage(seed: int = 1, current: float = 0.1) -> Passage:
-    """Return two legs at 1.5 m/s through an unmeasured current (m/s, north)."""
+    """Return a track of two legs at 1.5 m/s through an unmeasured current (m/s, north)."""
     rng = np.random.default_rng(seed)
     time = START + np.arange(0.0, LAST + 1.0)
     heading = np.where(time - START < 0.5 * LAST, np.radians(50.0), np.radians(-40.0))
@@ -58,12 +58,12 @@ def passage(seed: int = 1, current: float = 0.1) -> Passage:
 
 @cache
 def steep_map(seed: int = 1) -> AnomalyGrid:
-    """Return a map of 120 nT RMS and 1 km correlation length, 16 km to each side."""
+    """Return a map of 120 nT RMS and 1 km correlation length that extends 16 km to each side."""
     return synthetic(Map(120.0, 1000.0), seed)
 
 
 def _changing_wind(rng: np.random.Generator, seconds: int) -> np.ndarray:
-    """Return a wind (n, 2) in m/s, once a second, with the statistics that the options of a plane state."""
+    """Return one wind vector a second, (n, 2) in m/s, with the statistics of :data:`AIRCRAFT`."""
     sigma, kept = AIRCRAFT.current_sigma, np.exp(-1.0 / AIRCRAFT.current_time)
     steps = sigma * np.sqrt(1.0 - kept**2) * rng.normal(size=(seconds, 2))
     wind = np.empty((seconds, 2))
@@ -98,7 +98,7 @@ def flight(
     velocity = 22.0 * np.column_stack([np.cos(radians), np.sin(radians)])
     wind = _changing_wind(rng, time.size) if changing_wind else np.array([3.0, -2.6])
     away = np.vstack([[0.0, 0.0], np.cumsum(velocity + wind, axis=0)[:-1]])
-    away -= 0.5 * (away.min(axis=0) + away.max(axis=0))  # keep it on the map
+    away -= 0.5 * (away.min(axis=0) + away.max(axis=0))  # centre the track on the map
     latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
     anomaly = steep_map().evaluate(longitude, latitude).anomaly
     assert np.isfinite(anomaly).all()

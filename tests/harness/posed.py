@@ -1,4 +1,4 @@
-"""Problems of a diagnosis and candidates for them, made without a simulation."""
+"""Make problems of a diagnosis, and candidates for them, without a simulation."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ __all__ = [
 
 
 FIELD, T0 = 5e4, 1.7e9
-"""nT, and s since 1970: the reference, and when a survey begins."""
+"""Reference field, nT, and start of a survey, s since 1970 UTC."""
 
 
 def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
-    """A survey at 4 s without gaps, of a field along `directions` (n, 3) near a mass at p (n,).
+    """Return a gapless 4 s survey with the field along `directions` (n, 3) and a mass at `p` (n,).
 
-    `more` replaces fields by name; a dive has fifty samples.
+    `more` replaces attributes by name; a dive has fifty samples.
     """
     n = len(p)
     plain = {
@@ -52,31 +52,31 @@ def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
 
 
 def walk(n: int, rng: np.random.Generator) -> FloatArray:
-    """(n, 3) directions of a field that turns at random."""
+    """Return (n, 3) directions of a field that rotates as a random walk in vehicle axes."""
     return np.asarray(rng.normal(size=(n, 3)).cumsum(axis=0) * 0.1 + [0.3, 0.1, 0.9])
 
 
 def calibrated(coefficients: FloatArray, variance: float = 4.0, **parameter: float) -> Calibration:
-    """A calibration with a polynomial in p: nine coefficients for each power, of one `variance`, nT²."""
+    """Return a polynomial calibration in p: nine coefficients for each power, each of `variance` nT²."""
     limits = {"low": -1.0, "high": 1.0, "centre": 0.0, "scale": 1.0} | parameter
     return polynomial(coefficients, Parameter("p", "in", **limits), variance=variance, method="made")
 
 
 def regressors_of(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
-    """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
+    """Return the (r, n) regressors of an effect along the survey, computed for one sample at a time."""
     channels = dict.fromkeys((*calibration.units, *effect.channels()))
     values = {name: survey.channels[name].values for name in channels}
     return Effect.batch(effect, LogSeries(survey.time, survey.field, values, calibration.kernel))
 
 
 def right(rows: int) -> Problem:
-    """Return a calibrated vehicle with noise that turns to random attitudes."""
+    """Return the problem of an exact calibration at random attitudes."""
     directions = np.random.default_rng(4).normal(size=(rows, 3))
     return pose(surveyed(directions, np.linspace(-1.0, 1.0, rows)), calibrated(np.zeros(9), 1e-6))
 
 
 def thinned(survey: Survey, here: NDArray[np.bool_]) -> Survey:
-    """Return the remaining rows of an evenly sampled survey with lost samples."""
+    """Return the survey with only the rows of the mask `here` (n,), as if the other samples had been lost."""
     each = ("time", "field", "reference", "dive", "fitted", "learned")
     rows = {name: getattr(survey, name)[here] for name in each}
     channels = {name: c._replace(values=c.values[here]) for name, c in survey.channels.items()}
@@ -85,7 +85,7 @@ def thinned(survey: Survey, here: NDArray[np.bool_]) -> Survey:
 
 
 def candidate(cause: str, columns: FloatArray, **more: Any) -> Candidate:
-    """A candidate of the columns (n,) or (n, k), of width 1 unless `more` says otherwise."""
+    """Return a candidate with the regressors `columns`, (n,) or (n, k), and a prior width of 1 by default."""
     X = columns.reshape(len(columns), -1)
     k = X.shape[1]
     plain = {
@@ -96,5 +96,5 @@ def candidate(cause: str, columns: FloatArray, **more: Any) -> Candidate:
 
 
 def missed(y: FloatArray, X: FloatArray) -> float:
-    """Share of the power of y (n,) that the columns X (n, k) do not hold."""
+    """Return the fraction of the power of y (n,) that a least-squares fit of the columns X (n, k) leaves."""
     return float(np.sum((y - X @ np.linalg.lstsq(X, y, rcond=None)[0]) ** 2) / (y @ y))

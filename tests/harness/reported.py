@@ -1,4 +1,4 @@
-"""A diagnosis as its report shows it."""
+"""Render the report of a diagnosis for tests."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from magbridge.diagnose.report.page import report_html
 __all__ = ["page_of", "section"]
 
 NO_PICTURES = dict.fromkeys(("measured", "terms", "channels", "spectrum", "track"))
-"""The page's figures, none of which has anything to draw: to draw them takes a second."""
+"""Empty figures of the report, because drawing them takes a second."""
 
 
 def page_of(diagnosis: Diagnosis, *, drawn: bool = False) -> str:
-    """The page of a diagnosis, with its figures only if they are to be `drawn`."""
+    """Return the HTML report of a diagnosis, with its figures only if `drawn`."""
     if drawn:
         return report_html(assess(diagnosis))
     with patch.object(page, "_pictures", return_value=NO_PICTURES):
@@ -25,6 +25,6 @@ def page_of(diagnosis: Diagnosis, *, drawn: bool = False) -> str:
 
 
 def section(diagnosis: Diagnosis, title: str) -> str:
-    """One folded part of the page, its entities resolved and its spaces plain."""
+    """Return the section `title` of the report, with entities resolved and no-break spaces replaced."""
     part = page_of(diagnosis).partition(f"<h2>{title}")[2].partition("<h2>")[0]
     return unescape(part).replace("\N{NO-BREAK SPACE}", " ")

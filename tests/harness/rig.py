@@ -1,8 +1,8 @@
-"""A bridge on the bench: the real ``magbridge run`` as a process, between a fluxgate and an autopilot.
+"""Run ``magbridge run`` as a process between a simulated fluxgate and a simulated autopilot.
 
-The fluxgate sends into a pty, the autopilot on a UDP or TCP socket or a pty of its own. Both are played
-by the caller of :meth:`Rig.until`: nothing happens in the background, so a test states in order what
-goes wrong when.
+The fluxgate uses a pty; the autopilot uses a UDP socket, a TCP socket or a second pty. Both run only
+within :meth:`Rig.until`. Nothing happens in the background, so a test states its faults in the order
+in which they occur.
 """
 
 from __future__ import annotations
@@ -61,39 +61,38 @@ directory = "logs"
 
 OPTIONS = "sensitivity = 5e-5\nreference_voltage = 5.0"
 STALE_BY = 0.2
-"""s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s
-is `max_age`."""
+"""Pause of the machine (s, in the last second) above which telemetry may be late, as `max_age` is 0.5 s."""
 
 PATIENCE = 60.0
-"""s that an event is waited for: on a busy machine a bridge takes many to start."""
+"""Default time limit for an event, s: on a busy machine a bridge needs many seconds to start."""
 
 
 class Received(NamedTuple):
-    """A message of the bridge, and when it came (s, monotonic)."""
+    """Message of the bridge and its time of arrival (s, monotonic)."""
 
     when: float
     message: Message
 
 
 class Rig:
-    """A bridge, its sensor and its autopilot.
+    """Bridge process with its simulated sensor and autopilot.
 
     Parameters
     ----------
     folder : Path
-        Empty; holds the configuration, the log and the sensor's device.
+        Empty folder for the configuration, the log and the sensor's device.
     link : str
         ``udpout``, ``udpin``, ``tcp`` or ``serial``.
     key : bytes or None
         The signing key.
     stepped : bool
-        The bridge sees a clock that :meth:`step` sets.
+        True if the bridge uses a clock that :meth:`step` can shift.
     more : str
-        Further lines of the configuration.
+        Text that is appended to the configuration.
     sensor : (str, str), optional
-        Another driver, and its options.
+        Name of the sensor's driver, and its options.
     hz : float
-        Of the sensor.
+         Sample rate of the sensor, Hz.
     """
 
     def __init__(
@@ -131,60 +130,60 @@ class Rig:
         self.process: subprocess.Popen[bytes] | None = None
 
     def settings(self, url: str, signs: bool = False) -> str:
-        """Return a configuration."""
+        """Return the text of a configuration with the link `url`, and with a signing key if it `signs`."""
         signing = 'signing_key = "key.bin"' if signs else ""
         driver, options = self._sensor
         port = self.folder / "dev" / "ttyUSB*"
         return CONFIG.format(driver=driver, options=options, port=port, url=url, signing=signing)
 
     def start(self) -> float:
-        """Plug everything in and start the bridge; return the s until all is well."""
+        """Connect sensor and autopilot and start the bridge; return the s until the output is normal."""
         if not list(self.fluxgate.folder.iterdir()):
             self.fluxgate.plug()
         self.autopilot.up()
         return self.restart()
 
     def restart(self) -> float:
-        """Start the bridge; return the s until all is well."""
+        """Start the bridge process; return the s until the output is normal."""
         begun, self.process = time.monotonic(), self.spawn(self.config)
         self.until_well()
         return self.since(begun)
 
     def spawn(self, config: Path) -> subprocess.Popen[bytes]:
-        """Start a bridge."""
+        """Start a bridge process with a configuration file."""
         return subprocess.Popen([*self._launch, "run", "--config", str(config)])
 
     def stop(self) -> int:
-        """End the bridge as a user would; return its exit code."""
+        """Send SIGTERM to the bridge; return its exit code."""
         assert self.process is not None
         self.process.terminate()
         return self.process.wait(10)
 
     def close(self) -> None:
-        """End everything, in whatever state it is."""
+        """Kill the bridge if it runs, and close the autopilot's link."""
         if self.process is not None and self.process.poll() is None:
             self.process.kill()
             self.process.wait()
         self.autopilot.down()
 
     def step(self, seconds: float) -> None:
-        """Set the clock that the bridge sees."""
+        """Advance the bridge's clock by `seconds`."""
         temporary = self.offset.with_suffix(".new")
         temporary.write_text(str(int(self.offset.read_text()) + round(seconds * 1e6)))
         temporary.replace(self.offset)
 
     @property
     def mark(self) -> int:
-        """The present position in the stream of received messages."""
+        """Number of messages received until now."""
         return len(self.received)
 
     def since(self, begun: float, end: float | None = None) -> float:
-        """Return the s from `begun` to `end` or now (monotonic) in which this machine did not stand still."""
+        """Return the s from `begun` to `end` or now (monotonic), without pauses of this machine."""
         end = time.monotonic() if end is None else end
         return end - begun - self.machine.seconds(begun, end)
 
     def until(self, condition: Callable[[], object], timeout: float = PATIENCE) -> float:
-        """Play sensor and autopilot until `condition` holds; return the s it took, as in :meth:`since`."""
+        """Run sensor and autopilot until `condition` holds; return the s it took, as in :meth:`since`."""
         begun = time.monotonic()
         while not condition():
             if self.since(begun) > timeout:
@@ -197,12 +196,12 @@ class Rig:
         return self.since(begun)
 
     def run(self, seconds: float) -> None:
-        """Advance the time."""
+        """Run sensor and autopilot for `seconds`."""
         begun = time.monotonic()
         self.until(lambda: self.since(begun) >= seconds, seconds + 5)
 
     def until_answered(self) -> None:
-        """Ask the bridge for a parameter, and wait for the answer."""
+        """Request a parameter from the bridge, and wait for its reply."""
         mark = self.mark
         self.autopilot.send_message(
             "PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0
@@ -210,14 +209,14 @@ class Rig:
         self.until(lambda: self.of("PARAM_VALUE", mark))
 
     def until_well(self) -> float:
-        """Wait for a run of good samples, a sensor and an autopilot; return the s to the first of the run.
+        """Wait for five normal samples in a row and both lines up; return the s to the first of the samples.
 
-        The first run counts: while the rest is waited for, a busy machine may be late with a sample.
+        The first such run counts: a busy machine may deliver a later sample late.
         """
         begun, mark = time.monotonic(), self.mark
 
         def run() -> float | None:
-            """Return when the first of five good samples on end came (s, monotonic)."""
+            """Return the arrival (s, monotonic) of the first of five normal samples in a row, or None."""
             fields = [one for one in self.received[mark:] if one.message.name == "MAG_FIELD"]
             good = [one.message["flags"] == self.normal for one in fields]
             return next(
@@ -233,7 +232,7 @@ class Rig:
         return self.since(begun, run())
 
     def until_status(self, condition: Callable[[Message], object], timeout: float = PATIENCE) -> Message:
-        """Wait for a MAG_STATUS from now on for which `condition` holds; return it."""
+        """Wait for a new MAG_STATUS for which `condition` holds; return the message."""
         mark = self.mark
         self.until(lambda: any(map(condition, self.of("MAG_STATUS", mark))), timeout)
         return next(status for status in self.of("MAG_STATUS", mark) if condition(status))
@@ -243,11 +242,11 @@ class Rig:
         return self.until(lambda: any(text in line for line in self.texts(mark)), timeout)
 
     def of(self, name: str, mark: int = 0) -> list[Message]:
-        """Return the messages of one kind heard since `mark`."""
+        """Return the messages `name` received since `mark`."""
         return [message for _, message in self.received[mark:] if message.name == name]
 
     def texts(self, mark: int = 0) -> list[str]:
-        """Return the STATUSTEXTs since `mark`, put together again."""
+        """Return the STATUSTEXTs since `mark`, each joined from its chunks."""
         lines: list[str] = []
         for message in self.of("STATUSTEXT", mark):
             if message["chunk_seq"] and lines:
@@ -257,53 +256,53 @@ class Rig:
         return lines
 
     def flags(self, mark: int) -> str:
-        """Return the names of all flags published since `mark`."""
+        """Return the names of all abnormal flags published since `mark`."""
         seen = 0
         for message in self.of("MAG_FIELD", mark):
             seen |= message["flags"]
         return Quality(seen & ~self.normal).names()
 
     def undue_flags(self, mark: int) -> str:
-        """Return the same without those of late telemetry, where the machine or we stood still."""
+        """Return :meth:`flags` without the flags that a pause of the machine or of this process explains."""
         seen = 0
         for when, message in self.received[mark:]:
             if message.name == "MAG_FIELD":
                 late = self.machine.seconds(when - 1.0, when) > STALE_BY or self.untold(when) > STALE_BY
                 seen |= message["flags"] & ~(Quality.STALE_TELEMETRY if late else 0)
-        seen &= ~Quality.LATE_JOIN  # a busy machine holds the process up; it has a test of its own
+        seen &= ~Quality.LATE_JOIN  # a busy machine causes it; another test covers this flag
         return Quality(seen & ~self.normal).names()
 
     def untold(self, when: float) -> float:
-        """Return the longest time (s) in which we sent no telemetry, of the second before `when`."""
+        """Return the longest gap (s) between telemetry messages in the second before `when`, s, monotonic."""
         sent = [t for t in self.autopilot.reported if when - 1.0 < t < when]
         return max(after - before for before, after in pairwise([when - 1.0, *sent, when]))
 
     @property
     def status(self) -> dict[str, Any]:
-        """The latest MAG_STATUS, fresh."""
+        """Fields of the latest received MAG_STATUS; empty if there is none."""
         found = self.of("MAG_STATUS")
         return found[-1].fields if found else {}
 
     def fresh_status(self) -> dict[str, Any]:
-        """Wait for the next MAG_STATUS."""
+        """Wait for the next MAG_STATUS; return its fields."""
         return self.until_status(lambda _: True).fields
 
     @property
     def logs(self) -> list[Path]:
-        """The log's files, in order."""
+        """Log files in order of time."""
         return sorted((self.folder / "logs").glob("*.tlog"))
 
     def replay(self, files: list[Path] | None = None) -> tuple[Recorded, bytes]:
-        """Replay the log through another bridge; return the recorded and the new output."""
+        """Replay the log files through a new bridge; return the recorded log and the new output."""
         recorded, published = Recorded(files or self.logs), bytearray()
         Stage(self.config, published.extend).play(recorded.start, recorded.events())
         return recorded, bytes(published)
 
 
 def calibration(slope: tuple[float, float, float] = (30.0, -20.0, 10.0)) -> Calibration:
-    """A calibration with one moving mass, which changes nothing at its centre.
+    """Return a calibration with one moving mass that corrects nothing if the mass is at its centre.
 
-    `slope` is the nT by which the offset changes as the mass goes from there to the end of its range.
+    `slope` is the change of the offset (nT) as the mass moves from its centre to the end of its range.
     """
     return polynomial(
         np.array([0.0] * 15 + [*slope]),

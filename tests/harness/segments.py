@@ -1,4 +1,4 @@
-"""A Slocum's segments, made by hand after the format that dbdreader reads."""
+"""Write segment files of a Slocum glider, in the format that dbdreader reads."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ CRC = "ab12cd34"
 def segment(path: Path, cycles: Mapping[str, np.ndarray], *, factored: bool = False) -> None:
     """Write a file in which every sensor of `cycles` is updated in every cycle.
 
-    Eight bytes a value; a cycle is ``d``, two bits a sensor (2: updated), the values. With `factored`, the
-    list of sensors is left out: it is in a ``.cac``.
+    A cycle consists of ``d``, two bits per sensor (2: updated) and the values of eight bytes each. With
+    `factored`, the list of sensors is in a separate ``.cac`` file.
     """
     names = list(cycles)
     sensors = "".join(f"s: T {k} {k} 8 {name} unit\n" for k, name in enumerate(names))

@@ -1,4 +1,4 @@
-"""Detect that this machine had no processor time for a while, so that no test counts it as a fault."""
+"""Detect pauses in which this machine ran no process, so that no test counts a pause as a fault."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from functools import cache
 __all__ = ["Standstill", "standstill"]
 
 NAP = 0.01
-"""s between two looks at the clock."""
+"""Time between two readings of the clock, s."""
 LATE = 0.1
-"""s by which a look comes late where a processor stood still; a busy one is late by less."""
+"""Minimum delay of a reading that proves a pause, s; a busy processor delays a reading by less."""
 
 
 class Standstill:
-    """A thread on each processor sleeps, and writes down when it was woken late."""
+    """Monitor of pauses: a thread on each processor sleeps and records when it woke late."""
 
     def __init__(self) -> None:
         self._spells: list[tuple[float, float]] = []
@@ -33,7 +33,7 @@ class Standstill:
             self._spells += _late(last, self._looked[processor])
 
     def seconds(self, begin: float, end: float) -> float:
-        """Return for how many s a processor stood still between the two (s, monotonic)."""
+        """Return the total time (s) of pauses between `begin` and `end` (s, monotonic)."""
         now, seconds = time.monotonic(), 0.0
         still = [spell for last in self._looked.values() for spell in _late(last, now)]
         for first, last in sorted(self._spells + still):
@@ -43,11 +43,11 @@ class Standstill:
 
 
 def _late(last: float, now: float) -> list[tuple[float, float]]:
-    """Return begin and end of a standstill, if there was one between two looks (s, monotonic)."""
+    """Return begin and end of the pause between two readings of the clock (s, monotonic); empty if none."""
     return [(last + NAP, now)] if now - last > NAP + LATE else []
 
 
 @cache
 def standstill() -> Standstill:
-    """Return the watch over this machine; it begins with the first call."""
+    """Return the monitor of this machine's pauses; it starts with the first call."""
     return Standstill()

@@ -1,4 +1,4 @@
-"""The command ``magbridge monitor`` as a process, for tests that ask it as a browser does."""
+"""Run ``magbridge monitor`` as a process, and request its page as a browser does."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from urllib.error import HTTPError, URLError
 from urllib.request import HTTPCookieProcessor, build_opener
 
 Station = tuple[str, tuple[str, int]]
-"""The page's address, and where its link listens."""
+"""Address of the page, and host and port of its link."""
 
 
 def free(kind: socket.SocketKind) -> int:
-    """Return a free port."""
+    """Return a free port of the loopback interface."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -27,11 +27,11 @@ def free(kind: socket.SocketKind) -> int:
 
 @contextmanager
 def served(clock: Path, *options: str, warned: bool = False, url: str = "") -> Iterator[Station]:
-    """Run the page; `clock` holds by how many µs its computer's clock is set forward, `url` is its link."""
+    """Run the monitor on the link `url`; the file `clock` holds the shift of its clock in µs."""
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
     launch = [sys.executable, str(Path(__file__).parent / "stepped.py"), str(clock)]
     command = [*launch, "monitor", url or f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
-    # NiceGUI looks at them
+    # NiceGUI runs in a test mode if it sees pytest's variables
     alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
     with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
         assert process.stderr
@@ -49,7 +49,7 @@ def served(clock: Path, *options: str, warned: bool = False, url: str = "") -> I
 
 
 def get(url: str) -> str:
-    """Return the page, once it is there."""
+    """Return the text of a page; retry for 30 s until the server accepts connections."""
     browser = build_opener(HTTPCookieProcessor())
     for _ in range(150):
         try:

@@ -1,8 +1,8 @@
 """Run magbridge with a host clock that a test can set: ``stepped.py OFFSET_FILE ARGUMENT...``.
 
-The program is the unmodified one; only its UTC, ``time.time_ns`` and ``time.time``, is the host's plus the
-microseconds that a file holds. (A time namespace shifts only the monotonic clocks, and the real one belongs
-to everybody.)
+The program is unmodified, except that ``time.time_ns`` and ``time.time`` return the host's UTC plus the
+microseconds in a file. (A time namespace shifts only the monotonic clocks, and a change of the host's
+clock would affect all its processes.)
 """
 
 from __future__ import annotations
@@ -16,6 +16,6 @@ host = time.time_ns
 time.time_ns = lambda: host() + 1000 * int(offset.read_text())
 time.time = lambda: time.time_ns() * 1e-9
 
-from magbridge.cli import main  # noqa: E402 - the clock first
+from magbridge.cli import main  # noqa: E402 - replace the clock first
 
 sys.exit(main())

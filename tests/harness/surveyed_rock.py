@@ -1,4 +1,4 @@
-"""A survey over a crustal field of 40 nT by a vehicle with iron, and its fit."""
+"""Simulate a survey over a crustal field of 40 nT (RMS) by a vehicle with hard and soft iron."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOISE = 1.0
 def flown(
     *, legs: int = 16, straight: bool = False, zigzag: bool = False, seed: int = 3, noise: float = NOISE
 ) -> tuple[Observations, FloatArray]:
-    """Fly dives criss-cross over a crustal field of 40 nT; return the readings and the true total field."""
+    """Simulate dives on crossing courses; return the readings and the true total field (n,), nT."""
     rng = np.random.default_rng(seed)
     each, dt, speed = 110, 4.0, 0.9
     n = legs * each
@@ -48,7 +48,7 @@ def flown(
 
 
 def error_of(found: Fit, data: Observations, true: FloatArray) -> tuple[float, float]:
-    """Return the corrected field's error and its sigma, about the mean, nT."""
+    """Return the corrected field's standard deviation of error and its predicted sigma, without bias, nT."""
     channels = data.channels(found.calibration)
     got = correct(found.calibration, data.field, channels, data.time)
     level = level_of(found.calibration, data.field, channels, data.time)

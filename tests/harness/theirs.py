@@ -1,4 +1,4 @@
-"""Small files as people bring them: a vehicle turned through all attitudes, as their logger has it."""
+"""Write small logs in third-party formats, of a vehicle that turns through all attitudes."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ PLACE = 45.0, -63.0
 N = 240
 K = np.arange(N)
 ANGLES = np.column_stack([40.0 * np.sin(K / 9.0), 35.0 * np.sin(K / 14.0), 6.0 * K % 360.0])
-"""deg: roll, pitch, heading."""
+"""Roll, pitch and heading of each sample, deg."""
 HERE = (PLACE[1], PLACE[0], 0.0, float(T0))
 BODY = Rotation.from_euler("ZYX", ANGLES[:, ::-1], degrees=True)
 NED = np.asarray(igrf(*(np.array([one]) for one in HERE))).ravel()
 FIELD = float(np.linalg.norm(NED))
-"""nT: the total field that a corrected log must show."""
+"""Total field that a corrected log must show, nT."""
 STERN = 2.0 * (K // 40 % 3)
-"""mm: a mass that stands still in each of six legs."""
+"""Position of a mass that is constant in each of six legs, mm."""
 CURRENT = 10.0 * (K // 30 % 2)
-"""A: of the motors."""
+"""Current of the motors, A."""
 
 
 def sensor(*, mass: bool = False, motors: bool = False) -> FloatArray:
-    """Return the fluxgate's readings (n, 3), nT: field, hard iron, moving parts, 5 nT of noise."""
+    """Return readings (n, 3) in nT of field, hard iron, the chosen disturbances and 5 nT of noise."""
     noise = np.random.default_rng(3).normal(0.0, 5.0, (N, 3))
     field = BODY.inv().apply(NED) + np.array([900.0, -1400.0, 600.0]) + noise
     if mass:
@@ -46,7 +46,7 @@ def sensor(*, mass: bool = False, motors: bool = False) -> FloatArray:
 
 
 def engineer(path: Path) -> None:
-    """Write a German spreadsheet: semicolons, decimal commas, microtesla, days first."""
+    """Write a German spreadsheet: semicolons, decimal commas, microtesla, and the day before the month."""
     rows = ["when;F1;F2;F3;stern position [mm];pump;caesium;lock;lat;lon;roll;pitch;yaw"]
     for k, field in enumerate(sensor(mass=True) / 1e3):
         when = datetime.fromtimestamp(T0 + k, UTC).strftime("%d.%m.%Y %H:%M:%S")
@@ -94,7 +94,7 @@ def pixhawk(path: Path) -> None:
 
 
 def bag(path: Path) -> None:
-    """Write a bag of ROS 2: a ``MagneticField`` (forward, left, up), an ``Imu``, a ``NavSatFix``."""
+    """Write a ROS 2 bag with ``MagneticField`` (forward, left, up), ``Imu`` and ``NavSatFix`` messages."""
     from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an extra of the project
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -137,7 +137,7 @@ def bag(path: Path) -> None:
 
 
 def slocum(folder: Path) -> None:
-    """Write two segments of a Slocum, each with its flight and science file."""
+    """Write two segments of a Slocum, each as a flight and a science file."""
     for number in range(2):
         k = np.arange(60.0)
         time = T0 + 1000.0 * number + 4.0 * k

@@ -1,4 +1,4 @@
-"""A bridge that learns, without ports: line protocol, no masses; events are fed by hand."""
+"""Set up a bridge that calibrates in flight, without ports; the tests feed it events."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEARNING = "[learning]\nenabled = true\n"
 
 
 def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pipeline:
-    """Set up a bridge with a nominal calibration that is known to a nanotesla, or with none."""
+    """Set up a bridge with a nominal calibration (1 nT, 1-sigma), or without a calibration if not `known`."""
     coefficients = np.random.default_rng(1).normal(size=9) * 100.0
     config = write_bridge(
         folder,
@@ -40,7 +40,7 @@ def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pip
 
 
 def events(folder: Path) -> list[Event]:
-    """A vehicle turns and pitches in a field as strong as the IGRF; its offset has changed."""
+    """Return the events of a vehicle that turns and pitches, whose offset differs from its calibration."""
     rng, autopilot = np.random.default_rng(2), Codec(1, 1)
     cal = load(folder / "cal.json")
     A, T = (one[0] for one in cal.matrices(np.empty((1, 0))))
@@ -67,10 +67,10 @@ def events(folder: Path) -> list[Event]:
 
 
 def received(frames: list[tuple[int, bytes]]) -> list[Message]:
-    """Return the messages of frames."""
+    """Return the messages in a list of (priority, frame)."""
     return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
 
 
 def named(messages: list[Message], name: str) -> list[Message]:
-    """Return those of one name."""
+    """Return the messages called `name`."""
     return [message for message in messages if message.name == name]

@@ -1,4 +1,4 @@
-"""PX4's logs made here, after its description of ULog."""
+"""Write PX4 logs, after the specification of ULog."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 __all__ = ["Output", "ulog_of"]
 
 Output = list[tuple[str, int, tuple[Any, ...]]]
-"""Topic, instance and values of each message."""
+"""Messages of a log: topic, instance and values of each."""
 
 
 def ulog_of(topics: dict[str, tuple[str, str]], parameters: dict[str, float], texts: Output) -> bytes:
-    """Return a ULog of topics (definition, struct), each an instance, with parameters and messages."""
+    """Return a ULog file of `topics` (name: field definition, struct format), parameters and messages."""
 
     def message(kind: str, body: bytes) -> bytes:
         return pack("<HB", len(body), ord(kind)) + body

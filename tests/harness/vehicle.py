@@ -1,4 +1,4 @@
-"""An autopilot's messages by hand, and what the bridge's navigation makes of them."""
+"""Feed hand-made autopilot messages to the bridge's navigation, and collect its messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ACK = {"command": 43003, "target_system": 1, "target_component": 191}
 
 
 class Bench:
-    """A bridge's navigation without its ports."""
+    """Navigation service of a bridge, without its ports."""
 
     def __init__(self, kind: str, options: NavigationOptions = OPTIONS) -> None:
         self.component = Component(
@@ -34,27 +34,27 @@ class Bench:
         self.now_us = START_US
 
     def to(self, seconds: float) -> list[Message]:
-        """Advance the time; return the sent messages, and keep the texts."""
+        """Advance the time to `seconds` after the start; return the messages sent, and store the texts."""
         self.now_us = START_US + round(seconds * 1e6) // 4 * 4
         self.component.advance(self.now_us)
         return self._drain()
 
     def receive(self, name: str, component: int = 1, **fields: Any) -> list[Message]:
-        """Receive a message now; return the sent messages."""
+        """Deliver a message of the autopilot's `component` now; return the messages sent."""
         frame = self._autopilot[component].pack(name, **fields)
         for message in self.component.receive(frame, self.now_us):
             self.navigation.receive(message, self.now_us)
         return self._drain()
 
     def fix(self, sigma: float = 5.0) -> list[Message]:
-        """Offer a position; return the sent messages."""
+        """Offer a position of `sigma` (m) to the fix sender; return the messages sent."""
         at = Reckoned(self.now_us, *PLACE, sigma**2, 0.0, sigma**2)
         if self.navigation.fixing.send(at, 0):
             self.navigation.motion.fixes_sent()
         return self._drain()
 
     def texts_with(self, word: str) -> list[str]:
-        """Return the texts with a word in them, since asked last."""
+        """Return the new texts that contain `word`, and discard all others."""
         self._drain()
         found, self.texts = [text for text in self.texts if word in text], []
         return found

@@ -1,4 +1,4 @@
-"""Worlds for in-flight calibration: a glider that turns, dives and moves its mass over a smooth field."""
+"""Simulate in-flight calibration: a glider turns, dives and moves its mass over a smooth field."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ FIELD = 50_000.0
 
 
 def calibration(sigma: float = 1.0) -> Calibration:
-    """Return one whose coefficients are uncertain by `sigma` nT each."""
+    """Return a calibration whose coefficients have a standard deviation of `sigma` nT each."""
     K = 9 * len(ORDER)
     return polynomial(np.random.default_rng(3).normal(size=K) * 200.0, MASS, variance=sigma**2)
 
 
 class World:
-    """A glider that yaws, pitches and moves its mass over a smooth crustal field."""
+    """Samples of a glider that yaws, pitches and moves its mass over a smooth crustal field."""
 
     def __init__(self, truth: Calibration, samples: int, seed: int = 1, *, straight: bool = False) -> None:
         rng = np.random.default_rng(seed)
@@ -64,9 +64,10 @@ def learn(
     settled: np.ndarray | None = None,
     seen: Callable[[int], None] | None = None,
 ) -> list[int]:
-    """Give the learner a world's samples, and call `seen` after each; return where it had an alarm.
+    """Feed a world's samples to the learner; return the indices of the samples at which it had an alarm.
 
-    `settled` (n, 3) is what each sample's field turns out to have been, once the next has come.
+    The function calls `seen` after each sample. `settled` (n, 3) is the final field of each sample in nT,
+    given to the learner with the next sample.
     """
     corrector, doubted = Corrector(learner.first), []
     field = world.field if added is None else world.field + added
@@ -94,14 +95,14 @@ def learn(
 
 
 def error_of(learned: Calibration, world: World) -> float:
-    """Return the RMS error about its mean of the total field, nT, without the noise."""
+    """Return the standard deviation of the calibrated total field's error, nT, without bias."""
     A, T = learned.matrices(world.mass[:, None])
     total = np.linalg.norm(np.matmul(A, (world.field - T)[:, :, None])[:, :, 0], axis=1)
     return float(np.std(total - world.total))
 
 
 def grid_of(scale: float, shift: float = 0.0, level: float = 0.0) -> AnomalyGrid:
-    """Return a map of the crustal field along north, with errors of `scale`, `shift` (m) and `level` (nT)."""
+    """Return a map of the crustal field, scaled by `scale`, shifted by `shift` (m), plus `level` (nT)."""
     metres = np.arange(-3_000.0, 5_000.0, 100.0)
     rock = scale * 60.0 * np.sin((metres + shift) / 900.0) + level
     latitude = 49.0 + metres / 111_000.0

@@ -1,4 +1,4 @@
-"""What the interoperability tests share: the peers, and a bridge that lives on while they are asked."""
+"""Fixtures of the interoperability tests: third-party programs, and a bridge to which they connect."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def python() -> Path:
-    """Return the interpreter that has MAVProxy and MAVSDK; their commands are in its folder."""
+    """Return the Python interpreter with MAVProxy and MAVSDK; their commands are in its folder."""
     found = PEERS / "python" / "bin" / "python"
     if not found.exists():
         pytest.skip(f"MAVProxy and MAVSDK are {MISSING}")
@@ -33,7 +33,7 @@ def python() -> Path:
 
 @pytest.fixture(scope="session")
 def modules() -> Path:
-    """Where npm put node-mavlink."""
+    """Return the folder in which npm installed node-mavlink."""
     found = PEERS / "node" / "node_modules"
     if not (found / "node-mavlink").exists():
         pytest.skip(f"node-mavlink is {MISSING}")
@@ -41,7 +41,7 @@ def modules() -> Path:
 
 
 class Peer:
-    """A program that is asked on its stdin and answers on its stdout."""
+    """Third-party process that reads requests on stdin and replies on stdout."""
 
     def __init__(self, rig: Rig, command: list[str | Path], folder: Path) -> None:
         self._rig = rig
@@ -64,13 +64,13 @@ class Peer:
         self.lines.extend(line.rstrip() for line in self._process.stdout)
 
     def ask(self, line: str) -> None:
-        """Type a line."""
+        """Write a line to the program's stdin."""
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
 
     def until(self, text: str, since: int = 0, timeout: float = 30.0) -> str:
-        """Play the rig until the program says `text`; return that line."""
+        """Run the rig until the program prints `text`; return that line."""
         try:
             self._rig.until(lambda: any(text in line for line in self.lines[since:]), timeout)
         except AssertionError:
@@ -78,7 +78,7 @@ class Peer:
         return next(line for line in self.lines[since:] if text in line)
 
     def ask_until(self, line: str, text: str, timeout: float = 30.0) -> None:
-        """Type a line again and again until the program says `text`: it may not have been ready before."""
+        """Write a line every 0.5 s until the program prints `text`, because it may not be ready at first."""
         since, begun = len(self.lines), time.monotonic()
         while not any(text in texts for texts in self.lines[since:]):
             assert time.monotonic() - begun < timeout, "\n".join(self.lines[-60:])
@@ -86,12 +86,12 @@ class Peer:
             self._rig.run(0.5)
 
     def answer(self, name: str) -> dict[str, object]:
-        """Return what a script of ours tells of `name`: a line of JSON."""
+        """Return the JSON object that the project's script prints for `name`."""
         found: dict[str, object] = json.loads(self.until(f'{{"{name}":'))
         return found
 
     def end(self) -> None:
-        """Close its stdin and wait for it."""
+        """Close the program's stdin and wait for its end."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
@@ -106,7 +106,7 @@ class Peer:
 
 @pytest.fixture
 def start_peer() -> Iterator[Callable[..., Peer]]:
-    """Start programs that end with the test."""
+    """Yield a function that starts a third-party program; the fixture ends all of them after the test."""
     started: list[Peer] = []
 
     def start(rig: Rig, command: list[str | Path]) -> Peer:
@@ -120,7 +120,7 @@ def start_peer() -> Iterator[Callable[..., Peer]]:
 
 @pytest.fixture
 def make_rig(tmp_path: Path) -> Iterator[Callable[[str], Rig]]:
-    """Start a bridge whose link is left to a peer."""
+    """Yield a function that starts a bridge without the rig's autopilot, for a third-party peer."""
     made: list[Rig] = []
 
     def make(link: str) -> Rig:

@@ -1,4 +1,4 @@
-"""A first hour: the commands of a page, as it has them, in a folder with a file like theirs."""
+"""Run the commands of the documentation's pages in a folder with a user's files."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SHOWN = {tuple(words) for block in blocks("sh") for words in commands(block)}
 
 
 class Walk:
-    """Runs commands that the documentation shows, and no others."""
+    """Runner that accepts only commands that the documentation shows."""
 
     def __init__(self, command: Command) -> None:
         self._command = command
 
     def __call__(self, line: str, code: int = 0) -> Output:
-        """Run a line as a page has it, word for word, which must end with `code`."""
+        """Run a command line that a page shows word for word; assert that its exit code is `code`."""
         words = tuple(shlex.split(line))
         assert words in SHOWN, f"no page shows: {line}"
         files = [name for word in words[1:] for name in _globbed(word)]
@@ -27,7 +27,7 @@ class Walk:
 
 
 def _globbed(word: str) -> list[str]:
-    """Return the files that a shell would put in place of a pattern; one that fits none stays."""
+    """Return the files that match a pattern as a shell expands it; return the word itself if none matches."""
     return (
         [word] if "*" not in word or word.startswith("/") else sorted(map(str, Path().glob(word))) or [word]
     )

@@ -1,4 +1,4 @@
-"""A bridge's MAVLink side and a ground station."""
+"""Fixtures of the MAVLink tests: the bridge's component connected to a ground station."""
 
 from __future__ import annotations
 

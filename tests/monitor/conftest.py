@@ -1,4 +1,4 @@
-"""What the tests of the page share."""
+"""Fixture of the monitor's tests."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture
 def clock(tmp_path: Path) -> Path:
-    """By how many µs the page's computer's clock is set forward."""
+    """Return a file with the shift (µs) of the clock of the page's computer, at first 0."""
     offset = tmp_path / "offset"
     offset.write_text("0")
     return offset

@@ -1,4 +1,4 @@
-"""Maps and tracks, drawn by the same tool that prints the tables."""
+"""Fixtures of the navigation tests: options, and a map of the tool that prints the documented tables."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def options() -> NavigationOptions:
 
 @pytest.fixture(scope="session")
 def grid() -> AnomalyGrid:
-    """30 nT rms, 1,500 m."""
+    """Return a map of 30 nT RMS and 1,500 m correlation length."""
     return synthetic(Map(30, 1500), 3)
