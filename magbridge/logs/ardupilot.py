@@ -1,14 +1,14 @@
-"""ArduPilot's own logs, binary (``.BIN``) or as text (``.log``).
+"""Read ArduPilot's onboard logs, binary (``.BIN``) or as text (``.log``).
 
-The log holds the field as the autopilot used it. Its offsets, its motor compensation and its soft-iron
-matrix (``COMPASS_DIA``, ``COMPASS_ODI``) are in the log, too, and are undone, so ``mag_x`` is the raw channel
-(mG, so steps of 100 nT):
+The log holds the field as the autopilot used it, and the corrections of the autopilot: offsets, motor
+compensation and soft-iron matrix (``COMPASS_DIA``, ``COMPASS_ODI``). The reader undoes these corrections, so
+``mag_x`` is the raw channel in steps of 1 mG (100 nT):
 
-    MAG = D (s raw + Ofs) + MO        with D of DIA and ODI, and s = ``COMPASS_SCALE``, which is left in
+    MAG = D (s raw + Ofs) + MO        with D of DIA and ODI; the scale s = ``COMPASS_SCALE`` is not undone
 
-UTC is the median of what the GPS fixes say, so one damaged record does not date the log. The compass that is
-read is the one which the estimator names (``XKFS``), or the first that is enabled (``COMPASS_USE``) and
-healthy. Survey magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) follow the compasses.
+The time is the median of UTC over the GPS fixes, which one damaged record does not change. The compass is the
+one that the estimator used (``XKFS``), or the first that is enabled (``COMPASS_USE``) and healthy. Survey
+magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) are numbered after the compasses.
 
 The table :data:`ARDUPILOT_FIELDS` lists fields and their units. A log of ArduPilot 3.6 or later declares its
 units (``FMTU``, ``UNIT``, ``MULT``); declared units replace those of the table.
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
 
 MIN_GPS_STATUS = 3
-"""Least ``GPS.Status`` of a fix in three dimensions."""
+"""Lowest ``GPS.Status`` of a three-dimensional fix."""
 MAX_KIND_NUMBER = 8
-"""Highest number in the name of a kind, as ``ESC8``."""
+"""Highest number in the name of a kind of record, as ``ESC8``."""
 ID_PARAMETERS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
-"""Parameters that hold a compass' device id, the first that is there; the second has no number 1."""
+"""Parameters that hold a compass's device id, in order of preference; the second has no number 1."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces; the values that are read are held whole.
+    """Yield the log in pieces of at most `rows` rows; all values that are read are in memory.
 
     FormatError: the log lacks a record of a magnetometer with a time.
     """
@@ -87,7 +87,7 @@ def _run(fields: Fields, records: dict[str, Records]) -> BootRun:
 
 
 def _in_microseconds(name: str, records: Records) -> Records:
-    """Return records with times in µs; up to ArduPilot 3.2 they are ms, those of GPS in its week."""
+    """Return records with ``TimeUS``, µs since the boot, also for ArduPilot up to 3.2, which logs ms."""
     fields = records.fields
     if "TimeMS" not in fields or "TimeUS" in fields:
         return records
@@ -124,11 +124,11 @@ def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:
 def _magnetometer(
     number: int, records: Records, parameters: Mapping[str, float], chosen: int | None
 ) -> Magnetometer:
-    """Return the raw channels in nT, and the log's description of the compass."""
+    """Return the compass `number` with its raw channels; `chosen` is the number that the estimator used."""
     fields = records.fields
     field: FloatArray = np.stack([fields[f"Mag{axis}"] for axis in "XYZ"])
     none = np.zeros(len(records.at))
-    # the motors' share is MOX, up to ArduPilot 4.0 MOfsX
+    # the motor compensation is MOX, up to ArduPilot 4.0 MOfsX
     field -= np.stack([fields.get(f"MO{axis}", fields.get(f"MOfs{axis}", none)) for axis in "XYZ"])
     diagonal, off = ([parameters.get(f"COMPASS_{kind}{_numbered(number)}_{axis}", 0.0) for axis in "XYZ"]
                      for kind in ("DIA", "ODI"))  # fmt: skip
@@ -153,7 +153,7 @@ def _magnetometer(
 
 
 def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetometer]:
-    """Return the sensors of ``MAGH`` records, numbered from `first`; their ids are node, sensor and bus."""
+    """Return the magnetometers of ``MAGH`` records, numbered from `first`; ids are node, sensor and bus."""
     if records is None or not {"TimeUS", *SURVEY_AXES} <= records.fields.keys():
         return []
     fields = records.fields
@@ -169,12 +169,12 @@ def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetome
 
 
 def _numbered(number: int) -> str:
-    """Return the number of a compass in the names of parameters: none for the first, 2 for the second."""
+    """Return the number of a compass in names of parameters: "" for the first, "2" for the second."""
     return str(number + 1) if number else ""
 
 
 def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
-    """Yield everything but the magnetometers."""
+    """Yield the columns of all records in :data:`ARDUPILOT_FIELDS`, which has no magnetometers."""
     for record in ARDUPILOT_FIELDS:
         for number, found in _instances(records, record).items():
             time, table = found.fields["TimeUS"] * 1e-6, dict(found.fields)
@@ -187,7 +187,7 @@ def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
 
 
 def _instances(records: dict[str, Records], kind: str) -> dict[int, Records]:
-    """Return each instance of a kind, also if its number is in the name (``MAG2``)."""
+    """Return number (from 0) -> records of each instance of a kind, also if the name has it (``MAG2``)."""
     found: dict[int, Records] = {}
     for number, name in enumerate((kind, *(f"{kind}{k}" for k in range(2, MAX_KIND_NUMBER + 1)))):
         if (one := records.get(name)) is None or "TimeUS" not in one.fields or not len(one.at):
@@ -204,7 +204,7 @@ def _instances(records: dict[str, Records], kind: str) -> dict[int, Records]:
 
 
 def _utc_offset(records: dict[str, Records]) -> float | None:
-    """Return UTC minus time since boot in s, the median of all GPS fixes; None without one."""
+    """Return UTC minus time since boot in s, the median of all GPS fixes; None without a fix."""
     offsets = []
     for gps in (one.fields for one in _instances(records, "GPS").values()):
         if {"GWk", "GMS"} <= gps.keys():
@@ -219,18 +219,18 @@ def _utc_offset(records: dict[str, Records]) -> float | None:
 
 
 Fields = dict[str, list[FieldMap]]
-"""Kind of record to its fields."""
+"""Kind of record -> its fields."""
 ARDUPILOT_FIELDS: Fields = field_maps("ardupilot")
-"""Of records with one column, the first that the log has is taken. Sub's and Copter's CTUN have height and
-throttle, Rover's throttle is in THR, that of all motors together in MOTB."""
+"""If several records fill one column, the first in the log is used. CTUN has height and throttle in Sub and
+Copter, THR the throttle in Rover, MOTB the throttle of all motors together."""
 INSTANCE = ("I", "Instance", "Inst")
 TIME_FIELDS = ("TimeUS", "TimeMS")
-"""s since the boot in µs, or in ms up to ArduPilot 3.2."""
+"""Time since the boot, µs, or ms up to ArduPilot 3.2."""
 SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My", "Mz")
-"""Record of a survey magnetometer, what distinguishes several, and their axes in G."""
+"""Record of survey magnetometers, the fields that identify a sensor, and the fields of its axes, G."""
 POWER_MESSAGES = "CURR", "BAT"
 MAX_VOLTAGE_V = 100.0
-"""Larger integers in a log that does not declare its units are in hundredths of V and A."""
+"""Median above which integers without declared unit are in hundredths of V (and of A for the current)."""
 MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health"}
 NUMBERED = {"MAG": MAG, **{kind: {one.field for one in fields} for kind, fields in ARDUPILOT_FIELDS.items()}}
 WANTED: dict[str, set[str]] = {
@@ -247,7 +247,7 @@ WANTED: dict[str, set[str]] = {
     "UNIT": {"Id", "Label"},
     "MULT": {"Id", "Mult"},
 }
-"""Kinds of records, and of each the fields that are read."""
+"""Kind of record -> fields that are read."""
 for _gps in ("GPS", "GPS2"):
     WANTED[_gps] |= {"GWk", "GMS", "Status", "Week", "T"}
 
@@ -262,7 +262,7 @@ UNIT_FACTORS = {
     "us": ("us", 1.0),
     "cm": ("m", 0.01),
 }
-"""Label of a unit that a log declares to ours and its factor."""
+"""Label of a unit in a log -> unit of the column, and factor to it."""
 
 
 def _in_own_units(flash: Flash) -> tuple[Fields, list[str]]:
@@ -288,7 +288,7 @@ def _in_own_units(flash: Flash) -> tuple[Fields, list[str]]:
 
 
 def _converted(field: FieldMap, declared: tuple[str, float] | None) -> FieldMap:
-    """Return a field with the declared unit, where that is one of its kind."""
+    """Return a field with the unit and factor that the log declares, if this unit fits the field."""
     if declared is None or declared[0] not in UNIT_FACTORS:
         return field
     unit, scale = UNIT_FACTORS[declared[0]]
@@ -298,7 +298,7 @@ def _converted(field: FieldMap, declared: tuple[str, float] | None) -> FieldMap:
 
 
 def _declared(flash: Flash) -> dict[tuple[str, str], tuple[str, float]]:
-    """Return a mapping from kind and field to the label of the unit and the multiplier of the number."""
+    """Return (kind, field) -> declared unit label and multiplier; empty if the log does not declare units."""
     try:
         formats, fmtu, unit, mult = (flash.records[name] for name in ("FMT", "FMTU", "UNIT", "MULT"))
         labels = dict(zip(_characters(unit.fields["Id"]), unit.texts["Label"], strict=True))

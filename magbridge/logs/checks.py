@@ -1,14 +1,14 @@
-"""Drop and count impossible data, and values that a file states not to be valid.
+"""Drop and count impossible data, and values that a file marks as invalid.
 
-One damaged record costs only itself. The longest increasing series of times is kept: a clock that was set
-back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time become one. A
-value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units, or in another
-order, and is refused.
+The longest increasing series of times is kept. So a single wrong time costs one row, and a clock that was set
+back costs the rows of the repeated interval. Rows with equal times become one. A physically impossible value
+becomes NaN. A file is rejected if half of its rows, or of the values of a column, are wrong: it has other
+units or another order.
 
-A column ``Valid`` is 0 in rows that are not valid, ``MagValid`` where the field is not. A column ``X_QC`` has
-the quality flags of column ``X``, of which 3, 4 and 9 are bad or missing (Argo Quality Control Manual,
-reference table 2, https://doi.org/10.13155/33951). A column ``Flag`` with the values 0 and 1 marks the rarer
-of the two. Programs without NaN write codes such as -999 for "not known".
+A column ``Valid`` is 0 in invalid rows, and ``MagValid`` is 0 where the field is invalid. A column ``X_QC``
+has the quality flags of column ``X``; 3, 4 and 9 mean bad or missing (Argo Quality Control Manual, reference
+table 2, https://doi.org/10.13155/33951). In a column ``Flag`` with the values 0 and 1, the rarer value marks
+invalid rows. Programs without NaN write codes such as -999 for "not known".
 """
 
 from __future__ import annotations
@@ -34,29 +34,28 @@ from magbridge.logs.mapping import bare
 Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
 YEAR_10000 = 253_402_300_800.0
-"""s since 1970: a later time is in another unit, and no calendar goes beyond it."""
+"""Start of the year 10000, s since 1970; a later time is in another unit."""
 MAX_MAGNITUDE = {
     "latitude": 90.0,
     **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0),
     "depth": 1e5,
 }
-"""Largest magnitude, deg or m, of these columns; 4952.3 is degrees and minutes written together."""
+"""Largest magnitude of these columns, deg or m; a latitude of 4952.3 is in degrees and minutes."""
 MIN_VALUE = {
     "degC": -273.15, "K": 0.0, "Pa": -101325.0, "hPa": -1013.25, "mbar": -1013.25, "kPa": -101.325,
     "bar": -1.01325, "dbar": -10.1325,
 }  # fmt: skip
-"""Lowest temperatures and pressures, also of a pressure relative to the surface's: -9999 is a code for
-"not known"."""
+"""Unit -> lowest possible temperature or gauge pressure; a lower value such as -9999 means "not known"."""
 REFERENCE_FIELD_RANGE_NT = 1e3, 1e6
-"""Range of every reference field, nT: 5e-05 is in tesla, and -9999 a code for "not known"."""
+"""Range of a possible reference field, nT: 5e-05 is in tesla, and -9999 means "not known"."""
 MAX_CHANNEL_DELAY_S = 60.0
-"""s by which a channel's sampling time may differ from its row's time."""
+"""Largest difference between a channel's sampling time and its row's time, s."""
 MIN_GROUP_ROWS, MAX_ISOLATION_S = 3, 30 * 86_400.0
-"""Fewer rows than this, farther than this (s) from all others, are stamped wrong: no log of their own."""
+"""A group of fewer rows that is farther (s) from all other rows has wrong times and is dropped."""
 MIN_ROWS_FOR_ISOLATION = 10
-"""Rows from which on some can be called alone."""
+"""Fewest rows of a piece from which isolated groups are dropped."""
 LOOKAHEAD_ROWS = 64
-"""Rows looked at beyond the end of a piece: whether its last was stamped too late, they tell."""
+"""Rows after a piece that are examined to decide whether its last times are too late."""
 
 
 def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf) -> None:
@@ -72,17 +71,17 @@ def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf)
 
 
 def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) -> Iterator[xr.Dataset]:
-    """Yield the pieces of a deployment, given with the numbers of their rows, without impossible data.
+    """Yield the pieces of a deployment without impossible data; `pieces` come with their row numbers.
 
     The attributes of a piece count and name its losses. FormatError: at least half of the rows, or of a
-    column's values, are impossible (if `strict`: any); or the error of `pieces`, after the pieces before it.
+    column's values, are impossible (if `strict`: any). An error of `pieces` is raised after the last piece.
     """
     faults = Faults(file, strict=strict)
     previous = -np.inf
     last: xr.Dataset | None = None
     broken: list[FormatError] = []
     for piece, following in pairwise(chain(_up_to_error(pieces, broken), [None])):
-        if piece is None:  # only the last is
+        if piece is None:  # the end of the pieces
             break
         next_times = following[0]["time"].values if following else np.empty(0)
         part, rows = piece
@@ -101,13 +100,13 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
     if not broken:
         faults.finish()
     if last is not None:
-        yield with_losses(last, *faults.since_last())  # with the losses behind it
+        yield with_losses(last, *faults.since_last())  # with the losses after it
     for error in broken:
         raise error
 
 
 def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator[Piece]:
-    """Yield the pieces; append the error with which they end, if any, to `broken`."""
+    """Yield the pieces up to an error; append this error to `broken` instead of raising it."""
     try:
         yield from pieces
     except FormatError as error:
@@ -138,7 +137,7 @@ def _times(
 
 
 def _plausible(faults: Faults, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
-    """Return the piece with NaN for impossible values, and how many there were."""
+    """Return the piece with NaN for impossible values, and the number of these values."""
     count, time = 0, dataset["time"].values
     for name, column in dataset.data_vars.items():
         values = column.values
@@ -156,7 +155,7 @@ def _plausible(faults: Faults, dataset: xr.Dataset, rows: Sequence[int]) -> tupl
 
 
 def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
-    """Return the impossible `values` (n,) of a column as a mask, and the expected range; "" without one."""
+    """Return a mask (n,) of the impossible `values` (n,) of a column, and the expected range ("" for any)."""
     unit = usual(unit)
     if name in MAX_MAGNITUDE:
         return np.abs(values) > MAX_MAGNITUDE[name], f"expected {unit}, at most {MAX_MAGNITUDE[name]:g}"
@@ -179,7 +178,7 @@ def _wrong(time: FloatArray, previous: float) -> IndexArray:
 
 
 def _disorder(time: FloatArray) -> str:
-    """Return the expectation for times (n,) most of which run backwards, or are repeated; "" for others."""
+    """Return a message on the expected order if most times (n,) run backwards or are repeated; else ""."""
     steps = np.diff(time)
     if len(steps) > 1 and np.mean(steps < 0.0) > 0.5:
         return "expected times that increase, they run backwards: sort the rows by time"
@@ -191,7 +190,7 @@ def _disorder(time: FloatArray) -> str:
 
 
 def _expected(time: float, previous: float, following: float = np.inf) -> str:
-    """Return the expectation between two other times, s, in place of `time`."""
+    """Return a message on the time expected between `previous` and `following`, s, instead of `time`."""
     if YEAR_10000 <= abs(time) < np.inf:
         return f"expected seconds since 1970, not {time!r}"
     if previous < time and following <= time:
@@ -203,7 +202,7 @@ def _expected(time: float, previous: float, following: float = np.inf) -> str:
 def _rows_to_keep(time: FloatArray, previous: float) -> IndexArray:
     """Return the indices of the longest series of `time` (n,), s, that does not decrease, after `previous`.
 
-    The few rows that are far in time from all others are left out.
+    Small groups of rows that are far in time from all others are left out.
     """
     index = np.flatnonzero((time > previous) & (np.abs(time) < YEAR_10000))
     if (np.diff(time[index]) < 0).any():
@@ -216,7 +215,7 @@ def _rows_to_keep(time: FloatArray, previous: float) -> IndexArray:
 
 
 MAX_WRONG_FRACTION = 0.5
-"""Share of the rows, or of a column's values, that are wrong in a file that is refused."""
+"""Fraction of wrong rows, or of a column's wrong values, from which a file is rejected."""
 
 
 class Faults:
@@ -229,16 +228,17 @@ class Faults:
         self._wrong: Counter[str] = Counter()
         self._known: Counter[str] = Counter()
         self._first: dict[str, FormatError] = {}
-        # since they were last asked for
+        # since the last call of since_last
         self._counts: Counter[str] = Counter()
         self._lines: list[str] = []
 
     def note(
         self, column: str, count: int, row: int, expected: str, counter: str = "", *, wrong: bool = True
     ) -> None:
-        """Count the faults in a column, also in `counter`; `row` and `expected` are of the first.
+        """Count `count` faults in a column, also in a deployment's `counter`.
 
-        Unknown values are not `wrong`, and may be most of a column. FormatError: `strict`.
+        `row`, `expected`: row number and expectation of the first fault. `wrong`: False for unknown values,
+        of which a column may have any number. FormatError: reading is strict.
         """
         error = FormatError(self._file, expected, row=row, column=column or None)
         if self._strict:
@@ -251,15 +251,15 @@ class Faults:
             self._lines.append(str(error))
 
     def remark(self, line: str) -> None:
-        """Add a line to those that name the losses."""
+        """Add a line to the list of named losses."""
         self._lines.append(line)
 
     def count(self, column: str, known: int) -> None:
-        """Count the values that a column has."""
+        """Add `known` to the number of values that a column has."""
         self._known[column] += known
 
     def lost(self, **counts: int) -> None:
-        """Count losses, by the counters of a deployment."""
+        """Add counts to the losses, named as the counters of a deployment."""
         self._counts.update(counts)
 
     def since_last(self) -> tuple[Counter[str], list[str]]:
@@ -276,22 +276,21 @@ class Faults:
 
 
 MIN_SET_BACK_S = 1.0
-"""s by which times are set back where a vehicle was switched on again: records of one moment, which tasks of
-their own write, differ by less."""
+"""Smallest backward step that is a boot, s; records that several tasks write at one time differ by less."""
 MEDIAN_ROWS = 5
-"""Times before and after, whose median is compared: fewer than half of them may be damaged."""
+"""Times before and after a step whose medians are compared; fewer than half of them may be damaged."""
 
 
 def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
-    """Return the rows (n,) to keep so that `time` (n,), s, increases and the fewest rows are dropped.
+    """Return a mask (n,) of the rows to keep so that `time` (n,), s, increases and few rows are dropped.
 
-    A single time that is ahead costs its own row, and not all that follow; so does one set back. NaN is never
-    kept; of several rows with one time, `strictly` keeps only the first.
+    A single time that is too early or too late costs only its own row. NaN is never kept. Of several rows
+    with one time, `strictly` keeps only the first.
 
     Notes
     -----
-    The longest increasing subsequence, by patience sorting from the end, so that of equals the first is kept:
-    C. Schensted (1961), Canad. J. Math. 13, 179.
+    The longest increasing subsequence, by patience sorting from the end, so that the first of equal times is
+    kept: C. Schensted (1961), Canad. J. Math. 13, 179.
     """
     known = np.isfinite(time)
     steps = np.diff(time[known])
@@ -318,7 +317,7 @@ def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
 
 
 def boots(time: FloatArray) -> IndexArray:
-    """Return the rows at which the clock restarted, including the first; `time` (n,) is s since the boot."""
+    """Return the indices of rows at which a clock restarted, including 0; `time` (n,): s since the boot."""
     found = [0]
     for k in (1 + np.flatnonzero(np.diff(time) < -MIN_SET_BACK_S)).tolist():
         before, after = time[max(found[-1], k - MEDIAN_ROWS) : k], time[k : k + MEDIAN_ROWS]
@@ -337,13 +336,13 @@ MAX_FLAGGED = 0.2
 
 
 class Validity(NamedTuple):
-    """Rule by which one column states which values of others are valid."""
+    """Rule by which one column states which values of other columns are valid."""
 
     column: str
     targets: tuple[str, ...]
     """Columns whose values are not valid where `column` is bad; empty: the whole row."""
     bad: frozenset[float]
-    """Values of `column` that mean so."""
+    """Values of `column` that mean "not valid"."""
 
     @property
     def text(self) -> str:
@@ -361,7 +360,7 @@ def states_validity(name: str) -> bool:
 
 
 def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Validity]:
-    """Return the rules by which columns state which values are valid, from the cells of the first `rows`."""
+    """Return the rules by which columns state validity, from names and the cells of the first `rows`."""
     found = []
     words = [bare(name) if name else None for name in names]
     for k, name in enumerate(names):
@@ -388,18 +387,18 @@ CODES = np.outer([-1.0, 1.0], [
     9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
     2_147_483_647.0, 69_696_969.0, 999.0, 999.9, 999.99,
 ])  # fmt: skip
-"""As they are met, with either sign."""
+"""Common codes of missing values, with either sign."""
 ONLY_AMONG_OTHERS = 1_000.0
-"""Smaller codes count only where the column has other values, too."""
+"""Magnitude below which a code counts only if the column also has other values."""
 MIN_FILL_VALUE = 1e30
-"""A larger number is one, too, whatever it measures: 1e31, 1e34, 9.97e36."""
+"""Magnitude above which any number is the code of a missing value: 1e31, 1e34, 9.97e36."""
 
 
 def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
-    """Return the undeclared missing-value codes among columns (n,) as masks.
+    """Return a mask (n,) of undeclared missing-value codes for each column (n,) that has any.
 
-    A code is huge, or one of :data:`CODES` beyond all other values by half their range. A field with 0 or
-    the same code on its three axes is missing, and a position at 0, 0, as a receiver without a fix writes.
+    A code is huge, or one of :data:`CODES` beyond all other values by half their range. A field is missing
+    if its axes are all 0 or the same code. A position at 0, 0 is missing: receivers without a fix write it.
     """
     found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
     for together in (CHANNELS, ("latitude", "longitude")):
@@ -432,9 +431,10 @@ def without_invalid(
     *,
     codes: bool,
 ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-    """Return times (n,), columns (n,) and numbers of the rows without values that the file states as invalid.
+    """Return times (n,), columns (n,) and row numbers without data that the file marks as invalid.
 
-    These are missing-value `codes`, and values that the rules mark. They are counted in `faults`.
+    The `rules` mark rows, which are dropped, and values, which become NaN. If `codes`, missing-value codes
+    become NaN as well. `faults` counts all of them.
     """
 
     def note(name: str, wrong: BoolArray, expected: str) -> None:

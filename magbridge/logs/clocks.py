@@ -1,12 +1,12 @@
-"""Times as text files write them, in seconds since 1970-01-01 UTC.
+"""Convert times in text files to seconds since 1970-01-01 UTC.
 
-A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date. Where the heading
-does not state the kind, the size decides: an Excel serial of today is 46,000, a Julian date 2.46 million, a
-Unix time 1.8e9. GPS time, which is ahead of UTC by :func:`leap_seconds`, has the size of Unix time and must
-be named. Where several columns are the time, they come joined by blanks.
+A number counts from an epoch (Unix, Excel, Julian, GPS ...); a text is a calendar date. If the heading does
+not state the kind of number, its magnitude decides: an Excel serial of today is 46,000, a Julian date 2.46
+million, a Unix time 1.8e9. GPS time, ahead of UTC by :func:`leap_seconds`, is as large as Unix time and must
+be declared or named in the heading. If several columns form the time, their cells are joined by blanks.
 
-The pattern of a date is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. The
-fraction of a second, behind a point, a comma or a colon, is read whatever the pattern.
+The pattern of a date is that of :meth:`datetime.strptime`; the ending `` s`` stands for seconds of the day. A
+fraction of a second after a point, a comma or a colon is read with any pattern.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WHOLE_MOMENTS = ("%a %b %d %H:%M:%S %Y", "%Y%m%d%H%M%S", "%Y %m %d %H %M %S", "%
 """Patterns of date and time together; the last are columns of numbers, joined."""
 SECONDS_SUFFIX = " s"
 YEAR_1900 = -2_208_988_800.0
-"""s since 1970 of the year that times of day without a date are given; no log is older."""
+"""Start of 1900, s since 1970: date of a time of day without a date, and earliest date of a log."""
 FRACTION = r"(?:(?P<clock>\d:\d\d:\d\d)[.,:]|(?P<digits>\d{6}| \d\d?)\.)(?P<fraction>\d+)(?=(?: ?[AP]M)?$)"
 GPS_EPOCH = 315_964_800.0
 """s since 1970 of 1980-01-06, where GPS weeks begin."""
@@ -45,7 +45,7 @@ LEAPS = (
     *((0, 13), (1_136_073_600, 14), (1_230_768_000, 15)),
     *((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18)),
 )
-"""From when on (s since 1970) GPS time is ahead of UTC by how many s; IERS Bulletin C 52, from 1999 on."""
+"""Start (s since 1970) of each lead of GPS time over UTC, and the lead (s); IERS Bulletin C 52."""
 EPOCHS = {
     "s": (0.0, 1.0),
     "ms": (0.0, 1e-3),
@@ -61,31 +61,29 @@ EPOCHS = {
 }
 """Kind of a number -> s since 1970 of its zero, and s in its unit."""
 SUMS = {"seconds and nanoseconds": (0.0, 1.0, 1e-9), "GPS week and seconds": (GPS_EPOCH, WEEK, 1.0)}
-"""Kind of two numbers, joined -> s since 1970 of their zero, and s in the unit of each."""
+"""Kind of a pair of numbers, joined by a blank -> s since 1970 of its zero, and s in the unit of each."""
 SECONDS_OF_DAY = "date and seconds of the day"
 HEADING_WORDS = {
     "ms": r"milli|[_ .]ms$", "us": r"micro|[_ .]us$|time_?us$", "ns": r"nano|[_ .]ns$", "excel": "excel",
     "mjd": "mjd|modified", "julian": "julian|^jd$",
 }  # fmt: skip
-"""Kind -> words in a heading."""
+"""Kind of number -> pattern of the words in a heading that state it."""
 DAY_COUNT_RANGES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
-"""Kinds that count days, and between which numbers their times lie (1982 to 2064, 1943 to 2080, 1968 to
-2077)."""
+"""Kinds that count days, with the range of their numbers (1982 to 2064, 1943 to 2080, 1968 to 2077)."""
 STEP, CERTAIN = 5e-4, 1e-4
-"""Largest median step, in days (43 s, 9 s), by which a count of days is known: the seconds since a boot have
-larger ones; and by which it is under our own name, where they would be 10,000 a second."""
+"""Largest median step, days, with which a number counts days and not seconds since a boot: 43 s, or 9 s in a
+column named ``time``."""
 UNIX_TIME_RANGE_S = 3e8, 4.2e9
-"""s since 1970 of 1979 and 2103, between which a count is known by its size."""
+"""Range in which a count is recognised as Unix time by its size, s since 1970: 1979 to 2103."""
 YEAR_1980 = 315_532_800.0
 MIN_CLOCK_STEP = 10.0
-"""Median step of whole numbers from which on they hardly are seconds since a boot: of milliseconds it is a
-hundred a second."""
+"""Median step of whole numbers from which they are probably not seconds since a boot, but a finer unit."""
 DATE_ORDER = re.compile(r"\b(yyyy|yy|mm|dd)\W?(mm|dd)\W?(yyyy|yy|dd)\b", re.IGNORECASE)
-"""What in a heading states in which order a date is written."""
+"""Part of a heading that states the order of day, month and year."""
 MIN_RUN_ROWS = 3
-"""Fewest rows after a step back in a count, by which it is a start of the clock and not a wrong value."""
+"""Fewest rows after a backward step of a count that make it a restart of the clock, not a wrong value."""
 BETWEEN_RUNS_S = 60.0
-"""s between the runs of a logger that was restarted, whose clock tells nothing of the time between."""
+"""Assumed pause between the runs of a restarted logger, s, since its clock does not measure the pause."""
 OF_A_DAY = "times of day, of a day that the file does not tell"
 
 
@@ -95,9 +93,9 @@ class TimeFormat(NamedTuple):
     kind: str
     """A key of :data:`EPOCHS`, ``iso``, or a pattern of :meth:`datetime.strptime`."""
     assumed: str = ""
-    """The assumption; empty where the file says it all."""
+    """The assumption that was made; empty if the file states the format."""
     boot: bool = False
-    """Times count from an unknown start."""
+    """True if times count from an unknown start."""
 
     @property
     def is_text(self) -> bool:
@@ -113,20 +111,20 @@ class TimeFormat(NamedTuple):
 
 
 class CountState(NamedTuple):
-    """The state of a count of ms or us, or of any count from a boot, in the course of a file."""
+    """State of a count from an unknown start while a file is read, with the shift for wraps and restarts."""
 
     shift_s: float
-    """Added to the count, s, for its wraps and for the runs before."""
+    """Shift that is added to the count for wraps and for earlier runs, s."""
     last: FloatArray
-    """Its last values (n,), s, before the shift."""
+    """(n,): Last values of the count before the shift, s."""
     end_s: float
-    """The last time, s, after the shift."""
+    """Last time before the latest wrap or restart, with the shift, s."""
 
     def go_on(self, times: FloatArray, kind: str) -> tuple[CountState, int]:
         """Add the shift to the next times (n,), s, in place; return the new state and the number of boots.
 
-        A count of 32 bits that wraps around goes on. Where it begins again, a run of its own begins, some
-        time after the last.
+        After a wrap of a 32-bit count the times continue. After a restart they continue
+        :data:`BETWEEN_RUNS_S` after the last time.
         """
         period = (1 << 32) * EPOCHS[kind][1] if kind in {"ms", "us", "ns"} else np.inf
         before = len(self.last)
@@ -136,7 +134,7 @@ class CountState(NamedTuple):
         for k in boots(whole[known])[1:].tolist():
             row, last = int(known[k]), float(whole[known[k - 1]])
             has_wrapped = last - whole[row] > 0.9 * period
-            # one that was too near to the end of the last rows to be sure of is found with these
+            # a restart that was too near to the end of the previous rows to be certain is found now
             seen = before if has_wrapped else before - MIN_RUN_ROWS + 1
             if row < seen or (len(known) - k < MIN_RUN_ROWS and not has_wrapped):
                 continue
@@ -154,14 +152,14 @@ class CountState(NamedTuple):
 
 
 def date_order(headings: Sequence[str]) -> str:
-    """Return the heading that states in which order a date is written, as mm/dd/yyyy; "" for none."""
+    """Return the heading that states the order of a date, as mm/dd/yyyy; "" if no heading does."""
     return next((heading for heading in headings if DATE_ORDER.search(heading)), "")
 
 
 def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) -> TimeFormat:
-    """Return the clock of a column of times, from its heading, its unit and its first cells.
+    """Return the format of a column of times, from its heading, its unit and its first cells.
 
-    ValueError: dates that can be read in two ways; says what to declare.
+    ValueError: dates can be read in two ways; the message states the possible declarations.
     """
     unit = {"seconds": "s", "sec": "s", "hours": "h"}.get(unit, unit)
     if "%" in unit:
@@ -208,9 +206,9 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, integers: bool) ->
 
 
 def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, str]:
-    """Return the kind of a count, and the reason; seconds may be `declared`.
+    """Return the kind of a count, and the reason; `declared` is True if its unit is declared as seconds.
 
-    Under our own name, ``time``, it is in seconds, unless it is too large for seconds since 1970.
+    A count in a column named ``time`` is in seconds, unless it is too large for seconds since 1970.
     """
     ours = declared or heading == "time"
     for kind, words in HEADING_WORDS.items():
@@ -254,9 +252,9 @@ def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bo
 
 
 def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray:
-    """Return the cells (n,) in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
+    """Return the times (n,) in the cells (n,), s since 1970-01-01 UTC; NaN for empty or unreadable cells.
 
-    `zone` is that of times that do not say theirs; UTC if None.
+    `zone`: time zone of cells that do not state theirs; UTC if None.
     """
     if clock.kind in EPOCHS:
         start, scale = EPOCHS[clock.kind]
@@ -267,7 +265,7 @@ def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray
         parts = parts.apply(pd.to_numeric, errors="coerce")
         large, small = parts.to_numpy(np.float64).T
         if scales[0] == WEEK and np.nanmax(small, initial=0.0) > WEEK:
-            small = small * 1e-3  # of the week are then milliseconds
+            small = small * 1e-3  # the second number is in milliseconds of the week
         times = start + large * scales[0] + small * scales[1]
     else:
         times = epoch(cells, clock.kind, None if clock.boot else zone)
@@ -283,7 +281,7 @@ def _numbers(cells: pd.Series) -> FloatArray:
 
 
 def patterns(texts: Sequence[str]) -> list[str]:
-    """Return the patterns that fit all of these texts, one of each set of equivalent patterns."""
+    """Return the patterns that fit all texts, without patterns that give the same times as an earlier one."""
     whole, _ = _plain(pd.Series(list(texts), dtype="string"))
     dates_with_times = map(" ".join, product(DATES, (*HOURS, SECONDS_SUFFIX.strip())))
     candidates = [*WHOLE_MOMENTS, *dates_with_times, *DATES, *HOURS]
@@ -297,7 +295,7 @@ def patterns(texts: Sequence[str]) -> list[str]:
 
 
 def _fits(text: str, pattern: str) -> bool:
-    """Return True if a pattern may have written a text; much faster than parsing all texts."""
+    """Return True if a text fits a pattern: a fast test of one text before all texts are parsed."""
     if pattern.endswith(SECONDS_SUFFIX):
         text, pattern = text.rpartition(" ")[0], pattern.removesuffix(SECONDS_SUFFIX)
     try:
@@ -308,7 +306,7 @@ def _fits(text: str, pattern: str) -> bool:
 
 
 def _plain(texts: pd.Series) -> tuple[pd.Series, FloatArray]:
-    """Return the texts (n,), a blank between date and time, without fractions of a second, and these (n,)."""
+    """Return texts (n,) with a blank between date and time and no fraction, and the fractions (n,), s."""
     texts = texts.astype("string").str.strip().str.replace(r"(?<=\d)[T_](?=\d)", " ", regex=True)
     digits = texts.str.extract(FRACTION)["fraction"]
     fraction = pd.to_numeric("0." + digits, errors="coerce").to_numpy(np.float64, na_value=0.0)
@@ -316,10 +314,10 @@ def _plain(texts: pd.Series) -> tuple[pd.Series, FloatArray]:
 
 
 def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray:
-    """Return the texts (n,) in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
+    """Return the times (n,) of texts (n,), s since 1970-01-01 UTC; NaN for empty or unreadable texts.
 
-    `pattern` is one of :func:`patterns`, ``iso``, or one with a fraction of its own, ``%f``; `zone` is that
-    of times that do not say theirs, UTC if None.
+    `pattern`: one of :func:`patterns`, ``iso``, or a pattern with ``%f``. `zone`: time zone of texts that do
+    not state theirs; UTC if None.
     """
     seconds: FloatArray = np.zeros(len(texts))
     texts = texts.astype("string").str.strip()
@@ -340,7 +338,7 @@ def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray
 
 
 def leap_seconds(gps: FloatArray) -> FloatArray:
-    """Return by how many s GPS time `gps` (n,), s since 1970, is ahead of UTC, (n,)."""
+    """Return the lead of GPS time over UTC (n,), s, at GPS times `gps` (n,), s since 1970."""
     leap = np.zeros(len(gps))
     for since, ahead in LEAPS:
         leap[gps - ahead >= since] = ahead

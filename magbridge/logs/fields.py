@@ -1,9 +1,9 @@
-"""The table of a format: which field of its records becomes which column, in which unit.
+"""Convert the fields of a format's records to columns, and bring their values to the times of the rows.
 
-``fields.csv`` lists the fields of each format: the record (message, topic, kind) that holds one, its column
-and the column's unit, the value in this unit of one unit of the field, and the numbers that stand for a
-missing value. If several fields fill one column, the first that a log has is read. Telemetry with
-times of its own is brought to the rows by :func:`latest`, as known live, or by :func:`linear`.
+Each line of ``fields.csv`` describes one field of a format: its record (message, topic or kind), its column
+with unit, the factor to this unit, and the numbers that stand for a missing value. If several fields fill one
+column, the first that a log has is read. :func:`latest` holds values until the next, as a live bridge does;
+:func:`linear` interpolates them.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from magbridge.arrays import FloatArray
 FIELDS_FILE = Path(__file__).with_name("fields.csv")
 DEG_PER_RAD = 180.0 / np.pi
 MAX_AGE = 30.0
-"""Age from which on a value is not carried to a row, s."""
+"""Age beyond which a value is not carried to a row, s."""
 CIRCLES = {
     "heading": (360.0, 0.0),
     "roll": (360.0, -180.0),
     "longitude": (360.0, -180.0),
     "dr_longitude": (360.0, -180.0),
 }
-"""Columns on a circle: its circumference and its lowest value, in deg."""
+"""Column on a circle -> circumference and lowest value, deg."""
 Track = tuple[FloatArray, FloatArray]
 """Times (m,), s, and values (m,) of a field."""
 
 
 class FieldMap(NamedTuple):
-    """A field of a format, and the column that it becomes."""
+    """Field of a record, and the column that it becomes."""
 
     record: str
-    """Message, topic or kind of record that holds the field; empty where a format has one kind."""
+    """Message, topic or kind of record that holds the field; empty for a format with one kind of record."""
     field: str
     """Name of the field in the record."""
     column: str
@@ -45,12 +45,12 @@ class FieldMap(NamedTuple):
     unit: str
     """Unit of the column's values."""
     factor: float = 1.0
-    """Value in `unit` of one unit of the field."""
+    """Factor from the field's number to a value in `unit`."""
     missing: tuple[float, ...] = ()
-    """Numbers that the field holds where the value is not known."""
+    """Numbers of the field that stand for a missing value."""
 
     def values(self, raw: ArrayLike) -> FloatArray:
-        """Return the values (n,) of the column from those of the field; NaN where they are missing."""
+        """Return the column's values (n,), in `unit`, from the field's numbers (n,); NaN where missing."""
         values = np.asarray(raw, np.float64)
         if self.missing:
             values = np.where(np.isin(values, self.missing), np.nan, values)
@@ -72,9 +72,9 @@ def field_maps(name: str) -> dict[str, list[FieldMap]]:
 def fields_of(
     fields: Iterable[FieldMap], table: Mapping[str, FloatArray], instance: int = 0
 ) -> Iterator[tuple[str, str, FloatArray]]:
-    """Yield column, unit and values (n,) of each of the fields that a table, field to numbers (n,), holds.
+    """Yield column, unit and values (n,) of each of the `fields` that `table` (field -> numbers (n,)) holds.
 
-    `instance` is the number of the table among those of its record, from 0.
+    `instance`: number of the record's instance from which the table comes, from 0.
     """
     number = str(instance + 1) if instance else ""
     for one in fields:
@@ -85,9 +85,9 @@ def fields_of(
 def interpolated(
     fields: Iterable[FieldMap], tracks: Mapping[str, Track], time: FloatArray, max_gap_s: float
 ) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return columns (n,) and units of fields with `tracks` of their own, at the rows' `time` (n,), s.
+    """Return columns (n,) and units of `fields`, interpolated from their `tracks` to `time` (n,), s.
 
-    Nothing is interpolated across more than `max_gap_s` between two values.
+    Values are NaN in intervals longer than `max_gap_s`.
     """
     columns: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
@@ -100,10 +100,10 @@ def interpolated(
 
 
 def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
-    """Return the last value at or before each time `target` (n,), s, as known live, (n,).
+    """Return the last value (n,) at or before each time in `target` (n,), s, as a live bridge knows it.
 
-    `time` (m,), s, does not decrease; NaN among the `values` (m,) is a missing value. The result is NaN
-    before the first value, and once the last is older than `max_age`, s.
+    `time` (m,), s, must not decrease; NaN among the `values` (m,) is a missing value. The result is NaN
+    before the first value, and where the last value is older than `max_age`, s.
     """
     known = np.isfinite(values)
     time, values = time[known], values[known]
@@ -119,8 +119,8 @@ def linear(
 ) -> FloatArray:
     """Return the values (m,) of a column at `time` (m,), s, interpolated linearly to `target` (n,), s.
 
-    A column in :data:`CIRCLES` goes along the shorter arc. NaN is a missing value. The result is NaN in
-    intervals longer than `max_gap`, s, and farther than that beyond an end; nearer, the end is held.
+    A column in :data:`CIRCLES` follows the shorter arc. NaN is a missing value. The result is NaN in
+    intervals longer than `max_gap`, s. Beyond an end, the end value is held for `max_gap`.
     """
     known = np.isfinite(values) & np.isfinite(time)
     time, values = time[known], values[known]
@@ -141,7 +141,7 @@ def linear(
 
 
 def degrees(written: ArrayLike) -> FloatArray:
-    """Return degrees (n,) from numbers of degrees and minutes (n,), as ``-13036.442``."""
+    """Return degrees (n,) from degrees and minutes written together (n,): -13036.442 is -130 deg 36.442'."""
     values = np.asarray(written, np.float64)
     whole = np.trunc(values / 100.0)
     return np.asarray(whole + (values - 100.0 * whole) / 60.0)

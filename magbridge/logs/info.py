@@ -37,17 +37,17 @@ USES: dict[str, Needs] = {
     "replay": ((CHANNELS,),),
     "simulate --trajectory-from": ((ATTITUDE,), (HORIZONTAL_POSITION,)),
 }
-"""Command -> its needs: of each group, one of the alternatives, each a set of columns."""
+"""Command -> groups of alternative sets of columns; the command needs one set of each group."""
 INFO_GAP_INTERVALS = 2.5
 """A pause longer than this many sampling intervals is a gap."""
 ABOVE = 2.0
-"""m above the surface, from which on a vehicle that has a depth at all is hardly there."""
+"""Height above the surface, m, beyond which a column ``depth`` probably counts upwards."""
 CONDITION_COLUMNS = "sensor_temperature", "depth"
-"""Columns with a meaning of their own that a fit may follow."""
+"""Standard columns that may be regressors of a calibration."""
 CONDITION_UNITS = {"degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar"}
 """Units of temperatures and pressures."""
 STATES = {*(*CONDITION_UNITS, "inHg", "V", "s", "m", "m/s", "nT", "arcmin")}
-"""Units of what a vehicle is in, or drifts by: temperatures, pressures, voltages, speeds."""
+"""Units of quantities that do not move iron or drive currents: temperatures, pressures, voltages, speeds."""
 
 
 def info(log: xr.Dataset) -> dict[str, Any]:
@@ -63,8 +63,8 @@ def info(log: xr.Dataset) -> dict[str, Any]:
     dict
         ``rows``, ``start``, ``end`` (s since 1970), ``interval_s``, ``rate_hz``, ``gaps``, ``longest_gap_s``,
         ``references`` (what heading and time refer to), ``guessed``, ``skipped``,
-        ``losses`` (which name it), ``notes``, ``compasses``, ``columns`` (name, unit, meaning, share known,
-        lowest, highest, interval of its changes), ``uses`` (command -> missing columns) and ``hints``.
+        ``losses`` (a line each), ``notes``, ``compasses``, ``columns`` (name, unit, meaning, fraction known,
+        lowest, highest, interval between changes), ``uses`` (command -> missing columns) and ``hints``.
     """
     log = in_seconds(log)
     time = log["time"].to_numpy().astype(float)
@@ -95,7 +95,7 @@ def info(log: xr.Dataset) -> dict[str, Any]:
 
 
 def lacking(log: xr.Dataset, needs: Needs) -> list[str]:
-    """Return the columns of `needs` that a log lacks or has without values, as ``a b, or c``."""
+    """Return, for each group of `needs` that a log does not meet, the missing columns as ``a b, or c``."""
     there = {str(name) for name in log.data_vars if bool(log[name].notnull().any())}
     return [
         ", or ".join(" ".join(name for name in one if name not in there) for one in alternatives)
@@ -105,7 +105,7 @@ def lacking(log: xr.Dataset, needs: Needs) -> list[str]:
 
 
 def telemetry(log: xr.Dataset) -> list[str]:
-    """Return the columns that may be parameters of a calibration: telemetry that varies."""
+    """Return the columns that may be regressors of a calibration: telemetry that varies."""
     names = [str(name) for name in log.data_vars]
     return [
         name
@@ -118,7 +118,7 @@ def telemetry(log: xr.Dataset) -> list[str]:
 
 
 def movers(log: xr.Dataset) -> list[str]:
-    """Return the telemetry that may move the field: currents, throttles, positions; no states."""
+    """Return the telemetry that may change the field, such as currents, throttles and actuator positions."""
     reckoned = {name for names in RECKONING for name in names}
     return [
         name
@@ -129,7 +129,7 @@ def movers(log: xr.Dataset) -> list[str]:
 
 
 def conditions(log: xr.Dataset) -> list[str]:
-    """Return the columns of temperatures and pressures, which may move the field: those that vary."""
+    """Return the columns of temperature, pressure and depth that vary, and so may change the field."""
     reckoned = [name for name in CONDITION_COLUMNS if name in log and float(np.ptp(_known(log, name))) > 0.0]
     return reckoned + [
         name for name in telemetry(log) if log[name].attrs.get("units", "1") in CONDITION_UNITS
@@ -137,7 +137,7 @@ def conditions(log: xr.Dataset) -> list[str]:
 
 
 def _known(log: xr.Dataset, name: str) -> FloatArray:
-    """Return the known values of a column, at least one: 0 where none is known."""
+    """Return the known values (m,) of a column; a single 0 if none is known."""
     values = log[name].to_numpy().astype(float)
     known = values[np.isfinite(values)]
     return known if known.size else np.zeros(1)

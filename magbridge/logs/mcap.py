@@ -1,9 +1,9 @@
-"""MCAP, as Foxglove and Lichtblick open it: JSON messages, each topic with its schema.
+"""Read and write MCAP with JSON messages and a schema for each topic, as Foxglove and Lichtblick open it.
 
-A row becomes a message in each topic that has a known value of it: ``/magnetometer`` (raw), ``/field``
-(corrected), ``/quality`` (the flags, each also as a truth value), ``/vehicle`` (attitude, place, speed) and
-``/telemetry`` (everything else). ``/position`` repeats the place as a ``foxglove.LocationFix``. Only files
-written by this module are read; the MCAP of robots is read as :mod:`.rosbag`.
+A row becomes one message in each topic for which it has a known value: ``/magnetometer`` (raw), ``/field``
+(corrected), ``/quality`` (flags, also as booleans), ``/vehicle`` (attitude, position, speed) and
+``/telemetry`` (all other columns). ``/position`` repeats the position as a ``foxglove.LocationFix``. The
+module reads only files that it has written; :mod:`.rosbag` reads the MCAP files of robots.
 
 References
 ----------
@@ -36,7 +36,7 @@ except ImportError:
     raise MissingExtra("mcap", "formats") from None
 
 PROFILE = "magbridge"
-"""By which a file is known to be of this form."""
+"""Profile in the header of each file that this module writes."""
 RAW, FIELD, FLAGS, VEHICLE, OTHER_TOPIC = "/magnetometer", "/field", "/quality", "/vehicle", "/telemetry"
 POSITION_TOPIC = "/position"
 WHEN = {
@@ -54,11 +54,11 @@ LOCATION = {
     "position_covariance": {"type": "array", "items": NUMBER_SCHEMA, "minItems": 9, "maxItems": 9},
     "position_covariance_type": {"title": "foxglove.PositionCovarianceType", "oneOf": [{"const": 0}]},
 }
-"""A fix whose covariance is not known."""
+"""Properties of a ``foxglove.LocationFix`` with unknown covariance."""
 
 
 def topic_of(name: str) -> str:
-    """Return the topic in which a column stands."""
+    """Return the topic whose messages hold a column."""
     if name == "quality":
         return FLAGS
     if name == "sensor_temperature" or name.startswith("mag"):
@@ -69,7 +69,7 @@ def topic_of(name: str) -> str:
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield a file of :class:`FileWriter` in pieces; it is held whole."""
+    """Yield a file of :class:`FileWriter` in pieces of at most `rows` rows; the whole file is in memory."""
     try:
         with path.open("rb") as file:
             whole = _read(path, make_reader(file, validate_crcs=True))
@@ -103,7 +103,7 @@ def _read(path: Path, reader: Any) -> xr.Dataset:
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one."""
+    """Writer of successive deployments with the columns of the first."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -113,9 +113,9 @@ class FileWriter:
         self._topics: dict[str, tuple[int, list[str]]] = {}
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows; before the first ones, describe the topics.
+        """Write the rows; if `first`, write attributes and schemas before.
 
-        WriteError: a time before 1970, which MCAP does not have.
+        WriteError: a time before 1970, which MCAP cannot represent.
         """
         if first:
             attrs = json.dumps(plain_attrs(dataset.attrs))
@@ -171,7 +171,7 @@ class FileWriter:
         self._topics[topic] = self._writer.register_channel(topic, "json", number), names
 
     def _rows(self, dataset: xr.Dataset, names: Iterable[str]) -> Iterator[dict[str, Any]]:
-        """Yield the values of each row by topic; the position as a fix."""
+        """Yield the known values of each row in columns `names`; without names, its position as a fix."""
         if not names:
             yield from _fixes(dataset)
             return

@@ -1,7 +1,7 @@
-"""OceanGliders OG1.0: the metadata of a glider's file.
+"""Add the metadata of OceanGliders OG1.0 to a glider's netCDF file.
 
-A ``metadata.toml`` has the facts of people, platform and sensor that are in no log. Positions of GPS fixes
-are those of ``gps_latitude`` and ``gps_longitude``, where a log has them. Source: OceanGliders format 1.0.0,
+A ``metadata.toml`` describes people, platform and sensor, which a log does not. The positions of GPS fixes
+come from ``gps_latitude`` and ``gps_longitude``, if a log has them. Source: OceanGliders format 1.0.0,
 https://oceangliderscommunity.github.io/OG-format-user-manual/OG_Format.html
 """
 
@@ -24,13 +24,13 @@ MANDATORY_ATTRIBUTES = (
     *("contributing_institutions", "contributing_institutions_role"),
     *("contributing_institutions_role_vocabulary", "rtqc_method"),
 )
-"""Global attributes that are mandatory and are not in any log."""
+"""Global attributes that OG1.0 demands and that no log has."""
 PLATFORM = {
     "PLATFORM_SERIAL_NUMBER": "glider serial number",
     "PLATFORM_MODEL": "model of the glider",
     "WMO_IDENTIFIER": "wmo id",
 }
-"""Mandatory variables of the platform, and their long names."""
+"""Mandatory variable of the platform -> its long name."""
 SENSOR_ATTRIBUTES = (
     *("sensor_model", "sensor_model_vocabulary", "sensor_type_vocabulary", "sensor_serial_number"),
 )
@@ -46,16 +46,16 @@ OG1_POSITIONS = {
     "DEPTH": {"valid_max": 10_000.0, "vocabulary": "DEPTH"},  # a surface at -2 cm must not be masked
 }
 MEASURED = ("MAG_X", "MAG_Y", "MAG_Z", "TOTAL_FIELD", "FIELD_X", "FIELD_Y", "FIELD_Z", "ANOMALY")
-"""Variables that the magnetometer gives."""
+"""Variables that come from the magnetometer."""
 FIX_COLUMNS = {"LATITUDE": "gps_latitude", "LONGITUDE": "gps_longitude"}
 NO_FIXES = "the log does not say which positions are fixes"
 
 
 class OgMetadata(Table, frozen=True):
-    """A ``metadata.toml``."""
+    """Content of a ``metadata.toml``."""
 
     attributes: dict[str, str]
-    """Global attributes, any."""
+    """Global attributes of the file."""
     platform: dict[str, str]
     """Variables of the platform, as ``WMO_IDENTIFIER``."""
     sensor: dict[str, str]
@@ -74,9 +74,9 @@ def read_metadata(path: Path) -> OgMetadata:
 
 
 def complete(path: Path, metadata: OgMetadata) -> None:
-    """Complete a trajectory of :mod:`.netcdf` to a file of OG1.0.
+    """Complete a file of :mod:`.netcdf`, in place, with the variables and attributes that OG1.0 demands.
 
-    FormatError: it has no positions and depths.
+    FormatError: the file lacks time, position or depth.
     """
     with netCDF4.Dataset(path, "a") as file:
         for name in OG1_POSITIONS:
@@ -118,7 +118,7 @@ def _scalar(file: Any, name: str, kind: Any, value: object, **attributes: object
 
 
 def _fixes(file: Any, known: dict[str, Any]) -> None:
-    """Add the places of the GPS fixes, with their times; unknown where the log has no separate ones."""
+    """Add variables with the times and positions of GPS fixes; all NaN if the log has no separate fixes."""
     there = {name: file.variables.get(column.upper()) for name, column in FIX_COLUMNS.items()}
     nothing = np.full(len(known["TIME"]), np.nan)
     fixed = {name: nothing if one is None else floats(one) for name, one in there.items()}

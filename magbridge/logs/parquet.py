@@ -1,6 +1,6 @@
-"""Parquet: one float64 column per variable, its unit and meaning in the field's metadata.
+"""Read and write Parquet: a float64 column per variable, with unit and meaning in the field's metadata.
 
-Columns of other programs are found as those of a text file (:mod:`.naming`).
+:mod:`.naming` identifies the columns of other programs, as in a text file.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ except ImportError:
     raise MissingExtra("pyarrow", "formats") from None
 
 MAX_EXPANDED, MAX_EXPANSION = 100_000_000, 200
-"""Bytes of values that are always read, and per byte of a larger file: times alone take one byte a row."""
+"""Largest size of the values, bytes, and per byte of the file; if both are exceeded, it is damaged."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the file in pieces, each with the numbers of its rows; times may be numbers or timestamps."""
+    """Yield the file in pieces, each with its row numbers; times may be numbers or timestamps."""
     try:
         with pq.ParquetFile(path) as file:
             yield from _chunks(path, file, rows)
@@ -44,7 +44,7 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
 
 
 def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
-    """Yield the rows, each piece with their numbers."""
+    """Yield the rows of an open file in pieces, each with its row numbers."""
     schema = file.schema_arrow
     meanings = {field.name: _text(field.metadata, b"long_name") for field in schema}
     attrs = json.loads(_text(schema.metadata, b"magbridge") or "{}")
@@ -99,7 +99,7 @@ def _text(metadata: dict[bytes, bytes] | None, key: bytes) -> str:
 
 
 def _cells(path: Path, field: Any, array: Any, *, as_text: bool) -> Any:
-    """Return the cells of a column, timestamps in s since 1970; FormatError: texts, unless `as_text`."""
+    """Return the cells (n,) of a column, timestamps as s since 1970; FormatError: texts, unless `as_text`."""
     if pa.types.is_timestamp(field.type):
         scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[field.type.unit]
         return array.cast(pa.int64()).cast(pa.float64()).to_numpy(zero_copy_only=False) * scale
@@ -112,14 +112,14 @@ def _cells(path: Path, field: Any, array: Any, *, as_text: bool) -> Any:
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one."""
+    """Writer of successive deployments with the columns of the first."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._writer: Any = None
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows as one row group, and before the first ones the schema."""
+        """Write the rows as one row group; if `first`, write the schema before."""
         columns = [dataset["time"], *(dataset[name] for name in dataset.data_vars)]
         if first:
             fields = []

@@ -1,13 +1,12 @@
-"""PX4's logs (``.ulg``), through pyulog.
+"""Read PX4's logs (``.ulg``) through pyulog.
 
-The field is in gauss, as the driver gives it, before PX4's own calibration: that of ``sensor_mag`` or, where
-the log has it at a higher rate, that of ``vehicle_magnetometer``, from which the offsets and scales of
-``CAL_MAGn`` are removed again. The oldest logs have it in ``sensor_combined``. The compass that is read is
-the one which flew: the one that ``vehicle_magnetometer`` names, if it is enabled (``CAL_MAGn_PRIO`` is not
-0).
+The field is the driver's, before PX4's own calibration. It comes from ``sensor_mag``, or from
+``vehicle_magnetometer`` if this topic has a higher rate. In that case the reader removes the offsets and
+scales of ``CAL_MAGn``. The oldest logs have the field in ``sensor_combined``. The compass is the one that
+``vehicle_magnetometer`` names most often, if it is enabled (``CAL_MAGn_PRIO`` is not 0).
 
-``heading`` is the estimator's yaw. ``depth`` is the local position's z, down from where the vehicle was
-switched on. UTC is the median of what the GPS messages say.
+``heading`` is the estimator's yaw. ``depth`` is the local position's z, down from the place at which the
+vehicle was switched on. UTC is the median over the GPS messages.
 
 References
 ----------
@@ -58,17 +57,17 @@ NEEDED_FIELDS = {
     "debug_key_value": {"timestamp", "value", "key[0]"},
 }
 UNUSED = ("servo", "esc", "motor")
-"""Outputs that a log lists in the largest possible number; those that are always 0 are not in use."""
+"""Prefixes of outputs of which a log lists the largest possible number; outputs always 0 are not in use."""
 GPS = ("vehicle_gps_position", "sensor_gps")
 MIN_FIX_TYPE = 3
-"""Least ``fix_type`` of a fix in three dimensions."""
+"""Lowest ``fix_type`` of a three-dimensional fix."""
 MAX_CALIBRATIONS = 4
 FASTER = 1.5
-"""Times the rate of ``sensor_mag`` from which ``vehicle_magnetometer`` is read instead."""
+"""Ratio of rates above which ``vehicle_magnetometer`` is read instead of ``sensor_mag``."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces; it is held whole."""
+    """Yield the log in pieces of at most `rows` rows; the whole log is in memory."""
     try:
         with path.open("rb") as file, redirect_stdout(None):  # pyulog prints a line for each damage
             log = ULog(file, [*PX4_FIELDS, *NEEDED_FIELDS])
@@ -82,7 +81,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     mags = _magnetometers(topics, log.initial_parameters)
     if not mags:
         raise FormatError(path, "expected a PX4 log with a magnetometer")
-    # pyulog tells that there is damage, not in how many places
+    # pyulog reports damage, but not the number of damaged places
     lost = {"dropouts": len(log.dropouts), "damages": int(log.file_corruption)}
     run = BootRun(mags, _telemetry(topics), _utc_offset(topics))
     yield from pieces(path, rows, [run], lost, options.compass if options else None)
@@ -105,7 +104,7 @@ def _magnetometers(topics: Topics, parameters: Parameters) -> list[Magnetometer]
             mag = _uncalibrated(number, device, faster, parameters, in_use=device == current)
         found.append(mag)
     numbers = {one.compass.number for one in found}
-    for device, table in used.items():  # logged after the vehicle's own calibration only
+    for device, table in used.items():  # compasses that are logged only after PX4's calibration
         part = _of_device(table, device)
         if part is not None and (device or not found):
             number = next(k for k in range(len(numbers) + 1) if k not in numbers)
@@ -120,7 +119,7 @@ def _magnetometers(topics: Topics, parameters: Parameters) -> list[Magnetometer]
 
 
 def _of_device(table: Table | None, device: float) -> Table | None:
-    """Return the samples of one device: a topic may change from one compass to another."""
+    """Return the samples of one device, since a topic may change from one compass to another."""
     if table is None or "device_id" not in table:
         return table
     here = table["device_id"] == device
@@ -151,8 +150,8 @@ def _uncalibrated(
     """Return a compass from ``vehicle_magnetometer``, with PX4's calibration undone.
 
     PX4 computes ``R S (raw - offset - power compensation)``, where the symmetric S holds scales and
-    off-diagonals. S and the offset are undone; the rotation R, that of the mounting, stays: the axes are the
-    vehicle's. The compensation for power (``CAL_MAG_COMP_TYP``) is not in the log, and stays, too.
+    off-diagonals, and R rotates the mounting to the vehicle. S and the offset are undone if R is the
+    identity; else the values remain calibrated. The power compensation is not in the log and remains.
     """
     slot = _calibration(device, parameters)
     rotated = slot is not None and parameters.get(f"CAL_MAG{slot}_ROT", 0) > 0
@@ -167,13 +166,13 @@ def _uncalibrated(
 
 
 def _calibration(device: float, parameters: Parameters) -> int | None:
-    """Return the n of the ``CAL_MAGn`` that belong to a device; None where none does."""
+    """Return the n of the parameters ``CAL_MAGn`` of a device; None if no n belongs to it."""
     slots = (k for k in range(MAX_CALIBRATIONS) if device and parameters.get(f"CAL_MAG{k}_ID") == device)
     return next(slots, None)
 
 
 def _telemetry(topics: Topics) -> Iterator[Series]:
-    """Yield everything but the magnetometers."""
+    """Yield attitude, the columns in :data:`PX4_FIELDS` and named debug values."""
     for attitude in topics.get("vehicle_attitude", {}).values():
         for column, values in zip(("roll", "pitch", "heading"), _angles(attitude), strict=True):
             yield _time(attitude), column, "deg", values
@@ -205,7 +204,7 @@ def _time(table: Table) -> FloatArray:
 
 
 def _utc_offset(topics: Topics) -> float | None:
-    """Return UTC minus time since boot in s, the median of the GPS messages that have it, or None."""
+    """Return UTC minus time since boot in s, the median of the GPS messages with UTC; None without UTC."""
     ahead = [
         (gps["time_utc_usec"] - gps["timestamp"])[gps["time_utc_usec"] > 0] * 1e-6
         for topic in GPS

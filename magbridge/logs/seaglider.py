@@ -1,24 +1,23 @@
-"""A Seaglider's dive: raw compass counts, attitude and the moving masses.
+"""Read a Seaglider's dive: raw compass, attitude and the positions of the moving masses.
 
-From the netCDF of a basestation, or from the ``.eng`` (samples) and ``.log`` (settings, manoeuvres, fixes)
-that a glider sends. Either name, or both, give the same deployment; without its ``.log`` a dive has neither
-masses nor position, and between the fixes before and after the dive the position goes straight. Conventions,
-and how they were found (regression of the raw counts on the IGRF rotated by the logged attitude, dives of
-SG167, SG171, SG180, SG236, SG249, SG272 and SG686):
+The source is a basestation's netCDF, or the ``.eng`` (samples) and ``.log`` (settings, manoeuvres, fixes)
+that a glider sends; the two are read together by either name. Without its ``.log`` a dive has neither masses
+nor position. With it, the position is interpolated between the fixes before and after the dive. Regression of
+the raw counts on the IGRF, rotated by the logged attitude, verified the conventions with dives of SG167,
+SG171, SG180, SG236, SG249, SG272 and SG686:
 
-- ``mag_x/y/z`` are x forward, y starboard, z down, as ours: the 3x3 matrix of that regression is the identity
-  to 5 % with few elements off the diagonal above 0.05;
-- what a count is worth, the compass's type says (:data:`COMPASS_NT_PER_COUNT`). The matrix's diagonal is
-  0.95 to 1.04 counts/mG for the types 1, 2 and 6, and 1.75 to 1.91 for type 4;
-- ``head`` is magnetic (the file states it, and with that the matrix's elements between x and y vanish);
-  ``magnetic_variation`` is kept as an attribute, 0.1 deg coarse;
+- ``mag_x/y/z`` are x forward, y starboard, z down, as in magbridge. The 3x3 matrix of the regression is the
+  identity to 5 %, with few elements off the diagonal above 0.05.
+- The type of the compass determines the nT per count (:data:`COMPASS_NT_PER_COUNT`). The matrix's diagonal is
+  0.95 to 1.04 counts/mG for the types 1, 2 and 6, and 1.75 to 1.91 for type 4.
+- ``head`` is magnetic: the file states it, and the matrix's elements between x and y then vanish. The
+  attribute ``magnetic_variation_deg`` holds the declination, in steps of 0.1 deg.
 - ``pitchCtl`` is in cm, ``rollCtl`` in deg, ``vbdCC`` in cc: ``(AD - centre) * CNV`` of each mass's
-  potentiometer. Older firmware logs them with every sample (the formula gives SG167's to 2e-4 cm); newer only
-  around each manoeuvre, ``gc_*``, and there the masses go straight from where they were to where they came.
+  potentiometer. Older firmware logs them with every sample (the formula gives SG167's to 2e-4 cm). Newer
+  firmware logs them around each manoeuvre only (``gc_*``), during which the reader interpolates linearly.
 
-The CTD's temperature, pressure, latitude and longitude are interpolated to the compass samples. Of each
-motor's current, the file holds one mean per manoeuvre; rows within a manoeuvre in which that motor ran carry
-it, all others 0.
+Temperature, pressure, latitude and longitude of the CTD are interpolated to the compass samples. The file
+holds one mean current per motor and manoeuvre: it is the value of all rows in the manoeuvre; others have 0.
 """
 
 from __future__ import annotations
@@ -43,39 +42,38 @@ from magbridge.logs.fields import Track, degrees, field_maps, fields_of, interpo
 
 DIMENSION = "sg_data_point"
 COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
-"""nT in a count, by the type of the compass: ``COMPASS_DEVICE`` is 16 times the type, and the port."""
+"""Type of the compass -> nT per count; ``COMPASS_DEVICE`` is 16 times the type plus the port."""
 SECOND_COMPASS_BIT = 2048
 """Bit of ``COMPASS_USE``: the second compass is in use."""
 MAX_CTD_GAP_S = 120.0
-"""s between samples of the CTD across which nothing is interpolated."""
-# the channels are in counts, before they are multiplied by what a count is worth
+"""Longest interval between samples of the CTD that is interpolated, s."""
+# the channels are in counts here; dive() multiplies them by the nT per count
 SAMPLED, CTD_FIELDS = field_maps("seaglider").values()
 PLACE = "longitude", "latitude"
 MASSES = {"pitchCtl": ("pitch", "C_PITCH"), "rollCtl": ("roll", "C_ROLL_DIVE"), "vbdCC": ("vbd", "C_VBD")}
-"""Column to the name of its motor, and of the parameter that holds its centre in AD counts."""
+"""Column -> name of its motor, and parameter that holds its centre, AD counts."""
 
 
 @dataclass
 class Dive:
-    """Data of a glider's dive."""
+    """Data of one dive, as the files hold them."""
 
     time: FloatArray
-    """(n,), s since 1970 UTC, of the compass samples."""
+    """(n,): Times of the compass samples, s since 1970 UTC."""
     sampled: dict[str, FloatArray]
-    """(n,) each: Engineering columns by their own names, the depth in m."""
+    """Engineering columns by their names in the file, (n,) each; the depth in m."""
     settings: dict[str, float] = field(default_factory=dict)
     """Parameters of the log, as ``COMPASS_DEVICE``."""
     manoeuvres: dict[str, FloatArray] = field(default_factory=dict)
-    """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and the values logged of each, as ``pitch_ctl``.
-    """
+    """(m,) each: Start ``st_secs``, end ``end_secs`` (s since 1970), logged values, as ``pitch_ctl``."""
     elsewhere: dict[str, Track] = field(default_factory=dict)
-    """(k,) each: Times, s, and values of variables with their own times: positions, those of the CTD."""
+    """Times (k,), s, and values (k,) of variables with times of their own: positions and the CTD's data."""
     max_gap: float = MAX_CTD_GAP_S
-    """s between two of those times across which nothing is interpolated."""
+    """Longest interval between two times in `elsewhere` that is interpolated, s."""
 
 
 def dive(path: Path, known: Dive) -> xr.Dataset:
-    """Return one dive as a deployment; without the field, and with a note, if that was not logged raw."""
+    """Return one dive as a deployment; if it lacks a raw compass, without the field and with a note."""
     raw = [name for name in CHANNELS if name in known.sampled]
     for axis in "xyz":
         if raw and f"mag_{axis}" not in raw:
@@ -103,9 +101,9 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
 
 
 def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[float, list[str]]:
-    """Return the nT per count of the compass in use, and a note if that was estimated.
+    """Return the nT per count of the compass in use, and a note if the value is assumed or estimated.
 
-    For an unknown type, the sphere through the counts gets the radius of the Earth's field.
+    For an unknown type, the sphere through the counts is scaled to the total field of the IGRF.
     """
     use = known.settings.get("COMPASS_USE", 0.0)
     name = "COMPASS2_DEVICE" if np.isfinite(use) and int(use) & SECOND_COMPASS_BIT else "COMPASS_DEVICE"
@@ -127,7 +125,7 @@ def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[
 
 
 def _position(known: Dive, column: str) -> FloatArray | None:
-    """Return the position of a mass at each sample: measured, else commanded, else None."""
+    """Return the position (n,) of a mass at each sample, measured or else commanded; None without either."""
     motor, centre = MASSES[column]
     each = known.manoeuvres
     if not {"st_secs", "end_secs"} <= each.keys():
@@ -166,7 +164,7 @@ GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield in pieces the dive of the files that a glider sends; it is held whole."""
+    """Yield the dive in a glider's ``.eng`` and ``.log`` in pieces of at most `rows` rows."""
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():
         raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")
@@ -177,7 +175,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _samples(path: Path) -> Dive:
-    """Return the samples of the ``.eng``."""
+    """Return a dive with the samples of its ``.eng``."""
     header, rows = _split(path)
     names = re.split(r"[,\s]+", header.get("columns", "").replace(".", "_").strip())
     start = _start(path, header)
@@ -196,7 +194,7 @@ def _samples(path: Path) -> Dive:
 
 
 def _add_log(known: Dive, path: Path) -> None:
-    """Add the ``.log``: parameters, manoeuvres (s from the start of the dive) and fixes."""
+    """Add the parameters, manoeuvres and fixes in a ``.log`` to the dive."""
     header, rows = _split(path)
     start = _start(path, header)
     names: list[str] = []
@@ -230,7 +228,7 @@ def _split(path: Path) -> tuple[dict[str, str], list[str]]:
 
 
 def _start(path: Path, header: dict[str, str]) -> float:
-    """Return the s since 1970 of ``start: 02 03 126 19 35 52``, month day year-1900 hour minute second."""
+    """Return the s since 1970 of ``start: 02 03 126 19 35 52`` (month, day, year - 1900, hour, min, s)."""
     try:
         month, day, year, hour, minute, second = (int(part) for part in header["start"].split())
         return datetime(1900 + year, month, day, hour, minute, second, tzinfo=UTC).timestamp()

@@ -1,4 +1,4 @@
-"""Convert lines of text to columns of numbers; other cells are dropped, counted and named."""
+"""Convert lines of text to columns of numbers; drop, count and name cells that are not numbers."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ UNCLOSED_QUOTE = "expected every quote to be closed in its line"
 
 
 class TableReader:
-    """Convert the cells of a table to times and to columns of numbers.
+    """Converter of the cells of a table to times and columns of numbers.
 
-    `rows` are the cells of the first rows; `clock` is the format of the times where the file states it.
-    `guesses` are the assumptions about the times, `attrs` what they mean for the deployment; `faults` counts
-    the rows and values that were dropped.
+    `rows`: cells of the first rows. `clock`: format of the times, if the file states it. `guesses`:
+    assumptions about the times. `attrs`: attributes of the deployment that state the reference of times and
+    headings. `faults`: counts of the dropped rows and values.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class TableReader:
             raise FormatError(self._path, str(error), column="time") from None
 
     def _start_by(self, rows: Rows) -> float:
-        """Return the s since 1970 of a count's start, by other columns with date and time; 0 without them."""
+        """Return the start of a count, s since 1970, from columns with date and time; 0 without them."""
         layout, zone = self._layout, self._declared.zone
         if not self._clock.boot or not layout.calendar or not layout.stamp:
             return 0.0
@@ -94,14 +94,14 @@ class TableReader:
         if clock.boot or not np.isfinite(ahead).any():
             return 0.0
         self.guesses.append(f"dated by {' and '.join(map(repr, headings))}")
-        # whole seconds were cut off: on average by half a second, where there are several rows in one
+        # times cut to whole seconds are early by half a second on average, if several rows share a second
         cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
         return float(np.nanmedian(ahead)) + cut
 
     def read_lines(
         self, lines: list[str], numbers: Sequence[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-        """Return the times (n,), the values (n,) of each column, and the numbers of the rows' lines."""
+        """Return the times (n,), s, the values (n,) of each column, and the line numbers of the rows."""
         if not self.faults.rows:
             self._first_number = numbers[0]
         self.faults.rows += len(lines)
@@ -124,7 +124,7 @@ class TableReader:
     def read(
         self, frame: pd.DataFrame, kept: list[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-        """Return times (n,), values (n,) and numbers of rows whose cells are in columns by position."""
+        """Return times (n,), s, values (n,) by column, row numbers; `frame` has the cells by field index."""
         times, wrong = self._times(frame, kept)
         if wrong.any():
             frame, times = frame[~wrong], times[~wrong]
@@ -150,7 +150,7 @@ class TableReader:
     def _dropping(
         self, wrong: list[bool], lines: list[str], numbers: Sequence[int], text: str
     ) -> tuple[list[str], list[int]]:
-        """Return the lines that are not wrong, and their numbers; the others are noted."""
+        """Return the lines that are not `wrong`, and their numbers; count the other lines as dropped."""
         if not any(wrong):
             return lines, list(numbers)
         self._note("", np.array(wrong), numbers, text)
@@ -160,7 +160,7 @@ class TableReader:
     def _note(
         self, column: str, marked: BoolArray, numbers: Sequence[int], expected: str, *, wrong: bool = True
     ) -> None:
-        """Count the values `marked` (n,) of a column ("" and ``time``: rows); `expected` is of the first."""
+        """Count the `marked` (n,) values of a column as dropped, or the rows if it is "" or ``time``."""
         counter = "rows_dropped" if column in {"", "time"} else "values_dropped"
         self.faults.note(
             column, int(marked.sum()), numbers[int(marked.argmax())], expected, counter, wrong=wrong
@@ -193,8 +193,8 @@ class TableReader:
         return frame
 
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
-        """Return the times (n,), and which rows (n,) hold a cell that is no time."""
-        if self._layout.rate:  # a row that was left out keeps its time
+        """Return the times (n,), s, and a mask (n,) of the rows whose time cannot be read."""
+        if self._layout.rate:  # a dropped row also takes up its interval
             rows = np.asarray(numbers, np.float64) - self._first_number
             return rows / self._layout.rate, np.zeros(len(rows), bool)
         first, *others = self._layout.stamp
@@ -207,7 +207,7 @@ class TableReader:
             column = column.str.replace(",", ".")
         times = seconds(self._clock, column, self._declared.zone)
         if self._clock.is_text and self._clock.boot:
-            known = np.isfinite(times)  # times of day go on after midnight
+            known = np.isfinite(times)  # count times of day on beyond midnight
             steps = np.diff(times[known], prepend=self._last)
             days = self._midnights + DAY * np.cumsum(steps < -DAY / 2)
             if known.any():
@@ -283,7 +283,7 @@ def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray
 
 
 def _seconds_of_day(text: str) -> str:
-    """Return a date and a time as HHMM.mmm with the seconds of the day in place of the time."""
+    """Return a text with its time of day, HHMM.mmm, replaced by seconds of the day; other texts unchanged."""
     date, _, clock = text.rpartition(" ")
     try:
         hours, minutes = divmod(float(clock), 100.0)

@@ -2,9 +2,9 @@
 
 A row becomes these messages, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg,
 mm), a ``NAMED_VALUE_FLOAT`` (float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the
-deployment is corrected, ``MAG_FIELD``. So a column comes back to 6e-8 of its value, time to 1 µs. A
-``MAG_COLUMN`` at the start of the log has each name of more than ten letters in full, and units and
-attributes that change the meaning of values.
+deployment is corrected, ``MAG_FIELD``. A reader obtains a column to 6e-8 of its value, and time to 1 µs.
+``MAG_COLUMN`` messages at the start of the log hold the full name of columns with more than ten letters,
+units, and attributes that change the meaning of values.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ ATTITUDE = ("roll", "pitch", "heading")
 POSITION_COLUMNS = ("latitude", "longitude", "depth")
 SAMPLE = (*CHANNELS, "sensor_temperature", "sensor_supply", "power_cycle")
 STANDARD = {*ATTITUDE, *POSITION_COLUMNS, *SAMPLE, *CHANNEL_TIMES, *CORRECTED, "level_sigma"}
-"""Columns that have a field of their own in one of these messages."""
+"""Columns that are a field of one of these messages, other than ``NAMED_VALUE_FLOAT``."""
 ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
 )
 UNKNOWN_HEADING = 0xFFFF
 UNKNOWN_INT = 0x7FFFFFFF
 POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
-"""Flag of MAG_RAW: its power cycle is counted."""
+"""Flag of MAG_RAW: the message holds a count of power cycles."""
 NAMED_VALUE = {"message": "NAMED_VALUE_FLOAT", "field": "value", "scale": 1.0, "offset": 0.0}
 
 Row = dict[str, float]
 
 
 class FileWriter:
-    """Write successive deployments with the columns of the first one."""
+    """Writer of successive deployments with the columns of the first."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")
@@ -55,7 +55,7 @@ class FileWriter:
         self._sequence = 0
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows, and before the first ones the declarations of the columns."""
+        """Write the rows; if `first`, write the declarations of the columns before."""
         columns = [str(name) for name in dataset.data_vars]
         times = np.round(dataset["time"].values * 1e6).astype(np.int64).tolist()
         if first:
@@ -143,13 +143,13 @@ class FileWriter:
 
 
 def short_name(name: str, taken: Collection[str]) -> str:
-    """Return at most ten letters of a name, as a NAMED_VALUE_FLOAT holds, different from those `taken`."""
+    """Return a name of at most ten letters, for a NAMED_VALUE_FLOAT, that is not in `taken`."""
     short = name.encode("ascii", "replace")[:10].decode() or "_"
     return next(s for s in (short, *(f"{short[:6]}{k:04d}" for k in range(10_000))) if s not in taken)
 
 
 def _single(name: str, values: FloatArray) -> FloatArray:
-    """Round to float32, so that packing cannot overflow; columns that are not sent as float32 stay."""
+    """Return values (n,) rounded to float32; return columns that are not sent as float32 unchanged."""
     if name in (*POSITION_COLUMNS, *CHANNEL_TIMES, "total_field"):
         return values
     with np.errstate(over="ignore"):

@@ -1,14 +1,14 @@
-"""The live log: all bytes received and sent, as a ``.tlog`` for any MAVLink tool.
+"""Write the live log: all bytes received and sent, as a ``.tlog`` that any MAVLink tool reads.
 
 A record is an 8-byte big-endian stamp and a MAVLink frame. The stamp is the event's time in µs since 1970
 UTC, a multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
 
-The live thread only appends to a queue (about 0.3 µs an event); a thread of its own writes whole records. The
-first record after a pause is written at once, those that follow within `WINDOW` together: after ``kill -9``
-the file holds everything but the last group and reads to its end. A disk that stalls fills the queue, a disk
-that is full stops the log; either way records are dropped and counted, and the live thread never waits. The
-first file after a failure begins with the record of the run's start, whose ``time_usec`` precedes the file:
-so a replay knows that records are missing.
+The live thread only appends to a queue (about 0.3 µs an event); a second thread writes whole records. It
+writes the first record after a pause at once, and records that follow within :data:`WRITE_INTERVAL_S`
+together. So ``kill -9`` costs only the last group, and the file is readable to its end. A stalled disk fills
+the queue, and a full disk stops the log. Records are then dropped and counted; the live thread never waits.
+The first file after a failure begins with the record of the run's start. The ``time_usec`` of this record
+precedes the file, from which a replay detects that records are missing.
 """
 
 from __future__ import annotations
@@ -28,34 +28,33 @@ from magbridge.records import Channel
 __all__ = ["TlogWriter"]
 
 Record = tuple[int, int, bytes]
-"""µs of the event, channel, frame."""
+"""Time of the event (µs since 1970 UTC), channel, and frame."""
 
 WRITE_INTERVAL_S = 0.005
-"""s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the
-last one; at higher rates it costs the events of 5 ms. The latency is the same; the writing thread takes 66 us
-per sample at 100 Hz, where every event has a write of its own, and 19 us at 1,000 Hz."""
+"""Interval between two writes, s. Up to 200 events a second, each event is written at once, and ``kill -9``
+costs at most the last event; at higher rates it costs the events of 5 ms. The writing thread takes 66 us per
+sample at 100 Hz, with a write for every event, and 19 us at 1,000 Hz."""
 QUEUE = 50_000
-"""Events (some 10 MB) whose records wait for a stalled disk; those that follow are dropped."""
+"""Largest number of events (some 10 MB) that wait for a stalled disk; further events are dropped."""
 LOG_RETRY_US = 2_000_000
-"""µs of the events' time after which a log that failed is tried again, in a new file."""
+"""Time after which a failed log is tried again in a new file, µs of the events' clock."""
 SYNC_US = 5_000_000
-"""µs of the events' time between two syncs: no more is lost when the power fails or somebody deletes the
-file."""
+"""Interval between two syncs, µs of the events' clock: the most that a power failure or a deletion costs."""
 
 
 class TlogWriter:
-    """Write records to ``UTC-start_index.tlog`` files in a directory.
+    """Writer of records to files ``UTC-start_index.tlog`` in a directory.
 
-    `start` is that of the run, so that the files of one run are sorted together even if others write to the
-    directory; it is some seconds late where another run has taken the name.
+    The start in the name is the start of the run, so the files of one run are sorted together even if others
+    write to the directory. It is some seconds late if another run has taken the name.
 
-    `directory` is created if it does not exist, or no longer; existing files are never changed. A new file
-    begins after `max_size` MB, or `max_age` h of the events' time. The frames of `header` are written to
-    every file after its first record: what a reader needs to read that file alone. Those of `beginning`,
-    which the live thread may replace, begin the first file after a failure: the record of the run's start.
+    `directory` is created whenever it does not exist; existing files are never changed. A new file begins
+    after `max_size` MB, or `max_age` h of the events' time. The frames of `header` follow the first record of
+    every file, so that a reader can interpret each file alone. The frames of `beginning`, which the live
+    thread may replace, record the run's start; they begin the first file after a failure.
 
-    `records` counts the records written so far, `lost` those dropped because the disk stalled or the log had
-    failed; `failure` is the operating system's reason why the log has stopped, empty while it is written.
+    `records` counts the written records, `lost` the records dropped because the disk stalled or the log had
+    failed. `failure` is the operating system's reason why the log has stopped, empty while it is written.
     """
 
     def __init__(
@@ -85,13 +84,14 @@ class TlogWriter:
 
     @property
     def lost(self) -> int:
-        """Records dropped so far."""
+        """Number of records dropped so far."""
         return self._refused + self._dropped
 
     def extend(self, records: Sequence[Record]) -> None:
         """Log the frames of an event, each with its time and channel; returns at once and never raises.
 
-        There must be at least one, since none ends the writing thread. The caller must not change the list.
+        `records` must not be empty, since an empty list ends the writing thread. The caller must not change
+        the list.
         """
         if self._queue.qsize() < QUEUE:
             self._queue.put(records)
@@ -99,12 +99,12 @@ class TlogWriter:
             self._refused += len(records)
 
     def close(self, timeout: float = 5.0) -> None:
-        """Write the queue and end; wait for a stalled disk at most `timeout` s."""
+        """Write the queued records and end the thread; wait for a stalled disk at most `timeout` s."""
         self._queue.put(())
         self._thread.join(timeout)
 
     def _run(self) -> None:
-        """Write the received records until an event without records."""
+        """Write the queued records until an event without records arrives."""
         events: list[Sequence[Record]] = []
         while not events or events[-1]:
             events = [self._queue.get()]
@@ -145,7 +145,7 @@ class TlogWriter:
                 try:
                     self._file = os.open(self._name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
                 except FileExistsError:
-                    begin_s += 1  # another run, whose clock began at the same second
+                    begin_s += 1  # another run began in the same second
         except OSError as error:
             self._fail(error, time_us)
             return False
@@ -154,7 +154,7 @@ class TlogWriter:
         return True
 
     def _put_down(self, data: bytes, records: list[Record]) -> None:
-        """Write whole records; when that fails, leave none half-written."""
+        """Write records to the open file; if writing fails, remove a half-written record."""
         if not self._size:
             first = 0 if self._torn else 1
             frames = (*self.beginning, *self._header) if self._torn else self._header
@@ -166,7 +166,7 @@ class TlogWriter:
                 rest = rest[os.write(self._file, rest) :]
             if not 0 <= time_us - self._synced_us < SYNC_US:
                 os.fdatasync(self._file)
-                self._name.stat()  # raises if the file was deleted: writing to it would go on, and be lost
+                self._name.stat()  # raises if the file was deleted, since further writes to it would be lost
                 self._synced_us = time_us
         except OSError as error:
             self._fail(error, time_us)
