@@ -1,10 +1,10 @@
 """Bank of extended Kalman filters, for a position whose uncertainty is too large for one filter.
 
-A Gaussian too wide for the map to be linear within it is split into many that are narrow enough. Each is
-filtered as if it were alone, all in one pass of arrays, and weighted by its likelihood (Alspach & Sorenson
-1972). Hypotheses that grow too wide are split again, those of negligible weight are dropped, and those at
-the same place are merged. Nothing is drawn at random: the same samples give the same bits. A bank of
-infinite resolution is one extended Kalman filter of second order.
+If a Gaussian is too wide for the map to be linear within it, the bank splits it into many narrow ones, the
+hypotheses. A Kalman filter updates each of them, and its likelihood weights it (Alspach & Sorenson 1972).
+The bank splits hypotheses that grow too wide, drops those of negligible weight, and merges those at the same
+place. It draws no random numbers, so that the same samples give the same bits. A bank of infinite resolution
+is one extended Kalman filter of second order.
 """
 
 from __future__ import annotations
@@ -22,51 +22,50 @@ from magbridge.navigate.model import N_STATES, Block
 __all__ = ["Bank", "Innovation", "widest"]
 
 MAX_HYPOTHESES = 6_000
-"""Hypotheses, at most."""
+"""Largest number of hypotheses."""
 MAX_INITIAL_HYPOTHESES = 20_000
-"""Hypotheses, at most, until the first measurement has thinned them out."""
+"""Largest number of hypotheses before the first measurement."""
 MERGE_FRACTION = 0.8
-"""Fraction of the resolution, within which two hypotheses are one."""
+"""Side of a cell over the resolution; hypotheses whose positions share a cell are merged."""
 LATTICE_SPACING_SIGMA = 1.2
-"""Distance of two neighbours, in their own sigma: their sum is flat to 1 %."""
+"""Spacing of neighbouring hypotheses, in their own sigmas: a sum of equal Gaussians is then flat to 1 %."""
 LATTICE_EXTENT_SIGMA = 3.5
 """Extent of the first lattice of hypotheses, in sigmas of the Gaussian."""
 MIN_WEIGHT_FRACTION = 1e-7
-"""Fraction of the largest weight: a hypothesis with less is dropped."""
+"""Smallest weight of a hypothesis, as a fraction of the largest one; a smaller one is dropped."""
 COARSENING_FACTOR = 1.25
-"""Factor by which the resolution changes at a time."""
+"""Factor of one change of the resolution."""
 MERGE_INTERVAL = 4
 """Updates from one merging of hypotheses to the next."""
-# One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum
-# keeps its own.
+# One Gaussian as three narrower ones (DeMars et al. 2013, table 1); their sum keeps the original variance.
 SPLIT_MEANS = np.array([-1.0575154615, 0.0, 1.0575154615])
 SPLIT_WEIGHTS = np.array([0.2252246249, 0.5495507502, 0.2252246249])
 SPLIT_VARIANCE = 1.0 - float(SPLIT_WEIGHTS @ SPLIT_MEANS**2)
 
 
 class Innovation(NamedTuple):
-    """Innovation of a measurement; off the map, value, variance and anomaly are NaN, and it was not used."""
+    """Innovation of a measurement; off the map it is not used, and value, variance and anomaly are NaN."""
 
     value: float
-    """nT, or m of a position fix: measured minus expected."""
     variance: float
+    """`value`, `variance`: measured minus expected value, nT (m for a fix), and its variance."""
     log_likelihood: float
     accepted: bool
-    """It lies within the gate."""
+    """True if the innovation lies within the gate."""
     anomaly: float = nan
-    """nT, of the map at the likeliest hypothesis."""
+    """Anomaly of the map at the likeliest hypothesis, nT."""
 
 
 class Bank:
-    """A Gaussian mixture on the six states, each part linearised about its own mean.
+    """Gaussian mixture on the six states, each component (hypothesis) linearised about its own mean.
 
-    Hypotheses come last in every array, weights ``w`` (n,), states ``x`` (6, n) and covariances ``P``
-    (6, 6, n): each operation then runs along memory, three times as fast as on n small matrices.
+    The hypothesis is the last axis of every array: weights ``w`` (n,), states ``x`` (6, n) and covariances
+    ``P`` (6, 6, n). Each operation then runs along memory, three times as fast as on n small matrices.
 
-    The bank begins with the Gaussian `x` (6,), `P` (6, 6). A hypothesis is cut to a position sigma of
-    `resolution` m; if that is infinite, there is one hypothesis. It does not learn from an innovation whose
-    square over its variance exceeds `gate`. If `level` (nT) exceeds the bias's 1-sigma in P, half of the
-    weight goes to copies of the hypotheses whose bias has this 1-sigma.
+    The bank begins with the Gaussian `x` (6,), `P` (6, 6), and splits it into hypotheses with a position
+    sigma of `resolution` m; if that is infinite, there is one hypothesis. A hypothesis is not updated if the
+    squared innovation over its variance exceeds `gate`. If `level` (nT) exceeds the bias's 1-sigma in P, half
+    of the weight goes to copies of the hypotheses whose bias has this 1-sigma.
     """
 
     def __init__(
@@ -83,7 +82,7 @@ class Bank:
         self._updates = 0
         self.resolution = self.finest = resolution
         self.curvature_variance = 0.0
-        """Variance that the map's curvature within the hypotheses added to the last measurement's, nT²."""
+        """Variance that the map's curvature within the hypotheses added to the last measurement, nT²."""
         self.w, self.x, self.P = self._lattice(x, P)
         if level**2 > P[4, 4]:
             free = P.copy()
@@ -97,11 +96,11 @@ class Bank:
 
     @property
     def is_single(self) -> bool:
-        """True for one filter, which is never split."""
+        """True if the bank is one filter, which is never split."""
         return isinf(self.finest)
 
     def _lattice(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cut one Gaussian into a lattice of Gaussians of the bank's resolution along its position's axes.
+        """Split one Gaussian into a lattice of Gaussians as narrow as the resolution; return w, x and P.
 
         Notes
         -----
@@ -143,7 +142,7 @@ class Bank:
     def update(self, block: Block) -> Innovation:
         """Update with one measurement of the field and return its innovation.
 
-        A hypothesis off the map predicts the map's mean, with the map's variance, and is not updated.
+        A hypothesis off the map predicts the map's mean with the map's variance; its state is not updated.
 
         Notes
         -----
@@ -187,8 +186,8 @@ class Bank:
         return self._grid.look_up(longitude, latitude, block.depth).anomaly
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
-        """Update with a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
-        # One filter uses every fix: the caller has tested it.
+        """Update with a fix, m north and east of the dead-reckoned position; `sigma` is for each axis."""
+        # One filter uses every fix, because the caller has tested the fix.
         gate = inf if self.is_single else self._gate
         for axis, value in enumerate((north, east)):
             gain, used = self.P[axis], np.zeros(len(self), dtype=bool)
@@ -197,7 +196,10 @@ class Bank:
     def _observe(
         self, y: FloatArray, gain: FloatArray, s: FloatArray, rejected: BoolArray, gate: float
     ) -> Innovation:
-        """Update with innovations (n,) of variances (n,), and ``P H'`` (6, n)."""
+        """Update every hypothesis with innovations `y` (n,), their variances `s` (n,), and ``P H'`` (6, n).
+
+        `rejected` (n,) marks hypotheses whose state must not change. Return the mixture's innovation.
+        """
         # Log-likelihood of each innovation. The gate limits it, so that one outlier cannot decide.
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
@@ -228,11 +230,11 @@ class Bank:
         return mean, covariance
 
     def _limit_hypotheses(self) -> None:
-        """Drop hypotheses of negligible weight, split wide ones, now and then merge those at one place."""
+        """Drop hypotheses of negligible weight, split wide ones, and regularly merge those at one place."""
         keep = self.w > MIN_WEIGHT_FRACTION * self.w.max()
         if not keep.all():
             self._select(keep)
-        while len(self) > MAX_HYPOTHESES:  # coarsen the resolution; dropping any could lose the true place
+        while len(self) > MAX_HYPOTHESES:  # coarsen: dropping a hypothesis could lose the true place
             self.resolution *= COARSENING_FACTOR
             self._merge()
         # With few hypotheses the resolution becomes finer again, in the same steps.
@@ -251,7 +253,7 @@ class Bank:
         self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
 
     def _split(self, wide: BoolArray) -> None:
-        """Split each along its position's longest axis, keeping mean and covariance."""
+        """Split each `wide` hypothesis in three along its longest position axis; keep mean and covariance."""
         w, x, P = self.w[wide], self.x[:, wide], self.P[:, :, wide]
         values, axes = np.linalg.eigh(np.moveaxis(P[:2, :2], 2, 0))
         axis = axes[:, :, 1].T
@@ -263,7 +265,7 @@ class Bank:
         self.P = np.concatenate([self.P[:, :, ~wide]] + [narrow] * 3, axis=2)
 
     def _merge(self) -> None:
-        """Merge hypotheses whose positions lie in the same cell, keeping mean and covariance."""
+        """Merge hypotheses whose positions lie in the same cell; keep mean and covariance."""
         # Sort by cell, then sum over runs of equal cells: moments of each cell's mixture.
         cell = np.floor(self.x[:2] / (MERGE_FRACTION * self.resolution)).astype(np.int64)
         order = np.lexsort(cell)
@@ -281,6 +283,6 @@ class Bank:
 
 
 def widest(P: FloatArray) -> float:
-    """Return the largest 1-sigma of the position, m, of a covariance (6, 6)."""
+    """Return the position's 1-sigma, m, along its longest axis, from a covariance `P` (6, 6)."""
     (nn, ne), (_, ee) = P[:2, :2].tolist()
     return float(worse_axis(nn, ne, ee))

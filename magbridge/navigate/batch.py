@@ -1,4 +1,4 @@
-"""Match a whole log to a map: the navigator over all rows, a smoother's backward pass, and findings."""
+"""Navigation of a whole log on a map: the navigator over all rows, a smoother's backward pass, findings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MOTIONS: dict[str, dict[str, str]] = {
     "glide": {"depth": "depth", "pitch": "pitch", "heading": "heading"},
     "position": {"latitude": "dr_latitude", "longitude": "dr_longitude"},
 }
-"""Kinds of motion that a log may hold, best first: its columns, and their names in the dead reckoning."""
+"""Kinds of motion, the best first: the log's columns, and their names in :meth:`DeadReckoning.telemetry`."""
 
 COLUMN_UNITS = {
     "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",
@@ -50,7 +50,7 @@ def navigate(
     *,
     start: tuple[float, float] | None = None,
 ) -> xr.Dataset:
-    """Return the track that the field and the map give.
+    """Estimate the track of a log from its total field and a map.
 
     Parameters
     ----------
@@ -62,14 +62,14 @@ def navigate(
     options : NavigationOptions, optional
         How well start, current, calibration and map are known.
     start : (latitude, longitude), optional
-        deg; default the log's first position. Later ones are the reference track.
+        Position at the start, deg; default: the log's first position.
 
     Returns
     -------
     Dataset
         On ``time`` of the updates: every field of :class:`~magbridge.navigate.record.Record`,
-        ``smoothed_*`` from the backward pass, ``error_*`` where the log has a better position. Attributes:
-        ``findings``, sentences one a line; ``motion``; ``reference_track``.
+        ``smoothed_*`` from the backward pass, and ``error_*`` (m) if the log has a better position. The
+        attributes are ``findings`` (one sentence a line), ``motion`` and ``reference_track``.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def navigate(
 
 
 def samples_of(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArray, RealArray]:
-    """Return time (n,), s, total field and its sigma (n,), nT; NaN where a sample must not be used.
+    """Return time (n,), s, and total field and its sigma (n,), nT; the field is NaN where flagged unusable.
 
     FormatError: the total field is missing, or time does not increase.
     """
@@ -129,7 +129,7 @@ def samples_of(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArra
 
 
 def motion_of(deployment: xr.Dataset, source: str) -> str:
-    """Return the first of :data:`MOTIONS` that the log has; else raise FormatError."""
+    """Return the name of the first of :data:`MOTIONS` that the log has; else raise FormatError."""
     for name, columns in MOTIONS.items():
         there = all(column in deployment and deployment[column].notnull().any() for column in columns)
         if there and (name != "glide" or _glides(deployment)):
@@ -150,7 +150,7 @@ def _glides(deployment: xr.Dataset) -> bool:
 
 
 def columns_of(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, RealArray]:
-    """Return the columns (n,) that the log has, under their other names."""
+    """Return the log's columns (n,) that are keys of `names`, under the values of `names`."""
     return {
         name: deployment[column].to_numpy().astype(float)
         for column, name in names.items()
@@ -171,7 +171,10 @@ def first_position(deployment: xr.Dataset, source: str) -> tuple[float, float]:
 def _smooth(
     states: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return smoothed means (n, 6) and covariances (n, 6, 6), each stretch between jumps by itself."""
+    """Return smoothed means (n, 6) and covariances (n, 6, 6); the smoother does not cross restarts.
+
+    Each of `states` is mean, covariance, F and Q of the prediction, and the number of restarts before.
+    """
     x, P, F, Q = (np.stack([state[k] for state in states]) for k in range(4))
     jumps = np.array([state[4] for state in states])
     for piece in np.split(np.arange(jumps.size), np.flatnonzero(np.diff(jumps)) + 1):

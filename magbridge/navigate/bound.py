@@ -26,10 +26,10 @@ SLOPE_STEP_DEG = 0.005
 
 
 class Bound(NamedTuple):
-    """Along the track: time s, position deg, smallest covariance (n, 6, 6), and 1-sigma of the position, m.
+    """Smallest possible errors along a track of n points: time (s), position (deg), covariance (n, 6, 6).
 
-    ``sigma`` is ``sqrt(P_nn + P_ee)``, to compare with the RMS of an error; ``unaided`` is the same for dead
-    reckoning alone.
+    ``sigma`` (m) is ``sqrt(P_nn + P_ee)``, to compare with the RMS of a position error; ``unaided`` (m) is
+    that of dead reckoning alone.
     """
 
     time: FloatArray
@@ -57,17 +57,17 @@ def position_bound(
     grid : AnomalyGrid
         The anomaly map.
     time : array_like, (n,)
-        s since 1970 UTC, increasing: the planned track's corners are enough.
+        Times of the track's corners, increasing, s since 1970 UTC.
     latitude, longitude : array_like, (n,)
-        deg.
+        Positions of the corners, deg.
     options : NavigationOptions, optional
-        How well start, current, calibration and map are known.
+        Prior uncertainties of start, current, calibration and map.
     sigma : float, optional
-        nT, of one sample.
+        1-sigma of one sample, nT.
     depth : float, optional
-        m.
+        Depth of the track, m.
     every : float, optional
-        s between samples.
+        Time between samples, s.
 
     Returns
     -------
@@ -77,13 +77,13 @@ def position_bound(
     Raises
     ------
     OutOfRange
-        A track of one corner, or one in which time does not increase.
+        A track of one corner, a track shorter than half an update, or time that does not increase.
 
     Notes
     -----
-    Tichavský, Muravchik & Nehorai 1998, eq. 21; with linear motion and the map's slope at the true position
-    it is the covariance of a Kalman filter that knows where to linearise,
-    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map, measurements are missing.
+    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H`` (Tichavský, Muravchik & Nehorai 1998, eq. 21). With linear
+    motion it is the inverse covariance of a Kalman filter that linearises the map at the true position. Off
+    the map, measurements are missing.
     """
     # The bound is the covariance of a Kalman filter that linearises at the truth: only the slopes of the
     # field along the track are needed, no measurement.
@@ -93,7 +93,7 @@ def position_bound(
     along = _along(corners, lat, lon)
     speed = along[-1] / (corners[-1] - corners[0])
     lasts = min(o.interval, block_length(grid) / max(speed, 1e-9))
-    # Blocks as the filter's, so that bound and filter use as many samples.
+    # Blocks are those of the filter, so that bound and filter use the same number of samples.
     interval = every * (int(lasts / every + 1e-9) + 1)  # a block of as many samples as the filter's
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
     if not at.size:
@@ -129,7 +129,7 @@ def position_bound(
 
 
 def _along(time: FloatArray, latitude: FloatArray, longitude: FloatArray) -> FloatArray:
-    """Return the distance along a track, (n,) m, from its first corner to each."""
+    """Return the distance along a track from its first corner to each corner, (n,) m."""
     if time.size < 2:
         raise OutOfRange("track", f"{time.size} positions", "at least two are needed")
     if (np.diff(time) <= 0.0).any():
@@ -139,7 +139,7 @@ def _along(time: FloatArray, latitude: FloatArray, longitude: FloatArray) -> Flo
 
 
 def as_dataset(bound: Bound, grid: AnomalyGrid) -> xr.Dataset:
-    """Return the bound as a dataset on ``time``, with a sentence on it as the attribute ``findings``."""
+    """Return the bound as a dataset on ``time``; the attribute ``findings`` summarises it in a sentence."""
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
     columns = {

@@ -1,4 +1,4 @@
-"""Dead reckoning: how a vehicle has moved, from heading, speed and depth, or from a velocity or position."""
+"""Dead reckoning of a vehicle's position from heading, speed and depth, or from velocity or position."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ DEPTH_BASE = 10.0
 MAX_WATER_SPEED_M_S = 3.0
 """Largest speed through the water, m/s; a higher one comes from a jump in the depth."""
 MAX_TELEMETRY_GAP_S = 3600.0
-"""s without telemetry, after which the motion is unknown."""
+"""Longest time without telemetry for which the last velocity holds, s."""
 MAX_REPORT_INTERVAL_S = 60.0
-"""s between two reports of the velocity, over which a change between them is averaged."""
+"""Longest time between two reports of the velocity over which their change is averaged, s."""
 MIN_TURN_FRACTION = 0.25
-"""Fraction of the speed by which the velocity must have changed to count as a turn: noise is less."""
+"""Smallest change of velocity that counts as a turn, as a fraction of the speed; noise is smaller."""
 
 
 class MotionNoise(NamedTuple):
-    """Uncertainty of the dead-reckoned motion since the start; it only grows.
+    """Uncertainty of the dead-reckoned motion since the start, which only grows.
 
-    The difference of two is the uncertainty of the motion between them.
+    The difference of two values is the uncertainty of the motion between their times.
     """
 
     nn: float = 0.0
@@ -46,7 +46,7 @@ class Step(NamedTuple):
 
     seconds: float = 0.0
     metres: float = 0.0
-    """`seconds`, `metres`: time, and distance through the water."""
+    """`seconds`, `metres`: time (s), and distance through the water (m)."""
     noise: MotionNoise = MotionNoise()
 
     def joined(self, later: Step) -> Step:
@@ -58,9 +58,9 @@ class Step(NamedTuple):
 class DeadReckoning:
     """Dead-reckoned position from any kind of telemetry that the vehicle has.
 
-    `latitude` and `longitude` (deg) are NaN before :meth:`place`; `depth` is in m, `time` (s) that of the
-    last motion, NaN before the first. `travelled` (m through the water) and `noise`, the uncertainty of the
-    motion, count from the start.
+    `latitude` and `longitude` (deg) are NaN before :meth:`place`. `depth` is in m. `time` (s) is the time of
+    the position, NaN before the first telemetry. `travelled` is the distance through the water since the
+    start, m, and `noise` the uncertainty of the motion since the start.
     """
 
     def __init__(self) -> None:
@@ -76,11 +76,11 @@ class DeadReckoning:
         self._carrier: tuple[float, float] | None = None
 
     def place(self, latitude: float, longitude: float) -> None:
-        """Start, or start again, at a position."""
+        """Set the position, deg, from which dead reckoning continues."""
         self.latitude, self.longitude = latitude, longitude
 
     def forget(self) -> None:
-        """Discard the telemetry, because another source follows; the velocity is kept until then."""
+        """Discard the telemetry except the velocity, because another source of motion follows."""
         self._heading = self._pitch = self._speed = self._reported = nan
         self._local = self._carrier = None
 
@@ -90,7 +90,7 @@ class DeadReckoning:
         return hypot(*self._velocity)
 
     def advance(self, time: float) -> None:
-        """Move along the last known velocity up to `time` (s)."""
+        """Advance the position along the last known velocity to `time` (s)."""
         elapsed = time - self.time
         # Event time never goes back.
         if elapsed <= 0.0:
@@ -100,19 +100,19 @@ class DeadReckoning:
         self.time = time
 
     def extrapolate(self, time: float) -> tuple[float, float]:
-        """Return latitude and longitude at `time`, along the last known velocity, without moving there."""
+        """Return latitude and longitude (deg) at `time` (s) by the last velocity, without moving there."""
         elapsed = time - self.time
         if not 0.0 < elapsed < MAX_TELEMETRY_GAP_S:
             return self.latitude, self.longitude
         return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)
 
     def telemetry(self, time: float, values: dict[str, float]) -> None:
-        """Use the telemetry of `time`, s on any clock; an earlier one than the last moves nothing.
+        """Update position and velocity with the telemetry of `time`, s on any clock.
 
-        `values` holds any of ``depth`` m, ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the
-        water; ``velocity_north velocity_east`` m/s; ``north east`` m, a local position, or ``dr_latitude
-        dr_longitude`` deg, a dead-reckoned one, of which only the changes count. NaN counts as missing.
-        Without a speed, it is computed from the rate of depth and the pitch, as for a glider.
+        `values` holds any of ``depth`` m; ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the
+        water; ``velocity_north velocity_east`` m/s; ``north east`` m, a local position; ``dr_latitude
+        dr_longitude`` deg, a dead-reckoned position. Only the changes of a position count. NaN counts as
+        missing. Without ``speed``, the speed is a glider's, from pitch and rate of depth.
         """
         self.advance(time)
         values = {name: value for name, value in values.items() if isfinite(value)}
@@ -143,7 +143,7 @@ class DeadReckoning:
                 self._change_velocity(time, velocity, reported="heading" in values)
 
     def _change_velocity(self, time: float, velocity: tuple[float, float], *, reported: bool) -> None:
-        """Follow a new velocity; `reported` with its direction.
+        """Set a new velocity, m/s north and east; `reported` is True if its direction was reported.
 
         Notes
         -----

@@ -1,4 +1,4 @@
-"""Pictures: a track on its map with the filter's innovations and sigma, and the bound of a planned track."""
+"""Figures: a track on its map with the filter's innovations and sigma, and the bound of a planned track."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SHADES = {
 
 
 def draw_navigation(result: xr.Dataset, grid: AnomalyGrid | None, path: str | Path) -> None:
-    """Draw what :func:`~.batch.navigate` returned, or without a map :func:`~.own_survey.localise`."""
+    """Draw a result of :func:`~.batch.navigate`, or, if `grid` is None, of :func:`~.own_survey.localise`."""
     figure = Figure(figsize=(13.0, 9.0), layout="constrained")
     draws = {"field": _field, "innovation": _innovation, "sigma": _sigma}
     if grid is None:
@@ -94,7 +94,7 @@ def _sigma(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
 
 
 def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
-    """Draw a planned track on the map, coloured by the best possible position, and both over time."""
+    """Draw a planned track on the map, coloured by its bound, and bound and dead reckoning over time."""
     figure = Figure(figsize=(9.0, 9.0), layout="constrained")
     panels = figure.subplot_mosaic([["map"], ["time"]], height_ratios=(3, 1))
     axis = panels["map"]
@@ -133,7 +133,7 @@ def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
 
 
 def _map(axis: Axes, grid: AnomalyGrid, longitude: Any) -> None:
-    """Draw the map under a track, whose longitudes (n,) may be unwound past 180 degrees, into its frame."""
+    """Draw the map within the limits of `axis`; the track's `longitude` (n,), deg, may pass 180."""
     frame = axis.get_xlim(), axis.get_ylim()
     low, high = np.nanpercentile(grid.anomaly, [1, 99])
     west = grid.longitude + 360.0 * np.round((np.nanmean(longitude) - grid.longitude.mean()) / 360.0)
@@ -157,7 +157,7 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any) -> None:
 
 
 def _frame(axis: Axes, longitude: Any, latitude: Any) -> None:
-    """Make room for a track."""
+    """Set limits, aspect and labels of the map's axes so that a track (n,), deg, fits."""
     slender = float(np.cos(np.radians(np.nanmean(latitude))))  # of a degree of longitude
     (x, width), (y, height) = (
         (0.5 * (np.nanmin(v) + np.nanmax(v)), 0.65 * float(np.nanmax(v) - np.nanmin(v)) + 0.005)
@@ -175,7 +175,7 @@ def _frame(axis: Axes, longitude: Any, latitude: Any) -> None:
 
 
 def measured_on_track(result: xr.Dataset) -> RealArray:
-    """Return the anomaly (n,), nT: the measured field minus the main field at the filter's position."""
+    """Return the measured anomaly (n,), nT: total field minus the main field at the filter's position."""
     longitude, latitude = result["longitude"].to_numpy(), result["latitude"].to_numpy()
     per_latitude, per_longitude = metres_per_degree(latitude)
     east, north = result["east"].to_numpy() / per_longitude, result["north"].to_numpy() / per_latitude
@@ -187,7 +187,7 @@ def measured_on_track(result: xr.Dataset) -> RealArray:
 
 
 def _tracks(axis: Axes, result: xr.Dataset) -> list[RealArray]:
-    """Draw the dead-reckoned, filtered, smoothed and known tracks; return those to fit in, (2, n) each."""
+    """Draw the tracks; return those that the axes must show, (2, n) each: longitude and latitude, deg."""
     latitude = result["latitude"].to_numpy()
     longitude = np.unwrap(result["longitude"].to_numpy(), period=360.0)
     per_latitude, per_longitude = metres_per_degree(latitude)
@@ -229,7 +229,7 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
 
 
 def _legend_above(axis: Axes) -> None:
-    """Put the legend above the axes, where it hides no line."""
+    """Place the legend above the axes, where it hides no line."""
     entries = axis.get_legend_handles_labels()[1]
     axis.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(len(entries), 3), fontsize=8, frameon=False
@@ -237,7 +237,7 @@ def _legend_above(axis: Axes) -> None:
 
 
 def _plain(axis: Axes) -> None:
-    """Write 100, not 10^2."""
+    """Label the logarithmic y axis with plain numbers: 100, not 10^2."""
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axis.yaxis.set_major_formatter(plain)
     axis.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")

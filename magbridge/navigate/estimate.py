@@ -1,4 +1,4 @@
-"""Estimate of the position: one hypothesis or several, and the tests of whether it can be used."""
+"""Estimate of the position by one filter or a bank of them, and the tests of its validity."""
 
 from __future__ import annotations
 
@@ -18,35 +18,36 @@ from magbridge.navigate.record import Jump, NavigationState
 __all__ = ["Estimate"]
 
 MAX_FIX_DISTANCE_SQUARED = 25.0
-"""Squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6."""
+"""Largest squared Mahalanobis distance of a fix from the estimate; 4e-6 of right fixes exceed it."""
 MAX_INFORMED_RATIO = 0.8
-"""Fraction of the sigma of dead reckoning alone, above which the field has added no information."""
+"""Largest position sigma with which the field counts as informative, over that of dead reckoning alone."""
 MIN_CARRY_OFF_TIME_S = 60.0
-"""Shortest time in which fixes lead the position away without being noticed, s."""
+"""Shortest time in which wrong fixes can shift the position unnoticed, s."""
 MIN_SEARCH_RADIUS_M = 300.0
-"""Smallest radius in which the integrity monitor searches, m."""
+"""Smallest 1-sigma with which the integrity monitor searches around the filter, m."""
 JOIN_SPREAD, SPLIT_SPREAD = 1.2, 1.5
-"""Position spread over the resolution: below the first, one hypothesis; above the second, several."""
+"""Position spreads, in resolutions, below which a bank becomes one filter and above which a filter splits."""
 MIN_REFINEMENT = 0.8
-"""Fraction of the resolution: it changes only if a measurement asks for one finer than this."""
+"""Fraction of the resolution; a measurement changes the resolution only if it needs less than this."""
 SUSPECT_LOG_ODDS = 1.0
-"""Log odds: another place explains the field better, but not yet at the odds of ``options.alarm_odds``."""
+"""Natural log odds of another place above which the position is invalid, even below ``alarm_odds``."""
 SEARCH_SPREADS = (2.0, 4.0, 2.0, 8.0)
-"""1-sigma of successive searches, over the reach."""
+"""1-sigma of successive searches, in units of :meth:`Estimate._reach`."""
 
 
 class Estimate:
-    """Position around a dead-reckoned track, from blocks of samples and fixes given in order of time.
+    """Estimate of the position relative to a dead-reckoned track, from blocks and fixes in order of time.
 
-    `x` (6,) and `P` (6, 6) are estimate and covariance of :mod:`~magbridge.navigate.model`'s states at
-    `time_us` (µs), that of the last start, fix or measurement; `travelled` (m) and `motion` are distance and
-    uncertainty of the dead-reckoned motion until then, `step` the motion between the last two measurements on
-    the map. `valid` is True if the map has described the field at odds of ``options.alarm_odds``, the filter
-    began as wide as competing filters do, or they have since come to the same place, and no test rejects it
-    now. For a smoother, `moved` holds F and Q of the last prediction, and `jumps` the restarts, which it must
-    not cross. `alone` (4, 4) is the covariance of position and current by dead reckoning alone, since the
-    start or the last fix. `options` are those given, with a wider constant error of the field once the filter
-    was lost.
+    `x` (6,) and `P` (6, 6) are mean and covariance of the states of :mod:`~magbridge.navigate.model`. They
+    hold at `time_us` (µs), the time of the last start, fix or measurement. `travelled` (m) and `motion` are
+    distance and uncertainty of the dead-reckoned motion from the start to `time_us`; `step` is the motion
+    between the last two measurements on the map.
+
+    `valid` is True if the map has described the field at odds of ``options.alarm_odds``, no other place
+    remains possible, and no test rejects the position. For a smoother, `moved` holds F and Q of the last
+    prediction, and `jumps` the restarts, which it must not cross. `alone` (4, 4) is the covariance of
+    position and current by dead reckoning alone since the start or the last fix. `options` are the given
+    ones, but with a wider bias once the filter was lost.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -65,7 +66,9 @@ class Estimate:
         self._log_odds_unmapped = 0.0
         self._resolution = inf
         self.alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
-        self._level: tuple[float, int] | None = None  # nT², the bias's variance at a known place; µs, then
+        self._level: tuple[float, int] | None = (
+            None  # variance of the bias at a known place, nT²; its time, µs
+        )
         self._lost = False
         self._searches = 0
         self._unique = False  # competing filters that began wider have come to the same place
@@ -74,21 +77,21 @@ class Estimate:
 
     @property
     def begun(self) -> bool:
-        """Whether a measurement has been used."""
+        """True if the filter has used a measurement."""
         return self._filter is not None
 
     @property
     def odds(self) -> float:
-        """Natural logarithm of the odds of another place against this one."""
+        """Natural logarithm of the odds of another place against the filter's."""
         return self._monitor.odds if self._monitor else 0.0
 
     @property
     def hypotheses(self) -> int:
-        """Number of hypotheses."""
+        """Number of hypotheses of the filter; 1 before the first measurement."""
         return len(self._filter) if self._filter else 1
 
     def start(self, time_us: int, sigma: float) -> None:
-        """Begin at the dead-reckoned position, known to `sigma` m on each axis."""
+        """Start at the dead-reckoned position, whose 1-sigma on each axis is `sigma`, m."""
         self.time_us = time_us
         self._measured = time_us, self.travelled, self.motion
         self.x, self.P = prior(self.options, sigma)
@@ -97,11 +100,11 @@ class Estimate:
         self.state = NavigationState.SEARCHING
 
     def correct(self, fix: FloatArray, sigma: float, fused_sigma: float | None = None) -> None:
-        """Update with a fix that holds at the time of the last prediction.
+        """Update with a fix at the time of the last prediction; restart there if it contradicts the filter.
 
-        The fix confirms the place. It does not end :attr:`NavigationState.LOST`: the map must first describe
-        the field there. `fix` is (2,), m north and east of the dead-reckoned position, with `sigma` (m) on
-        each axis. It is fused with `fused_sigma`, larger if its error is that of the previous fix.
+        `fix` (2,) is in m north and east of the dead-reckoned position, and `sigma` (m) its 1-sigma on each
+        axis. The filter fuses it with `fused_sigma` (m), which allows for correlation with the previous fix.
+        A fix does not end :attr:`NavigationState.LOST`: the map must first describe the field there.
         """
         assert self._filter is not None
         self._refresh()
@@ -123,15 +126,15 @@ class Estimate:
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def widen(self, metres: float) -> None:
-        """Add an error of `metres` (1-sigma, each axis) to the position: fixes that were fused were wrong.
+        """Widen the position by a 1-sigma of `metres` on each axis, because fused fixes were wrong.
 
-        They also moved the current: by that error over :data:`MIN_CARRY_OFF_TIME_S`, and by its prior
-        sigma at most.
+        They also moved the current: its added 1-sigma is `metres` over :data:`MIN_CARRY_OFF_TIME_S`, and at
+        most the prior sigma.
         """
         if self._filter is None:
             return
         Q = np.zeros_like(self.P)
-        # Wrong fixes moved the position by `metres`, and the current by that over the time they took.
+        # Wrong fixes moved the position by `metres`, and the current by `metres` over their duration.
         Q[0, 0] = Q[1, 1] = metres**2
         Q[2, 2] = Q[3, 3] = min(metres / MIN_CARRY_OFF_TIME_S, self.options.current_sigma) ** 2
         self._filter.predict(np.eye(len(Q)), Q)
@@ -177,10 +180,10 @@ class Estimate:
         return seen
 
     def predict(self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> None:
-        """Propagate to `time_us`, `travelled` m after the start.
+        """Propagate the states to `time_us`, where the vehicle has travelled `travelled` m since the start.
 
-        The mean time of samples may precede a fix that came before the last of them: the estimate does not go
-        back, because a covariance can only be propagated forward.
+        If `time_us` precedes the last update, the states keep the later time. This happens if a fix came
+        between the samples of a block: a covariance can only be propagated forward.
         """
         time_us = max(time_us, self.time_us)
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
@@ -195,7 +198,7 @@ class Estimate:
             self._filter.predict(F, Q)
 
     def widen_current(self, sigma: float) -> None:
-        """Widen the current, the error of dead reckoning, by a 1-sigma of `sigma`, m/s, on each axis."""
+        """Add an error of 1-sigma `sigma`, m/s, on each axis to the current of every filter."""
         if self._filter is None:
             return
         banks = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
@@ -213,12 +216,12 @@ class Estimate:
     # ---- one hypothesis or many, and the tests of the estimate -------------------------------------------
 
     def _estimator(self, x: FloatArray, P: FloatArray) -> Bank:
-        """Return one filter if the position is narrow enough for it, else many."""
+        """Return one filter if the position's covariance is narrow enough for the map, else a bank."""
         single = widest(P) < SPLIT_SPREAD * self._resolution
         return Bank(self.grid, x, P, inf if single else self._resolution, self.options.gate)
 
     def _begin(self, x: FloatArray, P: FloatArray, cause: str) -> None:
-        """Start again from a Gaussian."""
+        """Restart the filter from the Gaussian `x` (6,), `P` (6, 6), and record the jump with its cause."""
         self._jump(x, cause)
         self._filter, self.x, self.P = self._estimator(x, P), x, P
 
@@ -228,7 +231,7 @@ class Estimate:
         self._monitor, self._unique, self._fixed = None, False, False
 
     def _judge(self, block: Block, seen: Innovation) -> None:
-        """Compare the filter with competing ones, and replace it if one of them has won."""
+        """Compare the filter with the competing explanations, and replace it if one of them has won."""
         assert self._filter is not None
         # Log odds of 'the map is unrelated to the field' against the filter, as a cumulative sum that starts
         # again at its lower limit (Page 1954).
@@ -244,7 +247,7 @@ class Estimate:
         self._map_confirmed |= self._log_odds_unmapped <= -log(self.options.alarm_odds)
         if self._map_confirmed and self._fixed and self._unique:
             self._lost, self._searches = False, 0
-        # A position that is still spread over several places has nothing to be compared with.
+        # As long as the filter itself is spread over several places, a comparison has no meaning.
         if not self._compact(widest(self.P)):
             return
         if self._monitor is None:
@@ -265,10 +268,10 @@ class Estimate:
                 self._lost, self._searches = False, 0
 
     def _levels(self) -> tuple[float, float]:
-        """Return the 1-sigma (nT) of the bias at other places, and that of half of them; 0: the same.
+        """Return two 1-sigmas (nT) of the bias: of all competing hypotheses, and of half of them (0: same).
 
-        Where the position was known, the field told the bias, wherever the filter has gone since: from then
-        on it may have changed by its prior sigma. After a search it is uncertain, too.
+        Where the position was last known, the field determined the bias; since then the bias has drifted as
+        its model allows. After a search, half of the hypotheses have the wide bias of that search.
         """
         o = self._claimed
         level = o.bias_sigma
@@ -280,7 +283,7 @@ class Estimate:
         return level, self.options.bias_sigma if self.options is not o else 0.0
 
     def _restart_search(self) -> None:
-        """Search around dead reckoning, within the next of SEARCH_SPREADS and at any bias (level)."""
+        """Restart with a search around dead reckoning, by the next of SEARCH_SPREADS and an unknown bias."""
         self._log_odds_unmapped, self._map_confirmed, self._lost = 0.0, False, True
         self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)
@@ -295,26 +298,26 @@ class Estimate:
         self.x, self.P = x, P
 
     def _compact(self, width: float) -> bool:
-        """Return whether a position of this 1-sigma (m) counts as one place on the scale of the map."""
+        """Return True if a position of 1-sigma `width` (m) counts as one place on the scale of the map."""
         return width <= max(SPLIT_SPREAD * self._resolution, 0.25 * self.grid.correlation_length)
 
     def _reach(self) -> float:
-        """Return the 1-sigma (m) of the places around the filter that competing filters start from."""
+        """Return the 1-sigma (m) with which a competing bank is spread around the filter at its start."""
         length = self.grid.correlation_length * (0.5 if self._unique else 1.0)
         return max(MIN_SEARCH_RADIUS_M, widest(self.alone), min(length, 5.0 * MIN_SEARCH_RADIUS_M))
 
     @property
     def informed(self) -> bool:
-        """Return True if the field has improved the position of dead reckoning alone."""
+        """True if the field has made the position clearly more precise than dead reckoning alone."""
         return widest(self.P) <= MAX_INFORMED_RATIO * widest(self.alone)
 
     def _tracks_from_fix(self) -> bool:
-        """Return True if a fix, and dead reckoning since, give the place as well as the map could."""
+        """Return True if a fix and the dead reckoning since then are as precise as the map could be."""
         limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
         return self._fixed and self._map_confirmed and widest(self.alone) <= limit
 
     def _set_state(self, on_the_map: bool) -> None:
-        """Change between a bank and one tracker if the width demands it; set the state."""
+        """Change between one filter and a bank if the position's width requires it, and set the state."""
         width = widest(self.P)
         # Hysteresis between JOIN_SPREAD and SPLIT_SPREAD: the kind of filter does not alternate.
         assert self._filter is not None

@@ -1,4 +1,4 @@
-"""Findings about a track, its errors against the best position that the estimate did not use included."""
+"""Findings about an estimated track, and its errors against positions that the estimate did not use."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ REFERENCES = (
     ("gps_latitude", "gps_longitude"),
     ("latitude", "longitude"),
 )
-"""Columns of a position, the best first."""
+"""Pairs of columns that may hold a position, the best first."""
 
 
 def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset | None:
-    """Return the best position that the estimate has not used, with the field there, or None."""
+    """Return the best positions of a log that the estimate has not used, with the total field; else None.
+
+    `used` has the names of the columns that the estimate used.
+    """
     for pair in REFERENCES:
         if pair[0] not in used and all(name in deployment for name in pair):
             others = [name for name in ("total_field_sigma", "depth") if name in deployment]
@@ -40,7 +43,7 @@ def reference_track(deployment: xr.Dataset, used: frozenset[str]) -> xr.Dataset 
 
 
 def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
-    """Add the errors against the reference track, m, where that has a position near in time."""
+    """Return `result` with its errors against the reference track, m; NaN without one near in time."""
     if truth is None:
         return result
     time = result["time"].to_numpy()
@@ -66,7 +69,7 @@ def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
 
 
 def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
-    """Return the errors (n,), m, of the estimate and of dead reckoning alone; NaN where unknown."""
+    """Return the position errors (n,), m, of the estimate and of dead reckoning alone; NaN where unknown."""
     if "error_north" not in result:
         nobody = result["north"] * np.nan
         return nobody, nobody
@@ -75,25 +78,25 @@ def errors(result: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
 
 
 MIN_MAP_POSITIONS = 40
-"""Positions, below which a map's place cannot be judged."""
+"""Smallest number of known positions with which the map's place is tested."""
 SEARCH = 1_500.0
-"""Largest displacement of a map that is tried, on each axis, m."""
+"""Largest displacement of the map that the search tries on each axis, m."""
 LATTICE = 31
-"""Shifts that are tried on each axis."""
+"""Number of shifts that the search tries on each axis."""
 MIN_RELIEF_SIGMA = 3.0
-"""Relief over the sigma of bias and map error, below which a map carries no information."""
+"""Smallest RMS of an informative map, in sigmas of bias and map error."""
 DOUBLE = 2.0
-"""Scatter over the sigma of bias and map error, above which it is that of another field."""
+"""Largest scatter of field minus map with the right map, in sigmas of bias and map error."""
 MAX_SHIFTED_SCATTER_FRACTION = 0.6
-"""Fraction of the scatter at the map's own place: a shift must do at least as well to be believed."""
+"""Largest scatter of field minus shifted map, over that without shift, with which a shift is reported."""
 MAX_BIAS_SIGMA = 4.0
-"""Sigmas of the calibration's bias: a larger difference in level has another reason."""
+"""Largest bias that the calibration can explain, in sigmas of the bias."""
 LISTED = 3
-"""Jumps of the filter that are reported one by one: the map of another place causes dozens."""
+"""Number of jumps that are reported one by one: the map of another place causes dozens."""
 MAX_MEDIAN_SIGMA_RATIO = 3.0
-"""Sigma of a sample over the median one, above which it says nothing about the map."""
+"""Largest sigma of a sample that is compared with the map, over the median sigma."""
 EXPLAINED = 0.5
-"""Fraction of the field's variance along the track, below which the map does not describe it."""
+"""Smallest fraction of the field's variance along the track that the right map explains."""
 
 
 def findings_of(
@@ -103,7 +106,7 @@ def findings_of(
     jumps: Sequence[Jump],
     reference_track: xr.Dataset | None,
 ) -> list[str]:
-    """Return the findings, one sentence each; empty when there is nothing to report.
+    """Return findings about a navigated track, one sentence each.
 
     `result` holds the records made with `grid` and `options`, `jumps` the restarts in order, and
     `reference_track` ``latitude longitude total_field`` at known positions.
@@ -166,7 +169,7 @@ def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:
 
 
 def _level(result: xr.Dataset, options: NavigationOptions) -> list[str]:
-    """Report the bias at the end, if no calibration would leave it."""
+    """Return a sentence on the bias at the end of the track, if it exceeds what a calibration leaves."""
     tracked = result.where(result["state"] == NavigationState.TRACKING, drop=True)
     if not tracked.sizes["time"]:
         return []
@@ -182,7 +185,7 @@ def _level(result: xr.Dataset, options: NavigationOptions) -> list[str]:
 
 
 class _Shift(NamedTuple):
-    """Shift of a map (m north, east) with which it fits best; scatter (nT) with it and without it."""
+    """Best-fitting shift of a map, m north and east, and the scatter (nT) with it and without it."""
 
     north: float
     east: float
@@ -193,7 +196,7 @@ class _Shift(NamedTuple):
 def _best_shift(
     grid: AnomalyGrid, latitude: RealArray, longitude: RealArray, depth: RealArray, anomaly: RealArray
 ) -> _Shift:
-    """Return by how much the map must be moved to describe an anomaly (n,), nT, except for a constant."""
+    """Return the shift with which the map best describes an anomaly (n,), nT, except for a constant."""
     # Exhaustive search over a lattice of shifts: the scatter has many minima.
     shifts = np.linspace(-SEARCH, SEARCH, LATTICE)
     per_latitude, per_longitude = metres_per_degree(float(np.mean(latitude)))
@@ -214,13 +217,13 @@ def _best_shift(
 
 
 def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: NavigationOptions) -> list[str]:
-    """Compare the map with the field at known positions: its place, and whether it is this field's map."""
+    """Return sentences on errors of the map (level, place, wrong field) by the field at known positions."""
     latitude, longitude = reference_track["latitude"].to_numpy(), reference_track["longitude"].to_numpy()
     depth = np.broadcast_to(np.nan_to_num(reference_track.get("depth", 0.0)), latitude.shape)
     time = reference_track["time"].to_numpy()
     measured = reference_track["total_field"].to_numpy() - total_field(longitude, latitude, depth, time)
     known = np.isfinite(measured + grid.evaluate(longitude, latitude, depth).anomaly)
-    if "total_field_sigma" in reference_track:  # while a mass moves the field is off by any amount
+    if "total_field_sigma" in reference_track:  # while a mass moves, the field may err by any amount
         sigma = reference_track["total_field_sigma"].to_numpy()
         known &= sigma <= MAX_MEDIAN_SIGMA_RATIO * np.nanmedian(sigma)
     if known.sum() < MIN_MAP_POSITIONS:

@@ -1,19 +1,19 @@
 """Integrity of GNSS positions: each is tested before the navigator uses it.
 
-A receiver that is jammed or spoofed goes on to report a 3-D fix with a small error. Its positions are tested
-against what else is known:
+A jammed or spoofed receiver can still report a 3-D fix with a small error. The monitor rejects positions for
+these reasons:
 
 =========== ============================================================================================
 jump        two positions differ by more than dead reckoning and its errors allow between them
 frozen      the position stays the same while the vehicle moves
-position    it differs from the navigator's position by more than both claim
+position    the difference from the navigator's position exceeds the errors of both
 field       the map does not describe the measured field at the position
 spoofing,   the receiver reports it (GNSS_INTEGRITY)
 jamming
 =========== ============================================================================================
 
-All positions are relative to the dead-reckoned position, so that a difference of two positions is the error
-of dead reckoning between them, whatever the vehicle did.
+All positions are relative to the dead-reckoned position. The difference of two right positions is then the
+error of dead reckoning between them, for any motion of the vehicle.
 """
 
 from __future__ import annotations
@@ -36,60 +36,60 @@ from magbridge.navigate.options import NavigationOptions, any_level
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
 MAX_DEVIATION_SIGMA = 4.5
-"""Deviation from a prediction, in sigmas, beyond which a position is rejected; by chance 4e-5 of right ones
-are, two degrees of freedom."""
+"""Largest accepted deviation from a prediction, in sigmas; 4e-5 of right positions exceed it by chance (two
+degrees of freedom)."""
 MIN_SIGMA_M = 1.5
-"""Smallest sigma of a receiver that is used, m: its error changes slowly."""
+"""Lower limit of a claimed position sigma, m: a receiver's error changes slowly."""
 MAX_RETURN_SIGMA, MAX_HOLD_US = 2.0, 180_000_000
-"""Largest change of the positions against dead reckoning, in sigmas of dead reckoning, with which rejected
-positions are used again; and the µs for which this limit holds, because a change of the wind lasts. By chance
-14 % of the changes are larger, two degrees of freedom."""
+"""Largest change of the positions against dead reckoning, in its sigmas, with which rejected positions are
+used again; 14 % of right changes exceed it by chance. The limit holds for the second value, in µs, because a
+change of the current may last."""
 WINDOW_US = 30_000_000
-"""µs over which the motion by GNSS is compared with dead reckoning."""
+"""Time over which the motion by GNSS is compared with dead reckoning, µs."""
 MEAN_TIME_S = 20.0
-"""Time constant of the mean deviation from the navigator, s."""
+"""Time constant of the mean deviation of positions from the navigator's, s."""
 HOLD_US, LONG_HOLD_US = 20_000_000, 45_000_000
-"""µs for which positions must agree with each other until they are used again: if the navigator or the field
-agrees, and if neither can tell."""
+"""Time for which rejected positions must agree with each other before they are used again, µs: if navigator
+or field confirms them, and if neither can."""
 MAX_SIGMA_RATIO = 3.0
-"""Largest sigma of a position over the smallest in WINDOW_US: a jammed receiver claims now 2 m, now 200 m."""
+"""Largest sigma of a position over the smallest in WINDOW_US: a jammed receiver's claim varies widely."""
 MIN_POSITIONS = 3
-"""Number of positions in that time."""
+"""Smallest number of positions that must agree with each other in HOLD_US."""
 OUTAGE_US = 60_000_000
-"""µs without a position, after which dead reckoning may be off by more than ``current_sigma`` says."""
+"""Time without a position after which dead reckoning may err by more than ``current_sigma``, µs."""
 OUTAGE_SPEED_FRACTION = 0.1
 """1-sigma of the velocity error after an outage, as a fraction of the speed."""
 MIN_FROZEN_M = 10.0
-"""Distance that the vehicle must have moved until a constant position is frozen, m."""
+"""Smallest distance that the vehicle must move before an unchanged position counts as frozen, m."""
 UNSEEN_FRACTION = 0.1
-"""Error of positions, in correlation lengths of the map, that the field shows only after it has lasted."""
+"""Position error, in correlation lengths of the map, that the field test detects only after a while."""
 MAX_GNSS_AGE_US = 10_000_000
-"""µs for which a position, or a report of the receiver's, holds."""
+"""Largest age of a usable position or integrity report, µs."""
 CORRELATION_TIME_S = 30.0
-"""s over which the errors of successive positions are correlated."""
+"""Correlation time of the errors of successive positions, s."""
 SEPARATION_TIME_S = 120.0
-"""s for which a filter goes on without the positions that the navigator uses; then it starts again."""
+"""Time for which a comparison filter runs without the positions, before it starts again, s."""
 RECENT_POSITIONS = 64
-"""Number of positions between which that of a measurement is interpolated."""
+"""Number of recent positions, from which the position at a measurement is interpolated."""
 OK_STATE, DETECTED_STATE = 1, 3
-"""GPS_JAMMING_STATE and GPS_SPOOFING_STATE: nothing found; found and not mitigated."""
+"""Values of GPS_JAMMING_STATE and GPS_SPOOFING_STATE: OK, and detected but not mitigated."""
 
 
 class GnssState(IntEnum):
     """Use of the receiver's positions; the values are those sent over the link."""
 
     NONE = 0
-    """No position yet."""
+    """The receiver has sent no position."""
     GOOD = 1
-    """They are used."""
+    """The navigator uses the positions."""
     SUSPECT = 2
-    """They are not used, but could be right."""
+    """The navigator does not use the positions, although they could be right."""
     REJECTED = 3
-    """They are wrong."""
+    """The navigator rejects the positions as wrong."""
 
 
 class GnssReason(IntEnum):
-    """Why positions are not used; the values are those sent over the link."""
+    """Reason for which positions are not used; the values are those sent over the link."""
 
     NONE = 0
     SPOOFING = 1
@@ -104,26 +104,30 @@ class Prediction(NamedTuple):
     """Position that the navigator predicts at the time of a GNSS position, relative to dead reckoning."""
 
     position: FloatArray
-    """(2,), m, north and east."""
+    """Predicted position (2,), m north and east."""
     covariance: FloatArray
     alone: FloatArray
-    """`covariance`, `alone`, (2, 2), m²: of the position, and of dead reckoning since the last position that
-    was used."""
+    """`covariance`, `alone`: covariances (2, 2), m², of the position, and of dead reckoning alone since the
+    last position that was used."""
     current: FloatArray
-    """(2,), m/s, by which dead reckoning is wrong."""
+    """Velocity error of dead reckoning (2,), m/s."""
     current_sigma: float
     travelled: float
     speed: float
-    """`current_sigma`, `travelled`, `speed`: m/s on each axis, m since the start, m/s."""
+    """`current_sigma`, `travelled`, `speed`: 1-sigma of the current on each axis, m/s; distance travelled
+    since the start, m; speed, m/s."""
     turns: float
     """:attr:`MotionNoise.turns` since the start."""
     lost: bool
     informed: bool
-    """`lost`, `informed`: The navigator is lost; the field has improved its position."""
+    """`lost`, `informed`: True if the navigator is lost; True if the field has improved its position."""
 
 
 class _Position(NamedTuple):
-    """A position that was tested: µs; m relative to dead reckoning; m; the current known then, m/s; turns."""
+    """Tested position: time (µs), m north and east of dead reckoning, its sigma (m), and the state then.
+
+    The state is the navigator's current with its sigma (m/s), and :attr:`MotionNoise.turns`.
+    """
 
     time_us: int
     north: float
@@ -136,10 +140,11 @@ class _Position(NamedTuple):
 
 
 class GnssMonitor:
-    """Test GNSS positions, in order of time; `state` and, where they are not used, the `reason`.
+    """Test of GNSS positions, given in order of time.
 
-    `drift` (m) is the mean distance of the positions that were used from the navigator's, over 20 s, and
-    `evidence` compares the field with the map at its position.
+    `state` is the use of the positions, and `reason` why they are not used. `drift` (m) is the length of the
+    mean deviation of used positions from the navigator's, over 20 s. `evidence` compares the field with the
+    map at the positions.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -148,9 +153,9 @@ class GnssMonitor:
         self._grid, self._options = grid, options
         self._history: deque[_Position] = deque()
         self._place: tuple[float, float] | None = None
-        self._frozen_from = 0.0  # m travelled when the position was first the present one
-        self._since_us = 0  # since when the positions agree with each other
-        self._count = 0  # positions since then
+        self._frozen_from = 0.0  # m travelled when the receiver first sent the present position
+        self._since_us = 0  # time since which the positions agree with each other
+        self._count = 0  # number of positions since `_since_us`
         self._chained = True  # no jump since the last position that was used
         self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
         self._change = 0.0  # of the positions over the window against dead reckoning, in its errors
@@ -161,12 +166,12 @@ class GnssMonitor:
 
     @property
     def possible_error(self) -> float:
-        """Error that positions may have had while they were still used, m."""
+        """Error that positions may have had while the navigator still used them, m."""
         unseen = UNSEEN_FRACTION * self._grid.correlation_length if self.reason is GnssReason.FIELD else 0.0
         return hypot(self.drift, unseen)
 
     def receive_integrity(self, time_us: int, jamming: int, spoofing: int) -> None:
-        """Use the receiver's own report, GNSS_INTEGRITY's jamming_state and spoofing_state."""
+        """Store the receiver's own report: jamming_state and spoofing_state of GNSS_INTEGRITY."""
         self._reported_us = time_us
         if spoofing == DETECTED_STATE:
             self._reported = GnssReason.SPOOFING
@@ -174,7 +179,7 @@ class GnssMonitor:
             self._reported = GnssReason.JAMMING if jamming == DETECTED_STATE else GnssReason.NONE
 
     def new_motion(self) -> None:
-        """Forget earlier positions: the error of dead reckoning is another from now on."""
+        """Discard earlier positions, because a new source of motion changes the error of dead reckoning."""
         self._history.clear()
         self._trusted = None
 
@@ -183,7 +188,7 @@ class GnssMonitor:
 
         Notes
         -----
-        Errors of one variance σ² that are correlated over τ, each Δt, count as independent ones
+        Errors of variance σ² and correlation time τ, at intervals Δt, are treated as independent errors
         of the variance σ² (1 + τ/Δt).
         """
         if len(self._history) < 2:
@@ -199,10 +204,10 @@ class GnssMonitor:
         sigma: float,
         prediction: Prediction,
     ) -> GnssState:
-        """Test a position and return the state.
+        """Test a position and return the resulting state.
 
-        `place`: latitude and longitude, deg. `offset_m`: the same, m north and east of the dead-reckoned
-        position. `sigma`: m, on each axis. `prediction`: of the navigator, at this time.
+        `place` is latitude and longitude, deg; `offset_m` is the same position in m north and east of the
+        dead-reckoned one; `sigma` is its claimed 1-sigma on each axis, m; `prediction` is the navigator's.
         """
         sigma = max(sigma, MIN_SIGMA_M)
         # A jammed receiver's claimed error varies: the smallest recent one is the limit.
@@ -240,8 +245,8 @@ class GnssMonitor:
     ) -> None:
         """Compare a measurement of the field with the map at the last position.
 
-        It is one `step` after the previous one, with a log-likelihood by the navigator's filter, whose
-        estimate is now x (6,), P (6, 6).
+        `step` is the motion since the previous measurement, `filter_likelihood` the log-likelihood of `block`
+        in the navigator's filter, and x (6,), P (6, 6) the filter's estimate after it.
         """
         if self.state is GnssState.GOOD:
             self.evidence.separate(x, P)
@@ -252,12 +257,12 @@ class GnssMonitor:
     def _jumps(
         self, time_us: int, offset_m: tuple[float, float], sigma: float, prediction: Prediction
     ) -> bool:
-        """Compare with the previous position, that of WINDOW_US ago, and one between them.
+        """Return True if the position jumped: against the previous one, one WINDOW_US old, or one between.
 
         Notes
         -----
-        In a time Δ, dead reckoning errs by the current c that was known at its start, with the variance
-        (σ_c² + 2 σ² Δ/τ) Δ² of a Gauss-Markov current (σ, τ), and by its own random walk.
+        In a time Δ, dead reckoning errs by the current c known at its start, times Δ. The variance of this
+        error is (σ_c² + 2 σ² Δ/τ) Δ² for a Gauss-Markov current (σ, τ), plus that of a random walk.
         """
         history, o = self._history, self._options
         # Three comparisons, with the latest, a middle and the oldest position: a jump shows in the first, a
@@ -306,7 +311,7 @@ class GnssMonitor:
         return squared_mahalanobis(away, P + sigma**2 * np.eye(2)) <= MAX_DEVIATION_SIGMA**2
 
     def _average(self, time_us: int, away: FloatArray) -> None:
-        """Add the deviation (2,), m, of a position that is used to the mean."""
+        """Include a used position's deviation (2,), m, from the navigator in the running mean."""
         seconds = (time_us - self._history[-2].time_us) * 1e-6 if len(self._history) > 1 else inf
         # Exponential mean with the time constant MEAN_TIME_S; it starts again after a pause.
         kept = exp(-seconds / MEAN_TIME_S) if seconds < MEAN_TIME_S else 0.0
@@ -332,16 +337,16 @@ class GnssMonitor:
         self.state, self.reason = state, reason
 
     def _returns(self, time_us: int, agrees: bool, prediction: Prediction) -> bool:
-        """Return True if positions that were not used are right again."""
+        """Return True if positions that were suspect or rejected may be used again."""
         held_us = time_us - self._since_us
         # Positions return only after they have agreed with each other for a while.
         if held_us < HOLD_US or self._count < MIN_POSITIONS:
             return False
-        # The field decides first: it describes the position better than the navigator's, or worse.
+        # The field decides first, if the map describes it clearly better or worse at the position.
         field, by_field = self.evidence, self.reason is GnssReason.FIELD
         if field.favours and field.log_odds_of_map > 0.0:
             return True
-        # Then the motion since, against dead reckoning; a carry-off goes on while it is held back.
+        # Then the motion since, against dead reckoning: a spoofer's carry-off continues while rejected.
         moves = self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US
         if field.contradicts or field.disfavours or (moves and not by_field):
             return False
@@ -355,18 +360,18 @@ class GnssMonitor:
 
 
 class _FieldTest:
-    """Log odds of the receiver's position by the field, each within ± `limit` (``options.alarm_odds``).
+    """Test of the receiver's position by the field: two log odds, each within ± log ``options.alarm_odds``.
 
-    `log_odds_of_map` is against a field unrelated to the map, `log_odds_of_position` against the navigator.
+    `log_odds_of_map` compares the map at the position with a field unrelated to the map;
+    `log_odds_of_position` compares the position with the navigator's.
 
     Notes
     -----
     Both are sums of log-likelihood ratios ``log p(y_k | y_1 .. y_k-1, H1) - log p(y_k | y_1 .. y_k-1, H0)``.
     Under H1 the vehicle is at the receiver's position; the position error is Gauss-Markov with the receiver's
-    sigma and :data:`CORRELATION_TIME_S`, so that the field's information on it lasts that long. Calibration
-    bias and map error are free states, as in the navigator. Under H0 the vehicle is where the navigator is,
-    which has not used the positions. Both predict each measurement from all earlier ones. The first is not
-    counted: it determines the level under H1.
+    sigma and :data:`CORRELATION_TIME_S`. Calibration bias and map error are free states, as in the navigator.
+    Under H0 the vehicle is at the navigator's position, which has not used the receiver's. Both predict each
+    measurement from all earlier ones. The first measurement does not count: it determines the bias under H1.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -390,44 +395,47 @@ class _FieldTest:
 
     @property
     def contradicts(self) -> bool:
-        """Return True if the map does not describe the field there, or describes it better without it."""
+        """True if the map contradicts the field at the positions, or a filter without them is more likely."""
         return self._against >= self.limit or self._log_odds_separate >= self.limit
 
     @property
     def confirms(self) -> bool:
-        """Return True if the map describes the field at the position, not worse than at the navigator's."""
+        """True if the map describes the field at the position, and not worse than at the navigator's."""
         return self.log_odds_of_map >= self.limit and self.log_odds_of_position >= 0.0
 
     @property
     def disfavours(self) -> bool:
-        """Return True if the map describes the field better at the navigator's position, with odds of 45."""
+        """True if the map describes the field better at the navigator's position; default odds: 45."""
         return self.log_odds_of_position <= -0.5 * self.limit
 
     @property
     def favours(self) -> bool:
-        """Return True if the map describes the field at the position better than at the navigator's."""
+        """True if the map describes the field better at the receiver's position, at ``alarm_odds``."""
         return self.log_odds_of_position >= self.limit
 
     def move(self, time_us: int, offset_m: tuple[float, float], sigma: float, *, restart: bool) -> None:
-        """Continue at a position (m, north and east of dead reckoning) with its 1-sigma (m)."""
+        """Move the test to a position (m north and east of dead reckoning) of 1-sigma `sigma` (m).
+
+        Discard the evidence if `restart` is True, or after a gap in the positions.
+        """
         if restart or time_us - self._time_us > MAX_GNSS_AGE_US:
             self._restart()
         self._positions.append((time_us, *offset_m))
         self._sigma, self._time_us = sigma, time_us
 
     def begin_comparison(self) -> None:
-        """Discard the evidence so far: from now on the navigator does not use the positions."""
+        """Discard evidence except that against the map: from now on the navigator rejects the positions."""
         self.log_odds_of_map = min(self.log_odds_of_map, 0.0)
         self.log_odds_of_position = self._log_odds_separate = 0.0
         self._separate = None
 
     def separate(self, x: FloatArray, P: FloatArray) -> None:
-        """Start a filter without the positions, from the navigator's estimate x (6,), P (6, 6), if it is due.
+        """Start a filter without the positions from the navigator's x (6,), P (6, 6), if the last has ended.
 
         Notes
         -----
-        Solution separation: its log-likelihood ratio against the navigator begins at 0. As long as the
-        positions are right, it exceeds c with a probability of at most 1/c in each period (Ville 1939).
+        Solution separation: the likelihood ratio of this filter against the navigator begins at 1. As long as
+        the positions are right, it exceeds c with a probability of at most 1/c in each period (Ville 1939).
         """
         if self._separate is None or self._separated_s > SEPARATION_TIME_S:
             self._separate = Bank(self._grid, x, P, inf, self._options.gate)
@@ -441,7 +449,7 @@ class _FieldTest:
             self._log_odds_separate += self._separate.update(block).log_likelihood - filter_likelihood
 
     def update(self, block: Block, step: Step, filter_likelihood: float) -> None:
-        """Add a measurement, one `step` after the previous one."""
+        """Add a measurement to the log odds; `step` is the motion since the previous measurement."""
         self._step = self._step.joined(step)
         if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US:
             return
@@ -466,8 +474,8 @@ class _FieldTest:
         self.log_odds_of_position = self._limited(self.log_odds_of_position + gained)
 
     def _predict(self, bank: Bank, step: Step, time_us: int) -> None:
-        """Propagate the filter of H1 to a time: the receiver's error decays, and its position moves."""
-        # Interpolated: with a wrong heading dead reckoning leaves the receiver by metres in a second.
+        """Propagate the filter of H1 to `time_us`: the receiver's error decays, and its position moves."""
+        # Interpolate the position: with a wrong heading, dead reckoning departs from it by metres per second.
         times, north, east = np.array(self._positions).T
         position = np.array([np.interp(time_us, times, north), np.interp(time_us, times, east)])
         F, Q = transition(self._options, *step)

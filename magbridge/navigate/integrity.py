@@ -1,14 +1,13 @@
 """Integrity: tests of the filter against other explanations of the field.
 
-A filter at the wrong place has small innovations, because it has moved to where they are small. The error
-shows only when another explanation predicts the same measurements better. Two are kept in addition to the
-filter:
-*elsewhere*, a bank of hypotheses spread around it; and *nowhere*, a random field as rough as the map but
-unrelated to it.
+A filter at a wrong place has small innovations, because it has moved to where they are small. The error
+shows only if another explanation predicts the same measurements better. Two explanations compete with the
+filter: *elsewhere*, a bank of hypotheses spread around it; and *nowhere*, a random field as rough as the map
+but unrelated to it.
 
-The odds of each against the filter, ratios of the products of predictive likelihoods, are a martingale as
-long as the filter is right, so they ever exceed c with a probability of at most 1/c (Ville 1939): a
-threshold of c limits false alarms to 1/c.
+The odds of each against the filter are ratios of the products of predictive likelihoods. As long as the
+filter is right, these odds are a martingale. They then ever exceed c with a probability of at most 1/c
+(Ville 1939): a threshold of c limits false alarms to 1/c.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ from magbridge.navigate.options import NavigationOptions
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 
 MAX_AGREEING_DISTANCE = 9.0
-"""Squared distance in sigmas within which two estimates are the same place."""
+"""Largest squared Mahalanobis distance of two estimates of the same place."""
 ELSEWHERE = 16.0
-"""Squared distance in sigmas beyond which they are not."""
+"""Squared Mahalanobis distance beyond which two estimates are different places."""
 MAX_AVERAGING_US = 45_000_000
-"""µs over which blocks are averaged to one measurement of the competing filters."""
+"""Longest time over which blocks are averaged to one measurement of the competing filters, µs."""
 MAX_AVERAGING_BLOCKS = 3.0
-"""Distance over that which a block covers: they are averaged after it, if that comes sooner."""
+"""Longest distance over which blocks are averaged to such a measurement, in block lengths."""
 
 
 class Verdict(Enum):
@@ -47,11 +46,11 @@ class Verdict(Enum):
 
 
 class Unmapped:
-    """The field as a smooth random function of the distance, with the map's scatter and correlation length.
+    """Model of a field that is unrelated to the map, to compare with the filter by its likelihood.
 
-    It predicts measurements as if the map were unrelated to the field: a Matérn process of smoothness 3/2
-    with two states (value nT, slope nT/m). Bias and map error enter by the variance that they add in each
-    step.
+    The field is a random function of the distance with the map's scatter and correlation length: a Matérn
+    process of smoothness 3/2 with two states (value nT, slope nT/m). Bias and map error add their variance
+    in each step.
 
     Notes
     -----
@@ -69,11 +68,10 @@ class Unmapped:
         self._p = self._value, 0.0, self._slope
 
     def update(self, block: Block, step: Step, curvature_variance: float) -> float:
-        """Update with a measurement, one `step` after the previous one; return its log-likelihood.
+        """Update with a measurement and return its log-likelihood; `step` is the motion since the last one.
 
-        `curvature_variance` (nT²) is what the filter adds to the measurement's variance for the map's
-        curvature. It is added here too; else a filter that is still searching would lose by its larger
-        variance alone.
+        `curvature_variance` (nT²) is the variance that the filter adds to the measurement for the map's
+        curvature. This model adds it too; otherwise a searching filter would lose by its larger variance.
         """
         o, rate = self._options, self._rate
         seconds, metres, _ = step
@@ -84,7 +82,7 @@ class Unmapped:
         value, slope = a * self._x[0] + b * self._x[1], c * self._x[0] + d * self._x[1]
         p, q, r = self._p
         v, w = self._value, self._slope
-        # What bias and map error may have changed since the previous measurement.
+        # Variance of the change of bias and map error since the previous measurement.
         wander = o.map_sigma**2 * -expm1(-2.0 * metres / o.map_length)
         wander += o.bias_sigma**2 * -expm1(-2.0 * seconds / o.bias_time)
         p, q, r = (
@@ -100,13 +98,13 @@ class Unmapped:
 
 
 class IntegrityMonitor:
-    """Two banks compared on equal terms: *here* begins at the filter, *elsewhere* is spread around it.
+    """Comparison of two banks: *here* begins at the filter's position, *elsewhere* is spread around it.
 
-    Both use the same measurements, several blocks averaged to one, because a bank costs more than a filter
-    and the comparison can wait a minute. The filter starts a new monitor once it is confirmed or starts
-    again. `x` (6,) and `P` (6, 6) are the filter's estimate at `time_us`, `reach` (m) the 1-sigma by which
-    *elsewhere* is spread around it, and `resolution` (m) that of the banks. `levels` (nT) are the 1-sigma of
-    the bias elsewhere, and that of half of the places there; 0: of none.
+    Both use the same measurements. Several blocks are averaged to one measurement, because a bank costs more
+    than a filter and the comparison can wait a minute. A new monitor follows once the filter is confirmed or
+    starts again. `x` (6,) and `P` (6, 6) are the filter's estimate at `time_us`. `reach` (m) is the 1-sigma
+    by which *elsewhere* is spread around it, and `resolution` (m) that of both banks. `levels` (nT) are two
+    1-sigmas of the bias: of all hypotheses elsewhere, and a larger one of half of them (0: none).
     """
 
     def __init__(
@@ -136,10 +134,10 @@ class IntegrityMonitor:
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
     def step(self, block: Block, step: Step, x: FloatArray, P: FloatArray) -> Verdict:
-        """Update both banks with a block, one `step` after the previous one, and compare them.
+        """Update both banks with a block and return the result of their comparison with the filter.
 
-        They are compared with the filter's estimate after that block: `x` (6,) and its covariance `P`
-        (6, 6).
+        `step` is the motion since the previous block. `x` (6,) and `P` (6, 6) are the filter's estimate after
+        the block.
         """
         # Collect blocks until the competing filters are worth an update.
         self._waiting.append(block)
@@ -165,13 +163,13 @@ class IntegrityMonitor:
 
     def _compare(self, x: FloatArray, P: FloatArray) -> Verdict:
         there, spread = self.elsewhere.moments()
-        # Another place has won if its odds pass the threshold and it is another place indeed.
+        # Another place has won if its odds pass the threshold and it is not the filter's place.
         if self.odds > self._threshold and squared_mahalanobis(there - x, P) > ELSEWHERE:
             return Verdict.ELSEWHERE
-        # As long as *elsewhere* covers several places, nothing is decided.
+        # As long as *elsewhere* covers several places, the comparison stays open.
         if widest(spread) > 1.5 * max(self.elsewhere.resolution, widest(P)):
             return Verdict.OPEN
-        # Spread out and started wide, it came back to the filter's place: the filter holds.
+        # *elsewhere* started wide and converged to the filter's place: the filter holds.
         if squared_mahalanobis(there - x, spread + P) < MAX_AGREEING_DISTANCE:
             return Verdict.HOLDS
         here, narrow = self.here.moments()  # where the filter would be without its single linearisation

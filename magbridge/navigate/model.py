@@ -6,14 +6,14 @@ vehicle does, and one model serves every estimator, the smoother and the bound:
 ==  =========================================  =====================================================
 0   north, m                                   of the true position from the dead-reckoned one
 1   east, m
-2   current north, m/s                         what carries the dead reckoning off; slow Gauss-Markov
+2   current north, m/s                         velocity error of dead reckoning; slow Gauss-Markov
 3   current east, m/s
 4   calibration bias, nT                       Gauss-Markov in time
-5   map error, nT, where it is typical         Gauss-Markov in the distance travelled
+5   map error, nT, at a typical node           Gauss-Markov in the distance travelled
 ==  =========================================  =====================================================
 
-:class:`Collector` averages samples into a block while the map is linear between them. A block is full when
-the next sample, as far on as the last, would lie beyond it. Where every step is longer than a block, every
+:class:`Collector` averages samples into a block while the map is linear between them. A block is full if the
+next sample, at the same spacing, would lie beyond it. If samples are farther apart than a block is long, each
 sample is a block.
 """
 
@@ -41,34 +41,34 @@ __all__ = [
 N_STATES = 6
 NO_MOTION_NOISE = MotionNoise()
 MAX_SPREAD_FRACTION = 0.35
-"""Share of the spread that one measurement allows: errors of successive ones are correlated and add up."""
+"""Fraction of the spread that the noise of one measurement allows: errors of successive ones add up."""
 MIN_SIGMA_NT = 1e-3
-"""Smallest sigma of a sample that is used, nT."""
+"""Lower limit of a sample's sigma, nT."""
 
 
 class Block(NamedTuple):
-    """Samples close enough together to be one measurement."""
+    """Mean of samples that are close enough together to be one measurement."""
 
     time_us: int
     """Mean time of the samples, µs."""
     latitude: float
     longitude: float
-    """`latitude`, `longitude`: deg, dead-reckoned, their mean."""
+    """`latitude`, `longitude`: mean dead-reckoned position, deg."""
     anomaly: float
     """Total field minus the main field at the dead-reckoned position, nT."""
     variance: float
-    """Variance of that mean, nT²."""
+    """Variance of `anomaly`, nT²."""
     slope_north: float
     slope_east: float
-    """`slope_north`, `slope_east`: nT/m, of the main field."""
+    """`slope_north`, `slope_east`: slopes of the main field, nT/m."""
     depth: float = nan
     """Mean depth, m; NaN stands for the map's own height."""
 
 
 def average(blocks: Sequence[Block] | FloatArray) -> Block:
-    """Return several blocks, or rows (n, 8) of their fields, as one: their mean, weighted by precision.
+    """Return the precision-weighted mean of several blocks, or of rows (n, 8) of their fields, as one block.
 
-    Its variance is that of independent ones.
+    Its variance is that of a mean of independent measurements.
     """
     rows = np.array(blocks)
     start, _, longitude, *_ = rows[0].tolist()
@@ -82,7 +82,10 @@ def average(blocks: Sequence[Block] | FloatArray) -> Block:
 
 
 def prior(options: NavigationOptions, position_sigma: float | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return mean (6,) and covariance (6, 6) before anything was measured."""
+    """Return mean (6,) and covariance (6, 6) of the states before the first measurement.
+
+    `position_sigma` is the 1-sigma of the position, m; default ``options.start_sigma``.
+    """
     o = options
     sigma = o.start_sigma if position_sigma is None else position_sigma
     sigmas = [sigma, sigma, o.current_sigma, o.current_sigma, o.bias_sigma, o.map_sigma]
@@ -92,14 +95,14 @@ def prior(options: NavigationOptions, position_sigma: float | None = None) -> tu
 def transition(
     options: NavigationOptions, seconds: float, metres: float, motion: MotionNoise = NO_MOTION_NOISE
 ) -> tuple[FloatArray, FloatArray]:
-    """Return F and Q (6, 6) over a time (s) and a distance through the water (m).
+    """Return transition F and noise covariance Q, (6, 6), over a time (s) and a distance through water (m).
 
     `motion` is the uncertainty of the dead-reckoned motion in that time, in addition to ``options.drift``.
 
     Notes
     -----
-    A Gauss-Markov state keeps ``a = exp(-Δ/τ)`` of itself and gains the variance ``σ²(1 - a²)``. The current
-    is carried into the position to second order in Δ/τ.
+    A Gauss-Markov state keeps ``a = exp(-Δ/τ)`` of itself and gains the variance ``σ²(1 - a²)``. The position
+    integrates the current, to second order in Δ/τ.
     """
     o = options
     f, q = np.eye(N_STATES), np.zeros((N_STATES, N_STATES))
@@ -122,7 +125,7 @@ def transition(
 
 
 def measurement_row(north: float, east: float, errors: float = 1.0) -> FloatArray:
-    """Return H (1, 6): the field's slopes, 1 for the calibration's bias, and how many errors of the map."""
+    """Return H (1, 6): the field's slopes (nT/m), 1 for the bias, and `errors` as the factor of map error."""
     return np.array([[north, east, 0.0, 0.0, 1.0, errors]])
 
 
@@ -134,14 +137,14 @@ def block_length(grid: AnomalyGrid) -> float:
 def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -> float:
     """Return the position spread, m, within which the map is linear to the noise of one measurement.
 
-    `variance` (nT²) is that of a measurement. A sixteenth of what bias and map error gain until the next is
-    added (as for half the spread): those errors persist, as the error by curvature does.
+    `variance` (nT²) is the noise of a measurement. The function adds 1/16 of the variance that bias and map
+    error gain until the next measurement: those errors persist, as the curvature error does.
 
     Notes
     -----
-    A spread s sees the curvature k as an error of variance ``(k s²)²/2``. With ``k = √3 σ/L²``, the rms
-    second derivative of a map of scatter σ and covariance ``exp(-r²/2L²)``, that stays below the noise r
-    while ``s² < √2 r/k``; and never more than a quarter of L, beyond which no Taylor series holds.
+    Within a spread s, a curvature k causes an error of variance ``(k s²)²/2``. A map of scatter σ and
+    covariance ``exp(-r²/2L²)`` has the rms curvature ``k = √3 σ/L²``. The error stays below a noise of sigma
+    n while ``s² < √2 n/k``. The spread is at most L/4, beyond which the Taylor series fails.
     """
     length = grid.correlation_length
     if not np.isfinite(length) or grid.rms == 0.0:
@@ -154,16 +157,16 @@ def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -
 
 
 class Collector:
-    """Subtract the main field where dead reckoning puts the vehicle, and average until the block is full.
+    """Collector of samples into blocks: it subtracts the main field, and averages until a block is full.
 
-    Samples are weighted by their precision, so that one in ten taken with a mass in motion does no harm. A
-    block covers at most `step` m.
+    The main field is that at the dead-reckoned position. Weights are precisions, so that the few samples
+    taken while a mass moves do no harm. A block covers at most `step` m.
 
     Notes
     -----
     The mean of n samples over a time T, of noise σ with correlation time τ, has the variance
-    ``σ² max(1/n, 2τ/(T + 2τ))``. The rest of a sample's variance does not average out; the part of it that is
-    the filter's bias is subtracted, because the filter has a state for it.
+    ``σ² max(1/n, 2τ/(T + 2τ))``. The rest of a sample's variance does not average out. The variance of the
+    bias is subtracted from that rest, because the filter has a state for the bias.
     """
 
     def __init__(self, options: NavigationOptions, step: float) -> None:
@@ -171,15 +174,16 @@ class Collector:
         self._white = inf if options.noise is None else options.noise**2
         self._bias = options.bias_sigma**2
         self._main_field = NearbyField()
-        self._rows = array("d")  # of numbers, a block of one sample each: 20,000 of them are averaged in 1 ms
-        self._start_us, self._begun = 0, 0.0  # the first of them: when, and m travelled until then
-        self._last: tuple[float, float] | None = None  # the sample before: when, and m travelled until then
+        self._rows = array("d")  # each sample as the fields of a block: 20,000 are averaged in 1 ms
+        self._start_us, self._begun = 0, 0.0  # time and m travelled at the first sample of the block
+        self._last: tuple[float, float] | None = None  # time and m travelled at the previous sample
 
     def add(
         self, time_us: int, reckoning: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
     ) -> Block | None:
-        """Add a sample; return the block that it fills, or the one that it is too far away to join.
+        """Add a sample; return the block that this completes, or None.
 
+        A sample too far from the block in time or distance completes it, and begins the next block.
         `utc_offset_us` is added to `time_us` for UNIX time: the main field depends on the date. `total_field`
         and its 1-sigma `sigma` are in nT.
         """
@@ -194,7 +198,7 @@ class Collector:
         block = self.flush() if apart else None
         if not self._rows:
             self._start_us, self._begun = there
-        # the first sample of all is a block by itself: how long a step is, is not known yet
+        # The very first sample is a block by itself, because the spacing of samples is not known yet.
         wait, step = (there[0] - self._last[0], there[1] - self._last[1]) if self._last else (inf, inf)
         self._last = there
         anomaly, variance = total_field - main, max(sigma, MIN_SIGMA_NT) ** 2

@@ -1,6 +1,6 @@
-"""The navigator: telemetry and corrected samples in, in order of time; a position with its uncertainty out.
+"""The navigator: it turns telemetry and corrected samples, in order of time, into positions with uncertainty.
 
-Pure in event time, with nothing random in it: a replay gives the same bits. ::
+It uses only event time and no random numbers, so that a replay gives the same bits. ::
 
     nav = Navigator(read_grid("grid.nc"), NavigationOptions(start_sigma=100.0))
     nav.fix(t_us, latitude, longitude)
@@ -30,24 +30,24 @@ __all__ = ["NO_POSITION_FLAGS", "Navigator"]
 
 NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED)
 MAX_SAMPLE_AGE_S = 10.0
-"""s by which a sample may be older than the dead-reckoned position, which does not go back to its place."""
+"""Largest age of a usable sample relative to the dead-reckoned position, which cannot go back, s."""
 MAX_UPDATE_AGE_INTERVALS = 3.0
-"""Age of an update, in intervals, from which on no position is dead-reckoned from it."""
+"""Largest age of an update from which a position is still dead-reckoned, in intervals."""
 
 
 class Navigator:
-    """Position from the total field and a map, around a dead-reckoned track.
+    """Estimator of the position from the total field and a map, relative to a dead-reckoned track.
 
     Attributes
     ----------
     estimate : Estimate
-        The position around the dead-reckoned track, and whether to trust it.
+        Position relative to the dead-reckoned track, and its validity.
     gnss : GnssMonitor
-        Whether the positions of the receiver are used.
+        Test of the GNSS receiver's positions.
     dropped : int
         Number of samples that were dropped because they came out of time order, or too late.
     utc_offset_us : int
-        µs to be added to the samples' times for UNIX time, where the host's clock was set since the start.
+        Offset from the samples' times to UNIX time, µs; not 0 if the host's clock was set since the start.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions | None = None) -> None:
@@ -62,18 +62,19 @@ class Navigator:
     def fix(
         self, time_us: int, latitude: float, longitude: float, sigma: float | None = None
     ) -> Record | None:
-        """Update with a position, the start or a GPS fix; return the update that it completes.
+        """Start at a position, deg, or fuse it as a fix; return the update that this completes, or None.
 
-        `sigma` is that of each axis, m; default ``options.start_sigma``.
+        The update is from samples taken before. `sigma` is the position's 1-sigma on each axis, m; default
+        ``options.start_sigma``.
         """
         return self._correct(time_us, (latitude, longitude), sigma, None)
 
     def gnss_position(
         self, time_us: int, latitude: float, longitude: float, sigma: float | None = None
     ) -> Record | None:
-        """Test a position of a GNSS receiver, use it if it is good; return the update that it completes.
+        """Test a GNSS position, and fuse it if it passes; return the update that this completes, or None.
 
-        Parameters as in :meth:`fix`; :attr:`gnss` has the result of the test.
+        Parameters are as in :meth:`fix`; :attr:`gnss` has the result of the test.
         """
         if not (isfinite(latitude) and isfinite(longitude)):
             return None
@@ -81,7 +82,7 @@ class Navigator:
         known = estimate.options.start_sigma if sigma is None else sigma
         self._reckoning.advance(time_us * 1e-6)
         if not estimate.begun:
-            # nothing to compare with: only the receiver's own report counts
+            # There is no estimate to compare with: only the receiver's own report counts.
             wide, zero, o = np.eye(2) * 1e12, np.zeros(2), estimate.options
             nothing = Prediction(
                 zero, wide, wide, zero, o.current_sigma, 0.0, 0.0, 0.0, lost=False, informed=False
@@ -100,7 +101,7 @@ class Navigator:
         return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
 
     def _prediction(self, time_us: int) -> Prediction:
-        """Return the predicted position at a time from the last update on."""
+        """Return the predicted position at `time_us`, not earlier than the last update."""
         now, where = self.estimate, self._reckoning
         # Prediction of the state; the receiver's own deviation is measured relative to dead reckoning.
         F, Q = transition(now.options, max((time_us - now.time_us) * 1e-6, 0.0), 0.0)
@@ -115,7 +116,10 @@ class Navigator:
     def _correct(
         self, time_us: int, place: tuple[float, float], sigma: float | None, fused_sigma: float | None
     ) -> Record | None:
-        """Use a position, deg; return the update that it completes."""
+        """Start at `place`, deg, or fuse it as a fix; return the update that this completes, or None.
+
+        `sigma` (m) is for the start and the test of the fix, `fused_sigma` (m) for its fusion.
+        """
         if not (isfinite(place[0]) and isfinite(place[1])):
             return None
         sigma = self.estimate.options.start_sigma if sigma is None else sigma
@@ -134,32 +138,32 @@ class Navigator:
         return record
 
     def telemetry(self, time_us: int, **values: float) -> None:
-        """Update the dead reckoning with telemetry, named as in :meth:`DeadReckoning.telemetry`."""
+        """Update dead reckoning with telemetry; names and units are as in :meth:`DeadReckoning.telemetry`."""
         self._reckoning.telemetry(time_us * 1e-6, values)
 
     def new_motion(self, time_us: int) -> None:
-        """From now on the motion is known by other telemetry."""
+        """Prepare for a new source of motion from `time_us` on: forget the old one, widen the current."""
         self._reckoning.advance(time_us * 1e-6)
         self._reckoning.forget()
         self.estimate.widen_current(self.estimate.options.current_sigma)
         self.gnss.new_motion()
 
     def widen_heading(self, time_us: int, sigma: float) -> None:
-        """Count an error of the heading of 1-sigma `sigma`, rad, that dead reckoning has from now on."""
+        """Widen the current by the effect of a heading error of 1-sigma `sigma`, rad, from `time_us` on."""
         self._reckoning.advance(time_us * 1e-6)
         self.estimate.widen_current(sigma * self._reckoning.speed)
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
-        """Add a corrected sample; return the update that it completes, or None."""
+        """Add a corrected sample; return the update that this completes, or None."""
         if corrected.quality & NO_POSITION_FLAGS:
             return None
         return self.measure(time_us, corrected.total_field, corrected.total_field_sigma)
 
     def measure(self, time_us: int, total_field: float, sigma: float) -> Record | None:
-        """Add a total field and its 1-sigma, nT; return the update that it completes, or None.
+        """Add a total field and its 1-sigma, nT; return the update that this completes, or None.
 
-        A sample is ignored if it is NaN, not later than the previous one, older than the dead-reckoned
-        position by more than :data:`MAX_SAMPLE_AGE_S`, or before any position.
+        The navigator ignores a sample that is NaN, not later than the previous sample, older than the
+        dead-reckoned position by more than :data:`MAX_SAMPLE_AGE_S`, or earlier than the first position.
         """
         if self.estimate.state is NavigationState.OFF or not isfinite(total_field + sigma):
             return None
@@ -173,14 +177,14 @@ class Navigator:
         return None if block is None else self._update(block)
 
     def finish(self) -> Record | None:
-        """Return the update from the samples collected so far; None if there are none."""
+        """Update with the samples collected so far and return the record; None without samples."""
         block = self._collector.flush()
         return None if block is None else self._update(block)
 
     def reckon(self, time_us: int) -> Reckoned | None:
-        """Return the position at a time after the last update, dead-reckoned from there; nothing is changed.
+        """Return the position at `time_us`, dead-reckoned from the last update; the filter does not change.
 
-        None if it is not valid: the last update was not, or is too long ago.
+        Return None if the last update is invalid or too old, or the position is too uncertain.
         """
         last = self.estimate
         elapsed = (time_us - last.time_us) * 1e-6
@@ -188,7 +192,7 @@ class Navigator:
             return None
         F, Q = transition(last.options, max(elapsed, 0.0), 0.0)
         x, P = F @ last.x, F @ last.P @ F.T + Q
-        # A position that is too uncertain is not sent, however valid it was.
+        # Do not send a position that has become too uncertain since the valid update.
         if widest(P) > last.options.sigma_limit:
             return None
         place = offset(*self.reckoned(time_us), float(x[0]), float(x[1]))
@@ -196,7 +200,7 @@ class Navigator:
         return Reckoned(time_us, *place, nn, ne, ee)
 
     def reckoned(self, time_us: int) -> tuple[float, float]:
-        """Return latitude and longitude by dead reckoning alone, at a time from the last one on."""
+        """Return latitude and longitude, deg, by dead reckoning alone at `time_us`."""
         return self._reckoning.extrapolate(time_us * 1e-6)
 
     def _update(self, block: Block) -> Record:

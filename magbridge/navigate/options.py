@@ -1,4 +1,4 @@
-"""Options: how well start, current, calibration and map are known; and the map at the vehicle's depth."""
+"""Prior uncertainties of start, current, calibration and map; and the map at the vehicle's depth."""
 
 from __future__ import annotations
 
@@ -17,42 +17,41 @@ from magbridge.field.grid import AnomalyGrid
 __all__ = ["NavigationOptions", "any_level", "at_depth", "informed", "lasting_errors", "with_level"]
 
 MAX_NOISE_INTERVALS = 3.0
-"""Longest correlation time of noise, in intervals; noise with a longer one becomes a bias."""
+"""Longest correlation time of noise, in update intervals; noise with a longer one counts as a bias."""
 LEG_TIME_S = 1_800.0
 """Duration of a leg between turns, or from dive to climb, s."""
 
 
 class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How well things are known beforehand; all 1-sigma."""
+    """Prior uncertainties (1-sigma) and limits of the navigator."""
 
     start_sigma: Positive = 50.0
-    """Sigma of the first position on each axis, m."""
+    """1-sigma of the first position on each axis, m."""
     current_sigma: NotNegative = 0.1
     current_time: Positive = 21_600.0
-    """`current_sigma`, `current_time`: m/s and s: the current, and its correlation time."""
+    """`current_sigma`, `current_time`: 1-sigma of the current, m/s, and its correlation time, s."""
     drift: NotNegative = 0.2
-    """m/sqrt(s), random walk of the dead reckoning."""
+    """Random walk of the dead reckoning, m/sqrt(s)."""
     motion_error: NotNegative = 0.02
-    """Relative error of speed, and of heading in rad: what a turn adds to the uncertainty of the current, as
-    a fraction of the change of velocity."""
+    """Relative error of the speed, and error of the heading in rad. A turn adds this fraction of its change
+    of velocity to the uncertainty of the current."""
     bias_sigma: NotNegative = 5.0
     bias_time: Positive = 21_600.0
-    """`bias_sigma`, `bias_time`: nT and s: the error that the calibration leaves, and its correlation time.
-    """
+    """`bias_sigma`, `bias_time`: 1-sigma of the calibration's residual error, nT; correlation time, s."""
     map_sigma: NotNegative = 2.0
     map_length: Positive = 1_000.0
-    """`map_sigma`, `map_length`: nT and m: the map's error, and its correlation length. Independent errors of
-    single nodes are the grid's own sigma."""
+    """`map_sigma`, `map_length`: 1-sigma of the map's error, nT, and its correlation length, m. Independent
+    errors of single nodes are the grid's own sigma."""
     noise: NotNegative | None = None
-    """White part of a sample's sigma, nT; of the rest, what goes beyond ``bias_sigma`` does not
-    average out. None: all of it is white."""
+    """White noise of a sample, nT. The rest of the sample's sigma beyond ``bias_sigma`` does not average out.
+    None: all of the sigma is white noise."""
     noise_time: NotNegative = 0.0
-    """Correlation time of that noise, s; noise that lasts longer than a few intervals belongs to the bias."""
+    """Correlation time of ``noise``, s; noise that lasts longer than a few intervals belongs to the bias."""
     gate: Positive = 16.0
-    """Largest innovation squared over its variance that is accepted."""
+    """Largest squared innovation over its variance that the filter accepts."""
     interval: NotNegative = 20.0
-    """Time over which samples are averaged to one update, s; less if the vehicle has moved 2 % of the map's
-    correlation length."""
+    """Longest time over which samples are averaged to one update, s. Averaging ends earlier if the vehicle
+    has moved 2 % of the map's correlation length."""
     sigma_limit: Positive = 500.0
     """Largest 1-sigma of a valid position, m."""
     alarm_odds: Positive = 2_000.0
@@ -60,16 +59,16 @@ class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 def informed(options: NavigationOptions, calibration: Calibration, sigma: float) -> NavigationOptions:
-    """Return options that include a calibration's own errors, with `sigma` (nT) that of a typical sample.
+    """Return options that include the calibration's errors; `sigma` (nT) is the 1-sigma of a typical sample.
 
-    The bias of `options` is that of all other sources: the map's level, the field's variation in time.
+    The bias of `options` covers all other sources: the map's level, the field's variation in time.
 
     Notes
     -----
-    The white part is the noise of the calibration runs. If that noise was correlated for longer than a few
-    updates, it does not average out: it becomes a bias with the same correlation time, and the white part
-    is what drives it, ``σ √(1 - ρ²)`` with ρ the correlation from sample to sample. A calibration's other
-    errors depend on attitude and masses, and last for a leg; its level is that of all samples.
+    The white noise is that of the calibration runs. If their noise was correlated for longer than a few
+    updates, it does not average out. It then counts as a bias with the same correlation time, and the white
+    noise is its driving noise ``σ √(1 - ρ²)``, with ρ the correlation from sample to sample. Other errors of
+    a calibration depend on attitude and masses, and last for a leg; the reference bias is constant.
     """
     # AR(1) noise with the correlation rho from sample to sample: correlation time -dt / log(rho).
     noise = calibration.noise
@@ -95,22 +94,25 @@ def informed(options: NavigationOptions, calibration: Calibration, sigma: float)
 
 
 def with_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
-    """Return options with a level that is uncertain by a further `sigma`, nT, and changes as before."""
+    """Return options whose bias has a further uncertainty of `sigma`, nT, but the same driving noise."""
     return _wider_level(options, hypot(options.bias_sigma, sigma)) if sigma else options
 
 
 def any_level(options: NavigationOptions, grid: AnomalyGrid) -> NavigationOptions:
-    """Return options with which the field's level carries no information, its changes as much as before."""
+    """Return options whose bias is at least as uncertain as the map's RMS, with the same driving noise.
+
+    The field's absolute value then carries no information, but its changes do.
+    """
     return _wider_level(options, grid.rms)
 
 
 def _wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
-    """Return options with a level of at least `sigma`, nT, whose changes are as large as before.
+    """Return options whose bias has a 1-sigma of at least `sigma`, nT, and the same driving noise.
 
     Notes
     -----
-    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). σ is raised, and τ in proportion to σ²,
-    so that it stays the same.
+    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). It stays the same if τ rises in
+    proportion to σ².
     """
     o = options
     if o.bias_sigma >= sigma:
@@ -121,21 +123,22 @@ def _wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
 
 
 NEGLIGIBLE_FRACTION = 0.1
-"""Interpolation error over the map error, below which the sum of both is less than 1 % larger."""
+"""Largest negligible interpolation error over the map error: their sum is then less than 1 % larger."""
 
 
 def at_depth(
     grid: AnomalyGrid, options: NavigationOptions, depth: ArrayLike
 ) -> tuple[AnomalyGrid, NavigationOptions]:
-    """Return the map at the vehicle's depth, and options whose map error includes what that and nodes cost.
+    """Return the map at the vehicle's depth, and options with the errors of continuation and interpolation.
 
     A map of unknown altitude is returned as it is. `depth` (n,), m, is the vehicle's; NaN is ignored, and
     without any depth the map is continued to the surface.
 
     Notes
     -----
-    Independent errors of the map add their variances σᵢ² and the mean squares of their slopes, σᵢ²/Lᵢ², so
-    that together 1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ². The error between nodes is as long as half their spacing.
+    Independent errors of the map add their variances σᵢ² and the mean squares of their slopes, σᵢ²/Lᵢ². The
+    correlation length L of the sum follows from 1/L² = Σ(σᵢ²/Lᵢ²) / Σσᵢ². The correlation length of the
+    interpolation error is half the spacing of the nodes.
     """
     known = np.asarray(depth, float)
     known = known[np.isfinite(known)]
@@ -148,12 +151,11 @@ def at_depth(
 
 
 def lasting_errors(grid: AnomalyGrid, options: NavigationOptions) -> tuple[AnomalyGrid, NavigationOptions]:
-    """Return the map and options whose map error has the sigma that lasts from sample to sample.
+    """Return map and options in which correlated errors of the map are in the filter's map error and bias.
 
-    A sigma with a ``sigma_length`` is correlated along the track, as the filter's map error is, and the noise
-    of a measurement is not. The state is a typical error, the map's median and that of the options; by how
-    much it counts at a node, the map's sigma there says, with that of the options in it. The map's level is
-    a bias.
+    A sigma of the map with a ``sigma_length`` is correlated along the track. It belongs to the filter's
+    state of map error, not to the noise of a measurement. The state is a typical error, from the median sigma
+    and the options; the map's sigma at a node scales it. The sigma of the map's level adds to the bias.
     """
     options = with_level(options, grid.level_sigma)
     if grid.level_sigma:
@@ -167,7 +169,7 @@ def lasting_errors(grid: AnomalyGrid, options: NavigationOptions) -> tuple[Anoma
 
 
 def _added(options: NavigationOptions, errors: list[tuple[float, float]]) -> NavigationOptions:
-    """Return options whose map error includes others, of a sigma, nT, and a length, m."""
+    """Return options whose map error includes `errors`, pairs of a sigma, nT, and a correlation length, m."""
     whole = [*errors, (options.map_sigma, options.map_length)]
     sigma = hypot(*(sigma for sigma, _ in whole))
     # sigma^2 = sum s_i^2 and (sigma / L)^2 = sum (s_i / L_i)^2.

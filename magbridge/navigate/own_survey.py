@@ -1,13 +1,13 @@
-r"""Localisation without a map: the track is bent to where the field that it met repeats itself.
+r"""Localisation without a map: estimate the track along which the measured field is consistent with itself.
 
 .. math:: y_i = f(x_i + d(t_i)) + b(t_i) + e_i
 
-d is the error of dead reckoning, b that of the calibration, f a Gaussian field in place whose size and
-length the data choose: localisation and mapping at once, as 'MagSLAM' (Lee & Canciani 2020), by a
-Rao-Blackwellised sampler: f is integrated out, and particles follow the posterior of d as the track goes on
-(:mod:`.particles`). One crossing leaves a curve of drifts that agree with it, and a drift as large as the
-field's length several: no single track with a Gaussian sigma describes that, the particles' spread does.
-Where the field says nothing they stay where dead reckoning has them.
+d is the drift (the error of dead reckoning), b the error of the calibration, and f a Gaussian random field in
+space, whose amplitude and correlation length the data determine. This is simultaneous localisation and
+mapping, as 'MagSLAM' (Lee & Canciani 2020), by a Rao-Blackwellised sampler: f is integrated out, and
+particles sample the posterior of d (:mod:`.particles`). One crossing of the track leaves a curve of possible
+drifts; a drift as large as the correlation length leaves several curves. Particles represent such a
+posterior, a Gaussian would not. Where the field carries no information, particles follow dead reckoning.
 
 The likelihood of a drift d(t) is
 
@@ -15,8 +15,8 @@ The likelihood of a drift d(t) is
 
 .. math:: K_{ij} = s^2 k(|x_i + d_i - x_j - d_j| / \ell) + \beta_{ij} + R_{ij}
 
-The Gaussian field (Rasmussen & Williams 2006, eq. 2.30; gradient eq. 5.9) has the size s and the length l;
-its covariance k is Matérn's of smoothness 5/2 (eq. 4.17).
+The Gaussian field (Rasmussen & Williams 2006, eq. 2.30; gradient eq. 5.9) has the amplitude s and the
+correlation length l; its covariance k is Matérn's of smoothness 5/2 (eq. 4.17).
 """
 
 from __future__ import annotations
@@ -47,27 +47,27 @@ from magbridge.navigate.particles import sample
 __all__ = ["OwnField", "drift_functions", "localise", "own_bound"]
 
 BLOCK_LENGTH_M, MIN_BLOCKS_PER_LOG, MAX_TRACK_BLOCKS = 60.0, 100.0, 400
-"""Limits of a block: its length, m, and the number of blocks that a log has at least. Of more than the last
-number, every second or third block is used."""
+"""Length of a block, m; smallest number of blocks in a log; largest number of blocks that are used. If there
+are more, only every second or third block is used."""
 MIN_TRACK_BLOCKS = 12
-"""Blocks."""
+"""Smallest number of blocks from which a track is estimated."""
 STAGE_COUNT, PARTICLE_COUNT = 10, 80
-"""Parts in which the track is processed, and number of tracks (particles)."""
+"""Number of stages in which the sampler adds the blocks, and number of particles (tracks)."""
 MIN_LOST_FRACTION = 0.49
-"""Fraction of the blocks from which on a track can be lost."""
+"""Fraction of the blocks that must be processed before a track can be lost."""
 MAX_NOISE_RATIO = 1.5
-"""Noise over the calibration's from which on field and track contradict each other."""
+"""Smallest estimated noise, over the calibration's, with which field and track contradict each other."""
 MAX_IMPROVED_RATIO = 0.85
-"""Of dead reckoning's sigma: less is worth saying."""
+"""Largest position sigma over dead reckoning's with which the field counts as an improvement."""
 
 
 @dataclass(frozen=True, eq=False)
 class _PosteriorTracks:
-    """The tracks that agree with the field: their errors (k, n, 2), m.
+    """Sample of tracks from the posterior: `moved` (k, n, 2), their errors of dead reckoning, m.
 
-    `typical` (q,) is the track nearest to the mean; `scales` (3,) are the median amplitude, length and noise.
-    Tracks that differ by more than the field's length agree with it at different repetitions, most of which
-    so few particles miss. Then `lost` is set, and the errors are those of dead reckoning alone.
+    `typical` (q,) is the particle nearest to the mean; `scales` (3,) are the median amplitude (nT),
+    correlation length (m) and noise ratio. `lost` is True if the tracks differ by more than the correlation
+    length. So few particles then miss most of the possible tracks, and `moved` is dead reckoning's prior.
     """
 
     moved: FloatArray
@@ -77,7 +77,7 @@ class _PosteriorTracks:
 
     @classmethod
     def from_particles(cls, field: OwnField, u: FloatArray) -> _PosteriorTracks:
-        """Return the tracks of the particles u (k, q)."""
+        """Return the sample of tracks that the particles u (k, q) represent."""
         moved = field.moved(u)
         nearest = int(((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2)).argmin())
         lost = _lost(field, u)
@@ -88,7 +88,7 @@ class _PosteriorTracks:
 def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
     """Return True if tracks u (k, q) differ by more than the field's length over the first `count` blocks.
 
-    Then more blocks do not bring them together: the first half decides.
+    Before half of the blocks, return False. More blocks do not bring tracks together that differ then.
     """
     if count is not None and count < MIN_LOST_FRACTION * len(field.time):
         return False
@@ -103,11 +103,12 @@ def localise(
     *,
     start: tuple[float, float] | None = None,
 ) -> xr.Dataset:
-    """Return the track that the field along it gives, without a map: arguments as :func:`~.batch.navigate`.
+    """Estimate the track of a log from its total field without a map; arguments as :func:`~.batch.navigate`.
 
-    It is on ``time`` of the blocks: position with covariance, ``north east`` from the dead-reckoned one,
-    ``unaided_sigma`` of dead reckoning alone, anomaly and that of the field found; where the log has a better
-    position, ``error_*`` and ``bound_sigma``, the smallest (:func:`own_bound`). Attributes: ``findings``,
+    The dataset is on ``time`` of the blocks. It holds the position with its covariance; ``north east``, the
+    offset from the dead-reckoned position; ``unaided_sigma`` of dead reckoning alone; ``anomaly`` and
+    ``map_anomaly``, measured and estimated. If the log has a better position, ``error_*`` and ``bound_sigma``
+    are the errors and the smallest possible error (:func:`own_bound`), m. Attributes: ``findings``,
     ``motion``, ``reference_track``.
 
     FormatError: no total field, no motion, no start, or no usable sample.
@@ -137,7 +138,7 @@ def localise(
 
 
 def _unaided(field: OwnField) -> FloatArray:
-    """Return errors (4 r, n, 2), m, whose mean is zero and whose covariance is dead reckoning's."""
+    """Return errors (4 r, n, 2), m, of dead reckoning alone: zero mean, and the prior covariance."""
     one = np.sqrt((4 * field.r - 1) / 2.0) * field.drift.T
     north = np.stack([one, np.zeros_like(one)], axis=2)
     return np.concatenate([north, -north, north[..., ::-1], -north[..., ::-1]])
@@ -146,7 +147,7 @@ def _unaided(field: OwnField) -> FloatArray:
 def _blocks(
     deployment: xr.Dataset, options: NavigationOptions, motion: str, start: tuple[float, float], source: str
 ) -> tuple[list[Block], int]:
-    """Return the blocks, and of how many each is one."""
+    """Return the blocks, of which every `step`-th is used, and that `step`."""
     time, field, sigma = samples_of(deployment, source)
     moves = columns_of(deployment, MOTIONS[motion] | {"depth": "depth"})
     interval = max(options.interval, float(time[-1] - time[0]) / MIN_BLOCKS_PER_LOG)
@@ -171,7 +172,7 @@ def _dataset(
     origin: tuple[float, float],
     depth: FloatArray,
 ) -> xr.Dataset:
-    """Return mean and covariance over the tracks, and the field that a typical one finds."""
+    """Return a dataset of mean and covariance over the tracks, and the field along the typical track."""
     moved = found.moved.mean(axis=0)
     # Sample covariance over the particles for each block.
     off = found.moved - moved
@@ -200,7 +201,7 @@ def _dataset(
 def _findings(
     result: xr.Dataset, field: OwnField, found: _PosteriorTracks, step: int
 ) -> Iterator[Diagnostic]:
-    """Yield statements on how much the field improved the track."""
+    """Yield diagnostics on how much the field improved the track."""
     sigma = np.sqrt((result["covariance_nn"] + result["covariance_ee"]).to_numpy())
     alone = result["unaided_sigma"].to_numpy()
     size, length, noise = found.scales.tolist()
@@ -226,17 +227,17 @@ def _findings(
 
 
 FIELD_AMPLITUDE_NT, AMPLITUDE_SPREAD = 50.0, np.log(4.0)
-"""nT of the crustal field, and the 1-sigma of its logarithm: sea floor and land by airborne surveys."""
+"""Prior median of the crustal field's amplitude, nT, and the 1-sigma of its logarithm (airborne surveys)."""
 LENGTH_SPREAD, NOISE_SPREAD = np.log(6.0), np.log(1.3)
-"""1-sigma of the logarithm of the length, and of the noise over what the calibration claims."""
+"""Prior 1-sigmas of the logarithms of the correlation length and of the noise over the calibration's."""
 MIN_LENGTH_SPACINGS, MIN_EXTENT_LENGTHS = 4.0, 2.5
-"""The shortest length expected, over the distance of neighbours; the longest, over the track's extent."""
+"""Shortest correlation length in spacings of blocks; track's extent in the longest correlation length."""
 LEVEL_SCATTERS = 10.0
-"""The level's 1-sigma, over the scatter of the measured field: it is not known."""
+"""Prior 1-sigma of the constant bias, over the scatter of the measured field; practically unknown."""
 COVARIANCE_TIMES, MAX_FUNCTIONS, NEGLIGIBLE_VARIANCE_FRACTION = 240, 48, 1e-4
-"""Times at which a drift's covariance is taken, its functions at most, and the share they may leave out."""
+"""Number of times of the drift's covariance; most drift functions; smallest eigenvalue over the largest."""
 MAX_PRIOR_SIGMAS = 8.0
-"""Sigmas of its prior beyond which no size, length or noise is tried."""
+"""Largest deviation of log amplitude, log length or log noise that is tried, in sigmas of its prior."""
 IMPOSSIBLE_LOG_LIKELIHOOD = -1e300
 """Log likelihood of an impossible track."""
 
@@ -244,8 +245,8 @@ IMPOSSIBLE_LOG_LIKELIHOOD = -1e300
 def drift_functions(time: FloatArray, options: NavigationOptions) -> FloatArray:
     """Return functions (n, r), m, whose sum with weights N(0, 1) is the error of dead reckoning on one axis.
 
-    `time` (n,) is in s. They are Karhunen-Loeve's: eigenvectors of the covariance that the state of
-    :mod:`.model` has, scaled by the root of their eigenvalues.
+    `time` (n,) is in s. It is a Karhunen-Loeve expansion: eigenvectors of the position error's covariance by
+    :mod:`.model`, scaled by the root of their eigenvalues.
     """
     # Covariance C(t_j, t_k) of the position error on a coarse grid of times, from the transition of position
     # and current: P(t_k) propagated forward to t_j.
@@ -268,10 +269,10 @@ def drift_functions(time: FloatArray, options: NavigationOptions) -> FloatArray:
 
 
 class OwnField:
-    """Blocks along a dead-reckoned track at `place` (n, 2), m, and the likelihood of what they measured.
+    """Likelihood of the anomalies measured in blocks along a track dead-reckoned at `place` (n, 2), m.
 
-    The unknown is u (q,), N(0, 1) each beforehand: the weights of the functions `drift` (n, r), m, north (r,)
-    and east (r,), and the logarithms of the field's size, its length and the noise over their spread.
+    The unknown vector u (q,) has the prior N(0, 1). It holds the weights of the functions `drift` (n, r), m,
+    north (r,) and east (r,), and scaled logarithms of the field's amplitude, correlation length and noise.
     """
 
     def __init__(self, blocks: list[Block], place: FloatArray, options: NavigationOptions) -> None:
@@ -293,17 +294,17 @@ class OwnField:
         )
 
     def moved(self, u: FloatArray) -> FloatArray:
-        """Return the error of dead reckoning (n, 2), m, of u (q,); (k, n, 2) of several, (k, q)."""
+        """Return the error of dead reckoning (n, 2), m, for the unknowns u (q,); (k, n, 2) for u (k, q)."""
         by = np.stack([u[..., : self.r], u[..., self.r : 2 * self.r]], axis=-1)
         return np.asarray(self.drift @ by)
 
     def scales(self, u: FloatArray) -> FloatArray:
-        """Return the field's size, nT, its length, m, and the noise over the claimed one: (3,) or (k, 3)."""
+        """Return amplitude (nT) and correlation length (m) of the field, and noise ratio: (3,) or (k, 3)."""
         at_zero = np.array([FIELD_AMPLITUDE_NT, self._middle, 1.0])
         return np.asarray(at_zero * np.exp(u[..., -3:] * (AMPLITUDE_SPREAD, LENGTH_SPREAD, NOISE_SPREAD)))
 
     def log_likelihood(self, u: FloatArray, count: int) -> tuple[float, FloatArray]:
-        """Return log p of the first `count` blocks, up to a constant, and its gradient by u (q,)."""
+        """Return the log likelihood of the first `count` blocks, up to a constant, and its gradient (q,)."""
         gradient = np.zeros(self.q)
         if np.abs(u[-3:]).max() > MAX_PRIOR_SIGMAS:
             return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
@@ -332,16 +333,16 @@ class OwnField:
         return value, gradient
 
     def covariance(self, place: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return K (n, n), nT², with the blocks at places (n, 2), m, and its part R (n,) that is noise."""
+        """Return the covariance K (n, n), nT², of blocks at places (n, 2), m, and its noise part R (n,)."""
         _, _, _, K, R = self._covariance(place, *self.scales(u).tolist())
         return K, R
 
     def slopes(self, place: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the slopes (n, 2), nT/m, of the field that the blocks show if they are at places (n, 2), m.
+        """Return the slopes (n, 2), nT/m, of the field estimated from the blocks at places (n, 2), m.
 
         Notes
         -----
-        The mean, ``∂k(x_i, x) K^-1 y`` (Rasmussen & Williams 2006, eq. 2.25 and section 9.4).
+        Posterior mean ``∂k(x_i, x) K^-1 y`` (Rasmussen & Williams 2006, eq. 2.25 and section 9.4).
         """
         size, length, noise = self.scales(u)
         _, _, h, K, _ = self._covariance(place, size, length, noise)
@@ -350,7 +351,7 @@ class OwnField:
         return np.asarray(weight.sum(axis=1)[:, None] * place - weight @ place)
 
     def _covariance(self, x: FloatArray, size: float, length: float, noise: float) -> tuple[FloatArray, ...]:
-        """Return ``|x_i - x_j|²``, k and h (n, n) of it, K (n, n), and R (n,)."""
+        """Return the squared distances of x (n, 2), k and h at them, K (all (n, n)), and the noise R (n,)."""
         squared = (x[:, None, 0] - x[:, 0]) ** 2 + (x[:, None, 1] - x[:, 1]) ** 2
         # Matern 5/2 in a = sqrt(5) r / l, and h = (dk/dr) l^2 / r
         a = np.sqrt(5.0 * squared) / length
@@ -365,15 +366,15 @@ class OwnField:
 def own_bound(field: OwnField, place: FloatArray, slopes: FloatArray, typical: FloatArray) -> FloatArray:
     """Return the smallest covariance (n, 2, 2), m², that any estimator of the drift could reach.
 
-    `place` (m) and `slopes` (nT/m), (n, 2), are the true places and the field's slopes there; blocks where
-    one is NaN carry no information. Size, length and noise are those of `typical` (q,).
+    `place` (m) and `slopes` (nT/m), (n, 2), are the true places and the field's slopes there. Blocks with a
+    NaN in either carry no information. Amplitude, length and noise are those of the particle `typical` (q,).
 
     Notes
     -----
-    Field and drift are linearised at the truth, jointly Gaussian; with the field integrated out the posterior
-    Cramér-Rao bound of the drift's weights is ``(I + G' K^-1 G)^-1``, G the slopes times the drift's
-    functions (Tichavský, Muravchik & Nehorai 1998, eq. 21, for one batch). The field's covariance is taken
-    as known.
+    Linearised at the truth, field and drift are jointly Gaussian. With the field integrated out, the bound of
+    the drift's weights is ``(I + G' K^-1 G)^-1``. G is the product of the slopes and the drift's functions
+    (posterior Cramér-Rao bound: Tichavský, Muravchik & Nehorai 1998, eq. 21, for one batch). The field's
+    covariance is assumed known.
     """
     whole = np.asarray(np.isfinite(np.hstack([place, slopes])).all(axis=1))
     K = field.covariance(np.where(whole[:, None], place, 0.0), typical)[0][np.ix_(whole, whole)]
@@ -386,7 +387,10 @@ def own_bound(field: OwnField, place: FloatArray, slopes: FloatArray, typical: F
 
 
 def with_bound(result: xr.Dataset, field: OwnField, moved: FloatArray, typical: FloatArray) -> xr.Dataset:
-    """Add the smallest error possible, m, to a track that is `moved` (n, 2), m, and whose error is known."""
+    """Return `result` with ``bound_sigma``, the smallest possible position error, m.
+
+    `moved` (n, 2), m, is the track's offset from dead reckoning; `result` holds its known error.
+    """
     error = np.stack([result["error_north"], result["error_east"]], axis=1)
     true = field.place + moved - error
     whole = np.isfinite(true).all(axis=1)

@@ -1,9 +1,9 @@
-"""A sequential Monte Carlo sampler: particles that follow a posterior as data comes in.
+"""A sequential Monte Carlo sampler: particles sample a posterior while the data grows in stages.
 
-Between two stages of data the new likelihood is let in by a power that grows from 0 to 1 in steps which leave
-half of the particles effective; after each they are resampled and moved by Hamiltonian Monte Carlo, in the
-metric of their own covariance (Del Moral, Doucet & Jasra 2006, section 3; adaptive steps: Jasra et al. 2011).
-Where a posterior is bent or has several maxima, the particles show it; a Gaussian would not.
+In each stage, the power of the new likelihood grows from 0 to 1 in steps that leave half of the particles
+effective (Del Moral, Doucet & Jasra 2006, section 3; adaptive steps: Jasra et al. 2011). After each step the
+particles are resampled, and moved by Hamiltonian Monte Carlo in the metric of their covariance. Particles
+represent a curved posterior or one with several maxima, which a Gaussian would not.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from magbridge.arrays import FloatArray
 __all__ = ["Likelihood", "sample"]
 
 Evaluation = tuple[float, FloatArray]
-"""A log density and its gradient by u (q,)."""
+"""Log density, and its gradient (q,) with respect to u (q,)."""
 Likelihood = Callable[[FloatArray, int], Evaluation]
-"""``f(u, count)``: log likelihood of the first `count` data."""
+"""``f(u, count)``: log likelihood of the first `count` data, and its gradient."""
 
 MIN_EFFECTIVE_FRACTION = 0.5
-"""Fraction of the particles that stays effective in a step."""
+"""Smallest fraction of the particles that stays effective in a tempering step."""
 MOVES_PER_STEP, LEAPFROG_STEPS = 2, 6
-"""Moves after a step, and leaps in a move."""
+"""Moves of a particle after a tempering step, and leapfrog steps in a move."""
 TARGET_ACCEPTANCE, MAX_STEP_SIZE = 0.7, 1.0
-"""Fraction of moves to be accepted, and the longest step_size, in the metric's unit."""
+"""Target fraction of accepted moves, and the largest leapfrog step, in units of the metric."""
 MAX_ENERGY_ERROR = 1e3
-"""Loss of log posterior after which a move is given up."""
+"""Loss of log posterior beyond which a move is abandoned."""
 DIAGONAL_FRACTION = 0.1
-"""Fraction of the metric that takes the unknowns as independent: few particles do not tell."""
+"""Weight of the diagonal in the metric: few particles do not determine a full covariance."""
 
 
 def sample(
@@ -40,10 +40,10 @@ def sample(
     number: int,
     stop: Callable[[FloatArray, int], bool] = lambda _u, _count: False,
 ) -> FloatArray:
-    """Return particles u (number, q) of the posterior of unknowns that are N(0, 1) beforehand.
+    """Return particles u (number, q) of the posterior of q unknowns whose prior is N(0, 1).
 
-    `counts` is the number of data after each stage. The sampler ends early where `stop`, given the particles
-    and the count, is True.
+    `counts` is the number of data after each stage. The sampler ends early if ``stop(u, count)`` is True
+    after a stage.
     """
     mover = _Mover(likelihood, np.random.default_rng(0))
     u = mover.rng.normal(size=(number, q))
@@ -66,7 +66,10 @@ def sample(
 
 
 def _next_power(gained: FloatArray, power: float) -> tuple[float, FloatArray]:
-    """Return the next power of the new likelihood, and the particles' weights (k,) by their gain."""
+    """Return the next power of the new likelihood, and the particles' weights (k,) at this power.
+
+    `gained` (k,) is the gain of log likelihood by the new data, and `power` the power so far.
+    """
 
     def weighed(to: float) -> FloatArray:
         w = np.exp((to - power) * (gained - gained.max()))
@@ -85,7 +88,7 @@ def _next_power(gained: FloatArray, power: float) -> tuple[float, FloatArray]:
 
 
 def _metric(u: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return a root of the particles' covariance (q, q)."""
+    """Return the Cholesky factor (q, q) of the weighted particles' covariance, shrunk to its diagonal."""
     off = u - weights @ u
     C = off.T @ (off * weights[:, None])
     # Shrink towards the diagonal: few particles do not determine a full covariance.
@@ -94,7 +97,7 @@ def _metric(u: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 class _Mover:
-    """Hamiltonian moves of particles, which leave their distribution unchanged (Neal 2011, fig. 2)."""
+    """Hamiltonian Monte Carlo moves, which preserve the particles' distribution (Neal 2011, fig. 2)."""
 
     def __init__(self, likelihood: Likelihood, rng: np.random.Generator) -> None:
         self.likelihood, self.rng = likelihood, rng
@@ -106,19 +109,19 @@ class _Mover:
         self.before, self.count, self.power = self.count, count, 0.0
 
     def evaluate(self, u: FloatArray) -> tuple[Evaluation, Evaluation]:
-        """Return the log likelihood of the data before this stage, and of all after it."""
+        """Return log likelihood and gradient of the data before this stage, and of those including it."""
         before = self.likelihood(u, self.before) if self.before else (0.0, np.zeros(len(u)))
         return before, self.likelihood(u, self.count)
 
     def move(self, u: FloatArray, seen: list[tuple[Evaluation, Evaluation]]) -> None:
-        """Move particles u (k, q) in place, and their likelihoods `seen`; adapt the step size."""
+        """Move the particles u (k, q) and update their likelihoods `seen` in place; adapt the step size."""
         for _ in range(MOVES_PER_STEP):
             accepted = sum(self._move_one(u, seen, i) for i in range(len(u)))
             growth = np.exp(0.5 * (accepted / len(u) - TARGET_ACCEPTANCE))
             self.step_size = min(self.step_size * float(growth), MAX_STEP_SIZE)
 
     def _move_one(self, u: FloatArray, seen: list[tuple[Evaluation, Evaluation]], i: int) -> bool:
-        """Move one particle along its posterior's slope; return True if the move was accepted."""
+        """Try a Hamiltonian move of particle `i`; return True if the move was accepted."""
         step_size = self.step_size * float(self.rng.uniform(0.7, 1.3))
         x, here = u[i], seen[i]
         # Leapfrog integration of H = -log posterior + p'p / 2, in the metric root root'.
@@ -140,7 +143,7 @@ class _Mover:
         return True
 
     def _log_posterior(self, u: FloatArray, seen: tuple[Evaluation, Evaluation]) -> Evaluation:
-        """Return log posterior and gradient, with the prior N(0, 1) and the new data's `power`."""
+        """Return log posterior and gradient: prior N(0, 1), earlier data, new data to the power so far."""
         (a, da), (b, db) = seen
         t = self.power
         return (1.0 - t) * a + t * b - 0.5 * float(u @ u), (1.0 - t) * da + t * db - u

@@ -1,4 +1,4 @@
-"""The navigator's output: its state, one record for each update, and its restarts."""
+"""The navigator's output: its state, a record of each update, and its restarts."""
 
 from __future__ import annotations
 
@@ -14,39 +14,40 @@ class NavigationState(IntEnum):
     """State of the filter; the values are those sent over the link."""
 
     OFF = 0
-    """No start yet."""
+    """The navigator has no position to start from."""
     SEARCHING = 1
-    """Several hypotheses."""
+    """Several positions still explain the field."""
     TRACKING = 2
-    """One hypothesis holds."""
+    """One position explains the field."""
     DEAD_RECKONING = 3
-    """Off the map, or the field adds no information here."""
+    """The vehicle is off the map, or the field does not improve the dead-reckoned position."""
     LOST = 4
-    """The field and the map disagree, or agree better elsewhere."""
+    """The field contradicts the map at the position, or agrees with it better elsewhere."""
 
 
 class Record(msgspec.Struct, frozen=True, gc=False):
-    """One update."""
+    """Estimate of the position and of the states after one update of the filter."""
 
     time_us: int
-    """µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in."""
+    """Mean time of the samples in the update, to which all fields refer, µs since 1970 UTC."""
     state: NavigationState
     valid: bool
-    """The position can be used: it may be sent as a fix."""
+    """True if the position may be sent as a fix."""
     latitude: float
     longitude: float
-    """`latitude`, `longitude`: deg."""
+    """`latitude`, `longitude`: estimated position, deg."""
     covariance_nn: float
     covariance_ne: float
     covariance_ee: float
-    """`covariance_nn`, `covariance_ne`, `covariance_ee`: m², of the position."""
+    """`covariance_nn`, `covariance_ne`, `covariance_ee`: covariance of the position, north and east, m²."""
     innovation: float
     innovation_variance: float
-    """`innovation`, `innovation_variance`: nT, nT²; measured minus expected anomaly; NaN off the map."""
+    """`innovation`, `innovation_variance`: measured minus expected anomaly, nT, and its variance, nT²; NaN
+    off the map."""
     gate: float
-    """Largest innovation squared over variance that is accepted."""
+    """Largest squared innovation over its variance that the filter accepts."""
     accepted: bool
-    """The measurement was accepted."""
+    """True if the filter accepted the measurement."""
     depth: float
     """Depth of the vehicle, m."""
     anomaly: float
@@ -55,22 +56,22 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     """Anomaly of the map at the position, nT; NaN off the map."""
     bias: float
     bias_sigma: float
-    """`bias`, `bias_sigma`: nT, of the calibration."""
+    """`bias`, `bias_sigma`: estimated bias of the calibration and its 1-sigma, nT."""
     map_error: float
     """Estimated error of the map, nT."""
     current_north: float
     current_east: float
-    """`current_north`, `current_east`: m/s."""
+    """`current_north`, `current_east`: estimated velocity error of dead reckoning, m/s."""
     north: float
     east: float
-    """`north`, `east`: m, from the dead-reckoned position."""
+    """`north`, `east`: offset of the estimate from the dead-reckoned position, m."""
     hypotheses: int
     odds: float
-    """Natural logarithm of the odds of another place against this one."""
+    """Natural logarithm of the odds of another place against the estimated position."""
 
 
 class Reckoned(NamedTuple):
-    """A position between updates: µs, deg, m²."""
+    """Position between updates: time (µs), latitude and longitude (deg), covariance (m²)."""
 
     time_us: int
     latitude: float
@@ -81,7 +82,10 @@ class Reckoned(NamedTuple):
 
 
 class Jump(NamedTuple):
-    """A restart of the estimate: µs, metres jumped, 1-sigma (m) of dead reckoning alone, and the cause."""
+    """Restart of the estimate: time (µs), jump north and east (m), and its cause.
+
+    `allowed` is the 1-sigma of dead reckoning alone, m.
+    """
 
     time_us: int
     north: float
