@@ -1,11 +1,11 @@
 """Measure each calibration out of sample, over random simulated gliders, and compare it with its bound.
 
-Each glider has dipoles of its own, flies the paper's Table 1, is calibrated, and flies a survey on another
-day with other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the
-error of a calibration that knows the vehicle), as median, 95th percentile and maximum of the gliders, and the
-standard deviation of the normalised error. The oracle knows that masses are dipoles, along which lines they
-travel, and the distribution of moments, volumes and iron on such gliders: its bound is the average error of
-its fits (Cramér-Rao, with that prior); "reached" is their error on these very data.
+Each glider has random dipoles. It is calibrated by the runs of the paper's Table 1, and surveys on another
+day with other roll and pitch. The table has for each method the survey's RMS error over its noise floor (the
+error of a calibration that knows the vehicle): median, 95th percentile and maximum of the gliders. Next to
+it is the standard deviation of the normalised error. The oracle knows that masses are dipoles, the lines of
+their travel, and the distribution of moments, volumes and iron. "Bound" is the average error of its fits
+(Cramér-Rao, with this prior); "reached" is the error of its fit to the simulated data.
 
     python tools/accuracy.py --seeds 40 --out accuracy.parquet
     python tools/accuracy.py --peers .venv-peers/bin/python        # see tools/peers.py
@@ -39,7 +39,7 @@ from sitl.instrument import rotation
 
 MASSES = {1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "ballast", "rollpos")}
 TAPE_SIGMA_M = 0.05
-"""Standard deviation of the masses' positions as measured with a tape."""
+"""Standard deviation of the masses' positions measured with a tape, m on an axis."""
 TAPE = "auto, positions to 5 cm"
 COLUMNS = {
     "error / noise: median": Column("ratio", np.median, ".3f"),
@@ -71,7 +71,7 @@ def run(
 
 
 def calibrate(method: str, flown: Glider, names: tuple[str, ...], seed: int) -> dict[str, Any]:
-    """Return the score of a method on a glider's survey, or why it failed."""
+    """Return the score of a method on a glider's survey, or the reason of its failure under ``failed``."""
     used = () if method == "nominal" else names
     options = {"vehicle": tape(flown, seed)} if method == TAPE else METHODS.get(method, {})
     try:
@@ -82,7 +82,7 @@ def calibrate(method: str, flown: Glider, names: tuple[str, ...], seed: int) -> 
 
 
 def tape(flown: Glider, seed: int) -> dict[str, dict[str, object]]:
-    """Return the masses' positions with the errors of a measurement; the tables of a ``vehicle.toml``."""
+    """Return the tables of a ``vehicle.toml`` with the masses' positions, m, and errors of a measurement."""
     rng = np.random.default_rng([seed, 99])
     return {
         name: {
@@ -95,7 +95,7 @@ def tape(flown: Glider, seed: int) -> dict[str, dict[str, object]]:
 
 
 def other_methods(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
-    """Yield the public methods' results: the corrected field is ``A (raw - T)``."""
+    """Yield name and (A, T, failure) of third-party methods; the corrected field is ``A (raw - T)``."""
     yield "scipy ellipsoid", (*ellipsoid(runs), "")
     if not peers:
         return
@@ -117,7 +117,7 @@ def other_methods(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.
 
 
 def ask_peers(interpreter: str, arrays: dict[str, Any], *arguments: str) -> dict[str, Any]:
-    """Return what tools/peers.py answers in another interpreter, by method."""
+    """Return the results of tools/peers.py, run by another interpreter, for each method."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "runs.npz"
         np.savez(file, **arrays)
@@ -130,7 +130,7 @@ def ask_peers(interpreter: str, arrays: dict[str, Any], *arguments: str) -> dict
 
 
 def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a free ellipsoid, nine numbers, by scipy from the identity."""
+    """Fit an ellipsoid with nine parameters by scipy, from a unit matrix; return A (3, 3) and T (3,), nT."""
     upper = np.triu_indices(3)
     size = float(np.mean(true_field(runs)))
 
@@ -147,7 +147,7 @@ def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def remainder(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
-    """Return the error (n,) of ``A (raw - T)``, nT."""
+    """Return the error (n,) of the total field ``|A (raw - T)|``, nT."""
     return np.asarray(np.linalg.norm((channels(part) - T) @ A.T, axis=1) - true_field(part))
 
 

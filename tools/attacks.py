@@ -1,12 +1,12 @@
-"""What an unfriendly network costs the autopilot: a running bridge, attacked, and a table of the losses.
+"""Attack a running bridge from the network, and print the losses of each attack in a table.
 
     .venv/bin/python tools/attacks.py              all: some minutes
-    .venv/bin/python tools/attacks.py header       some, by a part of their names
+    .venv/bin/python tools/attacks.py header       the attacks with "header" in their names
 
 The bridge runs as a process between an emulated sensor and an emulated autopilot, which sends 200 frames a
-second. *In*: the autopilot's frames that the bridge missed, by their numbers, or refused where an attacker
-sends as the autopilot and has numbers of its own. *Out*: the samples of MAG_FIELD that the autopilot missed.
-Attackers without a key may send whatever they like from where they like.
+second. *In*: the autopilot's frames that the bridge missed, by their sequence numbers. If the attacker
+sends as the autopilot, *in* counts rejected frames instead. *Out*: the samples of MAG_FIELD that the
+autopilot missed. Attackers without a key can send any data from any address.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from magbridge.mavlink import Codec, Signing
 
 KEY = bytes(range(1, 33))
 SECONDS = 2.0
-"""Of each attack."""
+"""Duration of each attack, s."""
 ALLOWED = 0.01
 YEARS_US = 315_576_000_000_000
-"""Ten years."""
+"""Ten years, µs."""
 
 
 class Attacker:
-    """Strangers on sockets of their own."""
+    """Attacker with `count` sockets that send to the bridge's link."""
 
     def __init__(self, rig: Rig, stack: ExitStack, count: int) -> None:
         kind = socket.SOCK_DGRAM
@@ -49,14 +49,14 @@ class Attacker:
             line.setblocking(False)
 
     def emit(self, data: bytes, times: int = 1) -> None:
-        """Send from each."""
+        """Send `data` from each socket, `times` times."""
         for line in self.lines:
             for _ in range(times):
                 with suppress(BlockingIOError):
                     line.sendto(data, self.rig.autopilot.address)
 
     def answered(self) -> int:
-        """Return the bytes that they got."""
+        """Return the number of bytes that the bridge sent to the attacker's sockets."""
         total = 0
         for line in self.lines:
             with suppress(OSError):
@@ -66,7 +66,7 @@ class Attacker:
 
 
 class Attack(NamedTuple):
-    """One: on which link, by how many, and the action at every frame of the autopilot."""
+    """An attack: its link, its number of sockets, and the action at each frame of the autopilot."""
 
     name: str
     link: str
@@ -77,36 +77,36 @@ class Attack(NamedTuple):
 
 
 def frame(system: int, component: int, message: str, /, **fields: Any) -> bytes:
-    """Return an unsigned frame."""
+    """Return an unsigned frame of a message from a system and component."""
     return Codec(system, component).pack(message, **fields)
 
 
 def to_us(**fields: Any) -> dict[str, Any]:
-    """Return fields with the bridge as the target."""
+    """Return the fields of a message with the bridge as the target."""
     return {"target_system": 1, "target_component": 191, **fields}
 
 
 def ftp(opcode: int, data: bytes, sequence: int, size: int = 0) -> bytes:
-    """Return a request for a file."""
+    """Return the frame of a MAVLink FTP request."""
     header = FTP_HEADER.pack(sequence & 0xFFFF, sequence & 0xFF, opcode, size or len(data), 0, 0, 0)
     payload = (header + data).ljust(251, b"\0")
     return frame(255, 190, "FILE_TRANSFER_PROTOCOL", **to_us(payload=payload))
 
 
 def signed(component: int, ahead_us: int) -> bytes:
-    """Return a frame of someone who has the key and another time."""
+    """Return a frame signed with the right key and a time `ahead_us` ahead."""
     codec = Codec(1, component, Signing(KEY))
     codec.now_us = time.time_ns() // 1000 + ahead_us
     return codec.pack("NAMED_VALUE_FLOAT", name="x", value=1.0)
 
 
 def recorded_frames(attacker: Attacker, _: int) -> None:
-    """Send again what the autopilot has just sent."""
+    """Replay the latest frame of the autopilot."""
     attacker.emit(RECORDED[0])
 
 
 def connect(attacker: Attacker, _: int, words: bytes = b"") -> None:
-    """Open connections, say something, and leave them open."""
+    """Open five TCP connections, send `words` on each open one, and keep at most 200 open."""
     for _ in range(5):
         line = socket.socket()
         line.setblocking(False)
@@ -186,7 +186,7 @@ ATTACKS = (
 
 
 def run(rig: Rig, attack: Attack, seconds: float = SECONDS) -> tuple[float, float, int, str]:
-    """Attack; return the shares lost in and out, bytes that the strangers got, and the reports."""
+    """Run an attack; return the fractions lost in and out, the bytes sent to the attacker, and the report."""
     rig.until_well()
     before, mark, sent, texts = rig.fresh_status(), rig.mark, [0], set(rig.texts())
     with ExitStack() as stack:
@@ -216,7 +216,7 @@ def run(rig: Rig, attack: Attack, seconds: float = SECONDS) -> tuple[float, floa
 
 
 def main() -> int:
-    """Run the attacks that the arguments name."""
+    """Run the attacks that the arguments name; return the exit code."""
     wanted = sys.argv[1:]
     chosen = [one for one in ATTACKS if not wanted or any(part in one.name for part in wanted)]
     columns = ("attack", "link", "lost in", "lost out", "strangers got", "told")

@@ -1,13 +1,13 @@
-"""Measure the reduced studies with fixed seeds, and report what moved beyond its noise since the baseline.
+"""Run reduced studies with fixed seeds, and report the figures that changed significantly since the baseline.
 
     python tools/baseline.py --save                    measure, and write tools/baseline.json
     python tools/baseline.py --compare                 measure, and compare with tools/baseline.json
     python tools/baseline.py --compare --part live     one part only
 
-Every case has a fixed seed, so old and new figures are compared case by case. A figure moved if the mean
-difference exceeds both twice its standard error over the cases and one per cent of the figure (two per cent
-where there is one case). Twenty minutes on two cores. The measured logs are those of
-``$MAGBRIDGE_REAL_DATA`` or ``--data``; without them, their part is left out.
+Every case has a fixed seed, so old and new figures are compared case by case. A change is significant if its
+mean exceeds both twice its standard error over the cases and one per cent of the figure (two per cent
+if there is one case). A run takes twenty minutes on two cores. Measured logs come from
+``$MAGBRIDGE_REAL_DATA`` or ``--data``; without them, the run omits their part.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ FILE = Path(__file__).with_name("baseline.json")
 REAL = Path(os.environ.get("MAGBRIDGE_REAL_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MIN_STANDARD_ERRORS, MIN_RELATIVE_CHANGE, MIN_RELATIVE_CHANGE_SINGLE = 2.0, 0.01, 0.02
 LOW, HIGH, ONE = "low", "high", "one"
-"""Which value of a figure is better: a lower one, a higher one, one nearer to 1."""
+"""Direction in which a figure improves: to a lower value, to a higher value, or towards 1."""
 Figures = dict[str, float]
 Case = Callable[[], Figures]
 
 
 def goal_of(name: str) -> str:
-    """Return which value of a figure is better."""
+    """Return the direction in which the figure `name` improves."""
     if "normalised" in name:
         return ONE
     return HIGH if any(word in name for word in ("found", "alone", "valid", "among")) else LOW
 
 
 def calibration(noise: str, seed: int) -> Figures:
-    """Calibrate a random glider by the paper's runs and score it on a survey."""
+    """Calibrate a random glider by the paper's runs; return its figures on a survey."""
     import accuracy  # noqa: PLC0415
 
     rows = {row["method"]: row for row in accuracy.run(seed, noise, 2, ("cubic", "auto"), oracles=False)}
@@ -60,7 +60,7 @@ def calibration(noise: str, seed: int) -> Figures:
 
 
 def survey(seed: int) -> Figures:
-    """Calibrate a random glider by its survey alone."""
+    """Calibrate a random glider from its survey only; return the figures of field and map."""
     import survey as study  # noqa: PLC0415
 
     row = study.run(6.0, 30.0, 1000.0, "1 nT white", 0.0, seed)[0]
@@ -75,7 +75,7 @@ def survey(seed: int) -> Figures:
 
 
 def live(change: str, seed: int) -> Figures:
-    """Change a vehicle after its calibration while the bridge learns."""
+    """Change a vehicle after its calibration while the bridge calibrates in flight; return the figures."""
     import live as study  # noqa: PLC0415
 
     row = study.run(change, seed, 6.0, 20.0)[0]
@@ -89,10 +89,10 @@ def live(change: str, seed: int) -> Figures:
 
 
 def diagnosis(entry: dict[str, Any]) -> Figures:
-    """Hide effects in a deployment and diagnose it.
+    """Hide effects in a deployment and diagnose it; return the figures.
 
     A name counts as alone if all its alternatives are the same cause, on another series or of the same trace.
-    The step of the offset since the calibration, in worlds with a map, is no false alarm.
+    The step of the offset since the calibration, in worlds with a map, does not count as a false alarm.
     """
     from study import table  # noqa: PLC0415
     from study.cases import NAMELESS, case  # noqa: PLC0415
@@ -115,7 +115,7 @@ def diagnosis(entry: dict[str, Any]) -> Figures:
 
 
 def navigation(rms: float, length: float, seed: int) -> Figures:
-    """Navigate a glider over a random map."""
+    """Navigate a glider over a random map; return the figures."""
     from voyages import Map, drawn_track, sail  # noqa: PLC0415
 
     kind = Map(rms, length)
@@ -129,7 +129,7 @@ def navigation(rms: float, length: float, seed: int) -> Figures:
 
 
 def twin(seed: int) -> Figures:
-    """Fly the twin of the paper's trials."""
+    """Simulate the paper's trials; return the error of each method on runs and survey."""
     from study_worlds import METHODS, TRIALS, fly_trials  # noqa: PLC0415
 
     trials = fly_trials(seed)
@@ -142,7 +142,7 @@ def twin(seed: int) -> Figures:
 
 
 def seaglider(data: Path) -> Figures:
-    """Hold each dive of a real Seaglider out of its calibration."""
+    """Cross-validate the calibration of a real Seaglider over its dives; return the figures."""
     from measured import hold_runs_out  # noqa: PLC0415
 
     from magbridge.calibration.fitting.observe import observations  # noqa: PLC0415
@@ -181,7 +181,7 @@ def ardusub(data: Path) -> Figures:
 
 
 def replay() -> Figures:
-    """Run the demo: a simulated survey through the unmodified bridge."""
+    """Run ``magbridge demo``, a simulated survey through the unmodified bridge; return its figures."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "magbridge", "demo", "--json", "--out", folder]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -216,7 +216,7 @@ def parts(data: Path) -> dict[str, list[Case]]:
 
 
 def run(part: str, case: Case) -> tuple[Figures, float]:
-    """Return the figures of a case and its processor time, s; none where it failed."""
+    """Return the figures of a case and its processor time (s); a failed case returns "failed cases"."""
     sys.path.insert(0, str(Path(__file__).parent))
     warnings.simplefilter("ignore")
     begun = time.process_time()
@@ -249,7 +249,7 @@ def measure(chosen: Sequence[str], data: Path, workers: int) -> dict[str, list[f
 
 
 def compare(old: dict[str, list[float]], new: dict[str, list[float]]) -> list[str]:
-    """Return a line for every figure that moved beyond its noise, the worse ones first."""
+    """Return a line for each figure that changed significantly, the worse figures first."""
     worse: list[str] = []
     better: list[str] = []
     for name, values in new.items():
@@ -274,7 +274,7 @@ def compare(old: dict[str, list[float]], new: dict[str, list[float]]) -> list[st
 
 
 def moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return True if the mean difference of paired values exceeds its noise."""
+    """Return True if the mean difference of paired values is significant."""
     difference = after - before
     if before.size == 0:
         return False
@@ -287,7 +287,7 @@ def moved(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def describe(values: np.ndarray) -> str:
-    """Return mean, spread and number of values."""
+    """Return the text of the mean, the standard deviation and the number of values."""
     if values.size < 2:
         return f"{values[0]:.4g}" if values.size else "no value"
     return f"{values.mean():.4g} (spread {values.std(ddof=1):.2g}, {values.size} cases)"

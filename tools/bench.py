@@ -1,12 +1,12 @@
-"""Measure speed and memory, each figure with its floor in the same run.
+"""Measure speed and memory, each next to a floor: the same task by a minimal program.
 
     python3 tools/dev.py bench                      everything: some minutes
-    python3 tools/dev.py bench processor start      some of it
+    python3 tools/dev.py bench processor start      the named benchmarks
     python3 tools/dev.py bench --table FILE.md      also as a table in Markdown, with date, commit and load
 
-Repetitions of the program and of its floor alternate and medians are printed, so that a busy machine slows
-both. Processor time and ratios hold on a busy machine; latencies do not: the load average is printed
-with them, and the floor's own tail shows how far they can be trusted.
+Repetitions of the program and of its floor alternate, so that a busy machine slows both; the table has
+medians. Processor time and ratios hold on a busy machine, but latencies do not. The table therefore states
+the load average, and the largest latencies of the floor.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ BENCHMARKS: dict[str, tuple[str, int]] = {
     "correcting": ("benchmarks.calibration:correcting", 5),
     "diagnosing": ("benchmarks.diagnose:diagnosing", 1),
 }
-"""Name to ``module:function`` and number of repetitions; the function takes a folder and that number."""
+"""Benchmark's name to ``module:function`` and repetitions; the function takes a folder and this number."""
 
 
 def measure(name: str, factor: float) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def measure(name: str, factor: float) -> dict[str, Any]:
 
 
 def markdown(results: list[dict[str, Any]]) -> str:
-    """Return the table in Markdown, below machine, date, commit, version and load."""
+    """Return a Markdown table of the results, below version, commit, date, load and machine."""
     git = ["git", "rev-parse", "--short", "HEAD"]
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "no commit"
     loads = [load for result in results for load in result["load"]]

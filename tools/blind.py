@@ -1,4 +1,4 @@
-"""Hide effects in simulated deployments, which ``diagnose`` must find and name without a hint.
+"""Hide effects in simulated deployments, and count how often ``diagnose`` finds and names them unaided.
 
     python tools/blind.py --cases 800 --out study
     python tools/blind.py --cases 250 --part null,named --seed 1409
@@ -18,7 +18,7 @@ from study.table import lines, plot_confusion, plot_detection
 
 
 def run(entry: Row) -> list[Row]:
-    """Run a case; its row is JSON because its entries are nested."""
+    """Run a case; return its part and its result as JSON, because the result is nested."""
     return [{"part": entry["part"], "row": json.dumps(case(entry))}]
 
 

@@ -1,10 +1,10 @@
 """Compare the twin of the Bonne Bay trials with the paper: its Table 2, and what ``diagnose`` finds in it.
 
-The twin's glider flies the paper's runs over a crustal field of its own, from a boat at -10 degC into water
-at 2 degC. It is calibrated on each trial's spirals (against the IGRF and the aeromagnetic map, as in the
-paper), and the survey between them is corrected with either calibration. Only the amplitudes in
-``sitl/scenarios/bonne_bay.toml`` were fitted to the paper. With ``--diagnose``, the survey of trial 1 is
-diagnosed against the true field, the map continued down to the glider, and the map as flown.
+The simulated glider performs the paper's runs over a random crustal field, from a boat at -10 degC into
+water at 2 degC. Each trial's spirals give a calibration (against the IGRF and the aeromagnetic map, as in the
+paper), and the survey between the trials is corrected with each calibration. Only the amplitudes in
+``sitl/scenarios/bonne_bay.toml`` were fitted to the paper. With ``--diagnose``, trial 1's calibration is
+diagnosed against the true field, the map continued down to the glider, and the map at flight level.
 
     python tools/bonne_bay.py --seeds 12
     python tools/bonne_bay.py --at-depth --seeds 6     # against the map continued down to the glider
@@ -28,11 +28,11 @@ from sitl.scenario import load
 from sitl.twin import Twin
 
 FIRST_SEED = 29
-"""A world that comes near the paper's."""
+"""Number of a simulated world whose errors are near the paper's."""
 
 
 def run(seed: int, at_depth: bool) -> list[Row]:
-    """Fly one world; return a row for each trial and method, and whether it shows the paper's signature."""
+    """Simulate one world; return a row for each trial and method, with the paper's values."""
     flight = fly_trials(seed, at_depth=at_depth)
     survey = flight.parts["survey"]
     reference_error = rms(survey["reference_field"].to_numpy() - true_field(survey))
@@ -57,10 +57,10 @@ def run(seed: int, at_depth: bool) -> list[Row]:
 
 
 def has_signature(flight: Trials) -> bool:
-    """Return True if a world shows the paper's signature, by cubic, or by auto if that failed.
+    """Return True if a world shows the paper's signature, by ``cubic``, or by ``auto`` if ``cubic`` failed.
 
-    One ellipsoid is far off, a parameterised fit is at least twice as good on its runs as on the survey, and
-    trial 1's survey is worse than trial 2's.
+    One ellipsoid has a large error, a parameterised fit is at least twice as good on its runs as on the
+    survey, and trial 1's survey is worse than trial 2's.
     """
     method = "auto" if any((trial, "cubic") in flight.failed for trial in TRIALS) else "cubic"
     runs, survey = ([flight.rms(part or trial, trial, method) for trial in TRIALS] for part in ("", "survey"))
@@ -70,7 +70,7 @@ def has_signature(flight: Trials) -> bool:
 
 
 def run_diagnosis(seed: int, reference: str) -> list[Row]:
-    """Diagnose the survey by trial 1's calibration, without a hint that the cause is a temperature."""
+    """Diagnose the survey with trial 1's calibration, without a hint that the cause is a temperature."""
     telemetry = {"reference": "map" if reference == "map" else "true"}
     twin = Twin.draw(load("bonne_bay").replace(telemetry=telemetry), seed)
     parts = measure_trials(twin, at_depth=reference == "map at its depth")

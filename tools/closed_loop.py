@@ -1,16 +1,16 @@
-"""Measure how far a bridge and an autopilot that uses its fixes mislead each other over hours.
+"""Measure how far the positions of a bridge and of an autopilot that uses its fixes diverge over hours.
 
     python tools/closed_loop.py [--runs 1] [--hours 6] [--maps 2] [--telemetry speed ...]
 
-The gliders of tools/navigation.py have GPS for ten minutes, then none, and for the last five minutes again.
-Each is run twice for every kind of fix and of telemetry: with an autopilot that ignores fixes, and with one
-that uses them by the rules of ArduPilot or PX4 (``tools/referee``).
+The gliders of tools/navigation.py have GPS for the first ten and the last five minutes only.
+Each kind of fix and of telemetry is run twice: with an autopilot that ignores fixes, and with an autopilot
+that uses fixes by the rules of ArduPilot or PX4 (``tools/referee``).
 
 bridge, m     RMS error of the bridge's position without GPS, with the autopilot that uses fixes
-ratio         the same over that with the autopilot that ignores them
-autopilot     RMS error of the autopilot's own position; *alone*: of the one that ignores fixes
-claimed       its 1-sigma on an axis, RMS; *normalised*: its error on an axis over that
-back, s       from the return of GPS until the autopilot is within 3 sigma of it
+ratio         this error over the bridge's error with the autopilot that ignores fixes
+autopilot     RMS error of the autopilot's position; *alone*: the same of the autopilot that ignores fixes
+claimed       RMS of the autopilot's 1-sigma on an axis; *normalised*: its error on an axis over this 1-sigma
+back, s       time from the return of GPS until the autopilot's position is within 3 sigma of GPS
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from studies import Column, Row, Study, study_options
 from voyages import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 
 LOST_S, BACK_S = 600.0, 300.0
-"""GPS is lost after the first, and back the second before the end."""
+"""Durations of GPS reception at the start and at the end of a run, s."""
 FOLLOWS = "dead reckoning by "
 MAPS = (Map(20, 1000), Map(60, 2000))
 STREAMS = {
@@ -47,7 +47,7 @@ PAIRS = (
 
 
 def passage(kind: Map, seed: int, hours: float) -> Passage:
-    """Return a track of the navigation study."""
+    """Return a glider's track of the navigation study on one kind of map."""
     grid = synthetic(kind, seed % 10)
     ds = track_over(grid, GLIDER, 1000 + seed, hours=hours, speed=SPEEDS[seed % 3])
     return Passage(
@@ -68,7 +68,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def run(fix: str, stack: str, streams: str, kind: Map, seed: int, hours: float) -> list[Row]:
-    """Run a glider with an autopilot that uses the fixes, and with one that ignores them."""
+    """Simulate a glider with an autopilot that uses fixes and with one that ignores fixes; return the row."""
     grid, way = synthetic(kind, seed % 10), passage(kind, seed, hours)
     options = replace(GLIDER, start_sigma=0.2 * grid.correlation_length)
 
@@ -116,7 +116,7 @@ STUDY = Study(
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the cases and print the table."""
     parser = study_options(__doc__)
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--hours", type=float, default=6.0)

@@ -2,9 +2,9 @@
 
     python tools/collection.py
 
-pytest-xdist's workers collect independently; where an identifier depends on the time, on random numbers or on
-the order of a set, the run ends before the first test. The two collections are separated by some seconds
-and hash strings differently.
+pytest-xdist's workers collect independently. If an identifier depends on the time, on random numbers or on
+the order of a set, the run ends before the first test. The two collections start some seconds after each
+other and use different hash seeds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 from difflib import unified_diff
 
 PAUSE_S = 3.0
-"""s, between the two collections: longer than the resolution of a time stamp in an archive."""
+"""Time between the two collections, s: longer than the resolution of a time stamp in an archive."""
 
 
 def collect(seed: str) -> list[str]:
@@ -30,7 +30,7 @@ def collect(seed: str) -> list[str]:
 
 
 def main() -> None:
-    """Collect twice and compare."""
+    """Collect the tests twice; exit with the differences if the two collections differ."""
     first = collect("1")
     time.sleep(PAUSE_S)
     second = collect("2")

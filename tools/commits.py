@@ -47,7 +47,7 @@ def problem(message: str) -> str:
 
 
 def is_imperative(word: str) -> bool:
-    """Return True if a word can be an imperative: no article, no ending of another form of a verb."""
+    """Return True if a word can be an imperative: not an article, not another form of a verb."""
     if word in NOT_A_VERB.split():
         return False
     if word.endswith("s"):
@@ -58,7 +58,7 @@ def is_imperative(word: str) -> bool:
 
 
 def commits(span: str) -> list[tuple[str, str]]:
-    """Return (short hash, message) of the commits of a range; none where there is no such range."""
+    """Return (short hash, message) of the commits of a range; an empty list for a range unknown to git."""
     command = ["git", "log", "--no-merges", "--format=%h%x00%B%x01", span]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     records = [record.strip("\n").split("\0") for record in done.stdout.split("\x01")]

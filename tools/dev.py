@@ -1,9 +1,9 @@
-"""Set up and run magbridge from a checkout, with nothing but Python 3.11 or newer.
+"""Set up and run magbridge from a checkout; Python 3.11 or newer is the only requirement.
 
     python3 tools/dev.py demo [ARG ...]     magbridge demo
     python3 tools/dev.py test [ARG ...]     the tests (pytest ARG ...)
     python3 tools/dev.py check              lint, format, types, import order, wording, names, size, site
-    python3 tools/dev.py baseline --compare what moved beyond its noise since tools/baseline.json
+    python3 tools/dev.py baseline --compare figures that changed since tools/baseline.json
     python3 tools/dev.py size               lines and modules of each part against its budget
     python3 tools/dev.py bench [ARG ...]    tools/bench.py
 
@@ -46,16 +46,16 @@ def call(*command: str | Path, **variables: str) -> int:
 
 
 def run(*command: str | Path, **variables: str) -> None:
-    """Run a command in the checkout; end with its exit code when it fails."""
+    """Run a command in the checkout; exit with the command's exit code if the command fails."""
     if code := call(*command, **variables):
         sys.exit(code)
 
 
 def run_tests(python: Path, *arguments: str) -> None:
-    """Run the tests, two at a time: first those that only compute, then those in real time.
+    """Run the tests in two processes: first the tests that only compute, then the tests in real time.
 
-    A test in real time would compete for the processor with one that computes; another in real time mostly
-    waits, as it does.
+    A test in real time would compete for the processor with a computing test. Two tests in real time mostly
+    wait.
     """
     if arguments:
         run(python, "-m", "pytest", *arguments)
@@ -67,16 +67,16 @@ def run_tests(python: Path, *arguments: str) -> None:
 
 
 def install(extra: str) -> None:
-    """Install the lock file's versions into an environment, with one extra; other packages in it stay.
+    """Install the locked dependencies with one extra into ``.venv``, and keep other packages in it.
 
-    Everything is compiled to bytecode at once, which uv does not do: if Python may not write any
-    (PYTHONDONTWRITEBYTECODE), each start of the program would compile a thousand modules.
+    The function also compiles the checkout to bytecode. Otherwise, each start of the program would compile
+    all modules again if PYTHONDONTWRITEBYTECODE is set.
     """
     if not (BIN / "python").exists():
         venv.create(BIN.parent, with_pip=True)
     if not (BIN / "uv").exists():
         run(BIN / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", UV)
-    known = ssl.get_default_verify_paths()  # a network's own proxy is known to the system only, not to uv
+    known = ssl.get_default_verify_paths()  # only the system's store has a proxy's certificate
     run(
         BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--compile-bytecode",
         "--extra", extra,
@@ -87,7 +87,7 @@ def install(extra: str) -> None:
 
 
 def main() -> None:
-    """Do what the first argument says."""
+    """Run the command that the first argument names."""
     if sys.version_info < (3, 11):  # noqa: UP036 - users of an older version get a message
         sys.exit("magbridge needs Python 3.11 or newer")
     what, *arguments = sys.argv[1:] or ["help"]

@@ -1,8 +1,8 @@
 """Write ``magbridge/mavlink/dialect.py`` and ``enums.py`` from ``magbridge.xml`` and pymavlink's definitions.
 
-pymavlink's mavgen writes ``dialect.py``: the classes of our messages and of the few upstream messages that
-the wheel lacks. ``enums.py`` holds what mavgen's Python modules leave out: enumerations as ``IntEnum``, and
-for each field the value that means "not known".
+pymavlink's mavgen writes ``dialect.py``: the classes of magbridge's messages and of the few upstream messages
+that the wheel lacks. ``enums.py`` holds definitions that mavgen's Python modules omit: enumerations as
+``IntEnum``, and for each field the value that means "not known".
 
     python tools/dialect.py [--check]
 """
@@ -26,7 +26,7 @@ XML = ROOT / "magbridge" / "mavlink" / "magbridge.xml"
 DIALECT, ENUMS_FILE = XML.with_name("dialect.py"), XML.with_name("enums.py")
 DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
 INCLUDED = "all.xml"
-"""More than our own messages: any that an autopilot sends can become a parameter, and is in logs."""
+"""Dialect of all messages, because any message of an autopilot can be a parameter or be in a log."""
 ENUMS: dict[str, tuple[str, ...]] = {
     "FIRMWARE_VERSION_TYPE": ("OFFICIAL",),
     "GLOBAL_POSITION_SRC": ("MAGNETIC",),
@@ -62,7 +62,7 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAV_STATE": ("ACTIVE", "CRITICAL"),
     "MAV_TYPE": ("GCS", "SUBMARINE", "ONBOARD_CONTROLLER"),
 }
-"""The enumerations that the code uses, and which of their entries; an empty list means all."""
+"""Enumerations that the code uses, and the entries that it needs; an empty tuple selects all entries."""
 
 
 UPSTREAM = """<?xml version="1.0"?>
@@ -96,11 +96,11 @@ UPSTREAM = """<?xml version="1.0"?>
   </messages>
 </mavlink>
 """
-"""Messages that upstream has added since the definitions in pymavlink; known by their id and checksum."""
+"""XML of upstream messages that pymavlink's definitions lack."""
 
 
 def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
-    """Parse `path` and its includes, each file once."""
+    """Parse `path` and its includes, each file once; return the parsed files by path."""
     if path not in seen:
         seen[path] = parsed = mavparse.MAVXML(str(path), mavparse.PROTOCOL_2_0)
         for name in parsed.include:
@@ -109,7 +109,7 @@ def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
 
 
 def invalid(one: Any) -> str:
-    """Return the number that stands for 'not known'; empty if there is none, or if it is NaN."""
+    """Return the value of a field that means "not known", as text; empty if there is none or if it is NaN."""
     text = one.invalid.strip("[]:,")
     if match := re.fullmatch(r"(U?)INT(\d+)_(MAX|MIN)", text):
         bits = int(match[2]) - (match[1] == "")
@@ -118,7 +118,7 @@ def invalid(one: Any) -> str:
 
 
 def definitions() -> dict[Path, Any]:
-    """Return the parsed XML of pymavlink's dialect ``all`` and of ours."""
+    """Return the parsed XML of pymavlink's dialect ``all`` and of magbridge's dialect, by path."""
     return collect(DEFINITIONS / INCLUDED, collect(XML, {}))
 
 
@@ -134,7 +134,7 @@ from pymavlink.dialects.v20.all import MAVLink_message, mavlink_msg_deprecated_n
 
 
 def render_dialect() -> str:
-    """Return the part of mavgen's module that holds our messages and those that the wheel lacks."""
+    """Return the part of mavgen's module with magbridge's messages and the messages that the wheel lacks."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         ours = XML.read_text(encoding="utf-8").replace("  <include>common.xml</include>\n", "")
@@ -148,7 +148,7 @@ def render_dialect() -> str:
         with redirect_stdout(StringIO()):
             mavgen.mavgen(options, [str(folder / "magbridge.xml")])
         text = (folder / "dialect.py").read_text(encoding="utf-8")
-    # the rest of the module is the same in each dialect of the wheel
+    # omit the rest of the module, which is equal in each dialect of the wheel
     begin, end = text.index("MAVLINK_MSG_ID_MAG_RAW ="), text.index("class MAVError(")
     return f"{HEADER}\n{text[begin:end].rstrip()}\n"
 

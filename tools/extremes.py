@@ -2,9 +2,9 @@
 
     python tools/extremes.py --events 1000000 [--seed 1]
 
-Every message of the dialect comes from the autopilot, from another component and from a station. Half of the
-fields hold plausible values, the others NaN, infinities, denormals and the limits of their type. The bridge
-learns and navigates, and its optional parts may not hide an exception.
+Autopilot, another component and a station send every message of the dialect. Some fields have plausible
+values; the others are NaN, infinities, denormals and the limits of their type. The bridge calibrates in
+flight and navigates, and its optional parts do not catch exceptions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from magbridge.parts import OptionalParts
 from magbridge.records import Channel
 
 PART = 20_000
-"""Events of one bridge."""
+"""Number of events after which a new bridge starts."""
 
 CONFIG = """NAMED_VALUE_FLOAT = 1
 [telemetry.current]
@@ -58,7 +58,7 @@ VARIANTS = (
     {"heading": "vision_position_estimate", "fix": "ODOMETRY"},
     {"heading": "odometry", "fix": "GLOBAL_POSITION_SENSOR"},
 )
-"""Settings of the bridge, by the seed."""
+"""Settings of the bridge; the seed selects one."""
 FLOATS = (
     float("nan"), float("inf"), float("-inf"), 0.0, -0.0, 1e-45, -1e-45, 3.4e38, -3.4e38, 1e30, 1.0, -1.0,
 )  # fmt: skip
@@ -92,13 +92,13 @@ HANDLED = (
     "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET", "SETUP_SIGNING", "SYS_STATUS", "TIMESYNC",
     "VFR_HUD", *("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT", "NAMED_VALUE_FLOAT", "VFR_HUD") * 6,
 )  # fmt: skip
-"""Messages that the bridge evaluates, some of them more often; nine of ten frames are one of them."""
+"""Messages that the bridge evaluates: nine of ten frames are from this list."""
 ANY = tuple(MESSAGES)
 SENDERS = (1, 1), (1, 1), (1, 1), (1, 25), (255, 190), (2, 1)
 STRETCH = 500
-"""Events with one share of extreme values: a bridge that never receives a plausible fix does not navigate."""
+"""Events with a constant fraction of extreme values; a bridge without plausible fixes does not navigate."""
 GPS_PERIOD = 100
-"""Events after which the plausible GPS is lost, or returns."""
+"""Number of events after which the plausible GPS is lost, or returns."""
 SHARES = 0.0, 0.02, 0.3, 0.8
 
 
@@ -114,7 +114,7 @@ def make_bridge(folder: Path, seed: int = 0) -> Pipeline:
 
 
 def _number(code: str, rng: random.Random) -> float | int:
-    """Return an extreme number of a struct code."""
+    """Return an extreme number of the type of a struct code."""
     if code in "fd":
         return rng.choice(FLOATS)
     low, high = _limits(code)
@@ -122,13 +122,13 @@ def _number(code: str, rng: random.Random) -> float | int:
 
 
 def _limits(code: str) -> tuple[int, int]:
-    """Return the lowest and the highest integer of a struct code."""
+    """Return the lowest and the highest integer of the type of a struct code."""
     size = 8 * struct.calcsize(code)
     return (-(1 << size - 1), (1 << size - 1) - 1) if code.islower() else (0, (1 << size) - 1)
 
 
 def _plausible(name: str, step: int) -> float | None:
-    """Return a plausible value of a field at a step; None where there is none."""
+    """Return a plausible value of the field `name` at a step, or None if no value is defined for it."""
     if name in ("lat", "latitude"):
         return 495_000_000 + 2 * step
     if name in ("lon", "longitude"):
@@ -143,7 +143,7 @@ def _plausible(name: str, step: int) -> float | None:
 
 
 def _frame(codecs: dict[tuple[int, int], Codec], rng: random.Random, step: int, extreme: float) -> bytes:
-    """Return a valid frame: the share `extreme` of its fields is not plausible."""
+    """Return a valid frame in which a fraction `extreme` of the fields has an extreme value."""
     layout = spec(rng.choice(HANDLED) if rng.random() < 0.9 else rng.choice(ANY))
     values: dict[str, object] = {}
     for name, field in layout.fields.items():
@@ -169,7 +169,7 @@ def _frame(codecs: dict[tuple[int, int], Codec], rng: random.Random, step: int, 
 
 
 def _line(step: int, rng: random.Random, extreme: float) -> bytes:
-    """Return a sensor's line: mostly a plausible reading, else extreme cells."""
+    """Return a sensor's line: a plausible reading, or with probability `extreme` one with extreme cells."""
     cells = [
         f"{rng.gauss(15_000.0, 50.0):.1f}",
         f"{rng.gauss(2000.0, 50.0):.1f}",
@@ -183,7 +183,7 @@ def _line(step: int, rng: random.Random, extreme: float) -> bytes:
 
 
 def events(count: int, seed: int) -> list[Event]:
-    """Return seeded events: link frames, sensor lines, and pauses of up to an hour."""
+    """Return `count` random events: link frames, sensor lines, and pauses of an hour."""
     rng = random.Random(seed)
     codecs = {sender: Codec(*sender) for sender in SENDERS}
     time_us, out = START, []
@@ -201,7 +201,7 @@ def events(count: int, seed: int) -> list[Event]:
 
 
 def feed(bridge: Pipeline, files: FileServer, event: Event) -> None:
-    """Feed an event, and empty the queues as ``run`` does."""
+    """Feed an event to the bridge, and empty its queues as ``magbridge run`` does."""
     bridge.feed(event)
     while bridge.component.file_requests:
         files.ask(bridge.component.file_requests.popleft())
@@ -212,7 +212,7 @@ def feed(bridge: Pipeline, files: FileServer, event: Event) -> None:
 
 
 def main() -> None:
-    """Feed the events; print the first that raises."""
+    """Feed the events; print the first event that raises an exception."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--events", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)

@@ -1,11 +1,11 @@
 """Put faults of sensor, telemetry and computer into a survey, and count the wrong samples without a flag.
 
     python3 tools/faults.py                      the table: each fault on a simulated survey
-    python3 tools/faults.py --hours 6 spikes     some of it, longer
+    python3 tools/faults.py --hours 6 spikes     the named faults, on a longer survey
     python3 tools/faults.py --clean 30           30 days without a fault: false alarms
 
-A glider like that of ``magbridge demo`` flies calibration spirals and a survey. The survey's bytes, with a
-fault in them, go through the bridge. A sample is wrong if it has no flag and its error exceeds three sigmas.
+The glider of ``magbridge demo`` performs calibration spirals and a survey. The bridge processes the survey's
+bytes with a fault in them. A sample is wrong if it has no flag and its error exceeds three sigmas.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from sitl.twin import simulate
 MASSES = ("battpos", "ballast")
 CHANNELS = ("mag_x", "mag_y", "mag_z")
 FAULT_AT = 0.27
-"""Where in the survey a fault begins that comes on the way."""
+"""Fraction of the survey after which a fault of kind `late` begins."""
 Rows = xr.Dataset
 Events = Iterator[Event]
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A calibrated glider's survey: its folder (``bridge.toml``, ``cal.json``) and rows."""
+    """Survey of a calibrated glider: folder with ``bridge.toml`` and ``cal.json``, and rows of the log."""
 
     folder: Path
     survey: xr.Dataset
@@ -55,10 +55,10 @@ class Flight:
 
 @dataclass(frozen=True)
 class Score:
-    """What a bridge made of a survey: numbers of samples, the largest error (nT) without a flag, the texts.
+    """Result of a survey: numbers of samples, the largest error (nT) without a flag, the reported texts.
 
-    A sample is `wrong` if it has no flag and lies beyond three sigmas; `sigma` is the median of those without
-    a flag, nT.
+    A sample is `wrong` if it has no flag and an error above three sigmas. `sigma` is the median sigma of the
+    samples without a flag, nT.
     """
 
     samples: int
@@ -70,7 +70,7 @@ class Score:
 
 
 def prepare(folder: Path, seed: int, hours: float, *, calibrated_by: int | None = None) -> Flight:
-    """Simulate a glider, fit its calibration (or that of another seed) and write the bridge's files."""
+    """Simulate a glider, fit its calibration (or another glider's, by its seed), write the bridge's files."""
     scenario = load("demo")
     survey = CrissCross(hours=hours, roll=(1.0, 2.0))
     deployment = simulate(scenario.replace(mission=(scenario.mission[0], survey)), seed)
@@ -88,7 +88,7 @@ def prepare(folder: Path, seed: int, hours: float, *, calibrated_by: int | None 
 
 
 def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] = iter) -> Score:
-    """Feed the bridge with `rows` of a flight, their events changed by `change`; compare with the truth."""
+    """Feed the events of `rows`, altered by `change`, to the bridge; compare its output with the truth."""
     config = load_config(flight.folder / "bridge.toml")
     pipeline = set_up(config, StartEvent(start_us(rows)))
     listener = Listener()
@@ -117,9 +117,9 @@ def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] =
 def fault_of(
     *channels: str, by: Callable[[FloatArray, FloatArray], FloatArray] | None, late: bool = False
 ) -> Callable[[Rows], Rows]:
-    """Return a fault: ``by(values, seconds)`` in place of each channel's values, or the value when it begins.
+    """Return a fault that replaces the values of channels by ``by(values, seconds)``, or freezes them.
 
-    It begins at `FAULT_AT` if it comes `late`.
+    A `late` fault begins at `FAULT_AT`, any other fault at the start.
     """
 
     def fault(rows: Rows) -> Rows:
@@ -137,13 +137,13 @@ def fault_of(
 
 
 def spikes(values: FloatArray, _: FloatArray) -> FloatArray:
-    """Shift 3 % of the samples by 500 nT."""
+    """Return the values with 3 % of them shifted by 500 nT."""
     hit = np.random.default_rng(5).random(len(values)) < 0.03
     return np.asarray(values + np.where(hit, 500.0, 0.0))
 
 
 def silent(rows: Rows) -> Rows:
-    """Remove the telemetry of 25 of every 60 s."""
+    """Remove the masses' telemetry in 25 of every 60 s."""
     seconds = rows["time"].to_numpy() - float(rows["time"][0])
     return rows.assign(
         {n: ("time", np.where(seconds % 60 < 25, np.nan, rows[n]), rows[n].attrs) for n in MASSES}
@@ -151,7 +151,7 @@ def silent(rows: Rows) -> Rows:
 
 
 def late(rows: Rows) -> Rows:
-    """Delay the telemetry by 2 s."""
+    """Delay the masses' telemetry by 2 s."""
     time = rows["time"].to_numpy()
     return rows.assign({n: ("time", np.interp(time - 2.0, time, rows[n]), rows[n].attrs) for n in MASSES})
 
@@ -166,13 +166,13 @@ def with_motion(rows: Rows) -> Rows:
 
 
 def noise(values: FloatArray, _: FloatArray) -> FloatArray:
-    """Add noise of twenty times the instrument's."""
-    seed = int(abs(values[0]))  # each channel's own
+    """Return the values with noise of 20 nT, twenty times the instrument's."""
+    seed = int(abs(values[0]))  # a different seed for each channel
     return np.asarray(values + np.random.default_rng(seed).normal(0.0, 20.0, len(values)))
 
 
 def hum(size: float, period: float) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """Return what adds a sine of `size` nT and a `period` in s."""
+    """Return a fault that adds a sine of amplitude `size` (nT) and `period` (s)."""
     return lambda v, t: np.asarray(v + size * np.sin(2.0 * np.pi * t / period))
 
 
@@ -215,7 +215,7 @@ FAULTS: dict[str, Callable[[Rows], Rows]] = {
 
 
 def stalls(length_us: int, every_us: int = 600_000_000) -> Callable[[Events], Events]:
-    """Return what a process that stands still for `length_us` of every `every_us` makes of its events."""
+    """Return a function that delays events as a process does that pauses `length_us` in every `every_us`."""
 
     def change(events: Events) -> Events:
         waiting: list[Event] = []
@@ -229,7 +229,7 @@ def stalls(length_us: int, every_us: int = 600_000_000) -> Callable[[Events], Ev
                 continue
             if waiting:
                 yield Event(end_us, Channel.STATE, standstill(end_us, length_us))
-                for channel in (Channel.LINK, Channel.SENSOR):  # as the live edge reads them
+                for channel in (Channel.LINK, Channel.SENSOR):  # the order of the live bridge
                     if data := b"".join(one.data for one in waiting if one.channel == channel):
                         yield Event(end_us, channel, data)
                 waiting = []
@@ -244,13 +244,13 @@ OTHER = "another glider's calibration"
 
 @cache
 def flight_of(seed: int, hours: float, calibrated_by: int | None) -> tuple[Flight, object]:
-    """Return a prepared flight, and the temporary folder that it lives in."""
+    """Return a prepared flight, and the temporary folder that holds its files."""
     folder = tempfile.TemporaryDirectory()
     return prepare(Path(folder.name), seed, hours, calibrated_by=calibrated_by), folder
 
 
 def run(fault: str, seed: int, hours: float) -> list[Row]:
-    """Fly one glider with one fault."""
+    """Simulate one glider with one fault; return the row."""
     flight, _ = flight_of(seed, hours, seed + 100 if fault == OTHER else None)
     rows = FAULTS[fault](flight.survey) if fault in FAULTS else flight.survey
     pause = STALLS.get(fault)
@@ -281,7 +281,7 @@ STUDY = Study(
 
 
 def main() -> None:
-    """Fly the faults, or days without a fault; print the table."""
+    """Simulate the faults, or days without a fault; print the table."""
     names = (*FAULTS, *STALLS, OTHER)
     parser = study_options(__doc__)
     parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(names).replace("%", "%%"))

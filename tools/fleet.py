@@ -1,12 +1,12 @@
 """Measure the survey's error after two calibration runs, with a fleet's prior and without.
 
-Each vehicle of a simulated fleet is drawn at random and flies several deployments: ten runs, then a survey on
-another day. From one refit to the next its fixed iron, its masses' places and moments change (`--refit
-battery`: the battery pack is another one, with a moment of its own), from one power-up to the next the
-sensor's offsets. The fleet learns from all deployments but each vehicle's last. The last one is calibrated
-with some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py
-does. The bound assumes that the vehicle before its last refit and the widths of all changes are known
-exactly.
+Each vehicle of a simulated fleet is random and performs several deployments: ten runs, then a survey on
+another day. A refit (overhaul) changes the fixed iron and the places and moments of the masses; with `--refit
+battery` it also replaces the battery pack by one with a random moment. A power-up changes the sensor's
+offsets. The fleet's prior is fitted to all deployments except the last of each vehicle. The last deployment
+is calibrated with some of its runs, with and without the prior, and scored on its survey as in
+tools/accuracy.py. The bound assumes that the vehicle before its last refit and the standard deviations of
+all changes are known exactly.
 
     python tools/fleet.py --vehicles 12 --deployments 8 --runs 0 2 10
 """
@@ -38,15 +38,15 @@ from sitl.dataset import at_rest
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
 
 REFITTED = {"fixed iron": 50.0, "soft iron": 1e-3, "place": 0.005, "moment": 0.1}
-"""1-sigma of what a refit changes: nT an axis, nT a nT, m an axis, A m² an axis."""
+"""1-sigma of a refit's changes, per axis: fixed iron, nT; soft iron, nT/nT; place, m; moment, A m²."""
 POWERED_UP = 5.0
-"""nT, 1-sigma of an axis' offset from one power-up to the next."""
+"""1-sigma of the change of an axis' offset from one power-up to the next, nT."""
 OFFSET = 1_000_000
-"""Between the seeds of vehicles and those of their deployments."""
+"""Distance between the seeds of vehicles and the seeds of their deployments."""
 
 
 class Flight(NamedTuple):
-    """A deployment: vehicle and number, with the kind of refit, and how many deployments each refit has."""
+    """Deployment `number` of a vehicle, with the kind of refit and the deployments from refit to refit."""
 
     vehicle: int
     number: int
@@ -76,7 +76,7 @@ class Flight(NamedTuple):
         )
 
     def fly(self) -> tuple[xr.Dataset, xr.Dataset, Vehicle]:
-        """Return calibration runs and survey, without the samples of masses in motion, and the vehicle."""
+        """Return calibration runs and survey, both without samples of moving masses, and the vehicle."""
         vehicle = self.state()
         scenario = load("random_glider").replace(vehicle=vehicle, masses=MASSES)
         seed = OFFSET * (1 + self.seed) + 1000 * self.vehicle + self.number
@@ -85,7 +85,7 @@ class Flight(NamedTuple):
         return at_rest(parts["calibration"], MASSES), at_rest(parts["survey"], MASSES), vehicle
 
     def widths(self) -> FloatArray:
-        """Return how far its vehicle may be from its state before: after a refit, or a power-up alone."""
+        """Return the 1-sigma (k,) of the vehicle's changes since its last state, by a refit or a power-up."""
         refitted = self.number % self.every == 0
         nothing = 1e-9  # the bound divides by it
         widths = [*[REFITTED["soft iron"] if refitted else nothing] * 9]
@@ -99,7 +99,7 @@ class Flight(NamedTuple):
 
 
 def lesson(flight: Flight) -> Lesson | str:
-    """Calibrate a deployment by its own runs."""
+    """Return the fit of a deployment as input of the fleet's prior, or the reason of its failure."""
     runs, _, _ = flight.fly()
     try:
         found = fit(observations(runs, MASSES))
@@ -116,7 +116,7 @@ def lesson(flight: Flight) -> Lesson | str:
 
 
 def run(flight: Flight, counts: tuple[int, ...], known: Known) -> list[Row]:
-    """Calibrate a vehicle's last deployment with some of its runs, with and without its fleet."""
+    """Calibrate a vehicle's last deployment with some of its runs, each with and without the prior."""
     runs, survey, vehicle = flight.fly()
     flown = Glider(vehicle, runs, survey)
     labels = np.unique(runs["run"])
@@ -142,7 +142,7 @@ def run(flight: Flight, counts: tuple[int, ...], known: Known) -> list[Row]:
 
 
 def expected(known: Known) -> Calibration:
-    """Return what a fleet expects as a calibration, without any run."""
+    """Return the fleet's prior as a calibration that has used no run."""
     return Calibration(
         known.parameters, (Polynomial(exponents=known.exponents),), known.mean, known.covariance,
         Noise(1.0), Reference(known.field),

@@ -1,4 +1,4 @@
-"""Effects for which ``diagnose`` has no cause: any name for them is wrong.
+"""Simulate effects for which ``diagnose`` has no cause, so that any name for such an effect is wrong.
 
 Like the causes in :mod:`sitl.inject`, each is a function of the scene, a size in nT and a random generator.
 """
@@ -21,7 +21,7 @@ def relay(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ship(scene: Scene, size: float, rng: Generator) -> None:
-    """Add the dipole of a ship on a straight course; the size is the field at the closest point."""
+    """Add the dipole of a ship on a straight course; `size` is the field at the closest point, nT."""
     t0 = rng.uniform(0.3, 0.7) * scene.t[-1]
     r = np.column_stack([4.0 * (scene.t - t0), np.full_like(scene.t, 900.0), np.full_like(scene.t, -50.0)])
     own = dipole_field(r, np.broadcast_to(direction(rng), r.shape))
@@ -88,7 +88,7 @@ def thermostat(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def perming(scene: Scene, size: float, rng: Generator) -> None:
-    """Add the hysteresis of cores that are never fully saturated, each with its own relays."""
+    """Add the hysteresis of unsaturated cores by the Preisach model, a different core on each axis."""
     memory = [
         rng.normal() * relays(h / 2e4, rng.normal(0.0, 0.8, 80), rng.lognormal(np.log(0.6), 0.5, 80))
         for h in scene.field.T
@@ -97,7 +97,7 @@ def perming(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def staircase(scene: Scene, size: float, rng: Generator) -> None:
-    """Cancel most of the field in uneven steps, and measure the remainder with another gain."""
+    """Add the error of a sensor that cancels the field in uneven steps, with another gain for the rest."""
     step, gain, steps = 4000.0, rng.choice([-1.0, 1.0]), 0.5 * rng.normal(size=(64, 3))
 
     def bend(H: Array) -> Array:
@@ -109,7 +109,7 @@ def staircase(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def jettison(scene: Scene, size: float, rng: Generator) -> None:
-    """Remove induced iron shot that leaks out of its box for a while; the size is the total loss."""
+    """Remove iron shot with an induced moment, which leaks out of its box; `size` is the total loss, nT."""
     began, lasts = scene.t[-1] * rng.uniform(0.2, 0.7), scene.t[-1] * rng.uniform(0.02, 0.2)
     lost = np.clip((scene.t - began) / lasts, 0.0, 1.0)
     unit = scene.field / np.linalg.norm(scene.field[0])
@@ -142,7 +142,7 @@ def winch(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def mooring(scene: Scene, size: float, rng: Generator) -> None:
-    """Add a steel buoy that swings about its anchor near the track; the size is the largest field."""
+    """Add a steel buoy that swings about its anchor near the track; `size` is the largest field, nT."""
     track = scene.track
     north, east = track.local(track.latitude, track.longitude)
     k, circle = rng.integers(len(north)), rng.uniform(40.0, 150.0)
@@ -168,4 +168,4 @@ FOREIGN: dict[str, Effect] = {
         duet, winch, mooring,
     )
 }  # fmt: skip
-"""Effects by name."""
+"""Foreign effects by name."""

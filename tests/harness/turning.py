@@ -67,7 +67,7 @@ def events(folder: Path) -> list[Event]:
 
 
 def received(frames: list[tuple[int, bytes]]) -> list[Message]:
-    """Return the messages in a list of (priority, frame)."""
+    """Return the messages in a list of (event time in µs, frame)."""
     return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
 
 

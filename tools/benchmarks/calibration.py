@@ -1,4 +1,4 @@
-"""Time fitting and correcting, compared with scipy and with the bare matrix product."""
+"""Time the fit against scipy's least squares, and the correction against the bare matrix product."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ print(json.dumps([used, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the others write there)
-    """Time `auto` on a glider's runs, scipy's least squares on them, and `auto` on very many samples."""
+    """Time `auto` on a glider's runs, scipy's least squares on these runs, and `auto` on many samples."""
     data = table_1()
     samples = polynomial_samples(data, full_order(2, 3))
 
@@ -60,7 +60,7 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
 
 
 def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
-    """Time `correct` with positions that change at every sample, and one sample live."""
+    """Time `correct` on a log whose masses move at every sample, and the live correction of one sample."""
     data = table_1()
     calibration = fit(data).calibration
     rng = np.random.default_rng(1)
@@ -104,13 +104,13 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
 
 
 def table_1(noise: float = 1.0) -> Observations:
-    """Return a random glider's runs of the paper's Table 1; `noise` in nT."""
+    """Return a random glider's runs of the paper's Table 1, with white noise of `noise` nT."""
     scenario = load("random_glider").replace(instrument={"noise_sigma": noise})
     return observations(segments(simulate(scenario, 1))["calibration"], NAMES)
 
 
 def many(count: int) -> Observations:
-    """Return `count` samples: the same runs repeated, each time with new noise."""
+    """Return `count` samples: the runs of Table 1 repeated, each time with new noise of 1 nT."""
     runs = table_1(0.0)
     rng = np.random.default_rng(2)
     pick = np.arange(count) % len(runs)

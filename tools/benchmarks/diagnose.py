@@ -1,4 +1,4 @@
-"""Diagnosing: a night's deployment and a month's with every cause, from their logs, in a process each."""
+"""Time the diagnosis of a 12 h and a 30-day deployment with every cause, each in its own process."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from sitl.mission import CrissCross
 NIGHT, MONTH = 12.0, 720.0
 """Durations of the logs, h."""
 NIGHTLY, MONTHLY = 10.0, 1.0
-"""nT/degC, in a night and in a month: either makes a signal-to-noise ratio of 30 to 45."""
+"""Amplitude of the hidden effect in a night and in a month, nT/degC: signal-to-noise ratio of 30 to 45."""
 
-# flying a month takes more memory than diagnosing it
+# another process simulates the log, because a month's simulation needs more memory than its diagnosis
 SIMULATED = """
 import sys
 from pathlib import Path
@@ -45,7 +45,7 @@ print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(foun
 
 
 def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (others repeat)
-    """Time `diagnose` without its figures: 12 h and 30 days, plain and with an effect."""
+    """Time `diagnose` without its figures on 12 h and 30 days, each without and with a hidden effect."""
     night, found, month, loud = (
         _diagnosed(folder, hours, size)
         for hours, size in ((NIGHT, 0.0), (NIGHT, NIGHTLY), (MONTH, 0.0), (MONTH, MONTHLY))
@@ -71,16 +71,16 @@ def _diagnosed(folder: Path, hours: float, size: float) -> Any:
 
 
 def survey_in(folder: Path, hours: float, size: float) -> None:
-    """Write a survey's log and its calibration; arguments as of :func:`long_survey`."""
+    """Write a survey's log and its calibration, made by :func:`long_survey`."""
     survey, calibration = long_survey(hours, size)
     write(survey, folder / "survey.nc")
     save(calibration, folder / "calibration.json")
 
 
 def long_survey(hours: float, size: float = 0.0) -> tuple[xr.Dataset, Calibration]:
-    """Return a glider's survey of some hours with its calibration.
+    """Return a glider's survey of `hours` with its calibration.
 
-    `size` (nT/degC) is that of an offset proportional to the logged temperature.
+    `size` (nT/degC) is the slope of an added offset proportional to the logged temperature.
     """
     scenario = load("random_glider")
     survey = CrissCross(hours=hours, roll=(1.0, 2.0), pitch=(25.0, 2.5), battery_spread=0.1)

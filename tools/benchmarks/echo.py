@@ -1,4 +1,4 @@
-"""The floor of latency: what a pty and a UDP socket cost a Python process that does nothing between them."""
+"""Floor of the latency: a Python process that copies bytes from a pty to a UDP socket."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 
 
 def main() -> None:
-    """Send whatever comes from the tty to the port, until the tty is closed."""
+    """Send the bytes from the tty to the UDP port until the tty is closed."""
     tty = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     link.connect(("127.0.0.1", int(sys.argv[2])))

@@ -1,10 +1,10 @@
 """The real programs as processes: latency and start of ``magbridge run``, processor time of commands.
 
-Latency is the time from the last byte of a frame into the pty to the datagram out.
+Latency is the time from writing the last byte of a frame to the pty until the datagram arrives.
 
-One thread of this process is the fluxgate, the autopilot and the station: it writes a frame, and then polls
-the socket until the next frame is due, so that the bridge is measured and not the wake-up of this process.
-The floor is measured in the same way: a process that sends whatever it reads.
+One thread of this process acts as fluxgate, autopilot and station. It writes a frame, then polls the socket
+until the next frame is due, so that its own wake-up does not add to the latency. The floor, a process
+that copies bytes (``echo.py``), is measured in the same way.
 """
 
 from __future__ import annotations
@@ -38,43 +38,43 @@ RATES = (100, 1000)
 SECONDS = 5.0
 """Duration of one repetition."""
 GRACE = 1.0
-"""s in which the last samples may still come."""
+"""Time to wait for the last samples of a repetition, s."""
 WARM_UP = 0.5
-"""s at the beginning that are not measured: caches fill, the IGRF is computed first."""
+"""Time at the beginning that is not measured, s: caches fill, and the IGRF is computed first."""
 RAW, FIELD = spec("MAG_RAW").id, spec("MAG_FIELD").id
 BIN = Path(sys.executable).parent
 START_FLOOR = "import numpy, msgspec, serial"
-"""The imports that any bridge needs; cyclopts (the command line) and our own modules come on top."""
+"""Imports that any bridge needs; the bridge also imports cyclopts (the command line) and magbridge."""
 SETTLE_S = 3.0
 """Time with readings and telemetry before the memory is read, s."""
 START_HZ = 100
 ROWS = 2250
 LIBRARIES = "import numpy, cyclopts, pandas, xarray, scipy.linalg, scipy.optimize"
-"""What reads the file, fits and understands the command line."""
+"""Imports with which a program would read the file, fit, and parse the command line."""
 
 
 class Sent(NamedTuple):
-    """One repetition."""
+    """Result of one repetition."""
 
     latency: np.ndarray
-    """ms of each frame; NaN where it was lost."""
+    """Latency of each frame, ms; NaN if the frame was lost."""
     cpu: float
-    """s of processor time, of all threads, kernel included."""
+    """Processor time of all threads, including the kernel's, s."""
     resident: float
-    """MB"""
+    """Resident memory, MB."""
 
 
 class Running(NamedTuple):
-    """A process that runs between a pty and a socket."""
+    """Process that runs between a pty and a socket."""
 
     process: subprocess.Popen[bytes]
     master: int
     link: socket.socket
     peer: tuple[str, int]
     seconds: float
-    """From its start to its first datagram."""
+    """Time from the start of the process to its first datagram, s."""
     first: bytes
-    """That datagram."""
+    """First datagram of the process."""
 
     def write(self, frame: bytes) -> None:
         """Send `frame` as the fluxgate."""
@@ -92,7 +92,7 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Running]:
     link.settimeout(30.0)
     line = command(os.ttyname(slave), link.getsockname()[1])
     begun = time.perf_counter()
-    process = subprocess.Popen(line, stderr=subprocess.DEVNULL)  # what the bridge announces
+    process = subprocess.Popen(line, stderr=subprocess.DEVNULL)  # discard the bridge's messages
     try:
         first, peer = link.recvfrom(65536)
         link.setblocking(False)
@@ -116,7 +116,7 @@ def bridge_command(folder: Path) -> Callable[[str, int], list[str]]:
 
 
 def latency(folder: Path, repetitions: int) -> list[Row]:
-    """Measure bridge and echo in turn, at each rate."""
+    """Measure the latency of bridge and echo in turn, at each sample rate."""
     rows = []
     for hertz in RATES:
         bridge, echo = [], []
@@ -157,7 +157,7 @@ def play(
     hertz: int,
     sequences: Callable[[bytes], list[int]],
 ) -> Sent:
-    """Send readings and telemetry for a while; match the datagrams by sequence number."""
+    """Send readings and telemetry for `SECONDS`; match the datagrams to the frames by sequence number."""
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     received: list[tuple[float, bytes]] = []
     written: dict[int, float] = {}
@@ -212,7 +212,7 @@ def _sequences_of_frames() -> Callable[[bytes], list[int]]:
 
 
 def processor_time(pid: int) -> float:
-    """Return the processor time of a process so far, in s, all threads, kernel included."""
+    """Return the processor time (s) of a process until now, with all threads and the kernel."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
 
@@ -226,7 +226,7 @@ def resident(pid: int) -> dict[str, float]:
 
 
 def start(folder: Path, repetitions: int) -> list[Row]:
-    """Start the bridge repeatedly, and an interpreter with the necessary imports."""
+    """Time the start of the bridge and of an interpreter with the necessary imports."""
     bridge, bare, used = [], [], []
     memory: dict[str, float] = {}
     for _ in range(repetitions):
@@ -254,7 +254,7 @@ def start(folder: Path, repetitions: int) -> list[Row]:
 
 
 def commands(folder: Path, repetitions: int) -> list[Row]:
-    """Time commands and an interpreter that only imports the libraries they stand on."""
+    """Time commands, and an interpreter that only imports the libraries that the commands need."""
     write(simulate(load("demo"), 1).isel(time=slice(ROWS)), folder / "runs.csv")
     asked = ("--parameter", "battpos", "--parameter", "ballast", "-o", str(folder / "cal.json"))
     measured: dict[str, tuple[list[str], str, float]] = {
@@ -271,7 +271,7 @@ def commands(folder: Path, repetitions: int) -> list[Row]:
     rows = []
     for what, (command, floor, most) in measured.items():
         times, bare = [], []
-        for _ in range(repetitions + 1):  # the first fills the caches
+        for _ in range(repetitions + 1):  # the first repetition fills the caches
             times.append(_spent(command))
             bare.append(_spent([sys.executable, "-c", floor]))
         rows.append(
@@ -281,7 +281,7 @@ def commands(folder: Path, repetitions: int) -> list[Row]:
 
 
 def _spent(command: list[str]) -> float:
-    """Return the processor time, s, of a command from its start to its end."""
+    """Return the processor time (s) of a command from its start to its end."""
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, _, used = os.wait4(process.pid, 0)
     process.returncode = 0

@@ -1,4 +1,4 @@
-"""MAVLink messages by the classes that pymavlink generates from our XML: floor of the benchmarks."""
+"""Encode and decode MAVLink by the classes that pymavlink generates: the floor of the benchmarks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import magbridge.mavlink
 
 @cache
 def classes() -> ModuleType:
-    """Return the module that mavgen writes for our dialect."""
+    """Return the Python module that mavgen generates from the project's XML dialect."""
     with tempfile.TemporaryDirectory() as name, redirect_stdout(StringIO()):
         folder = Path(name)
         shutil.copy(Path(magbridge.mavlink.__file__).with_name("magbridge.xml"), folder)
@@ -39,7 +39,7 @@ def classes() -> ModuleType:
 
 
 class Peer:
-    """pymavlink's codec: decodes what the bridge receives, and encodes the messages that it publishes."""
+    """pymavlink's codec, which decodes the bridge's input and encodes its output."""
 
     def __init__(self) -> None:
         self._in = classes().MAVLink(None)
@@ -47,17 +47,17 @@ class Peer:
         self._out = classes().MAVLink(None, srcSystem=1, srcComponent=191)
 
     def decode(self, pieces: Iterable[bytes]) -> int:
-        """Decode bytes as they come; return how many messages they were."""
+        """Decode bytes in pieces; return the number of messages."""
         return sum(len(self._in.parse_buffer(piece) or ()) for piece in pieces)
 
     def arguments(self, published: bytes) -> list[tuple[type, tuple[Any, ...]]]:
-        """Return class and arguments of every message of a stream, as :meth:`encode` takes them."""
+        """Return class and arguments of each message of a stream, for :meth:`encode`."""
         reader = classes().MAVLink(None)
         messages = reader.parse_buffer(published) or []
         return [(type(one), tuple(self._argument(one, name) for name in one.fieldnames)) for one in messages]
 
     def sensor_bytes(self, data: bytes) -> tuple[type, tuple[Any, ...]]:
-        """Return class and arguments of the message in which the log keeps a sensor's bytes."""
+        """Return class and arguments of the log's message that stores the bytes of a sensor."""
         kind = classes().MAVLink_mag_sensor_bytes_message
         return kind, (0, len(data), list(data.ljust(253, b"\0")))
 
@@ -67,6 +67,6 @@ class Peer:
         return value.encode() if isinstance(value, str) else value
 
     def encode(self, messages: Iterable[tuple[type, tuple[Any, ...]]]) -> int:
-        """Make and pack messages; return the number of bytes."""
+        """Construct and pack messages; return the number of bytes."""
         out = self._out
         return sum(len(kind(*arguments).pack(out)) for kind, arguments in messages)

@@ -1,7 +1,7 @@
-"""Processor time of the whole live path for one sample, compared with pymavlink's codec alone; of learning.
+"""Measure the processor time of the live path and of in-flight calibration, for each sample.
 
-The floor decodes the received frames, encodes the sent ones, and encodes the message in which the log keeps
-the sensor's bytes.
+The floor is pymavlink's codec alone: it decodes the received frames, encodes the sent frames, and encodes the
+messages in which the log stores the sensor's bytes.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from magbridge.records import Channel
 
 HERTZ = 100
 SECONDS = 10
-"""Simulated, in one repetition."""
+"""Simulated time of one repetition of the live path, s."""
 MAX_RATIO = 2.5
-"""Largest ratio to pymavlink's classes on the messages of link and log."""
+"""Maximum ratio of the processor time to that of pymavlink's codec."""
 LEARNING_S = 20
-"""Simulated time of one repetition, s."""
+"""Simulated time of one repetition with in-flight calibration, s."""
 LEARNING = "[learning]\nenabled = true\n"
 
 
 class Edge:
-    """Events from memory, output to memory."""
+    """Adapter that reads events from memory and writes the output to memory."""
 
     def __init__(self, events: Sequence[Event]) -> None:
         self._events = events
         self.sent = bytearray()
 
     def events(self, _deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield them."""
+        """Yield the events."""
         yield from self._events
 
     def credit(self, frames: list[bytes]) -> None:
         """Do nothing: no frame is signed."""
 
     def send(self, number: int, data: bytes) -> None:
-        """Keep what goes to the link."""
+        """Append the bytes for the link to `sent`, and discard other output."""
         if number == Channel.LINK:
             self.sent += data
 
 
 def processor(folder: Path, repetitions: int) -> list[Row]:
-    """Measure with masses that are mostly at rest, and with masses that always move."""
+    """Measure the live path with masses mostly at rest, and with masses that always move."""
     return [row for moving in (False, True) for row in _measure(folder, repetitions, moving=moving)]
 
 
@@ -84,7 +84,7 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[fl
     times: dict[str, list[float]] = {"bridge": [], "decode": [], "encode": [], "encode_log": []}
 
     def live(edge: Edge) -> None:
-        """Feed the bridge, and wait until the log's thread has written every record."""
+        """Feed the events to the bridge, and wait until the log's thread has written every record."""
         drive(pipeline, edge, log, lambda _: None)
         while log.records + log.lost < pipeline.recorder.count:
             time.sleep(0.01)
@@ -99,7 +99,7 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[fl
         sent = peer.arguments(bytes(edge.sent))
         kept = [peer.sensor_bytes(event.data) for event in events if event.channel is Channel.SENSOR]
         floors = (partial(peer.decode, received), partial(peer.encode, sent), partial(peer.encode, kept))
-        if repetition:  # the first one warms up
+        if repetition:  # the first repetition fills the caches
             for name, seconds in zip(times, (bridge, *map(processor_time, floors)), strict=True):
                 times[name].append(1e6 * seconds / samples)
     log.close()
@@ -108,7 +108,7 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[fl
 
 
 def learning(folder: Path, repetitions: int) -> list[Row]:
-    """Measure a bridge that learns and one that does not."""
+    """Measure a bridge with and a bridge without in-flight calibration."""
     pipelines = {}
     for more in ("", LEARNING):
         path = write_config(folder, more=more)
@@ -122,7 +122,7 @@ def learning(folder: Path, repetitions: int) -> list[Row]:
         for more, pipeline in pipelines.items():
             slow = longest if more and repetition else []
             seconds = processor_time(partial(_drive, pipeline, Edge(events), slow))
-            if repetition:  # the first one warms up
+            if repetition:  # the first repetition fills the caches
                 times[more].append(1e6 * seconds / (LEARNING_S * HERTZ))
     gc.unfreeze()
     added = [a - b for a, b in zip(times[LEARNING], times[""], strict=True)]
@@ -134,7 +134,7 @@ def learning(folder: Path, repetitions: int) -> list[Row]:
 
 
 def _drive(pipeline: Pipeline, edge: Edge, longest: list[float]) -> None:
-    """Feed a bridge; append the ms that the longest event of each second took."""
+    """Feed events to a bridge; append the duration (ms) of the longest event in each second to `longest`."""
     worst, second = 0.0, 0
     for event in edge.events(lambda: 0):
         begun = time.perf_counter()

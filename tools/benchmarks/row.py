@@ -1,4 +1,4 @@
-"""A line of the benchmarks' table, and how times are measured."""
+"""Row of the benchmarks' table, and functions that measure processor time."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 class Row(NamedTuple):
     """A measured figure, with its floor in the same run and its target.
 
-    The `floor` is the same work at its barest, in the same unit; `floor_is` says how. The target `most` or
-    `least` limits the value, or the `ratio` if there is one: the median over the repetitions of value divided
-    by floor.
+    The `floor` is the value of a minimal program for the same work; `floor_is` names this program. The target
+    `most` or `least` limits the value, or limits `ratio` if `ratio` is not None: the median over the
+    repetitions of value divided by floor.
     """
 
     what: str
@@ -38,7 +38,7 @@ class Row(NamedTuple):
 
 
 def in_own_process(script: str, *arguments: object) -> Any:
-    """Run a script with arguments in another process; return its output, which is JSON, or None."""
+    """Run a script with arguments in another process; return its output parsed as JSON, None if empty."""
     command = [sys.executable, "-c", script, *map(str, arguments)]
     place = Path(__file__).parents[1]
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)

@@ -1,7 +1,7 @@
 """The bridge's input in every benchmark: one configuration, one calibration, one stream of events.
 
-The field that comes out is the Earth's at the vehicle's position, with noise: with any other, a faulty
-sensor would be measured.
+The corrected field is the Earth's at the vehicle's position, plus noise. Another field would make the bridge
+treat the sensor as faulty.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ TELEMETRY_HZ = 20
 TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_POSITION_INT",)
 """Messages of one second, in addition to the autopilot's heartbeat."""
 HORIZONTAL, VERTICAL, NOISE = 19_000.0, 48_640.0, 0.5
-"""nT: the Earth's field at 49.5 N, 57.8 W, and the noise of an axis."""
+"""Horizontal and vertical field at 49.5 N, 57.8 W, and noise of an axis, nT."""
 IRON_NT = 0.02
-"""Scale of the coefficients, nT; the workload has no iron, so that larger ones would be a fault."""
+"""Standard deviation of the coefficients, nT; larger values would be a fault, as the input has no iron."""
 DECLINATION = -0.32
-"""rad."""
+"""Magnetic declination, rad."""
 OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
 
 
 def calibration() -> Calibration:
-    """Return a full cubic in two masses: 90 coefficients with a full covariance."""
+    """Return a full cubic calibration in two masses: 90 coefficients with a full covariance."""
     random = np.random.default_rng(1)
     size = 90
     root = random.normal(size=(size, size))
@@ -52,7 +52,7 @@ def calibration() -> Calibration:
 def write_config(
     folder: Path, port: str = "/dev/null", url: str = "udpout:127.0.0.1:14550", more: str = ""
 ) -> Path:
-    """Write ``bridge.toml``, with `more` tables, and ``cal.json`` to `folder`; return the first."""
+    """Write ``cal.json``, and ``bridge.toml`` with `more` text, to `folder`; return the latter's path."""
     return write_bridge(
         folder,
         calibration(),
@@ -67,7 +67,7 @@ def write_config(
 
 
 class Feed:
-    """The bytes of a digitizer and of an autopilot, second after second.
+    """Generator of the bytes that a digitizer and an autopilot send.
 
     The masses are always `moving`; else they are at rest nine seconds of ten, and their telemetry jitters in
     its last digit.
@@ -95,7 +95,7 @@ class Feed:
                 yield Event(time_us & ~3, channel, self.heartbeat() if index < 0 else data)
 
     def reading(self, hertz: int) -> bytes:
-        """Return the next frame of the digitizer."""
+        """Return the next frame of the digitizer, at a sample rate of `hertz`."""
         t = next(self._samples) / hertz
         noise = self._random.gauss
         x = HORIZONTAL * sin(0.1 * t) + noise(0.0, NOISE)
@@ -109,11 +109,11 @@ class Feed:
         )
 
     def heartbeat(self) -> bytes:
-        """Return the autopilot's heartbeat."""
+        """Return the frame of the autopilot's heartbeat."""
         return self._autopilot.pack("HEARTBEAT", type=12, autopilot=0, system_status=4, mavlink_version=3)
 
     def message(self, time_us: int) -> bytes:
-        """Return the next telemetry message."""
+        """Return the frame of the autopilot's next telemetry message."""
         number = next(self._messages)
         name = TELEMETRY[number * 7 % TELEMETRY_HZ]
         boot_ms = (time_us - BEGIN_US) // 1000 % (1 << 32)
