@@ -1,10 +1,10 @@
 """Correct raw samples: one after the other as the bridge does, or many at once.
 
-Where a channel of the field or a position is NaN, or so large that the total field exceeds
-:data:`~magbridge.records.MAX_MEASURED_NT`, total and vector are NaN and the sigmas infinite. The flag is
-``gap`` if the field's channels are the reason, else ``stale_telemetry``. The equations stand in
-:mod:`.kernel`; :class:`Corrector` and :func:`correct` share its functions. :func:`forward` is the inverse,
-from the true field to the readings: ``H_r = A^-1 R^T H + T``.
+If a channel of the field or a position is NaN, or so large that the total field exceeds
+:data:`~magbridge.records.MAX_MEASURED_NT`, total and vector are NaN and the sigmas infinite. The sample is
+flagged ``gap`` if the field's channels are the reason, else ``stale_telemetry``. :mod:`.kernel` gives the
+equations, and :class:`Corrector` and :func:`correct` share its functions. The inverse :func:`forward`
+computes the readings from the true field: ``H_r = A^-1 R^T H + T``.
 """
 
 from __future__ import annotations
@@ -24,19 +24,21 @@ from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.records import MAX_MEASURED_NT, Corrected, Quality
 
 Span = tuple[int, float, float]
+"""Index of a channel, and two values of it between which it lies, in its unit."""
 GAP: Final = int(Quality.GAP)
 STALE_TELEMETRY: Final = int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED: Final = int(Quality.EXTRAPOLATED)
 RANGE_MARGIN_FRACTION = 0.02
-"""Share of the half range: telemetry that jitters at the end of its range is not extrapolated."""
+"""Fraction of a parameter's half range by which it may leave the range before a sample counts as
+extrapolated, because telemetry jitters at the end of its range."""
 
 
 class Corrector:
-    """Correct one sample after the other, as the bridge does.
+    """Corrector of single samples in order of time, with the state of the calibration's effects.
 
     Notes
     -----
-    While positions and the regressors of effects stay the same, only :func:`.kernel.apply` is computed again.
+    While positions and the regressors of effects do not change, each sample only needs :func:`.kernel.apply`.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -62,22 +64,22 @@ class Corrector:
 
     @property
     def regressors(self) -> list[float]:
-        """The regressors at the last sample: the monomials, then those of effects."""
+        """Regressors at the last sample: the monomials, then the regressors of effects."""
         return self._last
 
     def vector_covariance(self) -> tuple[float, ...]:
-        """Return the covariance of the last sample's vector without the boresight's part, 9 numbers, nT^2."""
+        """Return the 9 entries of the last vector's covariance, nT^2, without the boresight's error."""
         numbers, V = self._prepared
         (hx, hy, hz), (tx, ty, tz) = self._field, numbers[9:]
         xx, yy, zz, xy, xz, yz = variances(hx - tx, hy - ty, hz - tz, V)
         return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
     def replace(self, calibration: Calibration, values: Sequence[float] = ()) -> float:
-        """Continue with other coefficients of the same terms, or with effects added or removed at the end.
+        """Continue with another calibration; return the change of the last sample's total field, nT.
 
-        `calibration`: effects that it has in common with the one before keep their state. `values`: its
-        channels at the last sample; needed where it has effects more. Returns: nT, by which the total field
-        of the last sample changes; NaN if there was none.
+        `calibration`: the same terms with other coefficients, or with effects added or removed at the end.
+        Effects that both calibrations have keep their state. `values`: its channels at the last sample,
+        needed if effects are added. The change is NaN if no sample has been corrected.
         """
         # Total field of the last sample by the old coefficients, for the change that is returned.
         before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
@@ -85,7 +87,7 @@ class Corrector:
         self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
         self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
         self._wanted, self._base = len(calibration.channels), _base_flags(calibration)
-        # Effects in common keep their steppers, hence their state; new ones begin with the last sample.
+        # Common effects keep their steppers, hence their state; new effects begin with the last sample.
         del self._steps[len(calibration.effects) :]
         regressors = self._last[: len(self._weights)]
         for effect in calibration.effects[len(self._steps) :]:
@@ -102,7 +104,7 @@ class Corrector:
     def step(
         self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
     ) -> Corrected:
-        """Correct one sample; see :meth:`numbers`."""
+        """Correct one sample; arguments and errors as for :meth:`numbers`."""
         (F, sigma, x, y, z, sx, sy, sz), quality = self.numbers(time_us, field, values, quality)
         return Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
 
@@ -114,25 +116,25 @@ class Corrector:
         Parameters
         ----------
         time_us : int
-            µs since 1970 UTC.
+            Time of the sample, µs since 1970 UTC.
         field : tuple of 3 float
-            nT, raw, sensor axes.
+            Raw reading in sensor axes, nT.
         values : sequence of float
-            ``calibration.channels``, in that order; NaN where unknown.
+            Value of each of ``calibration.channels``, in their order; NaN where unknown.
         quality : int
-            Flags that the sample already carries.
+            Flags that the sample already has.
 
         Raises
         ------
         CalibrationError
-            Another number of values than the calibration's channels.
+            The number of values is not that of the calibration's channels.
         """
         if len(values) != self._wanted:
             raise CalibrationError(
                 f"expected {self._wanted} values ({', '.join(self.calibration.channels)}), "
                 f"found {len(values)}"
             )
-        # The table's sums are computed only where a position or a regressor changed.
+        # Compute the table's sums only if a position or a regressor changed.
         hx, hy, hz = self._field = field
         self._time_us = time_us
         values = tuple(values)
@@ -163,11 +165,11 @@ class Corrector:
     def changes(
         self, field: tuple[float, float, float], values: tuple[float, ...], spans: Sequence[Span]
     ) -> list[float]:
-        """Return the change (nT) of the total field over each span of a position, without effects.
+        """Return by how much (nT) the total field changes from the first to the second value of each span.
 
-        `field`: nT, raw, sensor axes. `values`: ``calibration.channels``, in that order. `spans` (int,
-        float, float): index of a channel, and the two values between which it lies. Spans of channels that
-        are not positions are left out of the result.
+        `field`: raw reading in sensor axes, nT. `values`: value of each of ``calibration.channels``, in their
+        order. `spans`: index of a channel, and the two values between which it lies. The result omits spans
+        of channels that are not positions, and does not include effects.
         """
         positions = values[: self._positions]
         asked = positions, spans
@@ -189,12 +191,12 @@ class Corrector:
         return [totals[high] - totals[low] for low, high in self._ends]
 
     def _linear_at(self, positions: tuple[float, ...]) -> Linear:
-        """Return A's six entries and T."""
+        """Return A's six entries and T (nT) at the positions, without effects."""
         return linear(self._kernel.monomials(positions, 1.0), self._weights)
 
 
 def _total(field: tuple[float, float, float], linear: Linear) -> float:
-    """Return ``|A (H_r - T)|``."""
+    """Return the corrected total field ``|A (H_r - T)|``, nT, of a raw reading `field`, nT."""
     xx, yy, zz, xy, xz, yz, tx, ty, tz = linear
     hx, hy, hz = field
     dx, dy, dz = hx - tx, hy - ty, hz - tz
@@ -205,7 +207,7 @@ def _total(field: tuple[float, float, float], linear: Linear) -> float:
 
 
 def _omega_of(calibration: Calibration) -> tuple[float, ...] | None:
-    """Return six entries of the boresight's covariance, as :func:`.kernel.apply` takes them."""
+    """Return xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None without a boresight."""
     if calibration.boresight is None:
         return None
     O = calibration.boresight.covariance  # noqa: E741 - Omega, as in the equation
@@ -213,18 +215,18 @@ def _omega_of(calibration: Calibration) -> tuple[float, ...] | None:
 
 
 def _steppers(calibration: Calibration) -> list[Step]:
-    """Return a stepper for each effect, in a fresh state."""
+    """Return a stepper for each effect, with its state as at power-on."""
     return [effect.begin(calibration.channels, calibration.kernel) for effect in calibration.effects]
 
 
 def _base_flags(calibration: Calibration) -> int:
-    """Return the flags that every sample has."""
+    """Return the flags that every sample gets because of the calibration itself."""
     flags = Quality(0) if calibration.boresight else Quality.NO_BORESIGHT
     return int(flags | Quality.UNCALIBRATED) if calibration.method == "none" else int(flags)
 
 
 def _valid_ranges(calibration: Calibration) -> list[tuple[float, float]]:
-    """Return the lowest and the highest value of each parameter that is not extrapolated."""
+    """Return the lowest and highest value of each parameter for which samples are not ``extrapolated``."""
     return [
         (
             parameter.low - RANGE_MARGIN_FRACTION * parameter.scale,
@@ -237,37 +239,38 @@ def _valid_ranges(calibration: Calibration) -> list[tuple[float, float]]:
 # ---- Many samples at once ----
 
 CORRECTED_AT_ONCE = 4096
-"""Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
+"""Number of samples in a block: it outweighs the overhead of a call and fits the cache of a core."""
 
 
 class CorrectedArrays(NamedTuple):
-    """Corrected samples as arrays: nT, and :class:`~magbridge.records.Quality` bits."""
+    """Corrected samples as arrays."""
 
     total: FloatArray
     sigma: FloatArray
-    """`total`, `sigma`: (n,)."""
+    """`total`, `sigma`: (n,): Total field and its standard deviation, nT."""
     vector: FloatArray
     vector_sigma: FloatArray
-    """`vector`, `vector_sigma`, (n, 3): Body axes; sensor axes where ``no_boresight`` is set."""
+    """`vector`, `vector_sigma`: (n, 3): Field vector and its standard deviations, nT, in body axes; in sensor
+    axes if the flag ``no_boresight`` is set."""
     quality: IntArray
-    """(n,)."""
+    """(n,): Flags of each sample, bits of :class:`~magbridge.records.Quality`."""
 
 
 def correct(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> CorrectedArrays:
-    """Correct many samples; within 1e-12 of the field what :class:`Corrector` gives one by one.
+    """Correct many samples; the result equals that of :class:`Corrector` to within 1e-12 of the field.
 
     Parameters
     ----------
     calibration : Calibration
-        Of the sensor that took the samples.
+        Calibration of the sensor that took the samples.
     field : (n, 3) array
-        nT, raw, sensor axes.
+        Raw readings in sensor axes, nT.
     channels : (n, k) array
-        ``calibration.channels``, in that order; NaN where unknown.
+        Values of ``calibration.channels``, in their order; NaN where unknown.
     time : (n,) array
-        s since 1970 UTC, ascending: effects may have a state.
+        Time of the samples, s since 1970 UTC, ascending because effects may have a state.
 
     Returns
     -------
@@ -276,7 +279,7 @@ def correct(
     Raises
     ------
     CalibrationError
-        Another number of columns than the calibration's channels.
+        The number of columns of `channels` is not that of the calibration's channels.
     """
     field = np.asarray(field, float)
     n = len(field)
@@ -287,7 +290,7 @@ def correct(
             f"found {channels.shape[1]}"
         )
     out, turn = np.empty((8, n)), _omega_of(calibration)
-    with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
+    with np.errstate(all="ignore"):  # NaN inputs give NaN results, which are flagged below
         for part, prepared in _prepared_blocks(calibration, field, channels, time):
             hx, hy, hz = field[part].T
             out[:, part] = apply(hx, hy, hz, prepared, turn, np.sqrt)
@@ -307,7 +310,7 @@ def correct(
 def vector_covariance(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return the covariance of the corrected vector, without the boresight's part, (n, 3, 3) nT^2.
+    """Return the covariance (n, 3, 3), nT^2, of corrected vectors without the error of the boresight.
 
     Arguments as for :func:`correct`.
 
@@ -328,7 +331,7 @@ def vector_covariance(
 def _prepared_blocks(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> Iterator[tuple[slice, Prepared]]:
-    """Yield blocks of rows that fit the cache, in order of time because effects have a state."""
+    """Yield the rows of each block, in order of time, and the input of :func:`.kernel.apply` for them."""
     steps = _steppers(calibration)
     for start in range(0, len(field), CORRECTED_AT_ONCE):
         part = slice(start, start + CORRECTED_AT_ONCE)
@@ -339,7 +342,10 @@ def _prepared_blocks(
 def _regressors(
     kernel: Kernel, steps: list[Step], field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return (m, n) regressors: monomials vectorised; effects sample by sample, because they have a state."""
+    """Return the regressors (m, n) of n samples, those of effects computed by their steppers `steps`.
+
+    `field` (n, 3): raw reading, nT. `channels` (n, k): telemetry. `time` (n,): s since 1970 UTC.
+    """
     phi = kernel.monomials(list(channels.T), np.ones(len(field)))
     if steps:
         times = np.rint(np.asarray(time) * 1e6).astype(np.int64).tolist()
@@ -352,9 +358,10 @@ def _regressors(
 def regressors(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return (m, n) regressors of every sample, from a fresh state, in the effects' array form.
+    """Return the regressors (m, n) of n samples, those of effects computed by their method ``batch``.
 
-    Arguments as for :func:`correct`, which steps through the effects as the bridge does.
+    Arguments as for :func:`correct`. Unlike this function, :func:`correct` uses the effects' steppers, as the
+    bridge does.
     """
     kernel, channels = calibration.kernel, channels.reshape(len(field), -1)
     series = LogSeries(time, field, dict(zip(calibration.channels, channels.T, strict=True)), kernel)
@@ -366,7 +373,11 @@ def regressors(
 
 
 def _prepare_many(kernel: Kernel, phi: FloatArray) -> Prepared:
-    """Prepare (m, n) regressors; if most repeat the sample before, once for each stretch of equal ones."""
+    """Return the input of :func:`.kernel.apply` for n samples' regressors (m, n).
+
+    If at most half of the samples differ from the previous one, it is computed once for each stretch of equal
+    samples.
+    """
     # At rest the regressors of successive samples are equal: prepare each stretch once, and repeat it.
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
@@ -381,29 +392,29 @@ def _prepare_many(kernel: Kernel, phi: FloatArray) -> Prepared:
 def forward(
     calibration: Calibration, field_body: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return the noiseless readings in a true field.
+    """Return the noiseless readings of a sensor in a true field; the inverse of :func:`correct`.
 
     Parameters
     ----------
     calibration : Calibration
-        Of the simulated sensor.
+        Calibration of the simulated sensor.
     field_body : (n, 3) array
-        nT, the true field in body axes (in the calibration's sensor axes if it has no boresight).
+        True field in body axes, nT; in sensor axes if the calibration has no boresight.
     channels : (n, k) array
-        ``calibration.channels``, in that order.
+        Values of ``calibration.channels``, in their order.
     time : (n,) array
-        s.
+        Time of the samples, s since 1970 UTC.
 
     Returns
     -------
     (n, 3) array
-        nT, raw channels.
+        Raw readings in sensor axes, nT.
     """
     truth = np.asarray(field_body, float)
     if calibration.boresight is not None:
         truth = truth @ calibration.boresight.matrix()
     reading = truth
-    # the first pass is exact unless effects depend on the reading; each further one then gains two digits
+    # the first pass is exact unless effects depend on the reading; then each further pass gains two digits
     for _ in range(6 if calibration.effects else 1):
         # the nine coefficients at every sample, with effects
         phi = regressors(calibration, reading, np.asarray(channels, float), time)

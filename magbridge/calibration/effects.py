@@ -1,10 +1,10 @@
-"""Effects of telemetry, masses and the instrument: terms that do not depend on the present positions alone.
+"""Effects: terms of a calibration that depend on telemetry, time, the reading, or earlier positions.
 
 Notes
 -----
-An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
-regressors sample by sample (`begin` returns a stepper with a fresh state) or of a whole log (`batch`).
-Without a state one function does both (:class:`MomentaryEffect`).
+An effect names its channels (`channels`) and states how its coefficients map regressors to the slots
+(`columns`). It computes the regressors sample by sample (`begin` returns the stepper, a function with a
+state) or of a whole log (`batch`). A :class:`MomentaryEffect` has no state and uses one function for both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_INTERVAL = 60_000_000
 
 
 def offsets(regressors: int) -> FloatArray:
-    """Return columns (3 r, r, 9): each regressor adds to T with three coefficients of its own."""
+    """Return the columns (3 r, r, 9) of an effect in which each regressor adds three coefficients to T."""
     columns = np.zeros((3 * regressors, regressors, 9))
     for r in range(regressors):
         columns[3 * r : 3 * r + 3, r, 6:9] = np.eye(3)
@@ -38,12 +38,12 @@ def offsets(regressors: int) -> FloatArray:
 
 
 def powers(x: Any, order: int) -> tuple[Any, ...]:
-    """Return ``x, x^2, ... x^order`` of a number or an array: ``pow()`` is a hundred times as slow."""
+    """Return ``x, x^2, ... x^order`` of a number or an array, by products: ``pow()`` is slower."""
     return tuple(accumulate(repeat(x, order), mul))
 
 
 def held(values: FloatArray, first: float) -> FloatArray:
-    """Return values (n,) with each NaN replaced by the last known value, or by `first`."""
+    """Return values (n,) with each NaN replaced by the last known value, or by `first` at the start."""
     known = ~np.isnan(values)
     if known.all():
         return values
@@ -53,9 +53,10 @@ def held(values: FloatArray, first: float) -> FloatArray:
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
-    """Return y (n,) that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
+    """Return `values` (n,) filtered by equal first-order lags in series (:class:`ChannelEffect`).
 
-    `time`, `values` (n,): s, and x. `lag`: s, the sum of all `stages`; at 0, y is x.
+    The filter starts in equilibrium with the first value. `time` (n,): s. `lag`: s, the sum of the time
+    constants of all `stages`; with 0 the values are returned unchanged.
     """
     if lag <= 0.0 or len(time) < 2:
         return values
@@ -69,14 +70,17 @@ def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) ->
 
 
 def _filtered(values: FloatArray, share: float) -> FloatArray:
-    """Return (n,) ``y_t = y_(t-1) + s (x_t - y_(t-1))``."""
+    """Return y (n,) with ``y_t = y_(t-1) + s (x_t - y_(t-1))``; the fraction s is equal for all steps."""
     from scipy.signal import lfilter  # noqa: PLC0415  (the live path starts without scipy)
 
     return np.asarray(lfilter([share], [1.0, share - 1.0], values, zi=[(1.0 - share) * values[0]])[0])
 
 
 def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
-    """Return the same (n,) with a fraction for each step, by doubling over 2, 4, 8 ... rows."""
+    """Return y (n,) as :func:`_filtered` does, with a fraction `share` (n - 1,) for each step.
+
+    The function combines pairs of 2, 4, 8 ... rows, so the number of its passes grows with log2(n).
+    """
     # y_t = kept_t y_(t-1) + share_t x_t. Two such maps in series are one: combine pairs by doubling.
     y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
     step = 1
@@ -88,50 +92,50 @@ def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
 
 
 class MomentaryEffect(Effect, frozen=True, kw_only=True):
-    """An effect without a state: the function that :meth:`begin` returns accepts numbers and arrays."""
+    """Effect without a state; the function that its :meth:`begin` returns accepts numbers and arrays."""
 
     remembers: ClassVar[bool] = False
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return (r, n) regressors."""
+        """Return the regressors (r, n) of a whole log."""
         step: Any = self.begin(tuple(series.values), series.kernel)
         rows = step(series.time_us, *series.reading.T, [*series.values.values()])
         return np.stack([np.broadcast_to(row, len(series.time)) for row in rows])
 
 
 class SingleChannelEffect(Effect, frozen=True, kw_only=True):
-    """An effect that depends on one telemetry channel."""
+    """Effect that depends on one telemetry channel."""
 
     channel: str
-    """Name of the telemetry series."""
+    """Name of the telemetry channel."""
 
     @property
     def size(self) -> int:
-        """Three coefficients, one for each axis."""
+        """Number of coefficients: three, one for each axis."""
         return 3
 
     def channels(self) -> tuple[str, ...]:
-        """Return the name of its channel."""
+        """Return the name of the effect's only channel."""
         return (self.channel,)
 
 
 class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
-    """Offset or scale proportional to a channel, at once or through lags in series."""
+    """Effect whose offset or scale is proportional to a channel, directly or through lags in series."""
 
     kind: ClassVar[str] = "channel"
     origin: float = 0.0
-    """Value of the channel at which the effect is zero (the temperature at calibration; 0 A)."""
+    """Value of the channel at which the effect is zero, such as the temperature at calibration or 0 A."""
     lag: Annotated[float, Meta(ge=0.0)] = 0.0
-    """s, sum of the time constants of equal first-order lags in series, each ``dy/dt = (x - y) / (lag /
+    """Sum of the time constants (s) of equal first-order lags in series, each ``dy/dt = (x - y) / (lag /
     stages)``; 0: no lag."""
     stages: Power = 1
-    """Number of lags in series: 1 for a single heat store, 2 for one that is heated through another."""
+    """Number of lags in series: 1 for a single heat store, 2 for a store that is heated through another."""
     on: Literal["offset", "scale"] = "offset"
-    """``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three, added to the
-    diagonal of ``a``, nT at F_0 per unit."""
+    """``offset``: the three coefficients, nT per unit of the channel, add to T. ``scale``: they add to the
+    diagonal of ``a``, in nT at F_0 per unit of the channel."""
 
     def columns(self, field: float) -> FloatArray:
-        """Return one regressor, one slot for each axis."""
+        """Return the columns (3, 1, 9): the only regressor adds one coefficient to one slot of each axis."""
         columns = np.zeros((3, 1, 9))
         # Slots 6 to 8 are T (offset), slots 0 to 2 the diagonal of a (scale).
         columns[:, 0, 6:9] = np.eye(3) * (self.on == "offset")
@@ -139,7 +143,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
         return columns
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper that starts in equilibrium with the first value it sees."""
+        """Return a stepper that starts in equilibrium with the first known value of the channel."""
         index = channels.index(self.channel)
         origin, stages, lag = self.origin, self.stages, self.lag / self.stages
         levels, then, first = [origin] * stages, 0, True
@@ -161,7 +165,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return (1, n) regressors; 0 before the first value."""
+        """Return the regressor (1, n) of a whole log; it is 0 before the first known value."""
         values = series.values[self.channel]
         known = np.flatnonzero(~np.isnan(values))
         out = np.full(len(values), np.nan)
@@ -170,28 +174,28 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
 
 
 class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
-    """Offsets from a mass whose position is one telemetry channel."""
+    """Effect on the offset T of a mass whose position p is reported by one telemetry channel."""
 
     centre: float
     scale: Width
-    """`centre`, `scale`: In the channel's unit."""
+    """`centre`, `scale`: In the channel's unit; the scaled position is ``(p - centre) / scale``."""
 
     def columns(self, field: float) -> FloatArray:
-        """Offsets."""
+        """Return the columns (3 r, r, 9): each regressor adds three coefficients to T."""
         return offsets(self.size // 3)
 
 
 class PathEffect(MassEffect, frozen=True, kw_only=True):
-    """Offsets that depend on nothing but where the mass is, ``x = (p - centre) / scale``."""
+    """Effect on the offset T that depends only on the mass's present position, not on its path."""
 
     remembers: ClassVar[bool] = False
 
     @abstractmethod
     def regressors(self, x: Any) -> tuple[Any, ...]:
-        """Return the regressors at x, a number or an array."""
+        """Return the regressors at the scaled position x, a number or an array."""
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper; while the value is missing, the last one holds."""
+        """Return a stepper that uses the last known value of the channel while the value is NaN."""
         index, x = channels.index(self.channel), 0.0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
@@ -203,14 +207,15 @@ class PathEffect(MassEffect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return (r, n) regressors."""
+        """Return the regressors (r, n) of a whole log."""
         return np.stack(self.regressors(held((series.values[self.channel] - self.centre) / self.scale, 0.0)))
 
 
 class PowersEffect(PathEffect, frozen=True, kw_only=True):
-    """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
+    """Polynomial offset of a mass that another channel moves: ``T += sum_k c_k x^k``.
 
-    A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
+    Here ``x = (p - centre) / scale``. A permanent moment m on a mass at ``r(p)`` causes the field ``G(r(p))
+    m`` (see :mod:`.dipole`), which is a power series in p.
     """
 
     kind: ClassVar[str] = "powers"
@@ -219,70 +224,70 @@ class PowersEffect(PathEffect, frozen=True, kw_only=True):
 
     @property
     def size(self) -> int:
-        """Three coefficients (nT) for each power."""
+        """Number of coefficients (nT): three for each power."""
         return 3 * self.order
 
     def regressors(self, x: Any) -> tuple[Any, ...]:
-        """Return x to x^order."""
+        """Return the powers of x from 1 to `order`."""
         return powers(x, self.order)
 
 
 class SourcesEffect(PathEffect, frozen=True, kw_only=True):
-    """Iron that a mass passes on its path: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
+    """Offset by iron near the path of a mass: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
 
     Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the mass,
-    makes a field that falls with the cube of their distance. A row of sources near the path can make the same
-    field as iron at an unknown place: an equivalent layer (Dampney 1969, Geophysics 34:39).
-
-    `centre`, `scale`: position of the first source, and distance of all from the path, in the channel's unit.
-    `apart`: distance between neighbouring sources, in units of `scale`. `count`: number of sources.
+    causes a field that falls with the cube of their distance. A row of sources near the path can cause the
+    same field as iron at an unknown position: an equivalent layer (Dampney 1969, Geophysics 34:39). `centre`
+    is the position of the first source, and `scale` the distance of all sources from the path.
     """
 
     kind: ClassVar[str] = "sources"
     apart: Width
+    """Distance between neighbouring sources, in units of `scale`."""
     count: Power = 1
+    """Number of sources."""
 
     @property
     def size(self) -> int:
-        """Three coefficients (nT) for each source."""
+        """Number of coefficients (nT): three for each source."""
         return 3 * self.count
 
     def regressors(self, x: Any) -> tuple[Any, ...]:
-        """Return the regressor of each source."""
+        """Return the regressor of each source at the scaled position x."""
         # (1 + x_k^2)^(-3/2) without a power of a non-integer exponent.
         near = [1.0 / (1.0 + (x - self.apart * k) ** 2) for k in range(self.count)]
         return tuple(one * one**0.5 for one in near)
 
 
 class LegendreEffect(MomentaryEffect, frozen=True, kw_only=True):
-    """Field of the calibration's own positions beyond its terms: ``T += c prod_k P_e_k(x_k)``.
+    """Offset by a higher power of the calibration's own positions: ``T += c prod_k P_e_k(x_k)``.
 
-    P_e, Legendre's polynomial of degree e, is what a fit of all lower powers leaves of x^e over the
-    calibrated travel.
+    P_e is the Legendre polynomial of degree e. It is proportional to the residual of x^e after a fit of all
+    lower powers over the calibrated travel.
     """
 
     kind: ClassVar[str] = "legendre"
     exponents: Exponents
-    """Degrees, one for each parameter, of positions scaled as the calibration scales them."""
+    """Degree e_k for each parameter, whose positions x_k are scaled by the calibration."""
 
     @property
     def size(self) -> int:
-        """One for each axis, nT."""
+        """Number of coefficients (nT): three, one for each axis."""
         return 3
 
     def check(self, parameters: tuple[str, ...]) -> None:
-        """Require one exponent for each parameter."""
+        """Raise CalibrationError unless each parameter has an exponent >= 0, with a sum of at most 30."""
         if len(self.exponents) != len(parameters):
             raise CalibrationError(f"legendre: expected {len(parameters)} exponents, one for each parameter")
         if min(self.exponents, default=0) < 0 or sum(self.exponents) > MAX_ORDER:
             raise CalibrationError(f"legendre: expected exponents >= 0, together at most {MAX_ORDER}")
 
     def columns(self, field: float) -> FloatArray:
-        """Offsets."""
+        """Return the columns (3, 1, 9): the only regressor adds three coefficients to T."""
         return offsets(1)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return the product of the positions' polynomials, by Horner's scheme."""
+        """Return a function that computes the product of the polynomials, by Horner's scheme."""
         factors = [
             (k, kernel.centre[k], kernel.scale[k], leg2poly([0.0] * e + [1.0])[::-1].tolist())
             for k, e in enumerate(self.exponents)
@@ -302,31 +307,32 @@ class LegendreEffect(MomentaryEffect, frozen=True, kw_only=True):
 
 
 class PlayEffect(MassEffect, frozen=True, kw_only=True):
-    """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
+    """Offset by backlash or remanence: ``T += c (S(y) - S(p)) / width``.
 
-    ``y = min(max(y, p - width / 2), p + width / 2)``: y lags behind p by up to half the width, on the side
-    from which the mass came. A drive's backlash makes a loop of constant width (S linear). Steel near the
-    path is remagnetised only while the mass is near, so its loop closes farther away: ``S(v) = scale tanh((v
-    - centre) / scale)``, a generalised play (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*,
-    sec. 2.1 and 2.4).
+    y is the play operator (backlash) of the channel p, ``y = min(max(y, p - width / 2), p + width / 2)``. It
+    lags behind p by up to half the width, on the side from which the mass came. A drive's backlash causes a
+    loop of constant width (S linear). Steel near the path is remagnetised only while the mass is near, so its
+    loop closes farther away. S is then ``S(v) = scale tanh((v - centre) / scale)``, a generalised play
+    (Brokate & Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
 
-    `width`: in the channel's unit. `centre`, `scale`: position of the steel, and how far its effect reaches,
-    in the channel's unit; with a scale far beyond the travel S is linear. `order`: 0: S as above. In older
-    files, the highest power of a polynomial in its place: ``sum_k c_k (v^k - x^k)`` with ``v = (y - centre) /
-    scale`` and ``x = (p - centre) / scale``.
+    `centre` is the position of the steel and `scale` the range of its effect; if `scale` is much longer than
+    the travel, S is linear.
     """
 
     kind: ClassVar[str] = "play"
     width: Width
+    """Width of the loop, in the channel's unit."""
     order: Annotated[int, Meta(ge=0, le=MAX_ORDER)] = 0
+    """0: S as above. Older files have the highest power of a polynomial instead: ``sum_k c_k (v^k - x^k)``
+    with ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``."""
 
     @property
     def size(self) -> int:
-        """Three coefficients (nT), one for each axis; for a polynomial, three for each power."""
+        """Number of coefficients (nT): one for each axis; for a polynomial, three for each power."""
         return 3 * max(self.order, 1)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper that starts in the middle of its play."""
+        """Return a stepper that starts with ``y = p`` at the first known value, the middle of the play."""
         index, centre, scale, width, order = (
             channels.index(self.channel), self.centre, self.scale, self.width, self.order
         )  # fmt: skip
@@ -347,7 +353,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return (r, n) regressors; 0 before the first value."""
+        """Return the regressors (r, n) of a whole log; they are 0 before the first known value."""
         values = series.values[self.channel]
         known = ~np.isnan(values)
         out = np.full((max(self.order, 1), len(values)), np.nan)
@@ -361,10 +367,10 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
 
 def play(values: FloatArray, width: float) -> FloatArray:
-    """Return (n,) play operator of values, from the middle of the play (:class:`PlayEffect`).
+    """Return the play operator y (n,) of `values` (n,), starting at the first value (:class:`PlayEffect`).
 
-    Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
-    by doubling: over 2, 4, 8 ... rows.
+    Each row clips the output of the previous row. Two clips in series are one clip, so the function combines
+    them over 2, 4, 8 ... rows.
     """
     # Row t clips the output of row t - 1 to [p - w/2, p + w/2]; the first row begins in the middle.
     low, high = values - 0.5 * width, values + 0.5 * width
@@ -378,26 +384,26 @@ def play(values: FloatArray, width: float) -> FloatArray:
 
 
 class ClockEffect(Effect, frozen=True, kw_only=True):
-    """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, for all nine coefficients theta.
+    """Effect of delayed telemetry: ``theta += delay * dtheta/dp * dp/dt``, for all nine slots theta.
 
     The only coefficient is the delay: the time (s) by which the telemetry lags behind the field's samples.
     """
 
     kind: ClassVar[str] = "clock"
     sign: float = 1.0
-    """1; or -1 if the delay is that of the field's samples behind the telemetry, as after a filter."""
+    """1 if the telemetry lags behind the field's samples, -1 if the samples lag, as after a filter."""
 
     @property
     def size(self) -> int:
-        """One delay."""
+        """Number of coefficients: one, the delay."""
         return 1
 
     def columns(self, field: float) -> FloatArray:
-        """Return one coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
+        """Return the columns (1, 9, 9): the delay multiplies the rate of change (nT/s) of each slot."""
         return self.sign * np.eye(9)[None]
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper; rates are differences from the previous sample over the time between."""
+        """Return a stepper that computes the rates of the nine slots as backward differences."""
         last: list[float] = []
         still, weights, then = (0.0,) * 9, kernel.rate_weights.T.tolist(), 0
 
@@ -416,7 +422,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return (9, n) regressors."""
+        """Return the regressors (9, n) of a whole log: the rates of change of the nine slots, nT/s."""
         # Backward difference, as in the stepper; across a gap or at a repeated time the rate is zero.
         monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
         apart = 1e-6 * np.diff(series.time_us)
@@ -430,36 +436,36 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
 
 class TimeEffect(MomentaryEffect, frozen=True, kw_only=True):
-    """An offset that depends on time alone."""
+    """Offset that depends on time only."""
 
     kind: ClassVar[str] = "time"
     shape: Literal["step", "drift", "tone"]
-    """Step: ``H(t - t_0)``. Drift: ``x = (t - t_0) / period`` and its powers, with x held at -1 and 1 beyond
-    them, because nothing is known of a drift outside the time it was fitted to. Tone: ``cos`` and ``sin`` of
-    ``2 pi (t - t_0) / period``."""
+    """``step``: 1 from t_0 on. ``drift``: the powers of ``x = (t - t_0) / period``; x is limited to -1 and 1,
+    because a drift is unknown outside the time of its fit. ``tone``: ``cos`` and ``sin`` of ``2 pi (t - t_0)
+    / period``."""
     start: Annotated[float, Meta(ge=-1e12, le=1e12)]
-    """t_0, s since 1970 UTC."""
+    """Time t_0, s since 1970 UTC."""
     period: Width = 86_400.0
-    """Period of the slowest term, s."""
+    """Period of a tone, or time in which x of a drift changes by 1, s."""
     order: Power = 1
     """Highest power of a drift."""
 
     @property
     def regressors(self) -> int:
-        """Number of functions of time."""
+        """Number of regressors, each a function of time."""
         return {"step": 1, "drift": self.order, "tone": 2}[self.shape]
 
     @property
     def size(self) -> int:
-        """Three coefficients (nT) for each function of time."""
+        """Number of coefficients (nT): three for each function of time."""
         return 3 * self.regressors
 
     def columns(self, field: float) -> FloatArray:
-        """Offsets."""
+        """Return the columns (3 r, r, 9): each function of time adds three coefficients to T."""
         return offsets(self.regressors)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return the functions of time."""
+        """Return a function that computes the functions of time at a sample's time."""
         start, period, shape, order = round(self.start * 1e6), self.period * 1e6, self.shape, self.order
 
         def step(time_us: Any, hx: Any, hy: Any, hz: Any, values: Sequence[Any]) -> tuple[Any, ...]:
@@ -474,26 +480,27 @@ class TimeEffect(MomentaryEffect, frozen=True, kw_only=True):
 
 
 class RateEffect(Effect, frozen=True, kw_only=True):
-    """Offsets proportional to the rate of change of the reading, ``dH_r/dt``; coefficients in s.
+    """Offset proportional to the rate of change of the reading, ``dH_r/dt``; coefficients in s.
 
     Notes
     -----
-    Live, later samples are not known, so the rate is the second-order backward difference of three samples.
+    Later samples are unknown in live operation, so the rate is the second-order backward difference of three
+    samples.
     """
 
     kind: ClassVar[str] = "rate"
     on: Literal["skew", "eddy"]
-    """``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three
-    coefficients. ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six
-    coefficients xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961)."""
+    """``skew``: channel i is sampled tau_i later than the log states; the three coefficients are tau_i in
+    ``T_i = tau_i dH_i/dt``. ``eddy``: a changing field drives eddy currents; the six coefficients xy, xz, yx,
+    yz, zx, zy are k_ij in ``T_i = k_ij dH_j/dt`` (Tolles & Lawson 1950, in the notation of Leliak 1961)."""
 
     @property
     def size(self) -> int:
-        """Number of coefficients (times, s)."""
+        """Number of coefficients, each a time in s."""
         return {"skew": 3, "eddy": 6}[self.on]
 
     def columns(self, field: float) -> FloatArray:
-        """Return three regressors, the rates of the three channels (nT/s)."""
+        """Return the columns (K, 3, 9): each coefficient adds the rate (nT/s) of one channel to T."""
         columns = np.zeros((self.size, 3, 9))
         if self.on == "skew":
             for k in range(3):
@@ -506,14 +513,17 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         return columns
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return a stepper; rates are zero until three samples have come without a gap."""
+        """Return a stepper that computes the channels' rates, nT/s.
+
+        The rate is 0 at the first sample after a gap, and a first-order difference at the second.
+        """
         before: tuple[float, float, float] = (0.0, 0.0, 0.0)
         slope: tuple[float, float, float] = (0.0, 0.0, 0.0)
         then, apart_before, count = 0, 0.0, 0
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal before, slope, then, apart_before, count
-            if hx + hy + hz - (hx + hy + hz) != 0.0:  # NaN: as if the sample had not come
+            if hx + hy + hz - (hx + hy + hz) != 0.0:  # NaN or infinite: ignore the sample
                 return 0.0, 0.0, 0.0
             # Second-order backward difference: slope + (slope - previous slope) h / (h + previous h).
             apart = 1e-6 * (time_us - then)
@@ -529,7 +539,10 @@ class RateEffect(Effect, frozen=True, kw_only=True):
         return step
 
     def batch(self, series: LogSeries) -> FloatArray:
-        """Return the same backward difference (3, n): a centred one shares less noise with its sample."""
+        """Return the rates (3, n) of a whole log, nT/s, as the backward differences of the stepper.
+
+        Centred differences would not do: they share less noise with their sample than live rates share.
+        """
         # Rates over the finite samples only, as the stepper skips the others.
         known = np.flatnonzero(np.isfinite(series.reading).all(axis=1))
         apart = 1e-6 * np.diff(series.time_us[known])
@@ -544,33 +557,33 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
 
 class ResponseEffect(MomentaryEffect, frozen=True, kw_only=True):
-    """A nonlinear response: a power of each channel's reading, or one channel with a knee."""
+    """Nonlinear response of the sensor: a power of each channel's reading, or a knee in one channel."""
 
     kind: ClassVar[str] = "response"
     unit: Annotated[float, Meta(ge=1.0, le=1e9)]
-    """Unit of the coefficients, nT."""
+    """Field (nT) by which readings are divided."""
     power: Annotated[int, Meta(ge=0, le=MAX_ORDER)] = 0
-    """``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead."""
+    """Exponent in ``T_i += c_i (H_i / unit)^power``, with three coefficients, nT; 0: a knee instead."""
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
     """Index of the channel that has the knee."""
     knee: float = 0.0
-    """Knee of the curve, nT, for either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) /
-    unit``: two coefficients, nT."""
+    """Reading at the knee, nT; s is its sign. Where ``s H >= s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``
+    with two coefficients, nT."""
 
     @property
     def size(self) -> int:
-        """Three coefficients for a power, two for a knee."""
+        """Number of coefficients (nT): three for a power, two for a knee."""
         return 3 if self.power else 2
 
     def columns(self, field: float) -> FloatArray:
-        """For a power, each channel has a regressor of its own; for a knee, one channel has both."""
+        """Return the columns (K, K, 9): a power adds one regressor to each channel, a knee both to one."""
         columns = np.zeros((self.size, self.size, 9))
         for k in range(self.size):
             columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0
         return columns
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
-        """Return the powers of the readings, or the two functions beyond the knee."""
+        """Return a function that computes the readings' powers, or the two regressors beyond the knee."""
         power, unit, axis, knee = self.power, self.unit, self.axis, self.knee
         sign = 1.0 if knee >= 0.0 else -1.0
 

@@ -1,8 +1,8 @@
 """Export a calibration as C99 for a microcontroller: one header and one source, without allocation.
 
-The source is the table of :class:`~magbridge.calibration.kernel.Kernel` and the arithmetic of that module,
-in the same order: in double it gives the field to the last bits that the sum's order keeps (1e-8 nT), in
-float to some 0.02 nT of 50,000. Both files are templates in ``c_templates``.
+The source holds the table of :class:`~magbridge.calibration.kernel.Kernel` and repeats its arithmetic in the
+same order. In double its field differs from that of Python by 1e-8 nT, in float by about 0.02 nT. The
+templates of both files are in ``c_templates``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from magbridge.estimation.residual import PAIRS
 
 
 def c_header(calibration: Calibration) -> str:
-    """Return ``magbridge_calibration.h``."""
+    """Return the text of ``magbridge_calibration.h``."""
     lines = []
     for k, one in enumerate(calibration.parameters):
         listed = f"{k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}"
@@ -33,9 +33,9 @@ def c_header(calibration: Calibration) -> str:
 
 
 def c_source(calibration: Calibration) -> str:
-    """Return ``magbridge_calibration.c``.
+    """Return the text of ``magbridge_calibration.c``.
 
-    CalibrationError: it has effects, which follow telemetry in time: they have a state, and are not written.
+    CalibrationError: the calibration has effects, whose state the C code does not support.
     """
     if calibration.effects:
         names = ", ".join(sorted({type(one).__name__ for one in calibration.effects}))
@@ -44,10 +44,10 @@ def c_source(calibration: Calibration) -> str:
     kernel = calibration.kernel
     omega = calibration.boresight.covariance if calibration.boresight else ((0.0,) * 3,) * 3
     place = [[0] * 3 for _ in range(3)]
-    # place of entry (i, j) among the six of a symmetric matrix
+    # index of entry (i, j) among the six entries of a symmetric matrix
     for k, (i, j) in enumerate(PAIRS):
         place[i][j] = place[j][i] = k
-    # C has no empty arrays: one row of zeros where there is no parameter
+    # C has no empty arrays: without parameters, write one row of zeros
     some = calibration.parameters or ()
     tables = [
         reals("centre[]", kernel.centre or (0.0,)),
@@ -79,21 +79,24 @@ def c_source(calibration: Calibration) -> str:
 
 
 def c_template(name: str) -> Template:
-    """Return the C file `name` with places for a calibration's tables."""
+    """Return the template of the C file `name`, with placeholders for a calibration's tables."""
     return Template(files("magbridge.calibration").joinpath("c_templates", name).read_text("utf-8"))
 
 
 def hexadecimal(number: float) -> str:
-    """Return a C99 constant that is the number to the last bit."""
+    """Return a C99 hexadecimal constant that equals the number to the last bit."""
     return f"(real){number.hex()}"
 
 
 def reals(name: str, numbers: Sequence[float]) -> str:
-    """Return the C constant `name`, an array of the numbers."""
+    """Return the C definition of the constant array `name` with the numbers as elements."""
     return f"static const real {name} = {{{', '.join(map(hexadecimal, numbers))}}};"
 
 
 def rows(kind: str, name: str, table: Sequence[Sequence[str]]) -> str:
-    """Return the C constant `name`, a table of numbers of a `kind`, which are written already."""
+    """Return the C definition of the constant table `name`, with elements of the C type `kind`.
+
+    `table`: the elements, row by row, as C text.
+    """
     lines = ",\n".join(f"    {{{', '.join(row)}}}" for row in table)
     return f"static const {kind} {name} = {{\n{lines}\n}};"

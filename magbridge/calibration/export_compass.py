@@ -1,21 +1,21 @@
-"""Export a calibration as compass parameters of ArduPilot, PX4 and Seaglider, as far as they allow.
+"""Export the part of a calibration that ArduPilot, PX4 or a Seaglider can represent as compass parameters.
 
-The autopilots correct by a symmetric matrix and an offset, and by a vector times the battery's current::
+The autopilots correct with a symmetric matrix, an offset, and a vector times the battery's current::
 
     ArduPilot  b = M (h + OFS) + MOT I                      mG, mG/A
     PX4        b = M (h + COMP I - OFF)                     G, G/kA
 
-Ours is ``b = R A(x) (h - T(x))``. So ``M = A``, ``OFS = -T``; a parameter in ampere whose field is linear
-gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects and the boresight R; the
-export reports the resulting error.
+magbridge corrects with ``b = R A(x) (h - T(x))``. So ``M = A`` and ``OFS = -T``, and a parameter in ampere
+whose field is linear gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects and the
+boresight R; the export reports the resulting error.
 
 A Seaglider corrects counts of its compass in axes with y and z reversed, and levels the result with roll and
 pitch::
 
     m = (x, -y, -z),    p = soft (m - hard),    psi = atan2(p_y', p_x')
 
-With ``S = diag(1, -1, -1)`` and c nT in a count, the same heading follows from ``hard = S T / c`` and ``soft
-= S R A S``, at the middle of each parameter's range; :func:`heading_cost` computes the error of that.
+With ``S = diag(1, -1, -1)`` and c nT per count, ``hard = S T / c`` and ``soft = S R A S`` give the heading of
+magbridge at the middle of each parameter's range. :func:`heading_cost` computes the heading error elsewhere.
 
 References
 ----------
@@ -38,24 +38,25 @@ from magbridge.errors import CalibrationError
 
 AUTOPILOT_AXES = "X", "Y", "Z"
 OFF = (0, 1), (0, 2), (1, 2)
+"""Row and column of the entries of a symmetric matrix off its diagonal."""
 FLOAT, INTEGER = 9, 6
-"""MAV_PARAM_TYPE of a QGroundControl parameter file."""
+"""Values of MAV_PARAM_TYPE in a QGroundControl parameter file: REAL32 and INT32."""
 MAX_OFFSET_MG = 1_800.0
-"""Longest offset with which ArduPilot arms (COMPASS_OFFS_MAX), mG."""
+"""Largest length of the offset with which ArduPilot arms (COMPASS_OFFS_MAX), mG."""
 
 
 @dataclass(frozen=True)
 class Compass:
-    """The part of a calibration that an autopilot's compass model can represent."""
+    """Part of a calibration that an autopilot's compass model can represent."""
 
     matrix: FloatArray
-    """(3, 3), symmetric."""
+    """(3, 3): Symmetric matrix A at the middle of each parameter's range and zero current."""
     offset: FloatArray
-    """(3,): T at the middle of each parameter's range, at no current, nT."""
+    """(3,): T at the middle of each parameter's range and zero current, nT."""
     current: FloatArray | None
-    """(3,): dT/dI, nT/A."""
+    """(3,): dT/dI, nT/A; None if no parameter is a current."""
     lost: tuple[str, ...]
-    """What the format cannot represent, with the resulting error."""
+    """Description of each part that the format cannot represent, with the resulting error if it is known."""
 
 
 def compass_of(calibration: Calibration) -> Compass:
@@ -71,7 +72,7 @@ def compass_of(calibration: Calibration) -> Compass:
         step[currents] = 1.0
         current = matrix_and_offset(calibration, middle + step)[1] - offset
     lost = []
-    # the error of that expansion is largest at the corners of the ranges
+    # the error of this expansion is largest at the corners of the ranges
     corners = product(*((one.low, one.high) for one in calibration.parameters))
     field = calibration.reference.field * np.eye(3)
     worst = 0.0
@@ -92,7 +93,7 @@ def compass_of(calibration: Calibration) -> Compass:
 
 
 def matrix_and_offset(calibration: Calibration, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return A (3, 3) and T (3,), nT, at the parameters' values."""
+    """Return A (3, 3) and T (3,), nT, without effects, at the parameters' `values` (k,)."""
     A, T = calibration.matrices(np.reshape(values, (1, -1)))
     return A[0], T[0]
 
@@ -103,7 +104,7 @@ def _middle(calibration: Calibration) -> FloatArray:
 
 
 def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
-    """Return the text of a ``.param`` file for compass `number` (from 0), and warnings."""
+    """Return the text of an ArduPilot ``.param`` file for compass `number` (from 0), and warnings."""
     mG = NT_PER_UNIT["mG"]
     n = "" if number == 0 else str(number + 1)
     # ArduPilot: corrected = ODI (raw + OFS) + MOT I, in mG
@@ -150,25 +151,27 @@ def px4(compass: Compass, number: int = 0) -> str:
 
 
 TO_SEAGLIDER_AXES = np.diag([1.0, -1.0, -1.0])
+"""Matrix S from body axes to the axes of a Seaglider's compass."""
 TABLE_POSITIONS = 11
-"""Positions of the mass in a table."""
+"""Number of positions of the mass in a table."""
 PITCHES_DEG = -25.0, 0.0, 25.0
-"""Pitch angles of a glider at which the cost is computed."""
+"""Pitch angles of a glider at which heading errors are computed, deg."""
 HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
 
 
 @dataclass(frozen=True)
 class HeadingCost:
-    """Heading error (deg) that omitting a part of the calibration causes."""
+    """Heading error of a calibration that ignores the motion of a parameter, or of all parameters."""
 
     name: str
-    """The parameter; empty for all together."""
+    """Name of the parameter; empty for all parameters together."""
     rms: float
     largest: float
+    """`rms`, `largest`: RMS and largest absolute heading error, deg."""
 
 
 def rotation(calibration: Calibration) -> FloatArray:
-    """Return the boresight (3, 3); CalibrationError: there is none."""
+    """Return the rotation matrix (3, 3) of the boresight; CalibrationError: the calibration lacks one."""
     if calibration.boresight is None:
         raise CalibrationError(
             "no boresight: the matrix of a compass needs one; calibrate with roll and pitch in the log, at "
@@ -178,7 +181,7 @@ def rotation(calibration: Calibration) -> FloatArray:
 
 
 def seaglider(calibration: Calibration, nT_per_count: float) -> str:
-    """Return the text of a ``tcm2mat.cal``; CalibrationError: the calibration has no boresight."""
+    """Return the text of a Seaglider's ``tcm2mat.cal``; CalibrationError: the boresight is missing."""
     S = TO_SEAGLIDER_AXES
     A, T = matrix_and_offset(calibration, _middle(calibration))
     hard = S @ T / nT_per_count
@@ -189,10 +192,11 @@ def seaglider(calibration: Calibration, nT_per_count: float) -> str:
 
 
 def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
-    """Return the heading error of one offset and one matrix where masses move.
+    """Return the heading error of a constant offset and matrix at the ends of the parameters' ranges.
 
-    The first entry has all parameters at the ends of their ranges, each further one a single parameter.
-    `dip_deg`: inclination of the Earth's field; the error is inversely proportional to its horizontal part.
+    In the first entry all parameters are at the ends of their ranges, in each further entry a single
+    parameter. `dip_deg`: inclination of the Earth's field, which determines its horizontal part; the error is
+    inversely proportional to this part.
     """
     ends = [(one.low, one.high) for one in calibration.parameters]
     centre = _middle(calibration)
@@ -213,7 +217,10 @@ def _moved_mass(centre: FloatArray, k: int, value: float) -> FloatArray:
 
 
 def _errors(calibration: Calibration, R: FloatArray, positions: FloatArray, dip_deg: float) -> FloatArray:
-    """Return heading errors (deg), masses at `positions` and corrected as if at the middle."""
+    """Return heading errors, deg, at several headings and pitches, with masses at `positions` (k,).
+
+    The readings are corrected as if all masses were at the middle of their ranges. `R` (3, 3): boresight.
+    """
     A_0, T_0 = matrix_and_offset(calibration, _middle(calibration))
     A, T = matrix_and_offset(calibration, positions)
     F, dip = calibration.reference.field, np.radians(dip_deg)
@@ -231,7 +238,7 @@ def _errors(calibration: Calibration, R: FloatArray, positions: FloatArray, dip_
             ],
             axis=1,
         )
-        # what the sensor reads there: h = A^-1 R^T b + T
+        # reading of the sensor in this attitude: h = A^-1 R^T b + T
         raw = np.linalg.solve(A, (body @ R).T).T + T
         corrected = (raw - T_0) @ (R @ A_0).T
         found = heading(corrected, 0.0, np.full(len(psi), pitch)).magnetic
@@ -240,9 +247,10 @@ def _errors(calibration: Calibration, R: FloatArray, positions: FloatArray, dip_
 
 
 def position_table(calibration: Calibration, parameter: str) -> str:
-    """Return a CSV of offset (nT) and matrix at positions of one mass, the others at the middle.
+    """Return a CSV table of offset (nT) and matrix M against one parameter, the others at the middle.
 
-    ``b = M (h - offset)`` in body axes. CalibrationError: no such parameter, or no boresight.
+    The corrected field of a reading h is ``b = M (h - offset)``, in body axes. CalibrationError: no such
+    parameter, or no boresight.
     """
     names = [one.name for one in calibration.parameters]
     if parameter not in names:

@@ -1,7 +1,7 @@
-"""``cal.json``: a calibration on disk, checked when it is read.
+"""Read and write a calibration as ``cal.json``, and check its content.
 
-Every fault is one line that names the file and the expected content: a file that was cut short, comes
-from a newer magbridge, or was edited by hand and is inconsistent.
+If the file was cut short, was written by a newer magbridge, or is inconsistent, the error is one line that
+names the file and the expected content.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from magbridge.files import atomic_path, contents
 __all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
 CALIBRATION_FORMAT = 8
-"""Version of the layout; a reader takes this one and all before it. In 1, the noise's
-``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
-``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``, 6 ``conditions``, 7 the
-sensor's ``filter_cutoff``: each is written only where there is any."""
+"""Newest version of the layout; magbridge reads it and all earlier versions. Version 1 called the noise's
+``autocorrelation`` ``memory``. Version 3 added ``doubts``, 4 ``white`` of the noise, ``level`` and
+``level_sigma`` of the reference, 5 ``sensors``, 6 ``conditions``, 7 ``filter_cutoff`` of the sensor, 8
+``tilt_sigma`` of the boresight. A file holds each of these keys only if it has a value."""
 
 MAX_STATED_SIGMA = 1e15
-"""Largest standard deviation of a coefficient that is accepted: its square is a float32."""
+"""Largest accepted standard deviation, in the coefficient's unit: its square is still a float32."""
 
 AS_IN_MEMORY = (
     "software", "method", "sensor", "parameters", "noise", "reference", "boresight", "runs", "inputs",
     "level", "sensors", "conditions",
 )  # fmt: skip
-"""What the file holds as :class:`~.model.Calibration` does."""
+"""Keys of the file that are attributes of :class:`~.model.Calibration` with the same name and form."""
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
-    """Layout of ``cal.json``; names are public."""
+    """Layout of ``cal.json``: its keys and their types. The names are part of the public format."""
 
     format: int
     software: str
@@ -77,7 +77,7 @@ class _Version(msgspec.Struct):
 
 
 def encode_calibration(calibration: Calibration) -> bytes:
-    """Return `calibration` as JSON, one key a line."""
+    """Return `calibration` as the content of ``cal.json``, with one key in each line."""
     content = _File(
         format=_format(calibration),
         terms=[_term_out(term) for term in calibration.terms],
@@ -88,7 +88,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
         **{name: getattr(calibration, name) for name in AS_IN_MEMORY},
     )
     encode = msgspec.json.encode
-    # keys that older readers do not know are left out where they are empty
+    # omit empty keys that older readers do not know
     optional = "doubts", "level", "sensors", "conditions"
     names = [name for name in _File.__struct_fields__ if name not in optional or getattr(content, name)]
     values = {name: getattr(content, name) for name in names}
@@ -115,24 +115,24 @@ def _format(calibration: Calibration) -> int:
 
 
 def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibration:
-    """Inverse of :func:`encode_calibration`.
+    """Return the calibration in the content of a ``cal.json``; the inverse of :func:`encode_calibration`.
 
     Parameters
     ----------
     data : bytes
-        The file's content.
+        Content of the file.
     file : path
-        Named in errors.
+        Name of the file for error messages.
 
     Raises
     ------
     FormatError
-        Not JSON, a newer format, a key missing, unknown or of the wrong type.
+        The content is not JSON, has a newer format, or a key is missing, unknown or of the wrong type.
     CalibrationError
-        The numbers do not hold together.
+        The numbers are inconsistent.
     """
     try:
-        # the number of the format first: a newer file gets a message of its own
+        # read the format's number first: a newer file gets its own message
         version = msgspec.json.decode(data, type=_Version).format
         if version > CALIBRATION_FORMAT:
             raise FormatError(
@@ -157,16 +157,16 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
 
 
 def load(path: str | Path) -> Calibration:
-    """Read ``cal.json``.
+    """Return the calibration in a file ``cal.json``.
 
-    FormatError: it cannot be opened, or as :func:`decode_calibration`. CalibrationError: as
+    FormatError: the file cannot be opened, or as for :func:`decode_calibration`. CalibrationError: as for
     :func:`decode_calibration`.
     """
     return decode_calibration(contents(path), path)
 
 
 def save(calibration: Calibration, path: str | Path) -> None:
-    """Write ``cal.json``: whole, or not at all.
+    """Write a calibration to a file ``cal.json`` in one step, so that it is never incomplete.
 
     WriteError: the file cannot be written; the previous file is unchanged.
     """
@@ -175,7 +175,7 @@ def save(calibration: Calibration, path: str | Path) -> None:
 
 
 def calibration_id(calibration: Calibration) -> int:
-    """Return 32 bits that name this calibration on the link: CRC-32 of its file."""
+    """Return the CRC-32 of a calibration's file, which identifies the calibration in MAVLink messages."""
     return crc32(encode_calibration(calibration))
 
 
@@ -195,7 +195,7 @@ def _term_in(raw: dict[str, Any], file: str | Path) -> Term:
 
 
 def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...]) -> Calibration:
-    """Build the calibration; refuse inconsistent numbers."""
+    """Return the calibration of a file's `content`; CalibrationError: its numbers are inconsistent."""
     # shapes before values: a ragged covariance has no array
     coefficients = np.array(content.coefficients, float)
     size = coefficients.size
@@ -210,7 +210,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         if not 0.0 < content.boresight.tilt_sigma <= 90.0:
             raise CalibrationError("boresight: tilt_sigma: expected deg above 0, up to 90")
     _check_settings(content)
-    # plugins may define either kind; each must stand in its own list
+    # plugins may define terms and effects; each must be in its own list
     positions = tuple(term for term in terms if isinstance(term, PositionTerm))
     others = tuple(effect for effect in effects if isinstance(effect, Effect))
     if len(positions) < len(terms) or len(others) < len(effects):
@@ -228,7 +228,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
 
 
 def _check_settings(content: _File) -> None:
-    """Refuse parameters, conditions and scalar sensors that contradict themselves."""
+    """Raise CalibrationError if parameters, conditions or scalar sensors are inconsistent."""
     names = [parameter.name for parameter in content.parameters]
     if twice := [name for name in names if names.count(name) > 1]:
         raise CalibrationError(f"parameter {twice[0]!r} is named twice")
@@ -245,7 +245,7 @@ def _check_settings(content: _File) -> None:
 
 
 def _check_scalar(sensor: ScalarSensor) -> None:
-    """Refuse a scalar sensor with inconsistent numbers."""
+    """Raise CalibrationError if a scalar sensor has inconsistent numbers."""
     size = PLATFORM_TERMS + 3 * len(sensor.channels) + len(sensor.power_cycles)
     where = f"sensor {sensor.column!r}: "
     if not len(sensor.coefficients) == len(sensor.prior_sigma) == len(sensor.covariance) == size:
@@ -256,7 +256,10 @@ def _check_scalar(sensor: ScalarSensor) -> None:
 
 
 def _check_covariance(covariance: FloatArray, prefix: str = "") -> None:
-    """Symmetric and positive semidefinite, up to rounding."""
+    """Raise CalibrationError unless a matrix is symmetric and positive semidefinite, up to rounding.
+
+    `prefix`: start of the message, which names the matrix.
+    """
     if np.abs(covariance).max(initial=0.0) > MAX_STATED_SIGMA**2:
         raise CalibrationError(f"{prefix}covariance: expected standard deviations up to {MAX_STATED_SIGMA:g}")
     # a correlation beyond 1 cannot be a covariance; the scale makes the test independent of units
@@ -272,6 +275,6 @@ def _check_covariance(covariance: FloatArray, prefix: str = "") -> None:
 
 
 def _plain(problem: Exception) -> str:
-    """Put the path first in msgspec's message: ``noise.sensor: Expected `float`, got `str```."""
+    """Return msgspec's message with the path first: ``noise.sensor: Expected `float`, got `str```."""
     text, _, path = str(problem).partition(" - at ")
     return f"{path.strip('`').removeprefix('$.')}: {text}" if path else text

@@ -2,9 +2,9 @@
 
 Notes
 -----
-The corrected vector b (body axes: forward, starboard, down) is levelled with roll phi and pitch theta, and
-the horizontal part gives the angle from magnetic north (Denne 1979, Magnetic Compass Deviation and
-Correction, chapter 2)::
+Roll phi and pitch theta turn the corrected vector b (body axes: forward, starboard, down) into level axes.
+Its horizontal part then gives the angle from magnetic north (Denne 1979, Magnetic Compass Deviation and
+Correction, chapter 2); D is the declination::
 
     h = R_y(theta) R_x(phi) b,     psi_m = atan2(-h_y, h_x),     psi = psi_m + D
 
@@ -35,20 +35,20 @@ import numpy as np
 from magbridge.arrays import FloatArray
 
 Components = Sequence[Any]
-"""Components of one sample, or arrays (n,) of them."""
+"""Components of a vector or matrix: numbers for one sample, arrays (n,) for n samples."""
 
 
 DEFAULT_TILT_SIGMA_DEG = 0.3
 """1-sigma of roll and of pitch where the log does not state one, deg."""
 MODEL_DECLINATION_SIGMA_DEG = 0.26
-"""1-sigma of a main-field model's declination where the horizontal field is large, deg; error model of the
-World Magnetic Model 2020 (Chulliat et al. 2020, section 3.4): ``sqrt(0.26^2 + (5417 nT / H)^2)``."""
+"""1-sigma of a main-field model's declination in a strong horizontal field, deg: the constant term of the
+error model ``sqrt(0.26^2 + (5417 nT / H)^2)`` (Chulliat et al. 2020, section 3.4)."""
 MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
-"""deg nT, the part of the same error model that falls with the horizontal field."""
+"""Term of the same error model that is inversely proportional to the horizontal field H, deg nT."""
 UNIFORM_SIGMA_DEG = 180.0 / sqrt(3.0)
-"""Standard deviation of an angle of which nothing is known, deg."""
+"""Standard deviation of an unknown angle, uniform over a full turn, deg."""
 MAX_ADDED_VARIANCE = 1e12
-"""nT^2, largest variance that the published one adds to that of the calibration."""
+"""Largest variance that checks and moving masses may add to each axis, nT^2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,27 +56,27 @@ class Heading:
     """Headings of n samples, clockwise from north, deg."""
 
     magnetic: FloatArray
-    """(n,), from magnetic north, 0 to 360 deg; NaN where vector or tilt is unknown."""
+    """(n,): Heading from magnetic north, 0 to 360 deg; NaN if the vector, roll or pitch is unknown."""
     true: FloatArray
-    """(n,), from true north, 0 to 360 deg; NaN where the declination is unknown, too."""
+    """(n,): Heading from true north, 0 to 360 deg; NaN if `magnetic` or the declination is unknown."""
     sigma: FloatArray
-    """(n,), standard deviation of `true`, deg; infinite where `magnetic` is NaN. Where only the declination
-    is unknown it is that of `magnetic`."""
+    """(n,): Standard deviation of `true`, deg; of `magnetic` if the declination is unknown; infinite if
+    `magnetic` is NaN."""
 
 
 def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> FloatArray:
     """Return vectors (n, 3) in level axes: forward and starboard in the horizontal plane, and down.
 
-    `vector` (n, 3): body axes, any unit. `roll`, `pitch` (n,): rad.
+    `vector` (n, 3): vectors in body axes, any unit. `roll`, `pitch` (n,): rad.
     """
     turn = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
     return np.stack(_level(tuple(vector.T), turn), axis=1)
 
 
 def _level(b: Components, turn: Components) -> Components:
-    """Return h = R_y(pitch) R_x(roll) b; `turn`: sine and cosine of roll, then of pitch.
+    """Return the vector b in level axes, ``h = R_y(pitch) R_x(roll) b``.
 
-    This function and the next two accept numbers (one sample) and arrays (a log).
+    `turn`: sine and cosine of roll, then of pitch. Arguments may be numbers (one sample) or arrays (a log).
     """
     (x, y, z), (sin_roll, cos_roll, sin_pitch, cos_pitch) = b, turn
     z_rolled = sin_roll * y + cos_roll * z
@@ -96,10 +96,11 @@ def _variance(
     added_variance: Any,
     tilt_sigma: Any,
 ) -> Any:
-    """Return the variance of the magnetic heading, rad^2, as in the module's notes.
+    """Return the variance of the magnetic heading, rad^2, by the equations in the module's notes.
 
-    `covariance`, `boresight`: nine entries each, row by row, nT^2 and rad^2. `added_variance`: nT^2, of
-    each axis in addition. `tilt_sigma`: rad.
+    `b`, `h`: vector in body and in level axes, nT. `turn`: as for :func:`_level`. `covariance`, `boresight`:
+    V and Omega, nine entries each, row by row, nT^2 and rad^2. `added_variance`: further variance of each
+    axis, nT^2. `tilt_sigma`: 1-sigma of roll and of pitch, rad.
     """
     (x, y, z), (h_x, h_y, h_z), (sin_roll, cos_roll, sin_pitch, cos_pitch) = b, h, turn
     horizontal_squared = h_x * h_x + h_y * h_y
@@ -120,10 +121,11 @@ def _variance(
 
 
 def _excess(b: Components, covariance: Components, boresight: Components, published: Any) -> Any:
-    """Return a third of the published variance, nT^2, beyond ``tr V + tr Omega |b|^2 - b^T Omega b``.
+    """Return the variance of each axis, nT^2, that the bridge has added to the calibration's variance.
 
-    Checks and moving masses increase the published variances. That increase has no direction, so each axis
-    gets a third of it.
+    Checks and moving masses increase the published variances. The direction of this increase is unknown, so
+    each axis gets a third of it. `published`: sum of the three components' published variances, nT^2, of
+    which the calibration causes ``tr V + tr Omega |b|^2 - b^T Omega b``.
     """
     trace = boresight[0] + boresight[4] + boresight[8]
     known = covariance[0] + covariance[4] + covariance[8] - _quadratic_form(boresight, b)
@@ -131,7 +133,7 @@ def _excess(b: Components, covariance: Components, boresight: Components, publis
 
 
 def _quadratic_form(m: Components, v: Components) -> Any:
-    """Return ``v^T M v`` of a matrix (9 numbers, row by row)."""
+    """Return ``v^T M v`` of a vector v and a matrix M, given as 9 components row by row."""
     a, b, c = v
     return (
         a * (m[0] * a + m[1] * b + m[2] * c)
@@ -156,25 +158,25 @@ def heading(
     Parameters
     ----------
     vector : (n, 3) array
-        nT, corrected field in body axes.
+        Corrected field in body axes, nT.
     roll, pitch : (n,) array or float
-        rad.
+        Roll and pitch, rad.
     declination : (n,) array or float
-        deg, east positive; NaN where unknown.
+        Declination, deg, east positive; NaN where unknown.
     covariance : (n, 3, 3) array, optional
-        nT^2, of `vector` without the boresight's part; zero if not given.
+        Covariance of `vector` without the error of the boresight, nT^2; zero if not given.
     boresight_covariance : (3, 3) array, optional
-        rad^2, of the boresight's rotation vector in body axes; zero if not given.
+        Covariance of the boresight's rotation vector in body axes, rad^2; zero if not given.
     tilt_sigma_deg : (n,) array or float
-        deg, 1-sigma of roll and of pitch, independent of each other.
+        1-sigma of roll and of pitch, independent of each other, deg.
     declination_sigma_deg : (n,) array or float
-        deg, 1-sigma of the declination.
+        1-sigma of the declination, deg.
 
     Returns
     -------
     Heading
-        Where the horizontal field is not larger than its own standard deviation, a heading does not exist:
-        sigma there is that of a uniform angle, 180 / sqrt(3) deg.
+        Its sigma is at most that of a uniform angle, 180 / sqrt(3) deg: a heading does not exist if the
+        horizontal field is smaller than its own standard deviation.
     """
     b = tuple(np.asarray(vector, float).reshape(-1, 3).T)
     V, Omega = (
@@ -187,7 +189,7 @@ def heading(
         magnetic = np.degrees(np.arctan2(-h[1], h[0])) % 360.0
         sigma = np.degrees(np.sqrt(_variance(b, h, turn, V, Omega, 0.0, np.radians(tilt_sigma_deg))))
         sigma = np.hypot(sigma, np.nan_to_num(declination_sigma_deg))
-        # Nothing is worse known than a uniform angle.
+        # The largest possible uncertainty is that of a uniform angle.
         sigma = np.minimum(np.where(np.isnan(sigma), np.inf, sigma), UNIFORM_SIGMA_DEG)
     unknown = np.isnan(magnetic)
     return Heading(magnetic, (magnetic + declination) % 360.0, np.where(unknown, np.inf, sigma))
@@ -205,13 +207,14 @@ def heading_of_sample(
     tilt_sigma_deg: float,
     declination_sigma_deg: float,
 ) -> tuple[float, float, float]:
-    """Return :func:`heading` of one sample with :func:`published_covariance`, without arrays.
+    """Return magnetic heading, true heading and sigma of one sample, deg, as in :class:`Heading`.
 
-    `vector`: nT, corrected field in body axes. `roll`, `pitch`: rad. `declination`: deg, east positive; NaN
-    where unknown. `covariance`: nT^2, by the calibration alone, row by row. `boresight_covariance`: rad^2,
-    of the boresight's rotation vector in body axes, row by row. `published_variance`: nT^2, sum of the three
-    components' published variances. `tilt_sigma_deg`, `declination_sigma_deg`: deg, 1-sigma of roll and of
-    pitch, and of the declination. Returns `magnetic, true, sigma`: deg, as in :class:`Heading`.
+    The result equals that of :func:`heading` with :func:`published_covariance`, but the function uses no
+    arrays. `vector`: corrected field in body axes, nT. `roll`, `pitch`: rad. `declination`: deg, east
+    positive; NaN if unknown. `covariance`: of the vector by the calibration alone, row by row, nT^2.
+    `boresight_covariance`: of the boresight's rotation vector in body axes, row by row, rad^2.
+    `published_variance`: sum of the three components' published variances, nT^2. `tilt_sigma_deg`: 1-sigma of
+    roll and of pitch. `declination_sigma_deg`: 1-sigma of the declination.
     """
     turn = sin(roll), cos(roll), sin(pitch), cos(pitch)
     h = _level(vector, turn)
@@ -234,11 +237,11 @@ def heading_of_sample(
 def published_covariance(
     stated: FloatArray, turn: FloatArray, vector: FloatArray, variance: FloatArray
 ) -> FloatArray:
-    """Return the covariance of published vectors without the boresight's part, (n, 3, 3) nT^2.
+    """Return the covariance (n, 3, 3), nT^2, of published vectors without the error of the boresight.
 
-    `stated` (n, 3, 3): nT^2, by the calibration alone (:func:`.correct.vector_covariance`). `turn` (3, 3):
-    rad^2, covariance of the boresight's rotation vector. `vector` (n, 3): nT, corrected field in body axes.
-    `variance` (n,): nT^2, sum of the three components' published variances.
+    `stated` (n, 3, 3): covariance by the calibration alone, nT^2 (:func:`.correct.vector_covariance`). `turn`
+    (3, 3): covariance of the boresight's rotation vector, rad^2. `vector` (n, 3): corrected field in body
+    axes, nT. `variance` (n,): sum of the three components' published variances, nT^2.
     """
     more = _excess(tuple(vector.T), tuple(stated.reshape(-1, 9).T), tuple(np.ravel(turn)), variance)
     more = np.nan_to_num(np.maximum(more, 0.0), posinf=MAX_ADDED_VARIANCE)
@@ -246,11 +249,11 @@ def published_covariance(
 
 
 def model_declination_sigma(horizontal: FloatArray, crustal_sigma: float = 0.0) -> FloatArray:
-    """Return the standard deviation of a main-field model's declination, deg.
+    """Return the standard deviation (n,) of a main-field model's declination, deg.
 
-    `horizontal` (n,): nT, horizontal part of the main field. `crustal_sigma`: nT, 1-sigma of the crustal
-    field's total. Its component across the meridian is about ``crustal_sigma / sqrt(2)``, which turns north
-    by that over H.
+    `horizontal` (n,): horizontal part H of the main field, nT. `crustal_sigma`: 1-sigma of the crustal
+    anomaly of the total field, nT. The 1-sigma of the crustal component across the meridian is about
+    ``crustal_sigma / sqrt(2)``; divided by H it is the angle by which it turns magnetic north.
 
     Notes
     -----

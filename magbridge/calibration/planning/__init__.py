@@ -1,6 +1,6 @@
-"""Which calibration runs, or which survey, to fly next, from the covariance that they would leave.
+"""Plan the next calibration runs or the next survey, from the covariance that they are expected to leave.
 
-Start reading at :func:`~.plan.plan` (runs on all headings at chosen pitch, roll and positions of the masses);
-:func:`~.survey_patterns.propose` compares surveys that calibrate themselves. Both linearise the residual
-of a fit about a calibration, and fit nothing.
+:func:`~.plan.plan` chooses runs on all headings, at certain pitch, roll and positions of the masses.
+:func:`~.survey_patterns.propose` compares self-calibrating surveys. Both linearise the residual of a fit
+about a calibration, and do not fit any data.
 """

@@ -1,15 +1,16 @@
-"""Which calibration runs to fly next: those after which the mission's largest error is smallest.
+"""Choose the calibration runs to fly next, so that the largest error over the mission becomes smallest.
 
 Notes
 -----
-A run at one pitch, roll and position, on all headings, adds the information ``phi phi^T (x) G``, with ``G``
-the sum of ``g g^T / sigma^2`` over its samples. With the calibration's covariance C and ``F = phi (x)
-G^(1/2)``::
+A run at one pitch, roll and position, on all headings, adds the information ``phi phi^T (x) G``. Here phi are
+the monomials of the position, g the derivative of the residual by the nine slots, and ``G`` the sum of
+``g g^T / sigma^2`` over the run's samples. With the calibration's covariance C and ``F = phi (x) G^(1/2)``,
+the covariance after the run is::
 
     C' = C - C F (I + F^T C F)^-1 F^T C
 
 :func:`plan` chooses runs one by one, then exchanges them (Fedorov), to minimise the largest error over the
-mission (G-optimality, approximated by the eighth power mean, which is smooth).
+mission (G-optimality). The eighth power mean of the errors, which is smooth, approximates the largest error.
 """
 
 from __future__ import annotations
@@ -41,47 +42,53 @@ if TYPE_CHECKING:
 
 
 SLACK = 3.0
-"""Change of pitch by another trim of the vehicle at the same positions, deg."""
+"""Difference of pitch from the trim that the vehicle can fly at the same positions, deg."""
 MAX_REST_FRACTION = 0.01
-"""Motion between samples, as a fraction of half a position's range, of a mass at rest."""
+"""Largest motion of a mass at rest between samples, as a fraction of half a position's range."""
 MAX_POSITION_DIFFERENCE = 0.35
-"""Distance of a run from flown positions, at most, as a fraction of half a position's range."""
+"""Largest distance of a run from flown positions, as a fraction of half a position's range."""
 PLANNED_HEADINGS = 24
+"""Number of headings that represent a run on all headings."""
 PLANNED_RUN_SAMPLES = 225
-"""Samples of a run: a quarter of an hour at the paper's 0.25 Hz."""
+"""Number of samples of a run: a quarter of an hour at the paper's 0.25 Hz."""
 POSITION_LEVELS = 7
-"""Values of each position that are tried."""
+"""Number of values of each position that the search tries."""
 VARIANCE_POWER = 4
-"""Power of the variance that is averaged over the mission: the eighth of sigma."""
+"""Power of the variance that is averaged over the mission: the eighth power of sigma."""
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One spiral: pitch and roll (deg), positions in their units."""
+    """Planned calibration run: a spiral on all headings with fixed pitch, roll and positions."""
 
     pitch: float
     roll: float
+    """`pitch`, `roll`: Attitude, deg."""
     parameters: tuple[float, ...]
+    """Value of each parameter, in its unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Attitudes and positions that the vehicle can fly."""
+    """Limits of the attitudes and positions that the vehicle can fly."""
 
     roll: tuple[float, float] = (-10.0, 10.0)
-    """Smallest and largest bank in a spiral, deg."""
+    """Smallest and largest roll in a spiral, deg."""
     pitch: tuple[float, float] = (14.0, 30.0)
-    """Smallest and largest pitch of dives and climbs, deg."""
+    """Smallest and largest absolute pitch of dives and climbs, deg."""
     parameters: tuple[tuple[float, float], ...] = ()
-    """Ends of each position."""
+    """Smallest and largest value of each parameter, in its unit; empty: those of the calibration."""
     pitch_at: Callable[[FloatArray], float] | None = None
-    """Pitch (deg) that positions (k,) trim the vehicle to; None: pitch is free."""
+    """Function of the positions (k,) that returns the pitch (deg) of the trimmed vehicle; None: any pitch."""
     flown: FloatArray | None = None
-    """(m, k): positions that the vehicle has flown; a run stays near one of them."""
+    """(m, k): Positions that the vehicle has flown, near which a run must stay; None: any position."""
 
 
 def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
-    """Return the pitch (deg) that positions (k,) trim a vehicle to, linear in them; None if undetermined."""
+    """Return a linear function of the positions (k,) that gives the trimmed vehicle's pitch, deg.
+
+    The result is None if the positions explain less than 90 % of the variance of pitch in `data`.
+    """
     if data.attitude is None or not data.names:
         return None
     # Linear regression of pitch on positions; unusable if it explains less than 90 % of the variance.
@@ -97,7 +104,7 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
 
 
 def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray:
-    """Return the (m, k) positions of `data` at which all masses are at rest."""
+    """Return the positions (m, k) of the samples of `data` in which all masses are at rest."""
     scale = [parameter.scale for parameter in parameters]
     # A sample is at rest if no mass moved before or after it.
     moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > MAX_REST_FRACTION).any(axis=1)
@@ -108,7 +115,7 @@ def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray
 
 
 def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
-    """Return every run that the vehicle can fly, on a grid of `levels` values of each position."""
+    """Return all runs within the limits, on a grid with `levels` values of each position."""
     # Grid over positions, pitch and roll; only positions near flown ones, and pitches near their trim.
     ends = limits.parameters or tuple((p.low, p.high) for p in parameters)
     rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
@@ -132,27 +139,30 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
 
 
 def _is_near_flown(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
-    """Return True if a flown position (m, k) is near in all parameters."""
+    """Return True if one of the `flown` positions (m, k) is near `positions` (k,) in all parameters."""
     off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
     return bool((off.max(axis=1) <= MAX_POSITION_DIFFERENCE).any())
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Runs to fly, the most useful first, and the error that is expected after each."""
+    """Sequence of runs to fly, and the error that is expected after each run."""
 
     runs: tuple[PlannedRun, ...]
+    """Runs in the order of flight."""
     rms: tuple[float, ...]
     worst: tuple[float, ...]
-    """`rms`, `worst`: expected error over the mission before any run, after the first ..., nT."""
+    """`rms`, `worst`: RMS and largest expected error over the mission, nT, before the first run and after
+    each run."""
 
 
 def expected_calibration(
     parameters: tuple[Parameter, ...], field: float, order: int = 3, noise: float = 1.0
 ) -> Calibration:
-    """Return the prior of a vehicle before its first run: the physical widths of its coefficients.
+    """Return a calibration that represents the prior of a vehicle before its first run.
 
-    `field`, `noise`: field where the runs are flown, and noise of a sample, nT.
+    Its coefficients are 0, with the covariance of the physical prior. `field`: field where the runs are
+    flown, nT. `order`: highest total degree of the polynomials. `noise`: 1-sigma of a sample, nT.
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(p.name for p in parameters), field)
@@ -170,7 +180,11 @@ def expected_calibration(
 
 
 class Design:
-    """The linear algebra of candidate runs, linearised about one calibration."""
+    """Covariance updates by candidate runs, with the residual linearised about one calibration.
+
+    `mission`: fields and positions at which the error matters. `field_ned` (3,): field where the runs are
+    flown, nT. CalibrationError: the calibration does not consist of one polynomial, or has no noise.
+    """
 
     def __init__(self, calibration: Calibration, mission: Mission, field_ned: FloatArray) -> None:
         if (
@@ -190,9 +204,9 @@ class Design:
         self.points = jacobian(phi, g)
 
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return monomials (n, m) and derivatives of the residual by the nine coefficients (n, 9).
+        """Return monomials (n, m), and derivatives (n, 9) of the residual by the nine slots of A and T.
 
-        `truth` (n, 3): true field in body axes, nT.
+        `truth` (n, 3): true field in body axes, nT. `positions` (n, k): in the parameters' units.
         """
         calibration = self.calibration
         # Derivative of the residual at noise-free readings of the true field.
@@ -203,14 +217,14 @@ class Design:
         return phi, residuals(samples, calibration.coefficients)[1]
 
     def factor(self, run: PlannedRun) -> FloatArray:
-        """Return F (K, 9) of a run on all headings."""
+        """Return the factor F (K, 9) of the information that a run on all headings adds."""
         # One spiral at fixed pitch and roll: its information is phi phi^T (x) G (see the module's notes).
         turn = np.linspace(0.0, 2.0 * np.pi, PLANNED_HEADINGS, endpoint=False)
         attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * PLANNED_HEADINGS), turn])
         truth = field_body(attitude, np.tile(self.field_ned, (PLANNED_HEADINGS, 1)))
         phi, g = self.derivative(truth, np.tile(run.parameters, (PLANNED_HEADINGS, 1)))
         noise = self.calibration.noise
-        # Correlated noise: fewer samples count.
+        # Correlated noise reduces the number of independent samples.
         share = effective_fraction(noise.autocorrelation, noise.white)
         weight = PLANNED_RUN_SAMPLES / PLANNED_HEADINGS / noise.sensor**2 * share
         # F = phi (x) G^(1/2): a root of the information, so that the update has rank nine.
@@ -218,17 +232,20 @@ class Design:
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 
     def variances(self, C: FloatArray) -> FloatArray:
-        """Return the variance at the mission's points (n,), nT²."""
+        """Return the variance of the residual at each point of the mission, (n,), nT².
+
+        `C` (K, K): covariance of the coefficients.
+        """
         return np.asarray(np.einsum("ij,jk,ik->i", self.points, C, self.points))
 
     def covariance_after(self, C: FloatArray, F: FloatArray) -> FloatArray:
-        """Return the covariance (K, K) after one more run."""
+        """Return the covariance (K, K) after a run with the factor F (K, 9), from that before the run."""
         # Woodbury: C' = C - C F (I + F^T C F)^-1 F^T C.
         CF = C @ F
         return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
 
     def scores(self, C: FloatArray, factors: Sequence[FloatArray]) -> FloatArray:
-        """Return the mean power of the variance over the mission after each candidate: (m,)."""
+        """Return the criterion (m,) after each candidate run: the mean of the variance's fourth power."""
         PC, before = self.points @ C, self.variances(C)
         found = []
         for F in factors:
@@ -242,7 +259,10 @@ class Design:
 def evaluate_runs(
     calibration: Calibration, mission: Mission, field_ned: FloatArray, runs: Sequence[PlannedRun]
 ) -> Plan:
-    """Return the expected error after each of the given runs; `field_ned` is (3,), nT."""
+    """Return a plan of the given runs in their order, with the error expected after each run.
+
+    `field_ned` (3,): field where the runs are flown, nT.
+    """
     design = Design(calibration, mission, field_ned)
     C = calibration.covariance
     course = [design.variances(C)]
@@ -259,10 +279,10 @@ def evaluate_runs(
 def plan(
     calibration: Calibration, mission: Mission, field_ned: FloatArray, limits: Limits, *, runs: int = 10
 ) -> Plan:
-    """Choose the runs to fly next.
+    """Return a plan of the runs after which the largest error over the mission is smallest.
 
-    `mission`: where the error is to be small. `field_ned` (3,): field where the runs will be flown, nT.
-    `runs`: number of spirals.
+    `mission`: fields and positions at which the error should be small. `field_ned` (3,): field where the runs
+    are flown, nT. `runs`: number of runs.
 
     CalibrationError: no run lies within the limits.
     """
@@ -278,7 +298,7 @@ def plan(
         for _ in range(runs):
             chosen.append(int(np.argmin(design.scores(C, factors))))
             C = design.covariance_after(C, factors[chosen[-1]])
-        for _ in range(3):  # exchanges: each run against all others, given the rest
+        for _ in range(3):  # exchanges: replace each run by the best candidate, given the other runs
             changed = False
             for i in range(len(chosen)):
                 C = calibration.covariance
@@ -297,10 +317,10 @@ def plan(
 
 
 def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
-    """Choose runs for a mission.
+    """Return a plan of the calibration runs to fly before a mission.
 
-    `mission`: attitude, position and masses as the mission will have them, without magnetometer. `roll`:
-    largest bank either way, deg.
+    `mission`: attitude, position and masses as in the mission; it needs no magnetometer. `runs`: number of
+    runs. `roll`: largest roll to either side, deg.
 
     CalibrationError: the mission has no attitude or position. FormatError: it lacks a parameter of the
     calibration, or has it in another unit.
@@ -311,7 +331,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     data = mission_samples(mission, names)
     if data.reference_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
-    # runs at trims that the vehicle can fly: those that the mission shows
+    # plan runs at trims that occur in the mission, because the vehicle can fly them
     flown = settled(data, calibration.parameters) if names else None
     limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
     return plan(
@@ -324,13 +344,16 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
 
 
 def mission_samples(mission: xr.Dataset, names: tuple[str, ...]) -> Observations:
-    """Return a mission's samples, with placeholders for the magnetometer's readings."""
+    """Return the samples of a mission, with placeholders for the magnetometer's readings.
+
+    `names`: columns of the positions.
+    """
     some = ("time", np.ones(mission.sizes["time"]))  # zeros would count as missing
     return observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
 
 
 def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
-    """Return a plan as plain values."""
+    """Return a plan as values for JSON: the runs, and the expected error before and after each, nT."""
     names = [parameter.name for parameter in calibration.parameters]
     return {
         "expected_rms_nT": found.rms,
@@ -343,7 +366,7 @@ def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
 
 
 def summary(found: Plan, calibration: Calibration) -> str:
-    """Return a plan as a table: the runs, and the error expected after each."""
+    """Return a plan as a text table of the runs and the error expected after each run."""
     names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
     header = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
     lines = [

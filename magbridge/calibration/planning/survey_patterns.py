@@ -1,8 +1,9 @@
-"""Which survey to fly so that it calibrates itself: the error that each pattern of legs would leave.
+"""Compare patterns of a self-calibrating survey by the error that each is expected to leave.
 
-The vehicle trims, rolls and moves its masses as in the mission; a pattern gives each leg its course, and may
-bank every other leg. The Jacobian of the samples and a Gaussian field in place
-(:mod:`~magbridge.estimation.elimination`) give the coefficients' covariance before the survey is flown.
+The vehicle trims, rolls and moves its masses as in the mission. A pattern sets the course of each leg, and
+may alternate the roll from leg to leg. The Jacobian of the samples, with the crustal field as a Gaussian
+field (:mod:`~magbridge.estimation.elimination`), gives the coefficients' covariance before the survey is
+flown.
 """
 
 from __future__ import annotations
@@ -35,26 +36,28 @@ if TYPE_CHECKING:
 
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
-"""Amplitude (nT), length (m) and power of the crustal field of an unmapped place."""
+"""Amplitude (nT), correlation length (m) and power of the crustal field assumed at an unmapped place."""
 LEVEL_SIGMA_NT = 145.0
-"""1-sigma of the main field's level, nT."""
+"""1-sigma of the constant bias of a main-field model at a place, nT."""
 PATTERN_SAMPLES = 1_500
-"""Largest number of samples of a pattern; of more, averages are used."""
+"""Approximate number of samples that represent a pattern; each stands for the average of its neighbours."""
 SPIRAL = 1_800.0
-"""Duration of a spiral at the end, s."""
+"""Duration of the spiral at the end of a survey, s."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A pattern, its expected accuracy, and what it leaves undetermined."""
+    """Survey pattern with its expected accuracy."""
 
     name: str
     rms: float
     worst: float
-    """`rms`, `worst`: 1-sigma of the corrected field over the mission, about its mean, nT."""
+    """`rms`, `worst`: RMS and largest 1-sigma of the corrected field over the mission, relative to its mean,
+    nT."""
     crossings: int
-    """Places met again on another course."""
+    """Number of places that the track passes again on another course."""
     open: tuple[str, ...]
+    """Advice on what the track cannot separate from the crustal field, one text each."""
 
 
 def survey_plan(
@@ -65,9 +68,10 @@ def survey_plan(
     hours: float,
     roll: float = 10.0,
 ) -> list[Proposal]:
-    """Propose self-calibrating surveys of `hours`; arguments and errors as for :func:`.plan.flight_plan`.
+    """Return patterns of a self-calibrating survey of `hours`, the best first.
 
-    Without a calibration they are for an unknown vehicle, whose masses' positions are `parameters`.
+    `mission`, `roll` and errors as for :func:`.plan.flight_plan`. `calibration`: None for an unknown vehicle;
+    `parameters` then names the columns of its masses' positions.
     """
     if calibration is not None:
         require_units(mission, calibration.units)
@@ -82,10 +86,10 @@ def survey_plan(
 def propose(
     calibration: Calibration, data: Observations, *, hours: float, roll: float = 10.0
 ) -> list[Proposal]:
-    """Return patterns of a survey of `hours`, the best first.
+    """Return patterns of a self-calibrating survey of `hours`, the pattern with the smallest error first.
 
-    `calibration`: where to linearise, and the noise of a sample. `data`: attitude, position and masses as in
-    the mission. `roll`: largest bank either way, deg.
+    `calibration`: point of linearisation, and noise of a sample. `data`: attitude, position and masses as in
+    the mission. `roll`: largest roll to either side, deg.
 
     CalibrationError: the mission has no attitude or position, or does not move.
     """
@@ -93,7 +97,7 @@ def propose(
     if not known.any() or data.place is None:
         raise CalibrationError("the mission needs roll, pitch, heading, latitude and longitude")
     time, place = data.time[known], data.place[known, :2]
-    # Speed, sampling and attitudes of the mission are those of the patterns.
+    # The patterns have the speed, sampling and attitudes of the mission.
     speed = float(np.median(np.hypot(*np.diff(place, axis=0).T) / np.maximum(np.diff(time), 1e-3)))
     if not speed > 0.0:
         raise CalibrationError("the mission does not move: no survey can be flown like it")
@@ -123,7 +127,10 @@ def propose(
 def _patterns(
     n: int, interval: float, speed: float, roll: float
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield name, course and bank (n,), rad, of every pattern of n samples at `interval` s."""
+    """Yield name, course (n,) and bank (n,), rad, of every pattern of n samples.
+
+    `interval`: time between samples, s. `speed`: m/s. `roll`: bank of banked legs, deg.
+    """
     # Fraction of the survey at each sample; `level` flight has no bank.
     share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
     bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
@@ -145,8 +152,12 @@ def _patterns(
 
 
 def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
-    """Return courses (n,), rad, over `count` lines of `length` m, at fractions (n,) of the way."""
-    aside = min(0.1, 0.5 * LENGTH * count / max(length, 1.0))  # of a line's part, from each to the next
+    """Return courses (n,), rad, along `count` parallel lines, at fractions `share` (n,) of the track.
+
+    `length`: length of the whole track, m.
+    """
+    # fraction of a line's part of the track that leads to the next line
+    aside = min(0.1, 0.5 * LENGTH * count / max(length, 1.0))
     part = share * count
     line, within = part.astype(int), part % 1.0
     return np.where(within > 1.0 - aside, 0.5 * np.pi, np.where(line % 2, np.pi, 0.0))
@@ -155,13 +166,17 @@ def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
 def _expected(
     design: Design, attitude: FloatArray, place: FloatArray, positions: FloatArray, noise: float
 ) -> tuple[float, float]:
-    """Return RMS and largest 1-sigma over the mission, about its mean, nT, after a survey."""
+    """Return RMS and largest 1-sigma of the corrected field over the mission, nT, after a survey.
+
+    Both are relative to the field's mean over the mission. `attitude` (n, 3): roll, pitch, heading, rad.
+    `place` (n, 2): track, m. `positions` (n, k): in the parameters' units. `noise`: of a sample, nT.
+    """
     calibration = design.calibration
     truth = field_body(attitude, np.tile(design.field_ned, (len(attitude), 1)))
     phi, g = design.derivative(truth, positions)
     names = tuple(one.name for one in calibration.parameters)
     family = polynomial_prior(design.exponents, names, calibration.reference.field)
-    # Rows of the self-calibrating survey: coefficients, crustal field on nodes, and an unknown level.
+    # Unknowns of the self-calibrating survey: coefficients, crustal field on nodes, and a constant bias.
     D = np.column_stack([np.zeros(len(phi)), jacobian(phi, g) @ family.E, -np.ones(len(phi))])
     field = GaussianField(nodes_for(place, LENGTH, SMOOTH), LENGTH, SMOOTH)
     sums = sum_rows([LinearisedRows(D, -field.basis(place), np.zeros(len(phi), bool))])
@@ -169,14 +184,14 @@ def _expected(
     H = eliminate_field(sums, field, ROCK / noise, 0.0).quadratic.precision / noise**2
     prior = np.append(family.widths(family.centre), LEVEL_SIGMA_NT) ** -2.0
     P = covariance_of(H + np.diag(prior))[:-1, :-1]
-    # Error over the mission about its mean: the level cancels.
+    # Error over the mission about its mean: the constant bias cancels.
     points = (design.points - design.points.mean(axis=0)) @ family.E
     variance = np.einsum("ij,jk,ik->i", points, P, points)
     return float(np.sqrt(variance.mean())), float(np.sqrt(variance.max()))
 
 
 def facts(found: list[Proposal]) -> dict[str, Any]:
-    """Return the proposals as plain values."""
+    """Return the proposals as values for JSON."""
     return {
         "surveys": [
             {
@@ -192,7 +207,7 @@ def facts(found: list[Proposal]) -> dict[str, Any]:
 
 
 def summary(found: list[Proposal]) -> str:
-    """Return the proposals as a table."""
+    """Return the proposals as a text table."""
     header = (
         f"{'survey':52} {'met again':>9} {'error about the mean over the mission, nT: RMS':>48} {'worst':>7}"
     )
