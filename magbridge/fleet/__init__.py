@@ -1,8 +1,8 @@
-"""Fleets: many vehicles, many logs, one memory.
+"""Process the logs of many vehicles, and predict each vehicle's next calibration from all earlier ones.
 
-:mod:`.catalogue` keeps the tables, in a folder of Parquet files or in a database (:mod:`.postgres`);
-:mod:`.register` puts vehicles and logs there and lists the jobs, which :mod:`.process` runs in parallel.
-:mod:`.hierarchy` is the statistics of coefficients over vehicles, refits and power-ups; :mod:`.learn` applies
-it to calibrations and finds what changed and when; :mod:`.memory` is the fleet of a catalogue; :mod:`.page`
-shows it.
+:mod:`.catalogue` stores the tables, in a folder of Parquet files or in a database (:mod:`.postgres`).
+:mod:`.register` adds vehicles and logs to the catalogue and lists the jobs; :mod:`.process` runs the jobs in
+parallel. :mod:`.hierarchy` models how coefficients vary between vehicles, refits and power-ups.
+:mod:`.learn` fits that model to calibrations and detects changes. :mod:`.memory` reads the calibrations from
+a catalogue, and :mod:`.page` writes HTML pages of the results.
 """

@@ -1,4 +1,4 @@
-"""The catalogue: tables to which rows are only ever added, in a folder or on a server.
+"""Store the tables of a fleet, in a folder or on a server; rows are added and never changed.
 
 A row's key is the SHA-256 of its content, so that repeated additions store a row once. No
 row holds the time of writing: an interrupted and repeated run gives the same catalogue.
@@ -24,12 +24,13 @@ from magbridge.files import atomic_path
 
 Row = dict[str, Any]
 CATALOGUE_FORMAT = 1
-"""Version of the written catalogues; newer ones are refused."""
+"""Version of the written catalogues; newer catalogues are rejected."""
 SERVERS = ("postgresql://", "postgres://")
 MARK = "catalogue.json"
-"""File that makes a folder a catalogue."""
+"""File that marks a folder as a catalogue, and holds the version of its format."""
 MAX_SMALL_FILES, SMALL_FILE_ROWS = 64, 1000
-"""Number of files with fewer rows than the second number at which :meth:`Catalogue.compact` merges them."""
+"""Number of small files at which :meth:`Catalogue.compact` merges them; a small file has fewer rows than
+`SMALL_FILE_ROWS`."""
 TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
     pl.String(), pl.Float64(), pl.Int64(), pl.List(pl.String()), pl.List(pl.Float64()), pl.Binary(),
 )  # fmt: skip
@@ -70,27 +71,27 @@ CATALOGUE_TABLES: dict[str, dict[str, pl.DataType]] = {
     "populations": {"of": TEXT, "own": NUMBERS, "shaped": NUMBERS},
     "failures": {"job": TEXT, "attempt": COUNT, "vehicle": TEXT, "deployment": TEXT, "line": TEXT},
 }  # fmt: skip
-"""Table -> columns and their types, in nT, deg and s since 1970. `calibration` is a whole cal.json,
-`precision` and `vector` the information of the data alone (:func:`.packed`); `job` identifies what a
-result is made of, and its last `attempt` is the one that counts. A catalogue may lack a table that is newer
-than it: it is empty."""
+"""Table -> columns and their types, in nT, deg and s since 1970. `calibration` is the text of a cal.json.
+`precision` and `vector` are the information from the data, without a prior (:func:`.packed`). `job` names the
+inputs of a result; only the results of the job's last `attempt` are valid. A table that an older catalogue
+lacks is treated as empty."""
 PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {
     TEXT: (str,), NUMBER: (float, int, type(None)), COUNT: (int,), TEXTS: (list,), NUMBERS: (list,),
     PACKED: (bytes,), pl.Boolean(): (bool,),
 }  # fmt: skip
-"""Type of a column to those of its values; only numbers may be unknown."""
+"""Type of a column -> allowed Python types of its values; only numbers may be None (unknown)."""
 
 
 class Catalogue(ABC):
-    """A catalogue, wherever it is."""
+    """Catalogue of a fleet: the interface that all kinds of storage share."""
 
     name: str
-    """Location of the catalogue, for messages."""
+    """Location of the catalogue, as messages name it."""
     results: Path
     """Folder of corrected logs and maps."""
 
     def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:
-        """Return the `columns` (none named: all) of a table, each row once, in the order of their keys.
+        """Return the rows of a table in the order of their keys, each once, with `columns` (by default all).
 
         FormatError: a file is damaged, or a value is not of its column's type. PortError: the server does not
         answer.
@@ -107,23 +108,23 @@ class Catalogue(ABC):
 
     @abstractmethod
     def _rows(self, table: str, columns: Sequence[str]) -> list[Row]:
-        """Return the columns of a table's rows; errors as of :meth:`rows`."""
+        """Return the given columns of all rows of a table; raises the errors of :meth:`rows`."""
 
     def add(self, table: str, rows: Iterable[Row]) -> int:
-        """Add rows, unless they are there; return how many were not.
+        """Add the rows that the table does not contain yet, and return their number.
 
         WriteError: the disk is full, or the folder may not be written to. PortError: the server does not
-        answer, or refuses to write.
+        answer, or rejects the rows.
         """
         keyed = {_key(row): {name: row[name] for name in CATALOGUE_TABLES[table]} for row in rows}
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0
 
     def compact(self) -> None:  # noqa: B027  most need not
-        """Merge small files, where a catalogue consists of files."""
+        """Merge small files if the catalogue consists of files; else do nothing."""
 
     @abstractmethod
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
-        """Add rows by their keys, unless those are there; return how many were not."""
+        """Add rows (key -> row) whose keys the table does not contain yet, and return their number."""
 
     def _check_format(self, found: int) -> None:
         if found > CATALOGUE_FORMAT:
@@ -134,7 +135,7 @@ class Catalogue(ABC):
 
 
 class FolderCatalogue(Catalogue):
-    """A folder of Parquet files; safe with several writers on a shared disk, without a server.
+    """Catalogue in a folder of Parquet files; several processes may write to it on a shared disk.
 
     ::
 
@@ -143,13 +144,13 @@ class FolderCatalogue(Catalogue):
           TABLE/*.parquet           one file for each batch of rows
           results/VEHICLE/DEPLOYMENT/     corrected logs and maps
 
-    A file's name is the hash of its rows' keys. So the same rows are the same file, different writers never
-    write to one file, and a reader takes each row once.
+    A file's name is the hash of its rows' keys. So equal rows give the same file, and two processes never
+    write different rows to one file. A reader removes duplicate rows.
     """
 
     def __init__(self, folder: Path, results: Path | None = None, *, create: bool = False) -> None:
         self.folder, self.name, self.results = folder, str(folder), results or folder / "results"
-        self._keys_of: dict[Path, frozenset[str]] = {}  # a file's content never changes
+        self._keys_of: dict[Path, frozenset[str]] = {}  # the keys in a file, which never changes
         mark = folder / MARK
         if create and not mark.exists():
             with atomic_path(mark) as temporary:
@@ -166,9 +167,9 @@ class FolderCatalogue(Catalogue):
         return self._read(table, columns).drop("key").to_dicts()
 
     def compact(self) -> None:
-        """Merge the small files of each table; the new file is complete before the old ones are removed."""
+        """Merge the small files of each table; remove them after the merged file is complete."""
         for table, columns in CATALOGUE_TABLES.items():
-            with suppress(FileNotFoundError):  # another writer does the same
+            with suppress(FileNotFoundError):  # another process merges the same files
                 files = [path for path in self._files(table) if len(self._keys(path)) < SMALL_FILE_ROWS]
                 if len(files) < MAX_SMALL_FILES:
                     continue
@@ -180,7 +181,7 @@ class FolderCatalogue(Catalogue):
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
         known = set[str]()
         for path in self._files(table):
-            with suppress(FileNotFoundError):  # its rows are in another one now, or are written again
+            with suppress(FileNotFoundError):  # merged by another process; at worst, rows are written twice
                 known |= keyed.keys() & self._keys(path)
         fresh = [{"key": key, **row} for key, row in keyed.items() if key not in known]
         if fresh:
@@ -194,11 +195,11 @@ class FolderCatalogue(Catalogue):
 
     def _read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
         while True:
-            with suppress(FileNotFoundError):  # another writer has just made several files one
+            with suppress(FileNotFoundError):  # another process has just merged files: read again
                 return self._joined(table, self._files(table), columns)
 
     def _joined(self, table: str, files: Sequence[Path], columns: Sequence[str]) -> pl.DataFrame:
-        """Return the rows of files, each once, in the order of their keys."""
+        """Return the rows of several files in the order of their keys, without duplicates."""
         schema = {"key": TEXT, **{name: CATALOGUE_TABLES[table][name] for name in columns}}
         parts = [pl.DataFrame(schema=schema)]
         for path in files:
@@ -222,7 +223,7 @@ class FolderCatalogue(Catalogue):
         name = sha256("".join(frame["key"]).encode()).hexdigest()[:40]
         path = self.folder / table / f"{name}.parquet"
         if not path.exists():
-            whole = BytesIO()  # polars hides why it cannot write to a file
+            whole = BytesIO()  # polars would hide the reason of a failed write
             frame.write_parquet(whole, compression="zstd")
             with atomic_path(path) as temporary:
                 temporary.parent.mkdir(exist_ok=True)
@@ -231,13 +232,13 @@ class FolderCatalogue(Catalogue):
 
 
 def open_catalogue(location: str | Path, results: Path | None = None, *, create: bool = False) -> Catalogue:
-    """Open a catalogue: a folder, or a database (``postgresql://USER@HOST/DATABASE``).
+    """Open the catalogue in a folder, or in a database (``postgresql://USER@HOST/DATABASE``).
 
-    `results` is the folder of corrected logs and maps: by default `results` in the catalogue's folder, and
-    `fleet-results` here for one on a server. With `create`, a catalogue that does not exist is made.
+    `results` is the folder of corrected logs and maps. Its default is `results` in the catalogue's folder, or
+    `fleet-results` in the working directory for a database. With `create`, a missing catalogue is created.
 
-    FormatError: there is none, or it is of a newer format. PortError: the server does not answer.
-    MissingExtra: a server was named, and its client is not installed.
+    FormatError: the catalogue does not exist, or has a newer format. PortError: the server does not answer.
+    MissingExtra: the client of the database is not installed.
     """
     if not str(location).startswith(SERVERS):
         return FolderCatalogue(Path(location), results, create=create)

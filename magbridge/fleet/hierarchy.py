@@ -1,6 +1,7 @@
-r"""How coefficients vary from vehicle to vehicle, from refit to refit, and from one power-up to the next.
+r"""Model how coefficients vary between vehicles, between refits, and between power-ups.
 
-A tree of Gaussian random effects over the coefficients z (K of them, in units of their physical widths):
+The model is a tree of Gaussian random effects. z are the K coefficients, in units of their physical prior
+standard deviations:
 
 .. math::
 
@@ -9,26 +10,27 @@ A tree of Gaussian random effects over the coefficients z (K of them, in units o
     r_{ij} \sim N(v_i, V_2),\quad
     z_{ijk} \sim N(r_{ij}, V_3)
 
-with diagonal V_l, one variance for each group of similar coefficients. Where it is known how a refit moves a
-vehicle's coefficients together, :math:`r_{ij} \sim N(v_i, V_2 + D_i U D_i^T)`: the columns of D_i are such
-shapes, and U holds a variance for each group of them. The data of a deployment give a Gaussian likelihood of
-its z, of precision J and vector h. J may be singular: two runs determine few combinations, and ten most.
+with diagonal V_l and one variance for each group of similar coefficients. If the directions in which a refit
+moves the coefficients of vehicle i are known, :math:`r_{ij} \sim N(v_i, V_2 + D_i U D_i^T)`. The columns of
+D_i are these directions (shapes), and the diagonal U holds one variance for each group of shapes. The data of
+a deployment give a Gaussian likelihood of its z with precision J and vector h. J may be singular: two runs
+determine few combinations of coefficients, ten runs most.
 
 Notes
 -----
 Messages pass up the tree and means down (Gaussian belief propagation, exact on a tree; Pearl 1988).
-Integrating a child x of its parent p out, with S the covariance of its difference and
-:math:`L = J + S^{-1}`:
+A child x differs from its parent p by a difference of covariance S. With :math:`L = J + S^{-1}`, integrating
+over x gives the message to the parent:
 
 .. math::
 
     J_p \leftarrow J_p + J L^{-1} S^{-1},\quad h_p \leftarrow h_p + S^{-1} L^{-1} h
 
-and back, :math:`x | p \sim N(L^{-1}(h + S^{-1} p), L^{-1})`. A difference d splits into what each of its
-parts, with the covariance Q and the shape B (V and I, or U and D), contributes:
-:math:`b | d \sim N(Q B^T S^{-1} d,\ Q - Q B^T S^{-1} B Q)`. The variances maximise the likelihood by
-expectation-maximisation (Laird & Ware 1982, Biometrics 38:963), each with a scaled inverse chi-squared prior
-worth :data:`.PRIOR_DIFFERENCES` differences, so that a level with few members keeps a plausible size.
+On the way back, :math:`x | p \sim N(L^{-1}(h + S^{-1} p), L^{-1})`. A difference d is a sum of parts B b.
+Q is the covariance of b, and (Q, B) is (V, I) or (U, D). The contribution of a part is
+:math:`b | d \sim N(Q B^T S^{-1} d,\ Q - Q B^T S^{-1} B Q)`. Expectation-maximisation estimates the variances
+(Laird & Ware 1982, Biometrics 38:963). Each variance has a scaled inverse chi-squared prior, with the weight
+of :data:`.PRIOR_DIFFERENCES` differences, so that it stays plausible at a level with few members.
 """
 
 from __future__ import annotations
@@ -46,15 +48,15 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.information import GaussianInformation, covariance_of
 
 FLEET_LEVELS = ("vehicle", "refit", "power-up")
-"""Levels of the tree at which coefficients vary, from the root down."""
+"""Levels of the tree, from the root down: coefficients vary between the members of each level."""
 VARIATION_FRACTIONS = (1.0, 0.1, 0.02)
-"""Fractions of the physical widths by which they are expected to vary with each, before any fleet is seen."""
+"""Prior standard deviation at each level, as a fraction of the coefficients' physical widths."""
 PRIOR_DIFFERENCES = 2.0
-"""Differences that this expectation is worth."""
+"""Weight of the prior of a variance, in numbers of observed differences."""
 MAX_EM_ITERATIONS = 60
-"""Iterations of expectation-maximisation at most."""
+"""Largest number of iterations of expectation-maximisation."""
 MAX_LOG_CHANGE = 0.02
-"""Change of every log variance below which the iterations end."""
+"""Largest change of a log variance at which the iterations end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,22 +66,22 @@ class Shapes:
     of: Mapping[str, FloatArray]
     """Vehicle -> D (K, s); a vehicle that is not listed has none."""
     groups: IndexArray
-    """Group with which each column shares its variance, (s,)."""
+    """Number of the group of each column of D, (s,); the columns of a group share a variance."""
     rest: FloatArray | float = VARIATION_FRACTIONS[1]
-    """Expected variation of each coefficient with refits besides D, (K,), in physical widths."""
+    """Prior standard deviation between refits in addition to D, (K,), in physical widths."""
 
     def expected(self, K: int) -> FloatArray:
-        """Return the expected variation of coefficients (3, K), as fractions, before any fleet is seen."""
+        """Return the prior standard deviations at each level, (3, K), in physical widths."""
         vehicle, _, power_up = VARIATION_FRACTIONS
         return np.stack([np.full(K, vehicle), np.broadcast_to(self.rest, K), np.full(K, power_up)])
 
 
 NO_SHAPES = Shapes({}, np.zeros(0, np.intp))
-"""Nothing is known of how refits move coefficients."""
+"""Default for fleets without known shapes."""
 
 
 class Variances(NamedTuple):
-    """Variances of the differences between members and their parents."""
+    """Variances of the differences between the members of a level and their parents."""
 
     own: FloatArray
     """Variance of each coefficient at each of :data:`FLEET_LEVELS`, (3, K)."""
@@ -88,7 +90,7 @@ class Variances(NamedTuple):
 
     @classmethod
     def expected(cls, K: int, shapes: Shapes) -> Variances:
-        """Return the variances that are expected before any fleet is seen."""
+        """Return the prior variances, before any data of a fleet."""
         return cls(np.square(shapes.expected(K)), np.full(len(shapes.groups), VARIATION_FRACTIONS[1] ** 2))
 
 
@@ -102,7 +104,7 @@ class _Spread:
 
 
 def _spreads(variances: Variances, shapes: Shapes, vehicle: str) -> tuple[_Spread, ...]:
-    """Return how a vehicle differs from the fleet, its refits from it, and power-ups from their refit."""
+    """Return the spreads of vehicle about fleet, refit about vehicle, and power-up about refit."""
     identity = np.eye(variances.own.shape[1])
     by_vehicle, by_refit, by_power_up = ((row, identity) for row in variances.own)
     D = shapes.of.get(vehicle)
@@ -111,14 +113,14 @@ def _spreads(variances: Variances, shapes: Shapes, vehicle: str) -> tuple[_Sprea
 
 
 class _Sums:
-    """Expected squares of the differences (3, K) and of the shapes' amplitudes (s,), and their numbers."""
+    """Sums and counts of the expected squares of differences (3, K) and shape amplitudes (s,)."""
 
     def __init__(self, K: int, s: int) -> None:
         self.own, self.shaped = np.zeros((len(FLEET_LEVELS), K)), np.zeros(s)
         self.counts, self.refits = [0] * len(FLEET_LEVELS), 0
 
     def add(self, level: int, dd: FloatArray, spread: _Spread) -> None:
-        """Count a difference d with the expectation `dd` (K, K) of d d^T."""
+        """Add a difference d at a level, given `dd` (K, K), the expectation of d d^T."""
         squares = []
         for Q, B in spread.parts:
             # E[b^2] = Q + diag(Y (dd - S) Y^T) with the gain Y = Q B^T S^-1
@@ -131,7 +133,7 @@ class _Sums:
             self.shaped += squares[1]
 
     def maximised(self, groups: IndexArray, shapes: Shapes) -> Variances:
-        """Return the mode of the variances' posterior; `groups` (K,) of coefficients share a variance."""
+        """Return the posterior mode of the variances; `groups` (K,) numbers the group of each coefficient."""
 
         def mode(squares: FloatArray, count: int, member: IndexArray, expected: FloatArray) -> FloatArray:
             members = np.bincount(member)
@@ -147,7 +149,7 @@ class _Sums:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Information about the z of one deployment from its own data."""
+    """Information about the coefficients z of one deployment, from its own data only."""
 
     vehicle: str
     refit: str
@@ -156,23 +158,24 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """A fleet's variances, and the information about the fleet's mean."""
+    """Fitted model of a fleet: variances, and the information about the fleet's mean."""
 
     variances: Variances
     """Variances of the differences at each of :data:`.FLEET_LEVELS`."""
     shapes: Shapes
     """Directions in which refits move the coefficients of each vehicle."""
     total: GaussianInformation
-    """Posterior of the fleet's mean, its prior included."""
+    """Posterior information about the fleet's mean, including the prior."""
     each: dict[str, GaussianInformation]
-    """Vehicle -> its part of `total`."""
+    """Vehicle -> its contribution to `total`."""
 
     def expected(
         self, vehicle: str, observed: Iterable[Observed], refit: str
     ) -> tuple[FloatArray, FloatArray]:
-        """Return mean (K,) and covariance (K, K) of the next deployment's z of a vehicle, known or not.
+        """Predict z of the next deployment of a vehicle: return its mean (K,) and covariance (K, K).
 
-        `observed` are the same vehicle's deployments before; `refit` is one of theirs, or another.
+        The vehicle may be new to the fleet. `observed` are its earlier deployments; `refit` may be one of
+        their refits, or a new one.
         """
         by_vehicle, by_refit, by_power_up = _spreads(self.variances, self.shapes, vehicle)
         others = self.total
@@ -191,7 +194,7 @@ class Population:
 
 
 class _Message:
-    """A node's message to its parent, with what the way down needs: ``x | p ~ N(G p + g, R)``."""
+    """Message of a node x to its parent p, and the terms of ``x | p ~ N(G p + g, R)`` for the way back."""
 
     def __init__(self, information: GaussianInformation, spread: _Spread) -> None:
         self.spread = spread
@@ -207,10 +210,11 @@ def learn(
     shapes: Shapes = NO_SHAPES,
     variances: Variances | None = None,
 ) -> Population:
-    """Learn the variances of a fleet from its deployments, all with the same K coefficients.
+    """Estimate the variances of a fleet from its deployments, all with the same K coefficients.
 
-    `groups` (K,) has the number of the group that each coefficient shares its variances with, `shapes` how
-    refits move coefficients together. If `variances` are given, they are taken instead of learned.
+    `groups` (K,) is the number of each coefficient's group; coefficients of a group share their variances.
+    `shapes` are the directions in which refits move coefficients. If `variances` are given, they are used and
+    not estimated.
     """
     found, sums = _pass_messages(variances or Variances.expected(len(groups), shapes), observed, shapes)
     for _ in range(0 if variances else MAX_EM_ITERATIONS):
@@ -225,9 +229,9 @@ def learn(
 def _pass_messages(
     variances: Variances, observed: Sequence[Observed], shapes: Shapes
 ) -> tuple[Population, _Sums]:
-    """Pass messages up the tree and means down; return the population and the expected squares.
+    """Pass messages up the tree and moments down; return the population and the sums for the M-step.
 
-    A node's key is (vehicle, refit, number of the deployment), its parent's key the same without the last.
+    The key of a leaf is (vehicle, refit, number of the deployment); a parent's key lacks the last element.
     """
     K = variances.own.shape[1]
     spreads = {one.vehicle: _spreads(variances, shapes, one.vehicle) for one in observed}
@@ -262,7 +266,7 @@ def _pass_messages(
 def _updated(
     mean: FloatArray, P: FloatArray, evidence: Sequence[GaussianInformation]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of a Gaussian after independent information about it."""
+    """Return mean and covariance of N(mean, P) after adding independent information about it."""
     if not evidence:
         return mean, P
     J = covariance_of(P)

@@ -1,8 +1,9 @@
-"""Learn from the calibrations of a fleet's deployments, and predict the next one.
+"""Estimate the model of a fleet from its calibrations, and predict the next deployment of a vehicle.
 
-All deployments are brought to one scale of the positions and one F_0 (:func:`.rescaling`), and to units of
-the coefficients' physical widths (:mod:`magbridge.estimation.priors`). Coefficients that share a
-monomial and are of one kind (A or T; for the constant: gain, soft iron, hard iron) share their variances.
+The coefficients of all deployments are converted to one scale of the mass positions and one reference field
+F_0 (:func:`.rescaling`). z are these coefficients in units of their physical widths
+(:mod:`magbridge.estimation.priors`). Coefficients share their variances if they have the same monomial and
+kind: A or T, or for the constant monomial gain, soft iron or hard iron.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from magbridge.fleet.hierarchy import NO_SHAPES, Observed, Population, Shapes, V
 
 SHAPE_ITERATIONS = 4
 SHAPE_KINDS = 3
-"""Kinds of shapes of a mass: moment, susceptibility and position, with three numbers each."""
+"""Number of kinds of shapes of a mass: moment, susceptibility and position, with three components each."""
 
 
 def shapes_of(
@@ -38,13 +39,15 @@ def shapes_of(
     mean: FloatArray,
     covariance: FloatArray,
 ) -> FloatArray:
-    """Return the shapes (K, 9 n) along which refits move a vehicle's coefficients, nT, for its n masses.
+    """Return the directions (shapes) in which refits move a vehicle's coefficients, (K, 9 n), nT.
 
-    A refit changes the moment of a mass, its susceptibility, and its place. Each moves the coefficients along
-    the derivative of the mass's polynomials, here for the usual width of the dipole's number. That by the
-    place needs the moment: so a dipole is first fitted to the posterior of the vehicle's deployments, N(m,
-    P), ``l = argmin (c(l) - m)^T P^-1 (c(l) - m) + l^T W^-1 l`` with W the dipole's usual widths, linearised
-    again in each iteration. `mean` (K,) is m and `covariance` (K, K) P; the others are as in :class:`.Known`.
+    A refit changes the moment, the susceptibility and the position of each of the n masses. A shape is the
+    derivative of the coefficients by one of these dipole parameters, times the parameter's prior standard
+    deviation. The derivative by the position depends on the moment. Therefore a dipole l is first fitted to
+    the posterior N(m, P) of the vehicle's coefficients:
+    ``l = argmin (c(l) - m)^T P^-1 (c(l) - m) + l^T W^-1 l``, with the dipole's prior variances W. c(l) is
+    linearised again in each iteration. `mean` (K,) is m, `covariance` (K, K) is P; for the other arguments
+    see :class:`.Known`.
     """
     free = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
     family = mounted_prior(free, exponents, parameters, mounted)
@@ -70,22 +73,22 @@ def shapes_of(
 
 
 def shape_groups(masses: int) -> IndexArray:
-    """Return the number of the group of each shape (9 n,): kinds of a mass have a variance each."""
+    """Return the group number of each shape, (9 n,): a group is one kind of one of the n masses."""
     return np.repeat(np.arange(SHAPE_KINDS * masses), 3)
 
 
 UNEXPLAINED_FRACTION = 0.01
-"""Variation between refits that the dipole of a mounted mass does not explain, in physical widths."""
+"""Prior standard deviation between refits that a mass's dipole does not explain, in physical widths."""
 NO_MOUNTINGS: Mapping[str, Mapping[str, Mounting]] = {}
 REFERENCE_FIELD_NT = 50_000.0
-"""F_0 that a fleet's coefficients refer to, nT."""
+"""Reference field F_0 to which the coefficients of a fleet are converted, nT."""
 
 
 class Lesson(NamedTuple):
     """Information about the coefficients of one deployment from its own data, without a prior.
 
-    `time` is the start of the deployment, s since 1970; `noise` the 1-sigma of a sample, nT; the others are
-    as in :class:`.Known`.
+    `time` is the start of the deployment, s since 1970, and `noise` the 1-sigma of a sample, nT. For the
+    other fields see :class:`.Known`.
     """
 
     vehicle: str
@@ -99,17 +102,18 @@ class Lesson(NamedTuple):
     information: GaussianInformation
 
     def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> GaussianInformation:
-        """Return the information of z: with ``c_own = B z``, ``J = B^T I B`` and ``h = B^T i``.
+        """Return the information about z, which has q elements.
 
-        It is brought to the scales of `parameters` and the F_0 of :data:`REFERENCE_FIELD_NT`; `basis` (9 m,
-        q), nT, are coefficients there of z.
+        The coefficients of the deployment are ``c = B z``, so precision and vector become ``B^T J B`` and
+        ``B^T h``. `basis` (9 m, q), nT, maps z to coefficients for the scales of `parameters` and the
+        reference field :data:`REFERENCE_FIELD_NT`.
         """
         B = rescaling(self.exponents, parameters, self.parameters, REFERENCE_FIELD_NT, self.field) @ basis
         return GaussianInformation(B.T @ self.information.precision @ B, B.T @ self.information.vector)
 
 
 def packed(evidence: GaussianInformation | None) -> dict[str, bytes]:
-    """Return information as columns of the catalogue: little-endian doubles, row by row; empty: none."""
+    """Encode information for the catalogue as little-endian doubles in row order; None gives empty bytes."""
     if evidence is None:
         return {"precision": b"", "vector": b""}
     parts = {"precision": evidence.precision, "vector": evidence.vector}
@@ -117,7 +121,7 @@ def packed(evidence: GaussianInformation | None) -> dict[str, bytes]:
 
 
 def unpacked(row: Mapping[str, bytes]) -> GaussianInformation:
-    """Return the information that :func:`packed` has encoded."""
+    """Decode the information that :func:`packed` has encoded."""
     vector = np.frombuffer(row["vector"], "<f8")
     return GaussianInformation(np.frombuffer(row["precision"], "<f8").reshape(len(vector), -1), vector)
 
@@ -127,24 +131,24 @@ class Fleet:
     """Model of a fleet of vehicles with the same moving masses."""
 
     parameters: tuple[Parameter, ...]
-    """The scale that all are brought to: the whole range seen."""
+    """Common scale of the mass positions: the range that all deployments together cover."""
     exponents: tuple[Exponents, ...]
-    """The m monomials."""
+    """Exponents of the m monomials."""
     basis: FloatArray
-    """Coefficients for each element of z, which is in physical widths, (9 m, 9 m), nT."""
+    """Matrix from z, in physical widths, to coefficients, (9 m, 9 m), nT."""
     population: Population
     mounted: Mapping[str, Mapping[str, Mounting]]
-    """Vehicle -> where its masses sit."""
+    """Vehicle -> mounting positions of its masses."""
     lessons: tuple[Lesson, ...]
     """Deployments in the order of time."""
     observed: tuple[Observed, ...]
-    """Information of z."""
+    """Information about z from each deployment, in the order of `lessons`."""
 
     def known(self, vehicle: str, refit: str, before_time: float = np.inf) -> Known:
-        """Return the prediction of the next deployment of a vehicle, which may be new to the fleet.
+        """Predict the coefficients of the next deployment of a vehicle, which may be new to the fleet.
 
-        `refit` is one it had before, or a new one. Of its own deployments, those that began before
-        `before_time` (s since 1970) count.
+        `refit` may be an earlier refit of the vehicle, or a new one. Of the vehicle's own deployments, only
+        those that began before `before_time` (s since 1970) are used.
         """
         past = [
             seen
@@ -161,12 +165,12 @@ def learn_fleet(
     mounted: Mapping[str, Mapping[str, Mounting]] = NO_MOUNTINGS,
     variances: Variances | None = None,
 ) -> Fleet:
-    """Learn from deployments of vehicles whose masses have the same names, fitted to the same order.
+    """Estimate the model of a fleet whose vehicles have masses of the same names and one polynomial order.
 
-    `mounted` has the places of the masses of those vehicles of which all are known; `variances` are those
-    that the same lessons have given before.
+    `mounted` has the mounting positions of the masses, for the vehicles for which all are known. `variances`
+    are the result of an earlier call with the same lessons; if given, they are not estimated again.
 
-    DataError: there is no lesson.
+    DataError: `lessons` is empty.
     """
     if not lessons:
         raise DataError(
@@ -193,7 +197,7 @@ def _shapes(
     parameters: tuple[Parameter, ...],
     basis: FloatArray,
 ) -> Shapes:
-    """Return how refits move z, about where each vehicle is before the variances are estimated."""
+    """Return the shapes in units of z, linearised at each vehicle's estimate under the prior variances."""
     names = {one.name for one in parameters}
     whole = {vehicle: where for vehicle, where in mounted.items() if where.keys() == names}
     if not whole:
@@ -212,7 +216,7 @@ def _shapes(
 
 
 def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:
-    """Return the parameters, scaled to the range that any deployment saw."""
+    """Return the parameters, scaled to the range that all deployments together cover."""
     whole = []
     for seen in zip(*(lesson.parameters for lesson in lessons), strict=True):
         low, high = min(one.low for one in seen), max(one.high for one in seen)
@@ -222,7 +226,7 @@ def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:
 
 
 def _groups(exponents: Sequence[Exponents]) -> IndexArray:
-    """Return the number (9 m,) of the group whose variances each coefficient shares."""
+    """Return the group number of each coefficient, (9 m,); coefficients of a group share their variances."""
     names: list[tuple[object, str]] = []
     for powers in exponents:
         moved = sum(power > 0 for power in powers)
@@ -235,22 +239,22 @@ def _groups(exponents: Sequence[Exponents]) -> IndexArray:
 
 FIXED = "hard iron"
 FALSE_ALARM_PROBABILITY = 1e-3
-"""Probability of a false alarm in a deployment, over all its coefficients."""
+"""Probability of a false alarm in a deployment, over all monitored coefficients."""
 
 
 class Change(NamedTuple):
-    """A coefficient that left its band; the names are those of the JSON output."""
+    """Significant change of a coefficient; the field names are the keys of the JSON output."""
 
     what: str
-    """Name of the coefficient for a technician."""
+    """Name of the coefficient: mass or hard iron, and axis."""
     by_nT: float  # noqa: N815 - the JSON key
-    """Change of the coefficient."""
+    """Change of the coefficient from its prediction, nT."""
     sigmas: float
     """Change divided by its standard deviation."""
     chance: float
-    """Probability that any coefficient of an unchanged vehicle changes as much in one deployment."""
+    """Probability that any coefficient of an unchanged vehicle changes by as many sigmas."""
     cause: str
-    """Likely cause, and whether a refit was on record."""
+    """Likely cause, and if a refit is on record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,27 +262,27 @@ class History:
     """A vehicle's coefficients from deployment to deployment."""
 
     names: tuple[str, ...]
-    """The k quantities: hard iron, and what each mass changes over half its range."""
+    """Names of the k coefficients: hard iron, and the effect of each mass over half its range."""
     lessons: tuple[Lesson, ...]
-    """Deployments in the order of time."""
+    """Deployments of the vehicle in the order of time."""
     expected: FloatArray
     expected_sigma: FloatArray
-    """`expected`, `expected_sigma`, (n, k), nT, from the earlier value."""
+    """`expected`, `expected_sigma`: Prediction before the deployment, and its 1-sigma, (n, k), nT."""
     found: FloatArray
     found_sigma: FloatArray
-    """`found`, `found_sigma`, (n, k), nT, with its own data."""
+    """`found`, `found_sigma`: Estimate after its own data, and its 1-sigma, (n, k), nT."""
     changes: tuple[tuple[Change, ...], ...]
-    """Changes of each deployment."""
+    """Significant changes in each deployment."""
 
 
 def history(fleet: Fleet, vehicle: str) -> History:
-    """Return the history of a vehicle's coefficients, and where they left their bands.
+    """Return the history of a vehicle's coefficients, and their significant changes.
 
-    A deployment is predicted as N(m, S), wider where the vehicle was refitted. With its own data the
-    coefficients move to N(m', P), and under the model the move has the covariance ``Cov(m' - m) = S - P``. So
-    each coefficient's move over its own sigma is a standard normal number, whatever the runs determine. A
-    change is reported where the probability of a move as large is below :data:`FALSE_ALARM_PROBABILITY` over
-    all monitored coefficients.
+    The prediction of a deployment is N(m, S), with a larger S after a refit. The deployment's own data give
+    the posterior N(m', P). Under the model, ``Cov(m' - m) = S - P``. So the change of a coefficient, divided
+    by its sigma, has a standard normal distribution, however much the runs determine. A change is reported if
+    the probability of a change as large is below :data:`FALSE_ALARM_PROBABILITY` over all monitored
+    coefficients.
     """
     mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
     names, places = _looked_at(fleet)
@@ -295,7 +299,7 @@ def history(fleet: Fleet, vehicle: str) -> History:
         rows.append(
             (before.mean[places], np.sqrt(np.diag(S))[places], after[places], np.sqrt(np.diag(P))[places])
         )
-        if len(rows) == 1:  # it has no past
+        if len(rows) == 1:  # the first deployment has no predecessor
             changes.append(())
             continue
         refitted = lesson.refit not in {one.refit for one in mine[: len(rows) - 1]}
@@ -307,7 +311,7 @@ def history(fleet: Fleet, vehicle: str) -> History:
 
 
 def facts(history: History) -> dict[str, Any]:
-    """Return a history as a dictionary that JSON can hold; nT."""
+    """Return a history as a dictionary for JSON; coefficients in nT."""
     columns = history.expected, history.expected_sigma, history.found, history.found_sigma
     keys = "expected_nT", "expected_sigma_nT", "found_nT", "found_sigma_nT"
     return {
@@ -327,7 +331,7 @@ def facts(history: History) -> dict[str, Any]:
 def _significant_changes(
     names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool
 ) -> list[Change]:
-    """Return the moves (k,) beyond their sigmas (k,), the farthest first."""
+    """Return the significant changes among `moves` (k,), nT, with 1-sigma `sigmas` (k,), largest first."""
     found = []
     for name, move, sigma in zip(names, moves, sigmas, strict=True):
         z = abs(move) / max(sigma, 1e-12)
@@ -338,7 +342,7 @@ def _significant_changes(
 
 
 def _cause(name: str, refitted: bool) -> str:
-    """Return the likely cause, for a technician."""
+    """Return the text of the likely cause of a coefficient's change."""
     mass, _, _ = name.rpartition(",")
     what = (
         "iron that was magnetised, fitted or removed"
@@ -349,7 +353,7 @@ def _cause(name: str, refitted: bool) -> str:
 
 
 def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
-    """Return names and indices of the monitored coefficients: hard iron, and each mass's linear terms."""
+    """Return names and indices of the monitored coefficients: hard iron, and its change with each mass."""
     names, places = [], []
     for m, powers in enumerate(fleet.exponents):
         if sum(powers) > 1:

@@ -1,4 +1,4 @@
-"""Predict the next deployment of a vehicle from the calibrations in a catalogue."""
+"""Read the calibrations of a fleet from a catalogue, and predict a vehicle's next calibration."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class _Taught(NamedTuple):
-    """A deployment's calibration, the SHA-256 of its logs, its sensor, and if it was made elsewhere."""
+    """Training record of a deployment, SHA-256 of its logs, sensor, and True if calibrated elsewhere."""
 
     lesson: Lesson
     inputs: frozenset[str]
@@ -47,10 +47,10 @@ class _Taught(NamedTuple):
 
 
 def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> list[Lesson]:
-    """Return the training records of all deployments of vehicles with the masses of the vehicle `like`.
+    """Return the training records of all vehicles with the same masses and order as the vehicle `like`.
 
-    Estimates from logs of the SHA-256 in `excluded` are left out. A calibration made elsewhere from logs that
-    were also calibrated here is left out, too.
+    A record whose logs have a SHA-256 in `excluded` is omitted. A calibration that was made elsewhere is
+    omitted if its logs were also calibrated here.
 
     WrongUse: the vehicle does not exist.
     """
@@ -77,10 +77,10 @@ def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> 
 
 
 def fleet_of(catalogue: Catalogue, vehicle: str, excluded: Collection[str] = ()) -> Fleet:
-    """Return the fleet of the vehicles with the masses of this one; `excluded` as for :func:`lessons`.
+    """Return the model of the fleet of a vehicle; for `excluded` see :func:`lessons`.
 
-    WrongUse: there is no such vehicle. DataError: nothing has been calibrated yet, or the columns' units
-    differ.
+    WrongUse: the vehicle does not exist. DataError: no deployment has been calibrated, or the units of a
+    parameter differ.
     """
     found = lessons(catalogue, vehicle, excluded)
     units = {tuple(one.unit for one in lesson.parameters) for lesson in found}
@@ -99,7 +99,7 @@ def fleet_of(catalogue: Catalogue, vehicle: str, excluded: Collection[str] = ())
 
 
 def fleets(catalogue: Catalogue, names: Iterable[str]) -> dict[str, Fleet | DataError]:
-    """Return each vehicle's fleet, or why there is none; vehicles with the same masses share theirs."""
+    """Return the fleet model of each vehicle, or the error; vehicles with the same masses share a model."""
     found: dict[Any, Fleet | DataError] = {}
     out: dict[str, Fleet | DataError] = {}
     for name in names:
@@ -114,7 +114,7 @@ def fleets(catalogue: Catalogue, names: Iterable[str]) -> dict[str, Fleet | Data
 
 
 def remember(catalogue: Catalogue) -> None:
-    """Store the estimated variances of each fleet in the catalogue, so that they are estimated once."""
+    """Store the estimated variances of each fleet in the catalogue, so that later calls reuse them."""
     for fleet in fleets(catalogue, vehicles(catalogue)).values():
         if isinstance(fleet, Fleet):
             own, shaped = (one.ravel().tolist() for one in fleet.population.variances)
@@ -123,7 +123,7 @@ def remember(catalogue: Catalogue) -> None:
 
 
 def last_maps(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:
-    """Return the deployment and the file of each vehicle's newest anomaly map."""
+    """Return vehicle -> deployment and file of its newest anomaly map."""
     of = {job.name: job for job in jobs(catalogue)}
     start = {row["sha256"]: row["start"] for row in catalogue.rows("logs", ["sha256", "start"])}
     found: dict[str, tuple[float, str, Path]] = {}
@@ -137,9 +137,10 @@ def last_maps(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:
 
 
 def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
-    """Return the results of each vehicle's deployments, with their names, in the order of these.
+    """Return vehicle -> rows of the causes that ``diagnose`` found, in the order of deployment names.
 
-    A cause has its improvement, ``ratio low high``: the RMS with it over that without, and its interval.
+    A row with a known improvement has ``ratio``, the RMS with the cause modelled over the RMS without, and
+    its interval ``low`` to ``high``.
     """
     of = {job.name: job for job in jobs(catalogue)}
     better = {(row["job"], row["cause"], row["channel"]): row for row in current(catalogue, "improvements")}
@@ -152,9 +153,9 @@ def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
 
 
 def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
-    """Return vehicle and refit of logs by their SHA-256.
+    """Return vehicle and refit of the logs with the SHA-256 `digests`.
 
-    WrongUse: they are not catalogued, or are of several vehicles.
+    WrongUse: the logs are not in the catalogue, or belong to several vehicles.
     """
     wanted = set(digests)
     rows = [row for row in current_files(catalogue.rows("files")) if row["sha256"] in wanted]
@@ -166,12 +167,12 @@ def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
 
 
 def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
-    """Return the masses and the order, which vehicles must share to be one fleet."""
+    """Return the masses and the polynomial order, which all vehicles of a fleet have in common."""
     return tuple(vehicle["parameters"]), vehicle["order"]
 
 
 def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting]]) -> str:
-    """Return a hash of the deployments and positions of masses from which variances are estimated."""
+    """Return a hash of the inputs from which variances are estimated: training records and mass positions."""
     each = sorted(
         (one.vehicle, one.refit, one.deployment, one.time, one.information.vector.tolist()) for one in lessons
     )
@@ -180,7 +181,7 @@ def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting
 
 
 def _taught(row: Row) -> _Taught:
-    """Return the lesson of a calibration."""
+    """Return the training record in a row of the table ``calibrations``."""
     calibration = decode_calibration(row["calibration"].encode(), f"calibration of {row['deployment']}")
     term = calibration.terms[0]
     assert isinstance(term, Polynomial)
@@ -192,18 +193,20 @@ def _taught(row: Row) -> _Taught:
 
 
 MAX_VARIANCE_FRACTION = 0.25
-"""Largest remaining fraction of the prior's variance in a direction that the data have determined."""
+"""Posterior over prior variance below which the data are taken to have determined a direction."""
 MAX_DEPARTURE_RATIO = 3.0
-"""Departure from the vehicle's past over the expected departure, above which a warning is printed."""
+"""Departure from the vehicle's past, relative to the expected one, above which a warning is printed."""
 
 
 def add_calibration(
     catalogue: Catalogue, vehicle: str, deployment: Deployment, start: float, calibration: Calibration
 ) -> int:
-    """Put the calibration of a deployment that began at `start` (s since 1970) on record, unless it is.
+    """Add the calibration of a deployment to the catalogue, unless it is there; return the number added.
 
-    Return how many were added. WrongUse: there is no such vehicle, its masses are others, or the deployment
-    has another calibration.
+    `start` is the start of the deployment, s since 1970.
+
+    WrongUse: the vehicle does not exist, the calibration has other parameters or another sensor, or the
+    deployment has another calibration.
     """
     of = vehicle_named(catalogue, vehicle)
     names = [one.name for one in calibration.parameters]
@@ -245,11 +248,12 @@ def _row(
 
 
 def _information(calibration: Calibration, order: int) -> GaussianInformation | None:
-    """Return the information of its data; None unless it is a polynomial of that order alone.
+    """Return the information that the data of a calibration contributed, without the prior.
 
-    A cal.json holds a posterior N(c, P). Its prior is taken to have been the physical one, N(0, W). With
-    ``W^-1/2 P W^-1/2 = sum lambda_k v_k v_k^T``, the directions with lambda_k below
-    :data:`MAX_VARIANCE_FRACTION` count, with the precision ``1 / lambda_k - 1``.
+    The result is None if the calibration is not a single polynomial of degree `order`. A cal.json holds the
+    posterior N(c, P); its prior is assumed to be the physical prior N(0, W). With
+    ``W^-1/2 P W^-1/2 = sum lambda_k v_k v_k^T``, a direction v_k with lambda_k below
+    :data:`MAX_VARIANCE_FRACTION` gets the precision ``1 / lambda_k - 1``; all others get 0.
     """
     term, *others = calibration.terms
     if others or not isinstance(term, Polynomial) or max(map(sum, term.exponents)) != order:
@@ -270,8 +274,8 @@ def _information(calibration: Calibration, order: int) -> GaussianInformation | 
 def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
     """Return the prediction of a vehicle's next deployment as a calibration.
 
-    Arguments are those of :meth:`Fleet.known`. Its noise is what that of its deployments was in the mean (of
-    power), or of its fleet's, if it has none.
+    The arguments are those of :meth:`.Fleet.known`. The noise is the RMS of the noise of the vehicle's own
+    deployments, or of all deployments of the fleet if it has none.
     """
     known = fleet.known(vehicle, refit)
     own = [one.noise for one in fleet.lessons if one.vehicle == vehicle]
@@ -284,7 +288,7 @@ def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
 
 
 class FleetPrediction(NamedTuple):
-    """The prior, and the numbers of deployments behind it: of the vehicle, and of other vehicles."""
+    """Prior for a calibration, with the number of deployments of the vehicle (`own`) and of others."""
 
     known: Known
     vehicle: str
@@ -294,17 +298,18 @@ class FleetPrediction(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The columns that move its masses."""
+        """Names of the columns with the positions of the vehicle's masses."""
         return tuple(one.name for one in self.known.parameters)
 
 
 def start(location: str | Path, member: str, refit: str, digests: Collection[str]) -> FleetPrediction:
-    """Return the prediction of a catalogue for logs.
+    """Return the prediction of the calibration of logs, from the other logs of a catalogue.
 
-    Estimates from the logs themselves, of the SHA-256 `digests`, do not count. `member` and `refit` are the
-    logs' vehicle, and which refit it flew with; empty: as the catalogue has them.
+    Calibrations from the logs themselves, with the SHA-256 `digests`, are not used. `member` and `refit` are
+    the vehicle and the refit of the logs; if empty, the catalogue's entries for the logs are used.
 
-    WrongUse: there is no such vehicle, or the logs' is not known. DataError: nothing has been calibrated yet.
+    WrongUse: the vehicle does not exist, or is not known for these logs. DataError: no deployment has been
+    calibrated.
     """
     catalogue = open_catalogue(location)
     if not member:
@@ -316,9 +321,10 @@ def start(location: str | Path, member: str, refit: str, digests: Collection[str
 
 
 def gained(found: Fit, single: Fit | None, began: FleetPrediction) -> tuple[dict[str, Any], list[str]]:
-    """Return the benefit of the fleet, as values and as lines of text.
+    """Return the benefit of the fleet's prior, as values and as lines of text.
 
-    `found` is the fit with the fleet, `single` that by its own data, None where those allow no fit.
+    `found` is the fit with the fleet's prior; `single` is the fit to the same data without the prior, or None
+    if that fit fails.
     """
     with_it, without = (
         one and one.details["expected_over_noise"] * one.calibration.noise.sensor for one in (found, single)

@@ -1,4 +1,4 @@
-"""A fleet as pages: one of all vehicles and one of each, with pictures and no script, in light and dark."""
+"""Write HTML pages about a fleet, without scripts: an overview, and details of each vehicle."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from magbridge.pictures import literal
 from magbridge.plot import grid
 
 INK, BAND, CHANGED, REFIT = "#010101", "#020202", "#030303", "#040404"
-"""Stand-ins in the pictures, for the page's own colours."""
+"""Colours in the pictures that are replaced by the colour variables of the page."""
 PAGE_COLOURS = {INK: "var(--ink)", BAND: "var(--band)", CHANGED: "var(--changed)", REFIT: "var(--faint)"}
 SVG_SETTINGS: Any = {
     "svg.hashsalt": "fleet", "svg.fonttype": "none", "font.size": 8.0, "text.color": INK,
     "axes.labelcolor": INK, "axes.edgecolor": REFIT, "xtick.color": INK, "ytick.color": INK,
 }  # fmt: skip
 MAX_BAND_RATIO = 6.0
-"""Largest width of a band over the range of the estimates at which the whole band is drawn."""
+"""Largest ratio of a band's width to the range of the estimates at which the whole band is visible."""
 Maps = Mapping[str, tuple[str, Path]]
-"""Vehicle -> deployment and file of its last anomaly map."""
+"""Vehicle -> deployment and file of its newest anomaly map."""
 Findings = Mapping[str, Sequence[Mapping[str, Any]]]
-"""Vehicle -> rows of the findings in its deployments."""
+"""Vehicle -> rows of the causes that ``diagnose`` found in its deployments."""
 
 
 def write_pages(
@@ -46,9 +46,8 @@ def write_pages(
 ) -> None:
     """Write the pages of a fleet: one file (.html) with all vehicles, or a folder.
 
-    The folder gets index.html of the fleet, VEHICLE.html of each, and all numbers as fleet.json. `findings`
-    has the rows of the vehicles whose deployments were diagnosed, `maps` deployment and file of each one's
-    last map.
+    The folder receives index.html about the fleet, VEHICLE.html about each vehicle, and all numbers as
+    fleet.json. `findings` may lack vehicles without a diagnosed deployment, `maps` vehicles without a map.
 
     WriteError: a vehicle's name is not a file name, or the pages cannot be written.
     """
@@ -77,7 +76,7 @@ def write_pages(
 def _write(
     path: Path, title: str, listed: Sequence[dict[str, Any]], detailed: Sequence[dict[str, Any]]
 ) -> None:
-    """Write a page that lists some vehicles and shows some in detail."""
+    """Write a page with a list of the vehicles `listed` and the details of the vehicles `detailed`."""
     engine = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined
     )
@@ -92,7 +91,7 @@ def _write(
 def _shown(
     name: str, history: History, found: Sequence[Mapping[str, Any]], last: tuple[str, Path] | None
 ) -> dict[str, Any]:
-    """Return what the template shows of a vehicle."""
+    """Return the values about a vehicle that the template of the page needs."""
     deployments = facts(history)["deployments"]
     for one in deployments:
         one["masses"] = list(dict.fromkeys(change["what"].rpartition(",")[0] for change in one["changes"]))
@@ -103,7 +102,7 @@ def _shown(
 
 
 def _survey(last: tuple[str, Path] | None) -> dict[str, str] | None:
-    """Return the picture of a vehicle's last anomaly map; None where its file cannot be read."""
+    """Return deployment and PNG (base64) of a vehicle's newest map; None without a readable map."""
     if last is None:
         return None
     deployment, path = last
@@ -119,7 +118,7 @@ def _survey(last: tuple[str, Path] | None) -> dict[str, str] | None:
 
 
 def _panel(history: History, k: int) -> str:
-    """Return the picture of one coefficient from deployment to deployment."""
+    """Return the SVG of the chart of coefficient `k` over the deployments."""
     with rc_context(SVG_SETTINGS):
         figure = Figure(figsize=(3.4, 2.0))
         figure.subplots_adjust(0.15, 0.2, 0.98, 0.88)
@@ -128,7 +127,7 @@ def _panel(history: History, k: int) -> str:
         moved = np.array(
             [any(change.what == history.names[k] for change in changes) for changes in history.changes]
         )
-        # the first deployment's expectation is the fleet's: its band would hide all others
+        # the first prediction is so wide that its band would hide the others
         later = slice(1, None) if len(when) > 1 else slice(None)
         band = history.expected[later, k], 2.0 * history.expected_sigma[later, k]
         ax.errorbar(when[later], *band, fmt="none", color=BAND, lw=7)
@@ -154,8 +153,8 @@ def _panel(history: History, k: int) -> str:
 
 
 def _dates(ax: Axes, dates: Sequence[datetime]) -> None:
-    """Set the horizontal axis: a date at each deployment where few dates fit, else at intervals."""
-    aside = max(0.08 * (dates[-1] - dates[0]), timedelta(days=10))  # one deployment alone has no span
+    """Set the time axis: a tick at each of one or two deployments, else ticks at regular dates."""
+    aside = max(0.08 * (dates[-1] - dates[0]), timedelta(days=10))  # one deployment has no range of dates
     ax.set_xlim(dates[0] - aside, dates[-1] + aside)  # type: ignore[arg-type]
     if len(dates) == 1 or (len(dates) == 2 and dates[1] - dates[0] >= aside):
         ax.set_xticks(list(dates), [f"{one:%Y-%m-%d}" for one in dates])  # type: ignore[arg-type]
@@ -164,7 +163,7 @@ def _dates(ax: Axes, dates: Sequence[datetime]) -> None:
 
 
 def _limit(ax: Axes, history: History, k: int, later: slice) -> None:
-    """Set the vertical axis by the estimates where a band is far wider, and state that band."""
+    """Limit the vertical axis to the estimates if a band is much wider, and state the band as text."""
     low = float((history.found[:, k] - 2.0 * history.found_sigma[:, k]).min())
     high = float((history.found[:, k] + 2.0 * history.found_sigma[:, k]).max())
     half = float(2.0 * history.expected_sigma[later, k].max())

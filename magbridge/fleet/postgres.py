@@ -1,7 +1,7 @@
-"""A catalogue in a PostgreSQL database, for a team that shares one.
+"""Store the catalogue of a fleet in a PostgreSQL database, which several users can share.
 
-The tables are those of :data:`.CATALOGUE_TABLES`, in a schema of their own. The key of a row is the primary
-key, so that a row is stored once even if two processes add it at the same time.
+The tables are those of :data:`.CATALOGUE_TABLES`, in the schema ``magbridge_fleet``. The hash of a row is its
+primary key, so that a row is stored once even if two processes add it at the same time.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, Catalo
 
 SCHEMA = sql.Identifier("magbridge_fleet")
 CONNECT_TIMEOUT_S = 10
-"""Longest time to wait for the answer of a server, s."""
+"""Longest time to wait for a connection to the server, s."""
 CREATION_LOCK = 0x6D616762
-"""Key of the advisory lock under which a process creates the tables."""
+"""Key of the advisory lock that a process holds while it creates the tables."""
 TYPES: dict[pl.DataType, str] = {
     pl.String(): "text",
     pl.Float64(): "double precision",
@@ -36,12 +36,12 @@ TYPES: dict[pl.DataType, str] = {
 
 
 class PostgresCatalogue(Catalogue):
-    """The tables of a database, ``postgresql://USER@HOST/DATABASE``; as libpq, it reads ``~/.pgpass``."""
+    """Catalogue in the database ``postgresql://USER@HOST/DATABASE``; ``~/.pgpass`` may hold the password."""
 
     def __init__(self, url: str, results: Path, *, create: bool = False) -> None:
         self._url, self.results = url, results
         parts = urlsplit(url)
-        # without what may hold a password
+        # without the part that may contain a password
         self.name = f"postgresql://{parts.netloc.rpartition('@')[2]}{parts.path}"
         with self._connected() as connection:
             if create:
@@ -65,7 +65,7 @@ class PostgresCatalogue(Catalogue):
             ):
                 return cursor.execute(query).fetchall()
         except PortError as error:
-            if isinstance(error.__cause__, psycopg.errors.UndefinedTable):  # it is newer than the catalogue
+            if isinstance(error.__cause__, psycopg.errors.UndefinedTable):  # the catalogue is older
                 return []
             raise
 
@@ -87,7 +87,10 @@ class PostgresCatalogue(Catalogue):
 
     @contextmanager
     def _connected(self) -> Iterator[psycopg.Connection]:
-        """Connect for one transaction."""
+        """Yield a connection for one transaction.
+
+        PortError: the database reports an error.
+        """
         try:
             with psycopg.connect(self._url, connect_timeout=CONNECT_TIMEOUT_S) as connection:
                 yield connection
@@ -95,7 +98,7 @@ class PostgresCatalogue(Catalogue):
             raise PortError(self.name, " ".join(str(error).split())) from error
 
     def _make(self, connection: psycopg.Connection) -> None:
-        """Create the missing tables, under a lock."""
+        """Create the schema and the missing tables while holding the creation lock."""
         connection.execute("select pg_advisory_xact_lock(%s)", (CREATION_LOCK,))
         connection.execute(sql.SQL("create schema if not exists {}").format(SCHEMA))
         connection.execute(

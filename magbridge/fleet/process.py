@@ -1,8 +1,8 @@
-"""Process deployments of a catalogue, each a task, on dask.distributed.
+"""Process the deployments of a catalogue in parallel, each as a task of dask.distributed.
 
 A worker (:func:`work`) writes only corrected logs and maps; the calling process writes the rows of the
-catalogue. A fault of a log is recorded as a failure, and the deployment's other logs are processed. A
-temporary fault (a missing or changed file, a full disk) is reported, not recorded; the next call tries again.
+catalogue. If a log is faulty, a failure is recorded and the other logs of the deployment are processed. A
+temporary fault (a missing or changed file, a full disk) is reported but not recorded: the next call retries.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from magbridge.survey.maps import anomaly_map
 from magbridge.survey.run import samples_of, survey
 
 PIECE_ROWS = 20_000
-"""Rows that are corrected at a time."""
+"""Number of rows of a log that are corrected and written at a time."""
 
 
 class Done(NamedTuple):
-    """Result rows of a job by table, and the temporary fault that prevented them (empty: none)."""
+    """Result of a job: rows by table, or the temporary fault that prevented the job (else empty)."""
 
     tables: dict[str, list[Row]]
     hindrance: str = ""
 
 
 def work(job: Job, results: Path) -> Done:
-    """Read, check, calibrate, correct and, where that is asked for, diagnose a deployment.
+    """Read, check, calibrate and correct a deployment; also diagnose and map it if the job requests this.
 
     Corrected logs and maps are written to the folder `results`.
     """
@@ -70,7 +70,7 @@ def work(job: Job, results: Path) -> Done:
 
 
 def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
-    """Process a job step by step; `tables` receives the rows of each completed step."""
+    """Process a job step by step, and add the rows of each completed step to `tables`."""
     logs: dict[str, xr.Dataset] = {}
     for row in {row["sha256"]: row for row in job.files}.values():
         path = Path(row["path"])
@@ -109,7 +109,10 @@ def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
 
 
 def _checked(path: Path, job: Job) -> xr.Dataset:
-    """Read a log; refuse one of no date, or of another sensor."""
+    """Read a log.
+
+    FormatError: the log has no date, or is of another sensor than the job's.
+    """
     log = read(path, required=CHANNELS)
     if counts_from_boot(log):
         first = str(np.datetime64(int(log["time"][0]), "s"))
@@ -153,7 +156,7 @@ def _calibration(job: Job, found: Fit, start: float) -> Row:
 
 
 def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) -> Row:
-    """Write a log's corrected field; return its row."""
+    """Correct a log, write the result to `path`, and return the row for the table ``corrected``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     correction = Correction(calibration)
     samples, flagged, variances = 0, 0, 0.0
@@ -173,7 +176,10 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
 
 
 def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list[Row], list[Row]]:
-    """Return a row for each cause found (one with an empty cause if there is none), and the improvements."""
+    """Diagnose a deployment; return its rows for the tables ``findings`` and ``improvements``.
+
+    Without a finding, the only row of ``findings`` has an empty cause.
+    """
     found = diagnose([log], calibration, training_logs=[log]).diagnosis
     nothing: Row = {**job.mark, "verdict": found.verdict}
     if not found.findings:
@@ -188,7 +194,7 @@ def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list
 
 
 def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path) -> Row:
-    """Write the anomaly map of a deployment's corrected field; return its row."""
+    """Write the anomaly map of a deployment to `path`, and return the row for the table ``maps``."""
     made = survey(samples_of(logs, [calibration]))
     grid = anomaly_map(made.gridded, made.samples, name=path.name)
     grid.save(path)
@@ -211,20 +217,22 @@ def _named(job: Job) -> str:
 
 
 WORKER_START_TIMEOUT = "120s"
-"""Longest time until the worker processes of this machine run: they import much, and it may be busy."""
+"""Longest time for the start of local worker processes, which is slow on a busy machine."""
 COMPACT_INTERVAL = 64
-"""Number of deployments after which the catalogue merges its small files."""
+"""Number of processed deployments after which the catalogue merges its small files."""
 SCHEDULER_TIMEOUT = "20s"
-"""Longest time to wait for the answer of a scheduler."""
+"""Longest time to wait for a connection to a scheduler."""
 
 
 @contextmanager
 def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
-    """Connect to a dask scheduler; without its address, start `workers` processes here.
+    """Yield a client of the dask scheduler at an address, or of new local processes if it is empty.
 
-    Each of these may use `memory` at most, as ``4 GiB``. PortError: nothing answers there.
+    `workers` is the number of local processes, `memory` the limit of each, such as ``4 GiB``.
+
+    PortError: the scheduler does not answer.
     """
-    for name in ("distributed", "distributed.client"):  # what matters is raised
+    for name in ("distributed", "distributed.client"):  # faults are raised as errors, too
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler:
         try:
@@ -245,7 +253,7 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=memory,
-            dashboard_address="127.0.0.1:0",  # any free port: a second command is no reason to warn
+            dashboard_address="127.0.0.1:0",  # any free port, so that a second command causes no warning
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
@@ -254,9 +262,10 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
 
 
 def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[list[str]]:
-    """Process deployments; yield the failures of each, a line each, as it is finished.
+    """Process deployments; after each, yield a list with a line for each of its failures.
 
-    A task whose worker is lost is given to another; one that is killed leaves nothing but finished work.
+    The rows of a deployment are stored as soon as it is finished. If a worker is lost, another worker repeats
+    its task.
 
     PortError: the scheduler was lost.
     """
@@ -280,7 +289,7 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[l
         lines = [row["line"] for row in done.tables.get("failures", ())]
         if done.hindrance:
             lines.append(done.hindrance)
-        else:  # that it is done comes last
+        else:  # mark the job as done after its rows are stored
             catalogue.add("done", [{**job.mark, "diagnosed": job.diagnose, "mapped": job.map}])
         yield lines
         if number % COMPACT_INTERVAL == 0 or number == len(futures):

@@ -1,20 +1,20 @@
-"""Put vehicles and logs on record: from options, or from a fleet.toml.
+"""Add vehicles and logs to a catalogue, from options or a fleet.toml, and list the jobs.
 
 ::
 
     [vehicle.comet]
     serial = "U-213"                        # distinguishes two vehicles of one name
-    sensor = "HMR2300 0153"                 # refuses another sensor's logs
+    sensor = "HMR2300 0153"                 # logs of other sensors are rejected
     parameters = ["battpos", "ballast"]
 
-    [vehicle.comet.mass.battpos]            # where its masses sit, as in vehicle.toml; if all are known
+    [vehicle.comet.mass.battpos]            # mounting of the mass, as in vehicle.toml; for all masses or none
     at = [-0.45, 0.0, 0.05]
     travel = [0.0254, 0.0, 0.0]
 
     [[vehicle.comet.deployment]]
     name = "2026-05"
-    refit = "2026-04"                       # of which refit; if not given, each deployment is its own
-    sensor = "HMR2300 0160"                 # if it was not the vehicle's
+    refit = "2026-04"                       # refit of the vehicle; default: a new refit with each deployment
+    sensor = "HMR2300 0160"                 # only if another sensor was carried
     logs = ["comet/2026-05/*.nc"]
 """
 
@@ -40,11 +40,11 @@ from magbridge.toml import Table, check_entries, convert, load_toml
 from magbridge.wording import one_of
 
 FIXED_KEYS = "serial", "parameters"
-"""Properties of a vehicle that never change; of all others the newest row counts."""
+"""Columns of a vehicle that never change; for all other columns the newest row is valid."""
 
 
 class Deployment(Table, frozen=True):
-    """``[[vehicle.NAME.deployment]]``: a deployment, its equipment, patterns of its logs."""
+    """``[[vehicle.NAME.deployment]]``: a deployment with its refit, sensor and patterns of its logs."""
 
     name: str
     logs: tuple[str, ...]
@@ -53,7 +53,7 @@ class Deployment(Table, frozen=True):
 
 
 class Vehicle(Table, frozen=True):
-    """``[vehicle.NAME]``: a vehicle, its sensor, the columns that move its masses, and where those sit."""
+    """``[vehicle.NAME]``: a vehicle with its sensor, the position columns and mountings of its masses."""
 
     parameters: tuple[str, ...] = ()
     serial: str = ""
@@ -68,7 +68,7 @@ class _RegisteredFile(Table, frozen=True):
 
 
 def read_fleet(path: Path) -> dict[str, Vehicle]:
-    """Read a fleet.toml; return vehicles by name.
+    """Read a fleet.toml and return its vehicles by name.
 
     ConfigError: the file, a key or a type is not as expected.
     """
@@ -78,7 +78,7 @@ def read_fleet(path: Path) -> dict[str, Vehicle]:
 
 
 def vehicles(catalogue: Catalogue) -> dict[str, Row]:
-    """Return the vehicles by name; FormatError: two have one name."""
+    """Return the newest row of each vehicle, by name; FormatError: two vehicles have one name."""
     found: dict[str, Row] = {}
     for row in sorted(catalogue.rows("vehicles"), key=lambda row: row["version"]):
         last = found.get(row["vehicle"], row)
@@ -93,7 +93,7 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
 
 
 def masses(row: Row) -> dict[str, Mounting]:
-    """Return where a vehicle's masses sit, by the columns that move them.
+    """Return the mounting of each mass of a vehicle, by the column with the position of the mass.
 
     FormatError: the catalogue's text is not a table of positions.
     """
@@ -104,7 +104,7 @@ def masses(row: Row) -> dict[str, Mounting]:
 
 
 def vehicle_named(catalogue: Catalogue, name: str) -> Row:
-    """Return a vehicle; WrongUse: there is none of that name."""
+    """Return the row of the vehicle `name`; WrongUse: the vehicle does not exist."""
     known = vehicles(catalogue)
     if name not in known:
         if not known:
@@ -114,9 +114,10 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
 
 
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
-    """Put a vehicle, or its new properties, on record; return how many were added or changed.
+    """Add a vehicle or its changed properties to the catalogue; return 1 if a row was added, else 0.
 
-    WrongUse: another has that name, it can be no folder's, or only some masses have a position.
+    WrongUse: another vehicle has the name, the name cannot be a folder's, or only some masses have
+    a mounting.
     """
     _check_name(name, "a vehicle")
     if vehicle.mass and (odd := sorted(vehicle.mass.keys() ^ set(vehicle.parameters))):
@@ -140,11 +141,11 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
 def add_logs(
     catalogue: Catalogue, vehicle: str, deployment: Deployment, logs: Sequence[Path]
 ) -> tuple[int, list[str]]:
-    """Put a deployment's logs on record; return how many are new, and a line for each that cannot be.
+    """Add the logs of a deployment to the catalogue; return the number of new rows, and warnings.
 
-    `logs` are the files that match its patterns.
+    A warning names a log that cannot be read or that has changed since it was added.
 
-    WrongUse: there is no such vehicle, or the deployment's name can be no folder's.
+    WrongUse: the vehicle does not exist, or the deployment's name cannot be a folder's.
     """
     vehicle_named(catalogue, vehicle)
     _check_name(deployment.name, "a deployment")
@@ -172,7 +173,7 @@ def add_logs(
 
 
 def current_files(rows: Iterable[Row]) -> list[Row]:
-    """Return the newest version of each path."""
+    """Return the newest row of each path, in the order of vehicle, deployment and path."""
     newest: dict[str, Row] = {}
     for row in sorted(rows, key=lambda row: row["version"]):
         newest[row["path"]] = row
@@ -180,9 +181,9 @@ def current_files(rows: Iterable[Row]) -> list[Row]:
 
 
 def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
-    """Return the logs that a deployment's patterns name, relative to the fleet.toml.
+    """Return the files that match the patterns of a deployment, relative to the fleet.toml `fleet`.
 
-    ConfigError: a pattern names none.
+    ConfigError: a pattern does not match any file.
     """
     found: list[Path] = []
     for pattern in deployment.logs:
@@ -197,14 +198,17 @@ def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
 
 
 def is_file_name(name: str) -> bool:
-    """Return True if a name can be that of a file or folder: it names no other folder."""
+    """Return True if `name` is usable as a file or folder name and does not lead to another folder."""
     return (
         bool(name.strip()) and not name.startswith(".") and not set(name) & set("/\\") and name.isprintable()
     )
 
 
 def _check_name(name: str, kind: str) -> None:
-    """Check that a name can be a folder's, because results are stored in a folder of that name."""
+    """Check that `name` is usable as a folder's name, because results are stored in a folder of that name.
+
+    WrongUse: it is not.
+    """
     if not is_file_name(name):
         raise WrongUse(f"{name!r}: expected {kind}'s name without slashes, not beginning with a dot")
 
@@ -219,12 +223,12 @@ GIVEN = "given"
 STATUS_COLUMNS = (
     "deployments", "logs", "calibrated", "unsupported", "failed", "new", "given", "diagnosed", "mapped"
 )  # fmt: skip
-"""Counts of each vehicle; `given` are calibrations made elsewhere."""
+"""Names of the counts for each vehicle; `given` counts calibrations that were made elsewhere."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A deployment to process: its vehicle's row, and those of its logs."""
+    """Deployment to process, with the catalogue rows of its vehicle (`vehicle`) and logs (`files`)."""
 
     vehicle: Row
     deployment: str
@@ -236,17 +240,17 @@ class Job:
 
     @property
     def sensor(self) -> str:
-        """Name of the deployment's sensor; empty: any sensor."""
+        """Name of the deployment's sensor; empty if any sensor is accepted."""
         return str(next((row["sensor"] for row in self.files if row["sensor"]), self.vehicle["sensor"]))
 
     @property
     def mark(self) -> Row:
-        """Columns that identify the job in each row of its results."""
+        """Columns `job` and `attempt`, which identify the job in each row of its results."""
         return {"job": self.name, "attempt": self.attempt}
 
     @cached_property
     def name(self) -> str:
-        """Hash of the job's inputs, 32 hexadecimal digits; other logs or parameters give another name."""
+        """Hash of the job's inputs, 32 hexadecimal digits; it changes with the logs and the parameters."""
         made_of = (
             self.vehicle["vehicle"], self.deployment, self.refit, self.sensor,
             self.vehicle["parameters"], self.vehicle["order"], sorted({row["sha256"] for row in self.files}),
@@ -255,7 +259,7 @@ class Job:
 
 
 def jobs(catalogue: Catalogue, *, diagnose: bool = False, maps: bool = False) -> list[Job]:
-    """Return every deployment of a catalogue as a job, processed or not; `diagnose`, `maps`: with these."""
+    """Return every deployment of a catalogue as a job, with diagnosis and map if requested."""
     known = vehicles(catalogue)
 
     def owner(row: Row) -> tuple[str, str, str]:
@@ -270,7 +274,7 @@ def jobs(catalogue: Catalogue, *, diagnose: bool = False, maps: bool = False) ->
 
 
 def new_jobs(catalogue: Catalogue, every: list[Job], *, retry: bool = False) -> list[Job]:
-    """Return the jobs of which the catalogue has no result; with `retry`, also those with failures."""
+    """Return the jobs without a requested result in the catalogue; with `retry`, also jobs with failures."""
     done = catalogue.rows("done")
     last = last_attempts(done)
     has = {(row["job"], what) for row in done for what in ("diagnosed", "mapped") if row[what]}
@@ -290,7 +294,7 @@ def new_jobs(catalogue: Catalogue, every: list[Job], *, retry: bool = False) -> 
 
 
 def last_attempts(done: Iterable[Row]) -> dict[str, int]:
-    """Return the last attempt at each job, from the rows of finished jobs."""
+    """Return job -> number of its last attempt, from the rows `done` of finished jobs."""
     last: dict[str, int] = {}
     for row in done:
         last[row["job"]] = max(row["attempt"], last.get(row["job"], 0))
@@ -298,9 +302,10 @@ def last_attempts(done: Iterable[Row]) -> dict[str, int]:
 
 
 def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> list[Row]:
-    """Return the rows of a table of results that are made of what the catalogue's logs are now.
+    """Return the valid rows of a table of results.
 
-    Rows of a deployment that was tried again, those of the last attempt; and all that was made elsewhere.
+    A row is valid if it comes from the last attempt at a job with the present logs and parameters, or if it
+    was made elsewhere.
     """
     names = {job.name for job in jobs(catalogue)}
     last = last_attempts(catalogue.rows("done"))
@@ -313,7 +318,7 @@ def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> 
 
 
 def status(catalogue: Catalogue) -> dict[str, Any]:
-    """Return, as a dictionary that JSON can hold, each vehicle's counts and the failures on record."""
+    """Return the counts of each vehicle, the vehicles of each sensor, and the failures, for JSON."""
     every = {job.name: job for job in jobs(catalogue)}
     done = catalogue.rows("done")
     new = {job.name for job in new_jobs(catalogue, list(every.values()))}
