@@ -1,4 +1,4 @@
-r"""Alarms: tests whether the model still explains the data, the causes that fit, and the state of an alarm.
+r"""Test whether the model still explains the data, find the causes that fit, and keep the alarm's state.
 
 :class:`ChangeDetector` tests the innovations of the baseline estimator for each cause, by
 :mod:`magbridge.estimation.sequential`. A cause is learned by passing the result of its test to the estimator:
@@ -10,7 +10,7 @@ proportional to :math:`e^L`.
 :class:`LateTelemetryTest` tests whether the telemetry of the masses is late, by comparing each sample with
 later reports. Late telemetry shows in the samples before a motion is reported: they fit the positions of a
 later report. A sample of innovation v (variance S) has the innovation v' at the positions that are reported a
-time d later. How late they are is known to a share w only, so the variance of v' is
+time d later. The delay is known only to a fraction w, so the variance of v' is
 :math:`S' = S + w^2 (v' - v)^2`, and the log-likelihood ratio of 'late by about d' over 'in time' is
 
 .. math:: L_d \leftarrow \max\left(0, L_d + \tfrac12 \left(
@@ -47,8 +47,8 @@ CAUSE_UNITS: Final = {
     "clock_offset": 2.0,
     "map_error": 50.0,
 }
-"""Cause -> the unit of its amplitude: nT, nT/h, nT/degC, nT a half range, nT/A, s, nT. Each cause has a bit
-in MAG_LEARNING."""
+"""Prior 1-sigma of each cause's amplitude: nT, nT/h, nT/degC, nT per half range, nT/A, s, nT. Each cause has
+a bit in MAG_LEARNING."""
 FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
 """Causes whose effect is proportional to their regressor, not to its change since the onset."""
 NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
@@ -56,12 +56,12 @@ NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
 
 
 def named(causes: Sequence[str]) -> str:
-    """Return the likeliest two of `causes` in words."""
+    """Return the names of the first two of `causes`, the likeliest, as words of a message."""
     return " or ".join(causes[:2]).replace("_", " ")
 
 
 class AlarmCause(NamedTuple):
-    """A cause to test: its name, the telemetry that it follows, and the states (3,) that represent it."""
+    """Cause to test: its name, the telemetry that it follows or "", and the states (3,) that represent it."""
 
     name: str
     channel: str
@@ -69,7 +69,7 @@ class AlarmCause(NamedTuple):
 
 
 class LearningAlarm(NamedTuple):
-    """An alarm: the model no longer explains the data.
+    """Alarm that the model no longer explains the data.
 
     `causes` are those that fit, the likeliest first, and `channels` the telemetry that each follows, or "".
     `since` is the onset of the likeliest cause (s since 1970 UTC), `size` the RMS of its effect on the total
@@ -91,7 +91,7 @@ MAX_CAUSE_LOG_RATIO: Final = log(20.0)
 
 
 class ChangeDetector:
-    """Test the innovations of an estimator for every cause."""
+    """Sequential test of an estimator's innovations for every cause."""
 
     def __init__(self, model: LearnedTerms, estimator: Estimator) -> None:
         self._offsets, self._states, self._origin = estimator.offsets, estimator.states, model.origin
@@ -121,7 +121,7 @@ class ChangeDetector:
         return float(self._test.log_ratio.max())
 
     def propagate(self, estimator: Estimator, F: FloatArray, seconds: float) -> None:
-        """Propagate the absorbed part by `F` (4, 4), the transition of :meth:`.Estimator.propagate`."""
+        """Propagate what the filter has absorbed of each cause; `F` is from :meth:`.Estimator.propagate`."""
         estimator.advance(self._test.absorbed, F, seconds)
 
     def test(
@@ -149,7 +149,7 @@ class ChangeDetector:
         return self._alarm() if largest > ALARM_LOG_RATIO else None
 
     def updated(self, gain: FloatArray) -> None:
-        """Subtract the part that the estimator absorbed in its update with `gain` (n,)."""
+        """Account for the part of each cause that the estimator absorbed in its update with `gain` (n,)."""
         self._test.update(gain)
 
     def _alarm(self) -> LearningAlarm:
@@ -166,18 +166,18 @@ class ChangeDetector:
         )
 
     def learned(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return the state's shift (n,) by the causes that fit, and its additional covariance (n, n).
+        """Return the shift (n,) of the state that learns the fitting causes, and its covariance (n, n).
 
         Return None if no coefficient can represent the likeliest cause.
         """
         rows, weights = self._test.competing(MAX_CAUSE_LOG_RATIO)
-        # the likeliest cause decides whether there is anything to learn
+        # the likeliest cause decides whether coefficients can be learned
         if self._states_of(rows[0]) is None:
             return None
         by, covariance = np.zeros(self._states), np.zeros((self._states, self._states))
         # moments of the mixture: mean and covariance about it
         for weight, row in zip(weights.tolist(), rows, strict=True):
-            if self._states_of(row) is None:  # it moves no coefficient
+            if self._states_of(row) is None:  # the cause moves no coefficient
                 continue
             G, a = self._moves(row), self._test.amplitude[row]
             V = self._test.covariance(row) + np.outer(a, a)
@@ -187,19 +187,19 @@ class ChangeDetector:
 
     @property
     def misfit(self) -> float:
-        """Mean normalised square that the likeliest cause does not explain."""
+        """Mean normalised squared innovation that the likeliest cause leaves: 1 if it explains all."""
         return self._test.misfit(int(self._test.log_ratio.argmax()))
 
     def _states_of(self, row: int) -> IndexArray | None:
         return self._causes[int(self._test.kind[row])].states
 
     def _moves(self, row: int) -> FloatArray:
-        """Return (n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
+        """Return G (n, 3) of the module: the error of the state by a row's cause of unit amplitude."""
         kind, start = int(self._test.kind[row]), float(self._test.start[row])
         cause, unit = self._causes[kind], float(self._unit[kind])
         G = self._test.absorbed[:, row].copy()
         assert cause.states is not None
-        # a drift has moved the offset since its onset, and goes on with its slope
+        # a drift has moved the offset since its onset, and continues with its slope
         if cause.name == "offset_drift":
             G[cause.states, range(3)] += unit / 3600.0
             G[self._offsets, range(3)] += unit * (self._now / 3600.0 - start)
@@ -213,21 +213,21 @@ class ChangeDetector:
 
 
 DELAYS_US: Final = (8_000_000, 16_000_000, 32_000_000)
-"""Delays d that are tested, µs. Telemetry that is sent seldom has shorter ones."""
+"""Tested delays d, µs. Shorter delays are normal for telemetry that is sent seldom."""
 MAX_DELAY_ERROR: Final = 0.25
 """Largest difference of a report's delay from d, as a fraction of d."""
 DELAY_UNCERTAINTY: Final = 0.4
-"""w of the module: each d is the double of the last."""
+"""Fraction w of the module; it covers the gaps between the delays d, each twice the previous one."""
 MAX_HINDSIGHT_SQUARE: Final = 36.0
 """Largest v²/S that a sample contributes, so that an alarm needs two samples."""
 MAX_STORED_SAMPLES: Final = 41
-"""Number of samples that are kept, at most one a second."""
+"""Largest number of stored samples, at most one a second."""
 MIN_MOTION: Final = 0.01
-"""Change of a parameter, as a fraction of its scale, that is a motion."""
+"""Smallest change of a scaled parameter that counts as a motion."""
 
 
 class StoredSample(NamedTuple):
-    """A sample of masses at rest, with its innovation (nT) and the innovation's variance (nT²)."""
+    """Sample with its masses at rest, its innovation (nT) and the innovation's variance (nT²)."""
 
     sample: LearningSample
     innovation: float
@@ -235,7 +235,7 @@ class StoredSample(NamedTuple):
 
 
 class DelayTest:
-    """Page's test of telemetry that is late by `delay_us`."""
+    """Page's test for telemetry that is late by about `delay_us` (µs)."""
 
     def __init__(self, delay_us: int) -> None:
         self._delay_us, self._tested_us = delay_us, 0
@@ -243,7 +243,7 @@ class DelayTest:
         self.count, self._since_us = 0, 0
 
     def reported_since(self, time_us: int, kept: Sequence[StoredSample]) -> StoredSample | None:
-        """Return the sample not tested yet that a report of now would match, or None."""
+        """Return the stored sample about one delay older than `time_us`, or None if none is left to test."""
         delay_us = self._delay_us
         stored = min(kept, key=lambda one: abs(time_us - one.sample.time_us - delay_us), default=None)
         if stored is None or abs(time_us - stored.sample.time_us - delay_us) > MAX_DELAY_ERROR * delay_us:
@@ -254,7 +254,10 @@ class DelayTest:
         return stored
 
     def add(self, stored: StoredSample, change: float) -> LearningAlarm | None:
-        """Test a sample whose innovation is larger by `change` (nT) at the positions reported now."""
+        """Test a sample whose innovation grows by `change` (nT) at the positions reported now.
+
+        Return an alarm if the log-likelihood ratio exceeds its threshold.
+        """
         # the innovation v at the positions of then against v' at those of now, of variances S and S'
         v, S = stored.innovation, stored.variance
         S_late = S + (DELAY_UNCERTAINTY * change) ** 2
@@ -272,7 +275,7 @@ class DelayTest:
 
 
 class LateTelemetryTest:
-    """Keep the samples of the last half minute, and test each delay with them."""
+    """Test for late telemetry, which compares stored samples of the last 40 s with later reports."""
 
     def __init__(self) -> None:
         self.restart()
@@ -283,7 +286,7 @@ class LateTelemetryTest:
         self._tests = [DelayTest(delay_us) for delay_us in DELAYS_US]
 
     def keep(self, stored: StoredSample) -> None:
-        """Keep a sample."""
+        """Store a sample, unless the last stored one is less than a second older."""
         if not self._kept or stored.sample.time_us - self._kept[-1].sample.time_us >= 1_000_000:
             self._kept.append(stored)
             for test in self._tests:
@@ -296,7 +299,7 @@ class LateTelemetryTest:
         positions: list[float],
         observe: Callable[[Vector, FloatArray, float], Observation],
     ) -> LearningAlarm | None:
-        """Test the samples kept by the regressors (m,) and positions reported now.
+        """Test the stored samples with the regressors `phi` (m,) and the positions reported now.
 
         `observe` compares a field (nT), measured at some regressors, with a reference (nT).
         """
@@ -324,7 +327,7 @@ MAX_WAIT_SAMPLES: Final = 128
 MIN_UPDATE_GROWTH: Final = 2.0
 """Least growth of an alarm's log-likelihood ratio that updates the alarm."""
 SILENT_SAMPLES: Final = 300
-"""Informative samples without an alarm after which its cause is cleared."""
+"""Number of informative samples without a new alarm after which an alarm is over."""
 
 
 RELAPSE_FACTOR: Final = 4
@@ -334,7 +337,7 @@ SIGNIFICANT_SQUARE: Final = 16.0
 
 
 class AlarmState:
-    """The current `alarm`, if any; `mapped` is True if the reference is a map.
+    """State of the current `alarm`, if there is one; `mapped` is True if the reference is a map.
 
     A relapse is an alarm that comes before the last learned cause has explained :data:`SILENT_SAMPLES`
     informative samples. Alarms after a relapse continue the first one: it is announced once, and ends once a
@@ -433,8 +436,8 @@ class AlarmState:
         self._cover()
 
     def _cover(self) -> None:
-        """Set the variance to that of the likeliest cause, and of the errors once a cause was learned."""
-        # until the cause is published, sigma includes its effect; later the errors that are seen
+        """Set the variance to the cause's effect until it is published, or to the larger observed errors."""
+        # sigma includes the cause's effect until it is published, then the observed errors
         learned = self.is_tried and not self.is_pending
         size = 0.0 if self.alarm is None or learned or self.is_mapless else self.alarm.size
         self.variance = max(size * size, self._peak if self.relapses or self.is_pending else 0.0)
@@ -463,5 +466,5 @@ class AlarmState:
         fit, slower = len(self.alarm.channels), self._slower
         sure = self.alarm.strength > self._required + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
         if self._mapped and "map_error" in self.alarm.causes:
-            sure = False  # maps have sheets: the attitudes to come tell an offset from another level
+            sure = False  # map sheets may differ in level: only further attitudes show an offset
         return sure or self._informative > slower * MAX_WAIT_SAMPLES * fit

@@ -1,14 +1,14 @@
 r"""Estimate the coefficients: one Kalman filter for each hypothesis, and a batch fit at the start.
 
 The state of an :class:`Estimator` is the coefficients, the slope of the offset (nT/s, an axis), and the
-states of :class:`Nuisance`, the error of the reference. It is relinearised at each sample. If the crustal
-field could explain a sample as well as the coefficients, the filter *considers* the coefficients and does not
-learn them (:mod:`magbridge.estimation.kalman`).
+states of :class:`Nuisance`, the error of the reference. The filter is relinearised at each sample. If the
+crustal field could explain a sample as well as the coefficients, the filter *considers* the coefficients and
+does not update them (:mod:`magbridge.estimation.kalman`).
 
 Without a hypothesis, a change is learned only once its test is significant. Until then, the estimator
-attributes the change to the wrong coefficients, which is hard to undo: for example a change of temperature to
-the turn-on offset, or a drift to a step. The baseline estimator of the :class:`EstimatorBank` assumes no
-change. Further estimators assume from the start that
+attributes the change to the wrong coefficients, which is hard to undo. For example, it attributes a change of
+temperature to the turn-on offset, or a drift to a step. The baseline estimator of the :class:`EstimatorBank`
+assumes no change. Further estimators assume from the start that
 
 - the offset follows the sensor's temperature;
 - the offset drifts, at a rate that changes within hours;
@@ -51,9 +51,10 @@ from magbridge.records import Vector
 
 
 class Nuisance(TrackProcess):
-    """Dynamics of the reference's error for the samples of a calibration.
+    """Model of the reference's error: crustal field, constant error, and the calibration's `noise`.
 
     `spread` and `level` are the 1-sigma of the crustal field and of the reference's constant error, nT.
+    `length` is the crustal field's correlation length, m.
     """
 
     def __init__(
@@ -66,19 +67,19 @@ class Nuisance(TrackProcess):
 
 
 SLOPE_STATES: Final = 3
-"""States of the offset's slope."""
+"""Number of states of the offset's slope."""
 EXTRA_STATES: Final = SLOPE_STATES + TRACK_STATES
 """Number of states that are not coefficients."""
 MIN_INFORMATIVE_SHARE: Final = 0.01
-"""Fraction of a prediction's variance that comes from the coefficients and varies along the track: from here
-on the sample is informative about the coefficients."""
+"""Smallest fraction of a prediction's variance, from effects of the coefficients that vary along the track,
+at which the sample is informative about the coefficients."""
 AVERAGING_DISTANCE_M: Final = 250.0
 """Averaging distance of the mean derivative, m: a quarter of the crustal field's correlation length. Faster
 variations are not attributed to the crustal field."""
 MEAN_SAMPLES: Final = 1000
 """Samples over which the mean derivative of the total field is averaged."""
 CHANGED: Final = 2.0
-"""Change of the level, in sigma, from which on it counts as a change."""
+"""Smallest significant change of the mean field, in sigmas."""
 SLOPE_MEMORY_S: Final = 24.0 * 3600.0
 """Time in which the variance of a drift's slope grows by a factor of e, s. A drift changes, but a drift that
 was estimated as zero does not restart by itself."""
@@ -87,7 +88,7 @@ STEEPEST: Final = 20.0 / 3600.0
 
 
 class Estimator:
-    """Learn coefficients sample by sample, from their prior (K,) and its covariance (K, K).
+    """Kalman filter that estimates coefficients sample by sample, from a prior (K,) of covariance (K, K).
 
     The states of `filter` with the indices `offsets` (3,) are the constant offset, which walks by `creep` (nT
     per square root of a second); those of `slope` (3,) are its slope, nT/s. `is_informative` is True if the
@@ -134,9 +135,9 @@ class Estimator:
 
     @property
     def covariance(self) -> FloatArray:
-        """Their covariance (K, K), symmetric and positive semidefinite."""
+        """Covariance (K, K) of the coefficients, symmetric and positive semidefinite."""
         P = self.filter.covariance[: self.size, : self.size]
-        # rank-one addition: the level that was kept instead of the learned one
+        # rank-one addition: the level that keep_level restored instead of the learned one
         kept = self._kept * float(self._mean @ P @ self._mean)  # the part not learned since keep_level
         P = P + np.outer(kept, kept)
         # rounding leaves small negative eigenvalues, which no calibration file may have
@@ -145,7 +146,7 @@ class Estimator:
         return np.asarray(root @ root.T)
 
     def follow(self, s: float) -> None:
-        """Follow how the total field changes with the coefficients; s is the last residual's scale."""
+        """Update the total field's mean derivative; `s` is the scale of the last residual."""
         self._mean += (s * self.filter.row[: self.size] - self._mean) / MEAN_SAMPLES
         self._share += (1.0 - self._share) / MEAN_SAMPLES
 
@@ -192,20 +193,20 @@ class Estimator:
         self._sloping, self._lasting = True, lasting
 
     def shift(self, step: FloatArray, covariance: FloatArray) -> None:
-        """Move the state by `step` (n,), which is known to a further `covariance` (n, n)."""
+        """Move the state by `step` (n,), and add the step's `covariance` (n, n)."""
         self.filter.mean += step
         self.filter.covariance += covariance
         self._sloping = bool(self.filter.covariance[self.slope, self.slope].any())
 
     def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
-        """Move `state` (n, ...) on in place, over a time; F (4, 4) is the nuisance's transition."""
+        """Propagate `state` (n, ...) in place by `seconds`; `F` (4, 4) is the transition of the nuisance."""
         beside = state[-TRACK_STATES:]
         beside[:] = (F @ beside.reshape(TRACK_STATES, -1)).reshape(beside.shape)
         if self._sloping:
             state[self.offsets] += seconds * state[self.slope]
 
     def propagate(self, way: Way) -> FloatArray:
-        """Propagate over the way to the next sample; return the transition (4, 4) of the nuisance."""
+        """Propagate the filter to the next sample; return the transition (4, 4) of the nuisance states."""
         metres, seconds, _ = way
         P = self.filter.covariance
         F, Q = self._nuisance.transition(*way)
@@ -225,16 +226,15 @@ class Estimator:
         return F
 
     def predict(self, e: float, s: float, by_coefficients: FloatArray) -> None:
-        """Compute the innovation from a sample's residual and derivatives (K,) at these coefficients."""
+        """Compute a sample's innovation from its residual `e` (nT), scale `s` and derivatives (K,)."""
         K = self.size
         h = np.concatenate([by_coefficients, np.zeros(SLOPE_STATES), self._nuisance.row(s)])
-        # the derivative's running mean along the track: a constant one is hidden by the crustal field
+        # running mean of the derivative along the track: the crustal field hides a constant derivative
         if self._near is None:
             self._near = by_coefficients.copy()
         else:
             self._near += (1.0 - self._stay) * (by_coefficients - self._near)
-        # e is the residual at the present coefficients, so that they have no part in h^T x
-        # innovation of h^T x, with the nuisance's mean
+        # e is the residual at the present coefficients: subtract their part of h^T x
         known = e - float(by_coefficients @ self.coefficients)
         self.filter.innovate(known, h, self._nuisance.white_variance)
         # share of the variance S that the coefficients explain and the crustal field does not
@@ -247,12 +247,12 @@ class Estimator:
     def update(self, *, learn: bool) -> FloatArray:
         """Update the state with the predicted sample; return the gain (n,).
 
-        Without `learn`, the coefficients and the slope are considered.
+        Without `learn`, the coefficients and the slope are considered, but not changed.
         """
         return self.filter.update(None if learn else slice(None, -TRACK_STATES))
 
     def leave_map(self, nuisance: Nuisance) -> None:
-        """Replace the nuisance by `nuisance`, of a reference without a map, in its initial state."""
+        """Replace the nuisance by one for a reference without a map, and reset its states."""
         # the nuisance starts again, uncorrelated with the coefficients
         self._nuisance = nuisance
         P, states = self.filter.covariance, slice(-TRACK_STATES, None)
@@ -262,7 +262,7 @@ class Estimator:
 
     @property
     def crust(self) -> float:
-        """Crustal field as estimated, nT."""
+        """Estimated crustal field, nT."""
         return float(self.filter.mean[-TRACK_STATES])
 
     @property
@@ -274,18 +274,18 @@ class Estimator:
 BEYOND_CHANCE: Final = 13.5
 """Log-likelihood ratio that is exceeded by chance once in 30 days of 0.25 Hz (Ville's inequality)."""
 BANK_MEMORY_SAMPLES: Final = 2000.0
-"""Samples over which predictions are weighted (exponential forgetting)."""
+"""Time constant, in samples, of the exponential forgetting of predictions."""
 MIN_LEAD: Final = 3.0
-"""Lead in log w that changes the selected estimator. To leave the baseline estimator the lead has to reach
-:data:`BEYOND_CHANCE`, because quantities that no test observes, as the level, depend on the hypothesis."""
+"""Lead in log w that changes the selected estimator. Only a lead of :data:`BEYOND_CHANCE` replaces the
+baseline estimator, because quantities that no test observes, such as the level, depend on the hypothesis."""
 MAX_BANK_SQUARE: Final = 25.0
 """Largest v²/S that one sample contributes: an outlier does not distinguish the estimators."""
 MAX_DEFICIT: Final = 10.0
-"""Largest deficit in log w against an alarm's, which is the best of dozens of onsets and causes."""
+"""Largest deficit of log w against an alarm's ratio, which is the best of dozens of onsets and causes."""
 PER_DEGREE: Final = 2.0
-"""Prior 1-sigma of the offset's change with temperature, nT/degC an axis."""
+"""Prior 1-sigma of the offset's change with temperature, nT/degC on each axis."""
 DRIFT_SIGMA_NT_S: Final = 5.0 / 3600.0
-"""Prior 1-sigma of the offset's drift, nT/s an axis."""
+"""Prior 1-sigma of the offset's drift, nT/s on each axis."""
 DRIFT_CORRELATION_TIME_S: Final = 2.0 * 3600.0
 """Correlation time of the drift rate, s."""
 
@@ -294,8 +294,8 @@ class EstimatorBank:
     """Estimators of the coefficients, one for each hypothesis.
 
     The baseline is the first of `all`. If the reference is a map, the last of them is `without_map`, which
-    does not use it. `map_doubted` is True if that one predicts significantly better, and is selected;
-    `map_lead` is its lead in log w, since the time `map_since`, s.
+    does not use it. `map_doubted` is True while `without_map` is selected, because it predicts significantly
+    better. `map_lead` is its lead in log w; `map_since` (s) is the time since when it has led.
     """
 
     def __init__(self, model: LearnedTerms, quiet: Estimator, mapless: Nuisance | None = None) -> None:
@@ -317,7 +317,7 @@ class EstimatorBank:
         return self.all[self._best]
 
     def suppose(self) -> None:
-        """Add the other hypotheses, each starting from the baseline's state."""
+        """Add an estimator for every other hypothesis, starting from the baseline's state."""
         slots = self._model.slots(TEMPERATURE)
         if TEMPERATURE in self._model.further and slots is not None:
             warm = deepcopy(self.quiet)
@@ -346,7 +346,7 @@ class EstimatorBank:
             v, S = one.filter.innovation, one.filter.variance
             self._weights[k] *= 1.0 - 1.0 / BANK_MEMORY_SAMPLES
             self._weights[k] -= 0.5 * (min(v * v / S, MAX_BANK_SQUARE) + log(S))
-        # the map has its own test below, since its estimator predicts another reference
+        # the map has its own test below, because without_map assumes another reference error
         with_map = [k for k, one in enumerate(self.all) if one is not self.without_map]
         ahead = max(with_map, key=self._weights.__getitem__)
         if self._weights[ahead] > self._weights[self._best] + (MIN_LEAD if self._best else BEYOND_CHANCE):
@@ -367,7 +367,7 @@ class EstimatorBank:
         warm = self._warm
         if self._weights[warm] - self._weights[0] < max(BEYOND_CHANCE, strength - MAX_DEFICIT):
             return False
-        # the warm estimator goes on as well, so that it is compared with its copy
+        # the warm estimator continues as well, for comparison with its copy
         self.all[0], self._weights[0], self._best = deepcopy(self.all[warm]), self._weights[warm], 0
         return True
 
@@ -386,22 +386,22 @@ class EstimatorBank:
 
 FIRST_FIT_SAMPLES: Final = 32
 LAST_FIT_SAMPLES: Final = 4096
-"""Number of samples of the first and the last fit: 2 minutes and 4.5 hours of 0.25 Hz."""
+"""Number of samples of the first and the last fit: 2 minutes and 4.5 hours at 0.25 Hz."""
 MAX_GAUSS_NEWTON_STEPS: Final = 12
 MIN_STEP_SIGMA: Final = 0.01
 """Step, in sigmas of the prior, that ends the iteration."""
 START_NOISE_NT: Final = 2.0
 """1-sigma of a channel's noise until it is estimated, nT."""
 MIN_SAMPLES_FOR_NOISE: Final = 256
-"""Number of samples from which on it is estimated."""
+"""Number of samples from which on the fit estimates the noise."""
 
 
 def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, order: int = 3) -> Calibration:
-    """Return the prior of any vehicle with some moving masses: an identity and its uncertainty.
+    """Return the prior of any vehicle with these moving masses: an identity and its uncertainty.
 
-    `field` is the reference field F_0 (nT), `order` the highest total degree of the polynomials. The widths
-    are those that the fit begins with (:mod:`magbridge.estimation.priors`), each with its own uncertainty:
-    the mean of a log-normal's square.
+    `field` is the reference field F_0 (nT), `order` the highest total degree of the polynomials. The prior
+    variances are the means of squared log-normal widths, with which the fit begins
+    (:mod:`magbridge.estimation.priors`).
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
@@ -420,7 +420,7 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
 
 
 class BatchFit:
-    """Keep the samples since the start, and fit them from a prior (K,) of covariance (K, K)."""
+    """Batch fit of all samples since the start, from a prior (K,) of covariance (K, K)."""
 
     def __init__(
         self, model: LearnedTerms, coefficients: FloatArray, covariance: FloatArray, field: float
@@ -434,7 +434,7 @@ class BatchFit:
         self._next = FIRST_FIT_SAMPLES
 
     def add(self, field: Vector, phi: FloatArray, reference: float, way: Way) -> bool:
-        """Keep a sample, its regressors (m,), reference and way from the last; return whether to fit."""
+        """Store a sample with regressors (m,), reference (nT) and way; return True if a fit is due."""
         self._samples.append((field, phi, reference, way))
         if len(self._samples) < self._next:
             return False
@@ -448,7 +448,7 @@ class BatchFit:
 
     @property
     def is_over(self) -> bool:
-        """Return True if a filter can go on alone."""
+        """Return True if there are enough samples to continue with the filters instead."""
         return len(self._samples) >= LAST_FIT_SAMPLES
 
     def fit(
@@ -481,7 +481,7 @@ class BatchFit:
     def _whitened(
         self, c: FloatArray, nuisance: Nuisance
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return residuals (n,) and derivatives (n, K), white; nuisance, its derivative and covariance."""
+        """Return white residuals (n,) and derivatives (n, K); nuisance states, derivatives and covariance."""
         weights = self._model.weights(c)
         n, K = len(self._samples), len(c)
         out = np.empty((n, K + 1))

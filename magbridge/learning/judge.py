@@ -1,10 +1,10 @@
-r"""Compare the first calibration with learned coefficients, by samples that came after they were learned.
+r"""Compare the first calibration with learned coefficients, on samples that were taken after the learning.
 
-Time is divided into blocks, each longer than the crustal field is correlated along the track (10 minutes
-suffice), with a turn of the vehicle in it. The coefficients learned before a block are its *candidate*: they
-stay fixed within the block, so that all of its samples test them, most of them at another attitude and
-position. Both calibrations are filtered with the same model of the reference's error (:class:`.Nuisance`),
-with the standard deviation of the crustal field under which the better of them predicts best. With
+Time is divided into blocks. A block contains a turn, and lasts until the crustal field along the track has
+decorrelated (or 10 minutes). The coefficients learned before a block are its *candidate*. They stay fixed in
+the block, so all of its samples test them, most samples at another attitude and position. The predictions of
+both calibrations use one model of the reference's error (:class:`.Nuisance`), with the standard deviation of
+the crustal field under which the better calibration predicts best. With
 innovations v of the first calibration and v + d of the candidate, of variance S, the share of the candidate's
 change that the samples confirm is
 
@@ -13,11 +13,11 @@ change that the samples confirm is
 This is the generalised least-squares coefficient of the first calibration's error on the change: 1 if the
 change is right, 0 if the first calibration is. From :math:`\beta > 1/2` on, the candidate has the smaller
 error; the log-likelihood ratio of both is :math:`(\beta - 1/2) \sum d^2 / S`. The standard error of the share
-is the larger of that by the model and that by the differences between the blocks, which includes errors that
-neither calibration explains (Liang & Zeger 1986, Biometrika 73:13).
+is the larger of two: the model's, and one from the differences between the blocks. The latter includes errors
+that neither calibration explains (Liang & Zeger 1986, Biometrika 73:13).
 
-A change that holds where it was tested may still be wrong at other attitudes. :class:`Coverage` compares it
-with its uncertainty at all attitudes so far.
+A change that is right at the tested attitudes may still be wrong at other attitudes. :class:`Coverage`
+compares the change with its uncertainty at all attitudes so far.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ MAX_JUDGE_SQUARE: Final = 25.0
 """Normalised square of the smaller innovation above which a sample has a larger variance: an outlier of both
 calibrations does not distinguish them."""
 JUDGE_MEMORY_SAMPLES: Final = 500
-"""Samples over which mean squares are followed."""
+"""Averaging time of the mean squares, in samples."""
 MIN_BLOCK_S: Final = 60.0
 MAX_BLOCK_S: Final = 600.0
-"""Shortest and longest duration after which a block may end, s; in between the time in which the vehicle
-travels the crustal field's correlation length."""
+"""Shortest duration of a block, and duration from which it may end at any distance, s. In between, it may end
+once the vehicle has travelled the crustal field's correlation length."""
 STEADY_TIME_S: Final = 60.0
 """Time after a turn for which a block does not end, s, so that it contains the whole turn; a vehicle that
 turns all the time ends it after twice the duration."""
 TURN: Final = 0.4
-"""Change of the field's direction in sensor axes that is another attitude, rad."""
+"""Change of the field's direction in sensor axes that counts as another attitude, rad."""
 MIN_BLOCKS: Final = 3
 MAX_BLOCKS: Final = 12
-"""Number of last blocks that are compared."""
+"""Smallest and largest number of recent blocks that a comparison uses."""
 SIGNIFICANCE_SIGMA: Final = 2.0
-"""Normal quantile (2.3 %) at which a share differs from 1/2. Few blocks need more, as Student's t does."""
+"""Normal quantile (2.3 %) at which a share differs from 1/2. Few blocks need Student's larger quantile."""
 MIN_DIRECTIONS: Final = 4
 """Number of directions of the field, :data:`TURN` from each other, from which on a change is
 known at all attitudes."""
@@ -60,28 +60,31 @@ MIN_CHANGE_RATIO: Final = 3.0
 CRUST_FACTORS: Final = np.array([1.0, 0.3, 0.1, 0.03])
 """Standard deviations of the crustal field that are compared, as fractions of the nuisance's."""
 CRUST_MEMORY_SAMPLES: Final = 2000.0
-"""Samples over which their likelihoods are compared."""
+"""Averaging time of the likelihoods of these standard deviations, in samples."""
 
 
 def student_quantile(dof: int) -> float:
-    """Return Student's quantile of :data:`SIGNIFICANCE_SIGMA` (Abramowitz & Stegun 1964, eq. 26.7.5)."""
+    """Return Student's t for the normal quantile 2 (Abramowitz & Stegun 1964, eq. 26.7.5)."""
     z = SIGNIFICANCE_SIGMA
     return z + (z**3 + z) / (4.0 * dof) + (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / (96.0 * dof**2)
 
 
 class Blocks:
-    """Compare the candidates of the last blocks with one calibration."""
+    """Comparison of the candidates of recent blocks with one calibration."""
 
     def __init__(self) -> None:
         self._ended: deque[FloatArray] = deque(maxlen=MAX_BLOCKS)
         self._sums = np.zeros((len(CRUST_FACTORS), 2))
 
     def add(self, v: FloatArray, d: FloatArray, S: FloatArray) -> None:
-        """Add a sample: innovations v and those of the candidate, v + d, of variance S, by each crust."""
+        """Add a sample with the innovations v (calibration) and v + d (candidate), of variance S.
+
+        Each array (4,) has one element for each of :data:`CRUST_FACTORS`.
+        """
         self._sums += np.stack([d * d / S, -v * d / S], axis=1)
 
     def end(self) -> None:
-        """End the present block."""
+        """End the present block and begin the next."""
         self._ended.append(self._sums)
         self._sums = np.zeros_like(self._sums)
 
@@ -91,14 +94,15 @@ class Blocks:
         return len(self._ended)
 
     def log_ratio(self, crust: int) -> float:
-        """Return the log-likelihood ratio of the candidates over the calibration, by one of the crusts."""
+        """Return the candidates' log-likelihood ratio over the calibration, for an index of CRUST_FACTORS."""
         information, confirmed = sum(self._ended, self._sums)[crust].tolist()
         return float(confirmed - 0.5 * information)
 
     def significance(self, crust: int, *, expected: bool = False) -> float:
-        """Return by how many times its bound the share of the last blocks differs from 1/2.
+        """Return the difference of the confirmed share from 1/2, in units of its significance bound.
 
-        If the change was `expected`, one block suffices, and the normal quantile.
+        Above 1 the candidates are significantly better, below -1 worse. `crust` is an index of
+        :data:`CRUST_FACTORS`. If the change was `expected`, one block and the normal quantile suffice.
         """
         largest = 0.0
         for count in range(1 if expected else MIN_BLOCKS, len(self._ended) + 1):
@@ -108,7 +112,7 @@ class Blocks:
             if total <= 0.0:
                 continue
             share = float(confirmed.sum()) / total
-            # what a block confirms more or less than the common share
+            # deviation of each block from the common share
             excess = confirmed - share * information
             by_blocks = float(excess @ excess) / total**2 * count / max(count - 1, 1)
             # the larger of the model's standard error and the sandwich estimate over the blocks
@@ -121,7 +125,7 @@ class Blocks:
 
 
 class Judge:
-    """Follow the predictions of the first and the published calibration and of the candidates.
+    """Comparison of the predictions of the first calibration, the published one and the candidates.
 
     `mean_square` (3,) are the recent mean squares of their prediction errors, nT²; `last` is the error of the
     published calibration's last prediction (nT), with its predicted variance (nT²).
@@ -135,7 +139,7 @@ class Judge:
         self.restart()
 
     def restart(self, nuisance: Nuisance | None = None) -> None:
-        """Discard all blocks, for another first calibration, candidate or nuisance."""
+        """Reset the filters and discard all blocks, after a change of a calibration or of the nuisance."""
         self._nuisance = nuisance or self._nuisance
         # one filter for each standard deviation of the crustal field: its value and slope are scaled
         scale = np.ones((len(CRUST_FACTORS), TRACK_STATES))
@@ -148,7 +152,7 @@ class Judge:
         self.discard()
 
     def discard(self) -> None:
-        """Discard all blocks, because other candidates follow."""
+        """Discard all blocks, because their candidates are no longer considered."""
         self._to_first, self._to_published = Blocks(), Blocks()
         self._begin_block()
 
@@ -158,9 +162,10 @@ class Judge:
         self._direction: FloatArray | None = None
 
     def is_due(self, metres: float, seconds: float, direction: FloatArray) -> bool:
-        """Return True if a sample begins a block, so that it needs a new candidate.
+        """Return True if a sample begins a new block, which needs a new candidate.
 
-        `metres` and `seconds` lead from the previous sample; `direction` (3,) is the field's in sensor axes.
+        `metres` and `seconds` are distance and time since the previous sample; `direction` (3,) is the
+        field's direction in sensor axes.
         """
         if self._direction is None:
             self._direction = direction
@@ -186,14 +191,14 @@ class Judge:
         return True
 
     def replace(self, index: int, change: float, scale: float) -> None:
-        """Keep the level of a calibration that is replaced, which changes the present residual, nT."""
+        """Correct the level of a replaced calibration, whose present residual changes by `change` (nT)."""
         self._states[:, 3, index] += scale * change
 
     def judge(self, F: FloatArray, residuals: tuple[float, float, float], scale: float) -> None:
-        """Compare one sample, after the reference's error moved by `F` (4, 4).
+        """Update the comparison with one sample; `F` (4, 4) is the transition of the reference's error.
 
-        `residuals` are those of the first and the published calibration and of the candidate, nT; `scale` is
-        that of the first calibration's residual.
+        `residuals` (nT) belong to the first calibration, the published calibration and the candidate;
+        `scale` is s of the first calibration's residual.
         """
         # the three calibrations share the covariance, because only their residuals differ
         h = self._nuisance.row(scale)
@@ -248,7 +253,7 @@ class Judge:
 
     @property
     def is_complete(self) -> bool:
-        """Return True if as many blocks as are compared have ended."""
+        """Return True if :data:`MAX_BLOCKS` blocks have ended."""
         return self._to_published.count == MAX_BLOCKS
 
     @property
@@ -258,7 +263,7 @@ class Judge:
 
 
 class Coverage:
-    """Evaluate a change of the `size` coefficients at all attitudes, masses and temperatures so far."""
+    """Statistics of all samples so far, which test a change of the `size` coefficients at every attitude."""
 
     def __init__(self, size: int) -> None:
         # moments of the samples' derivatives: number, mean, and sum of squares about the mean
@@ -280,7 +285,7 @@ class Coverage:
     def is_significant(self, change: FloatArray, covariance: FloatArray) -> bool:
         """Return True if a change of the coefficients (K,) exceeds its uncertainty (K, K) at all attitudes.
 
-        The level, the mean over all samples, does not count.
+        The mean of the change over all samples does not count, because the reference hides it.
         """
         if len(self._directions) < MIN_DIRECTIONS:
             return False

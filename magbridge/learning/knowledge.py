@@ -1,4 +1,4 @@
-"""The state of one learning period, and the calibrations that are published."""
+"""State of one learning period, and the calibrations that the bridge publishes."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from magbridge.learning.samples import LearnedTerms, LearningSample, Observation
 from magbridge.records import Vector
 
 MAX_LINEAR_SIGMA_NT: Final = 300.0
-"""Offset uncertainty from which on the batch fit repeats the whole estimate, nT, 1-sigma of an axis."""
+"""Offset uncertainty above which learning begins with a batch fit, nT, 1-sigma of an axis."""
 OFFSET_WALK: Final = 3.0 / 86_400.0**0.5
-"""nT per square root of a second: an offset walks by 3 nT a day."""
+"""Random walk of an offset, nT per square root of a second: 3 nT in a day."""
 LEARNING_OUTLIER_SIGMA: Final = 5.0
 MIN_AGREEING_OUTLIERS: Final = 3
-"""An innovation beyond so many sigmas says nothing, unless it is the third in a row."""
+"""An innovation above LEARNING_OUTLIER_SIGMA sigmas is an outlier, unless it is the third in a row."""
 
 
 class Knowledge:
     """Estimators, tests and batch fit of one learning period.
 
-    It begins with a calibration, whose offsets may have changed at this power-on by `turn_on` (nT, 1-sigma),
-    and with the nuisance of the reference, and of the main field alone if the reference is a map.
+    The period begins with the calibration `first`, whose offsets may have changed at this power-on by
+    `turn_on` (nT, 1-sigma). `nuisance` models the error of the reference; if the reference is a map,
+    `mapless` models the error of the main field alone.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Knowledge:
         self.bank, self.detector = EstimatorBank(model, quiet, mapless), ChangeDetector(model, quiet)
         self.late_telemetry, self._outliers = LateTelemetryTest(), 0
         self.coverage = Coverage(model.size)
-        self._before: FloatArray | None = None  # regressors of the previous sample, and of the present one
+        self._before: FloatArray | None = None  # regressors of the previous sample
         self._present: FloatArray | None = None
         self._reference_steps = ReferenceSteps()
         self.start: BatchFit | None = None
@@ -67,37 +68,40 @@ class Knowledge:
 
     @property
     def believed(self) -> Nuisance:
-        """Nuisance in use: the one without the map during a map alarm."""
+        """Model of the reference's error in use: during a map alarm, the model without the map."""
         return self._mapless if self.bank.map_doubted and self._mapless else self.nuisance
 
     def observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
-        """Return the observation of a field (nT) with nine coefficients (9,)."""
+        """Return the observation of a raw field (nT) with nine coefficients (9,), see :func:`.observe`."""
         return observe(field, nine, self._field, reference)
 
     def _observation_with(self, estimator: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
-        """Return the observation of a field at regressors (m,) with an estimator's coefficients."""
+        """Return a function that observes a field at regressors (m,) with an estimator's coefficients."""
         return lambda field, phi, reference: self.observe(
             field, phi @ self._model.weights(estimator.coefficients), reference
         )
 
     def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> LearningAlarm | None:
-        """Test whether the regressors (m,) reported now fit earlier samples better than those of then."""
+        """Test whether the telemetry reported now fits earlier samples better than the earlier telemetry.
+
+        Return an alarm if it does. `phi` (m,) are the regressors, `positions` the scaled mass positions.
+        """
         if self.start is not None:
             return None
         return self.late_telemetry.test(time_us, phi, positions, self._observation_with(self.bank.quiet))
 
     def keep(self, sample: LearningSample, innovation: float) -> None:
-        """Keep a sample that is wrong by an innovation (nT), to look back at."""
+        """Store a sample and its innovation (nT) for the test of late telemetry."""
         self.late_telemetry.keep(StoredSample(sample, innovation, self.bank.quiet.filter.variance))
 
     def keep_faulty(self, sample: LearningSample) -> None:
-        """Keep a sample that is not predicted."""
+        """Store a faulty sensor's sample for the test of late telemetry, without updating a filter."""
         quiet = self.bank.quiet
         now = self._observation_with(quiet)(sample.field, sample.phi, sample.reference)
         self.keep(sample, now.e - quiet.expected)
 
     def predict(self, sample: LearningSample, way: Way) -> Observation:
-        """Predict a sample with every estimator, on the way from the previous one.
+        """Predict a sample with every estimator, propagated over the `way` from the previous sample.
 
         Return the selected estimator's residual and derivatives.
         """
@@ -124,7 +128,7 @@ class Knowledge:
         return live
 
     def outlying(self, *, learnable: bool) -> bool:
-        """Return True for an outlier that no estimator predicts and no `learnable` alarm explains."""
+        """Return True for an outlier of the selected estimator that no `learnable` alarm explains."""
         if self.start is not None:
             return False
         best = self.bank.best
@@ -137,13 +141,14 @@ class Knowledge:
     ) -> tuple[LearningAlarm | None, bool]:
         """Test the prediction, then learn from it; return the alarm, and True if the sample was used.
 
-        `seconds` lead from the previous sample.
+        `seconds` is the time since the previous sample.
         """
         quiet, now, by_delay = self.bank.quiet, self._quiet_observation, 0.0
-        if self._before is not None and 0.0 < seconds < 30.0:  # the residual if telemetry were a second late
+        # derivative of the residual by the telemetry's delay
+        if self._before is not None and 0.0 < seconds < 30.0:
             late = self._observation_with(quiet)(sample.field, self._before, sample.reference)
             by_delay = (late.e - now.e) / seconds
-        # the main field's model alone is smooth: without a map and without a step it has no error to test
+        # without a map and without steps, the reference is smooth and has no error to test
         may_step = self._mapless is not None or self._reference_steps.total != 0.0
         by_level = -1.0 / now.s if may_step else 0.0
         # test the innovation first: the update absorbs a part of every change
@@ -161,7 +166,7 @@ class Knowledge:
         if not self.start.add(sample.field, sample.phi, sample.reference, way):
             quiet.update(learn=True)
             return False
-        # all samples so far, from the prior: no linearisation of a poor start stays
+        # refit all samples from the prior, so that no linearisation at a poor start remains
         coefficients, nuisances, covariance, noise = self.start.fit(quiet.coefficients, self.nuisance)
         self.noise = msgspec.structs.replace(self.noise, sensor=noise)
         self.nuisance = Nuisance(self.noise, self.nuisance.spread, self.nuisance.constant)
@@ -176,19 +181,20 @@ class Knowledge:
 
 
 NO_METHOD: Final = "none"
-"""Method of the prior of any vehicle, which is not a calibration yet."""
+"""`method` of the prior of any vehicle, before there is a calibration."""
 MAX_PUBLISHED_DIFFERENCE: Final = 0.3
 """Difference of learned and published total field that causes an update, as a fraction of the noise."""
 MIN_UPDATE_SAMPLES: Final = 32
 MAX_UPDATE_SAMPLES: Final = 256
-"""Samples after which it may be updated, and is in any case."""
+"""Number of samples after which an update of the published calibration may follow, and must follow."""
 
 
 class Publication:
-    """Hold the first (initial or accepted) calibration and the published one, and judge between them.
+    """The first (initial or accepted) calibration, the published calibration, and the judge between them.
 
     `coefficients` (K,) are those of the published `calibration`; `judge` compares it with the first one and
-    with the candidate. `is_update` is True if its last change was a routine update, `age` samples ago.
+    with the candidate. `is_update` is True if the last publication was a routine update. `age` is the number
+    of samples since the last publication.
     """
 
     def __init__(self, model: LearnedTerms, first: Calibration, nuisance: Nuisance) -> None:
@@ -208,11 +214,11 @@ class Publication:
         return self.calibration is not self.first
 
     def nine(self, phi: FloatArray) -> list[FloatArray]:
-        """Return the nine coefficients (9,) at `phi` (m,): first, published one and candidate."""
+        """Return the nine coefficients (9,) of first, published and candidate calibration at `phi` (m,)."""
         return [phi @ weights for weights in self._weights]
 
     def replaced(self, phi: FloatArray) -> dict[int, FloatArray]:
-        """Return the nine coefficients (9,), at `phi` (m,), of the calibrations that were replaced."""
+        """Return, once, the former nine coefficients (9,) at `phi` (m,) of each replaced calibration."""
         replaced, self._replaced = self._replaced, {}
         return {which: phi @ weights for which, weights in replaced.items()}
 
@@ -225,7 +231,7 @@ class Publication:
         self._weights[index] = weights
 
     def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
-        """Return the calibration that an estimator has learned, with its origin."""
+        """Return the calibration that an estimator has learned from `samples` samples."""
         first, coefficients, method = self.first, estimator.coefficients, self.first.method
         covariance, level = estimator.covariance, first.level
         reference = first.reference
@@ -235,10 +241,10 @@ class Publication:
                 coefficients = estimator.at_level_of(self.coefficients)
                 by = coefficients - estimator.coefficients
                 covariance = covariance + np.outer(by, by)
-            toward = covariance @ estimator.mean  # how coefficients go with the level, which has this sigma
-            # level vector of the file: covariance with the mean field, over its sigma
+            toward = covariance @ estimator.mean  # covariance of the coefficients with the mean field
+            # level vector of the file: this covariance over the mean field's sigma
             sigma = float(np.sqrt(estimator.mean @ toward))
-            if sigma:  # no sample, no level
+            if sigma:  # zero before the first sample
                 level = tuple((toward[: first.coefficients.size] / sigma).tolist())
                 reference = msgspec.structs.replace(reference, level_sigma=sigma)
         elif "learned" not in method:

@@ -1,4 +1,4 @@
-"""Learn a calibration on board the bridge, sample by sample."""
+"""Estimate a calibration on board the bridge, sample by sample."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Notice(NamedTuple):
-    """Text of a notification, its time (s since 1970 UTC), and whether it is `grave`, so a warning."""
+    """Notification: text, time (s since 1970 UTC), and `grave`, which is True for a warning."""
 
     text: str
     time: float
@@ -36,10 +36,11 @@ class Notice(NamedTuple):
 
 
 class LearnerState(NamedTuple):
-    """Contents of MAG_LEARNING: samples learned from, and RMS errors of three calibrations, nT.
+    """Contents of a MAG_LEARNING message.
 
-    The calibrations are the first, the published and the learned one; `better` is the log-likelihood ratio of
-    the last over the first. The `causes` are those of an alarm of `size` (nT), since the time `since_us`.
+    `learned_samples` is the number of samples learned from. `rms` are the RMS errors of the first, the
+    published and the learned calibration (nT); `better` is the log-likelihood ratio of the learned over the
+    first. `causes`, onset `since_us` (µs since 1970 UTC) and `size` (nT) describe the alarm, if there is one.
     """
 
     learned_samples: int
@@ -51,10 +52,10 @@ class LearnerState(NamedTuple):
 
 
 MIN_CAUSE_LOG_RATIO: Final = 9.0
-"""Log-likelihood ratio below which an alarm is closed instead of its cause learned."""
+"""Log-likelihood ratio below which the learner closes an alarm and does not learn its cause."""
 MAX_MISFIT: Final = 2.0
-"""Mean normalised square of the innovations that a cause leaves, up to which it explains them. A cause that
-leaves more is not the true one, as where a current has no telemetry."""
+"""Largest mean normalised squared innovation that a cause may leave if it explains the samples. A larger
+value shows that the true cause is another, such as a current without telemetry."""
 MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 """Flags of samples from which nothing is learned."""
@@ -63,28 +64,28 @@ MAIN_FIELD_SIGMA_NT: Final = 145.0
 
 
 class Learner:
-    """Learn a calibration's coefficients while the bridge corrects with it.
+    """On-board estimator of a calibration's coefficients, fed with the samples that the bridge corrects.
 
     Parameters
     ----------
     calibration : Calibration
         Initial calibration.
     grid : AnomalyGrid, optional
-        Anomaly map to add to the main field; outside of it no sample is used.
+        Anomaly map to add to the main field; samples outside the map are not used.
     spread : float
-        1-sigma of the Earth's field about its reference, nT. A map has a known level; the level of the main
-        field is uncertain by `spread`.
+        1-sigma of the Earth's field about its reference, nT. Without a map, it is also the 1-sigma of the
+        reference's constant error; a map has none.
     turn_on : float
         1-sigma of the offsets' change at every power-on, nT.
     max_rate : float
         Highest rate of samples to learn from, Hz.
     currents : tuple of str
-        Names of telemetry in ampere.
+        Names of the telemetry channels that are electric currents, in ampere.
 
     Attributes
     ----------
     watched : tuple of str
-        Telemetry that :meth:`sample` wants: the temperature, and the currents.
+        Names of the telemetry that :meth:`sample` needs: the temperature, and the currents.
     samples : int
         Number of samples that coefficients were learned from.
     notices : list of Notice
@@ -123,7 +124,7 @@ class Learner:
 
     @property
     def first(self) -> Calibration:
-        """The calibration that it began with, or that was accepted."""
+        """Initial calibration, or the last calibration that the operator accepted."""
         return self._publication.first
 
     @property
@@ -143,12 +144,12 @@ class Learner:
 
     @property
     def variance(self) -> float:
-        """Variance to add to that of the total field while the data are not explained, nT²."""
+        """Variance to add to the total field's while an alarm lasts, nT²."""
         return self._standing.variance
 
     @property
     def state(self) -> LearnerState:
-        """The present state of learning."""
+        """Present state of learning, for MAG_LEARNING."""
         judge, alarm = self._publication.judge, self._standing.alarm
         first, published, learned = np.sqrt(judge.mean_square).tolist()
         causes = alarm.causes if alarm else ()
@@ -156,7 +157,7 @@ class Learner:
         return LearnerState(self.samples, (first, published, learned), judge.better, causes, since, size)
 
     def learned(self) -> Calibration:
-        """Return the calibration as learned so far, with its covariance and where it comes from."""
+        """Return the calibration as learned so far, with its covariance and origin."""
         knowledge = self._knowledge
         return self._publication.made(knowledge.bank.best, self.samples, knowledge.noise)
 
@@ -179,9 +180,9 @@ class Learner:
         self._restart(nuisance)
         self._intake = Intake(self._max_rate)
         self.samples = 0
-        self._unconfirmed = False  # a cause was learned, and nothing was published since
+        self._unconfirmed = False  # a cause was learned, and no calibration was published since
         self._expected = False  # the cause that was learned explains the samples
-        self._refuted = False  # another alarm came before later samples confirmed it
+        self._refuted = False  # another alarm came before later samples confirmed the cause
 
     def _restart(self, nuisance: Nuisance) -> None:
         """Begin to learn from the published calibration; offsets may have changed at this power-on."""
@@ -199,7 +200,7 @@ class Learner:
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))
 
     def restarted(self) -> None:
-        """Allow for a power cycle of the sensor: its offsets may have changed."""
+        """Handle a power cycle of the sensor, which may have changed the offsets."""
         self._intake.drop()
         self._knowledge.bank.open(self._turn_on**2)
 
@@ -218,16 +219,16 @@ class Learner:
         age: float = 0.0,
         settled: Vector | None = None,
     ) -> None:
-        """Add a corrected sample of a time (µs since 1970 UTC).
+        """Add a corrected sample, taken at `time_us` (µs since 1970 UTC).
 
         The sample waits until newer telemetry arrives. If a mass had begun to move, it is discarded.
 
-        `field` is the raw field, nT, sensor axes; `regressors` and `values` are the calibration's at that
-        time, the latter of its channels. `faulty` is True if the sensor is at fault, or the field cannot be
-        the Earth's. `reference` is H_e, nT, NaN without a position (latitude and longitude, deg). `watched`
-        are the values of the telemetry named by :attr:`watched`, NaN if unknown; `age` is that of the
-        parameters' oldest telemetry, s. `settled` is the field of the previous sample, if this sample makes
-        it more exact.
+        `field` is the raw field (nT, sensor axes). `regressors` and `values` are the regressors and channel
+        values of the calibration at that time. `faulty` is True if the sensor is at fault, or the field
+        cannot be the Earth's. `reference` is the main field's H_e (nT; NaN without a `position`, which is
+        latitude and longitude in deg). `watched` are the values of the telemetry :attr:`watched` (NaN if
+        unknown). `age` is the age of the parameters' oldest telemetry (s). `settled` is the field of the
+        previous sample, if this sample makes it more exact.
         """
         # axes sampled in turn: the next reading makes the waiting sample more exact
         self._intake.settle(settled)
@@ -246,7 +247,7 @@ class Learner:
         if isnan(reference) or not np.isfinite(phi).all():
             self._nothing(time_us)
             return
-        # late telemetry shows only now, in samples that have waited or are kept
+        # late telemetry shows only now, in stored samples
         self._raise_alarm(self._knowledge.look_back(time_us, phi, positions))
         if unfit:
             self._intake.drop()
@@ -261,7 +262,7 @@ class Learner:
         self._intake.wait(new)
 
     def _nothing(self, time_us: int) -> None:
-        """Send a notification after every hour without a usable sample."""
+        """Record an unusable sample; send a notification after an hour without a usable one."""
         if self._intake.short(time_us):
             self._notify("learning: an hour without a sample to learn from", True)
 
@@ -279,7 +280,7 @@ class Learner:
         published = self._judge(sample, way)
         difference = published.e - now.e
         if knowledge.start is None:
-            # compare and test before learning: a prediction must not know its own sample
+            # compare and test before learning: a prediction must not use its own sample
             self._compare(sample.time_us * 1e-6, difference)
             alarm, learned = knowledge.learn(sample, way.seconds, frozen=self.frozen)
             self._raise_alarm(alarm)
@@ -309,7 +310,7 @@ class Learner:
         if self._standing.alarm is None:
             return
         self._standing.end()
-        # the evidence so far belongs to the alarm that is over
+        # the evidence so far belongs to the closed alarm
         self._knowledge.detector.restart()
         self._knowledge.late_telemetry.restart()
         self._notify(f"explained again: {how}")
@@ -320,7 +321,7 @@ class Learner:
         self._settle("gone")
 
     def _judge(self, sample: LearningSample, way: Way) -> Observation:
-        """Predict a sample by every calibration; return the published one's observation."""
+        """Predict a sample by every calibration; return the observation by the published calibration."""
         publication, judge = self._publication, self._publication.judge
 
         def observe(nine: FloatArray) -> Observation:
@@ -330,17 +331,17 @@ class Learner:
         if judge.is_due(way.metres, way.seconds, direction) and self._knowledge.start is None:
             publication.propose(self._knowledge.bank.best.coefficients)
         seen = [observe(nine) for nine in publication.nine(sample.phi)]
-        # a calibration that was replaced goes on with the level of its crustal field
+        # a replaced calibration keeps the level of its crustal field
         for which, nine in publication.replaced(sample.phi).items():
             judge.replace(which, seen[which].e - observe(nine).e, seen[which].s)
         first, published, candidate = seen
-        # the judge's filters move on over the same way as the estimators
+        # the judge's filters use the same transition as the estimators
         F = self._knowledge.believed.transition(*way)[0]
         judge.judge(F, (first.e, published.e, candidate.e), first.s)
         return published
 
     def _compare(self, time: float, difference: float) -> None:
-        """Select the best estimator; `difference` (nT): published residual less the best's."""
+        """Select the best estimator; `difference` is the published residual minus the best one's, nT."""
         bank, publication = self._knowledge.bank, self._publication
         best, was_doubted = bank.best, bank.map_doubted
         seen = (
@@ -370,7 +371,7 @@ class Learner:
         self._knowledge.go_on()
 
     def _count(self, *, learned: bool) -> None:
-        """Count a sample, and whether coefficients were learned from it."""
+        """Count a sample; `learned` is True if coefficients were learned from the sample."""
         self.samples += learned
         self._publication.age += 1
 
@@ -393,7 +394,7 @@ class Learner:
             return
         if self.frozen or not self._trusted():
             return
-        # the first publication needs the judge; later ones follow the estimator
+        # the first publication needs the judge; later updates follow the estimator
         pending = self._standing.is_pending
         if pending or not publication.learned:
             if self._holds():
@@ -408,11 +409,11 @@ class Learner:
         self._restart(self._knowledge.nuisance)
 
     def _holds(self) -> bool:
-        """Return True if the learned calibration is better, and its change significant everywhere."""
+        """Return True if the learned calibration is better, and its change significant at all attitudes."""
         publication, best = self._publication, self._knowledge.bank.best
         if self._knowledge.start is not None and not publication.learned:  # no calibration is published
             return publication.judge.better > BEYOND_CHANCE
-        # better in the last blocks, and known at all attitudes so far
+        # better in the last blocks, and significant at all attitudes so far
         change = best.coefficients - publication.coefficients
         expected = self._standing.is_pending and self._expected
         return publication.judge.adopt(expected=expected) and self._knowledge.coverage.is_significant(
@@ -440,7 +441,7 @@ class Learner:
         return standing.is_learnable and not standing.relapses and bank.best is not bank.quiet
 
     def _end(self) -> bool:
-        """Close an alarm that has been silent for long, or learn the cause of one that is certain enough.
+        """Close an alarm that has been silent for long, or learn its cause if the evidence suffices.
 
         Return True if learning has to restart, because no later samples confirmed the learned calibration.
         """
@@ -452,7 +453,7 @@ class Learner:
             if standing.is_certain:
                 self._take_up()
             return False
-        # learning that nothing has confirmed restarts from the published calibration
+        # unconfirmed learning restarts from the published calibration
         restart = self._unconfirmed or (standing.relapses > 0 and not standing.is_tried)
         if not standing.is_tried:
             self._close_unexplained()

@@ -1,11 +1,11 @@
-"""One sample against its reference, which samples are learned from, and the terms that are learned.
+"""Compute the residual of a sample, select the samples for learning, and define the learned terms.
 
-The equations of :func:`observe` are those of :mod:`magbridge.estimation.residual`, for one sample and without
-scipy: the live path runs here. At most ``max_rate`` samples a second are learned from, each once newer
-telemetry has come.
+The equations of :func:`observe` are those of :mod:`magbridge.estimation.residual`, but for one sample and
+without scipy, because they run in the live path. Learning uses at most ``max_rate`` samples a second, each
+once newer telemetry has come.
 
 The terms are the calibration's own, and offsets that follow the temperature or a current
-(:class:`~magbridge.calibration.effects.ChannelEffect`). The coefficients of the latter start at zero with
+(:class:`~magbridge.calibration.effects.ChannelEffect`). The coefficients of these offsets start at zero with
 zero variance; a hypothesis or an alarm gives them a variance. A learned calibration contains the terms with
 non-zero coefficients.
 """
@@ -31,7 +31,10 @@ from magbridge.records import Vector
 
 
 class Observation(NamedTuple):
-    """Residual ``e = (|A (H_r - T)| - H_e) / s`` (nT), s, and de by the nine coefficients (9,)."""
+    """Residual ``e = (|A (H_r - T)| - H_e) / s`` of one sample (nT), and its scale s.
+
+    `by_nine` (9,) is the derivative of e by the nine coefficients of A and T, see :func:`observe`.
+    """
 
     e: float
     s: float
@@ -39,15 +42,15 @@ class Observation(NamedTuple):
 
     @property
     def direction(self) -> FloatArray:
-        """Direction of the field in sensor axes (3,), but for the soft iron."""
+        """Direction of the field in sensor axes (3,), exact for A = I."""
         return -self.s * self.by_nine[6:]
 
 
 def observe(field: Vector, nine: FloatArray, F_0: float, reference: float) -> Observation:
-    """Compare one sample with its reference.
+    """Return the residual of one sample's raw `field` (nT) against its `reference` total field (nT).
 
-    `nine` (9,) are the coefficients of A (as ``(A - I) F_0``: xx, yy, zz, xy, xz, yz) and of T at the
-    sample's positions, nT.
+    `nine` (9,) are the coefficients at the sample's mass positions, nT: six of A (as ``(A - I) F_0``: xx, yy,
+    zz, xy, xz, yz) and three of T.
     """
     xx, yy, zz, xy, xz, yz = (nine[:6] / F_0).tolist()
     A = np.array(((1.0 + xx, xy, xz), (xy, 1.0 + yy, yz), (xz, yz, 1.0 + zz)))
@@ -61,10 +64,10 @@ def observe(field: Vector, nine: FloatArray, F_0: float, reference: float) -> Ob
     s2 = float(w @ w)
     s = sqrt(s2)
     e = (F - reference) / s
-    # derivative of e by b: that of F / s, and that of s, to which the part of A w along u does not contribute
+    # derivative of e by b, through F and through s; the part of A w along u cancels
     v, k = A @ w, e / s2
     z = u / s - k / F * (v - u * (u @ v))
-    # derivative by the elements of A; by an element off the diagonal it is that by both of its places
+    # derivative by the elements of A; an off-diagonal element occurs at two places
     by_A = np.outer(z, d) - k * np.outer(w, u)
     both = by_A + by_A.T
     by_six = np.array((by_A[0, 0], by_A[1, 1], by_A[2, 2], both[0, 1], both[0, 2], both[1, 2]))
@@ -78,9 +81,11 @@ SHORTAGE_US: Final = 3_600_000_000
 
 
 class LearningSample(NamedTuple):
-    """A sample to learn from, or of a `faulty` sensor: see :meth:`.Learner.sample`.
+    """Sample to learn from; a sample of a `faulty` sensor only serves the test of late telemetry.
 
-    ``phi`` (m,) are all regressors, ``positions`` the masses', scaled.
+    `field` is raw (nT, sensor axes), `reference` the reference total field (nT), `phi` (m,) all regressors.
+    `positions` are the scaled mass positions, `where` latitude and longitude (deg), and `watched` the values
+    of the channels :attr:`.Learner.watched`.
     """
 
     time_us: int
@@ -94,7 +99,7 @@ class LearningSample(NamedTuple):
 
 
 class Way(NamedTuple):
-    """Distance, time and change of course from one sample to the next."""
+    """Distance (m), time (s) and change of course from one sample to the next."""
 
     metres: float
     seconds: float
@@ -103,7 +108,7 @@ class Way(NamedTuple):
 
 
 class Intake:
-    """Hold the samples until newer telemetry has come, at most `max_rate` (Hz) of them."""
+    """Queue of samples that wait for newer telemetry; it accepts samples at `max_rate` (Hz) at most."""
 
     def __init__(self, max_rate: float) -> None:
         self._period_us = round(1e6 / max_rate)
@@ -114,15 +119,15 @@ class Intake:
         self._course = Course()
 
     def due(self, time_us: int, *, fit: bool) -> bool:
-        """Return True if it is time for another sample; `fit` is True if it can be learned from."""
+        """Return True if another sample is due; `fit` is True if learning can use the present sample."""
         return not 0 <= time_us - (self._taken_us if fit else self._looked_us) < 0.99 * self._period_us
 
     def drop(self) -> None:
-        """Discard the waiting sample, because a mass had begun to move or the sensor was power-cycled."""
+        """Discard the waiting samples, because a mass had begun to move or the sensor was power-cycled."""
         self._held.clear()
 
     def confirmed(self, time_us: int, age: float) -> list[LearningSample]:
-        """Return the waiting samples that are older than the telemetry, which has the `age` (s) at a time."""
+        """Remove and return the samples older than the telemetry, whose age is `age` (s) at `time_us`."""
         self._looked_us = time_us
         out = []
         # a sample is confirmed by telemetry that is newer than it
@@ -138,13 +143,13 @@ class Intake:
         self._newest = True
 
     def settle(self, field: Vector | None) -> None:
-        """Correct the waiting sample's field (nT) from the next reading, if a sample waits."""
+        """Replace the newest sample's field by a more exact `field` (nT), if the sample still waits."""
         if self._newest and self._held and field is not None:
             self._held[-1] = self._held[-1]._replace(field=field)
         self._newest = False
 
     def short(self, time_us: int) -> bool:
-        """Count an unusable sample; return True if a notification of the shortage is due."""
+        """Record an unusable sample; return True if a notification about the lack of samples is due."""
         self._last_us = self._last_us or time_us
         if time_us - self._last_us <= SHORTAGE_US or self._reported_us == self._last_us:
             return False
@@ -152,7 +157,7 @@ class Intake:
         return True
 
     def moved(self, sample: LearningSample) -> Way:
-        """Return the way from the previous sample that was learned from to this one."""
+        """Return distance, time and turn from the previous call's sample to `sample`."""
         before, last_us = self._where or sample.where, self._last_us or sample.time_us
         self._where, self._last_us = sample.where, sample.time_us
         north, east = separation(*before, *sample.where)
@@ -161,11 +166,12 @@ class Intake:
 
 
 class LearnedTerms:
-    """A calibration's terms, and offsets that follow the temperature and `currents` (telemetry in ampere).
+    """Terms that learning estimates: the calibration's, and offsets that follow temperature or currents.
 
-    `parameters` are the names of the calibration's parameters, `watched` the temperature and the currents,
-    `further` those of them that the calibration does not follow itself. `size` is the number of coefficients
-    K with those of the further terms, three a channel; `offsets` (3,) are the indices of the constant offset.
+    `currents` are the names of telemetry in ampere, `parameters` those of the calibration's parameters.
+    `watched` are the temperature and the currents; `further` are the watched channels for which the
+    calibration has no term. `size` is the number K of coefficients, with three for each further channel.
+    `offsets` (3,) are the indices of the constant offset.
 
     Raises
     ------
@@ -204,7 +210,7 @@ class LearnedTerms:
         self.offsets = offsets
 
     def _extended(self, terms: Sequence[int]) -> Calibration:
-        """Return the calibration with further terms, whose coefficients are 0."""
+        """Return the calibration with further `terms` (indices of `watched`), whose coefficients are 0."""
         base = self._base
         effects = tuple(
             ChannelEffect(
@@ -226,7 +232,10 @@ class LearnedTerms:
         )
 
     def _offset_slots(self, row: int) -> IndexArray | None:
-        """Return which coefficients add one regressor to the offset of x, y and z, and do nothing else."""
+        """Return the indices (3,) of the coefficients that only add the regressor `row` to the offsets.
+
+        Return None if an axis has no such coefficient.
+        """
         found = []
         for axis in range(3):
             only = np.zeros(self._tensor.shape[1:])
@@ -239,7 +248,10 @@ class LearnedTerms:
         return np.array(found)
 
     def slots(self, name: str) -> IndexArray | None:
-        """Return the coefficients (3,) by which the offset follows a parameter or channel, if it may."""
+        """Return the indices (3,) of the coefficients by which the offset follows a parameter or channel.
+
+        Return None if the offset has no such coefficients.
+        """
         row = self._rows.get(name)
         return None if row is None else self._offset_slots(row)
 
@@ -251,11 +263,11 @@ class LearnedTerms:
         return next((effect.origin for effect in effects if effect.channel == name), 0.0)
 
     def scaled(self, values: Sequence[float]) -> list[float]:
-        """Return the parameters' values (the first of the calibration's channels) in their scale."""
+        """Return the parameters (the first of the `values`), centred and divided by their scales."""
         return [(v - one.centre) / one.scale for v, one in zip(values, self._base.parameters, strict=False)]
 
     def regressors(self, calibrated: Sequence[float], watched: Sequence[float]) -> FloatArray:
-        """Return all regressors (m,): the calibration's `calibrated`, and those of the `watched` channels."""
+        """Return all regressors (m,): the calibration's `calibrated`, and the further ones of `watched`."""
         for place, k in enumerate(self._further):
             value = watched[k]
             if not isnan(value):  # while the value is unknown, the last one holds
@@ -266,21 +278,21 @@ class LearnedTerms:
         return np.array([*calibrated[: self._terms], *self._regressors])
 
     def weights(self, coefficients: FloatArray) -> FloatArray:
-        """Return (m, 9) what each regressor adds to the nine coefficients, nT."""
+        """Return the weights (m, 9) of the regressors in the nine coefficients of :func:`observe`, nT."""
         return np.asarray((coefficients @ self._flat).reshape(self._tensor.shape[1:]))
 
     def derivative(self, phi: FloatArray, by_nine: FloatArray) -> FloatArray:
-        """Return the derivative (K,) by the coefficients from that by the nine coefficients (9,)."""
+        """Convert a derivative by the nine coefficients (9,) to a derivative by all K coefficients (K,)."""
         return np.asarray(self._flat @ np.outer(phi, by_nine).ravel())
 
     def _index(self, used: Sequence[int]) -> IndexArray:
-        """Return which of the K coefficients a calibration has that carries the further terms `used`."""
+        """Return the indices of the coefficients of a calibration with the further channels `used`."""
         places = [self._further.index(k) for k in used]
         further = [self._own + 3 * place + axis for place in places for axis in range(3)]
         return np.array([*range(self._own), *further])
 
     def coefficients(self, calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-        """Return the coefficients (K,) and covariance (K, K) of a calibration with some of the terms."""
+        """Return a calibration's coefficients (K,) and covariance (K, K), 0 for terms that it lacks."""
         names = [name for name in calibration.channels if name not in self._base.channels]
         index = self._index([self.watched.index(name) for name in names])
         coefficients, covariance = np.zeros(self.size), np.zeros((self.size, self.size))
@@ -289,7 +301,7 @@ class LearnedTerms:
         return coefficients, covariance
 
     def calibration(self, coefficients: FloatArray, covariance: FloatArray) -> Calibration:
-        """Return the calibration with coefficients (K,) and covariance (K, K), without terms of zero."""
+        """Return the calibration with coefficients (K,) and covariance (K, K), without further terms of 0."""
         by_further = coefficients[self._own :].reshape(-1, 3)
         used = [k for k, three in zip(self._further, by_further, strict=True) if three.any()]
         index = self._index(used)
