@@ -1,18 +1,19 @@
-"""Diagnose errors of the forward model: their physical causes, and the improvement of correcting them.
+"""Diagnose errors of the forward model: find their physical causes, and measure the gain of a correction.
 
 :func:`~magbridge.diagnose.run.diagnose` is the entry point; start reading there. The package uses the
 calibration and the estimation library, and must not depend on the bridge or on other applications.
 
-1. :mod:`.survey` reads deployments, and :mod:`.problem` compares them with a calibration: the measured less
-   the predicted field, linear in every coefficient.
-2. :mod:`.causes` put forward their candidates: :mod:`.columns` of that problem, at a grid of nonlinear
-   parameters.
-3. :mod:`.joint` fits calibration, effects and :mod:`.noise` together. :mod:`.evidence` weighs one candidate,
-   :mod:`.state` all of them in a round, and :mod:`.search` adds cause after cause and exchanges them for
-   their competing hypotheses.
-4. :mod:`.leftover` describes the remaining signal, or all of it, without a name, by :mod:`.descriptions` and
-   :mod:`.packets`; names must be likelier.
-5. :mod:`.extend` adds the named causes to a calibration; :mod:`.improvement` corrects held-out dives with it.
-6. :mod:`.diagnosis` is the result, :mod:`.assessment` decides on its use, and :mod:`.report` writes both for
-   people and for programs.
+1. :mod:`.survey` reads deployments. :mod:`.problem` linearises the difference of measured and predicted field
+   in every coefficient of a calibration.
+2. Each of the :mod:`.causes` proposes candidates on a grid of its nonlinear parameters. A candidate is a set
+   of :mod:`.columns` of the linear problem.
+3. :mod:`.joint` fits calibration, effects and :mod:`.noise` together. :mod:`.evidence` tests one candidate,
+   and :mod:`.state` all candidates in a round. :mod:`.search` adds one cause after the other and exchanges
+   causes for their competing hypotheses.
+4. :mod:`.leftover` fits free functions (:mod:`.descriptions`, :mod:`.packets`) to the signal. A cause is
+   named only if it is likelier than these.
+5. :mod:`.extend` adds the named causes to a calibration. :mod:`.improvement` corrects held-out dives with the
+   extended calibration.
+6. :mod:`.diagnosis` holds the result, :mod:`.assessment` decides whether the extended calibration is usable,
+   and :mod:`.report` writes the page and ``findings.json``.
 """

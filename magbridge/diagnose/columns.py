@@ -1,4 +1,4 @@
-"""Columns of a design matrix, and the candidates of causes, which are made of them."""
+"""Columns of the design matrix of a linear problem, and candidates of causes as sets of columns."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Problem
 
 Columns = Callable[[slice], FloatArray]
-"""Slice of m rows -> (m, k) change of the residual per unit of each of k coefficients, column by column."""
+"""Function of a slice of m rows: (m, k) change of the residual per unit of each of k coefficients, stored
+column by column."""
 AXIS_NAMES = ("x", "y", "z")
 About = Literal["vehicle", "constant", "place", "time"]
 Group = tuple[str, str | None]
-"""A cause and its channel: candidates that share both are one grid."""
+"""Cause and telemetry channel of a candidate. Candidates with an equal pair are the points of one grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,7 @@ class Mixture:
     """Linear combinations ``sum_i X_i M_i`` of columns ``X_i`` that many hypotheses share."""
 
     parts: tuple[tuple[Columns, FloatArray], ...]
-    """X_i and M_i."""
+    """Pairs of columns X_i (p_i of them) and weights M_i (p_i, k)."""
 
     def __call__(self, rows: slice) -> FloatArray:
         """Return these rows of the columns, (m, k)."""
@@ -35,7 +36,7 @@ class Mixture:
 
 @dataclass(frozen=True)
 class Since:
-    """Columns set to zero in the rows where `fresh` (n,) is false."""
+    """Columns that are set to zero in the rows where `fresh` (n,) is false."""
 
     columns: Columns
     fresh: BoolArray = field(compare=False)
@@ -46,24 +47,24 @@ class Since:
 
 
 def parts(columns: Columns) -> tuple[tuple[Columns, FloatArray], ...]:
-    """Return the pairs (X_i, M_i (p_i, k)) of a mixture; other columns are their own only part, M = I."""
+    """Return the pairs (X_i, M_i (p_i, k)) of a mixture; for other columns X, the single pair (X, 1)."""
     if isinstance(columns, Mixture):
         return columns.parts
     return ((columns, np.eye(size_of(columns))),)
 
 
 def size_of(columns: Columns) -> int:
-    """Return the number of columns."""
+    """Return the number k of columns."""
     return len(columns(slice(0, 1)).T)
 
 
 def places(sizes: Iterable[int], first: int = 0) -> list[slice]:
-    """Return the slices of blocks of the given numbers of columns, from `first` on."""
+    """Return the slices of adjacent blocks of the given `sizes`, the first of which begins at `first`."""
     return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=first))]
 
 
 def join_columns(columns: Sequence[Columns]) -> Mixture:
-    """Return all columns side by side as one mixture, in which shared parts occur once."""
+    """Return several sets of columns side by side as one mixture, in which a shared part occurs once."""
     listed = [parts(one) for one in columns]
     sizes = [blocks[0][1].shape[1] for blocks in listed]
     # Parts that several columns share occur once, with the weights of all of them
@@ -76,13 +77,13 @@ def join_columns(columns: Sequence[Columns]) -> Mixture:
 
 @dataclass(frozen=True)
 class Products:
-    """Products of functions of time and derivatives, from which the columns of effects are made."""
+    """Columns ``phi_r(t) g_s(t)``: an effect's regressor times a derivative of the residual."""
 
     problem: Problem
     phi: Callable[[slice], FloatArray] | None
-    """Rows -> (r, m) functions; 1 if there is none."""
+    """Function of m rows that returns the regressors (r, m); None for a single regressor of 1."""
     pairs: tuple[tuple[int, int], ...]
-    """For each column, the place of its function and the slot of its slope."""
+    """Index of the regressor, and of the derivative (0 to 8, by the nine coefficients), for each column."""
 
     def __call__(self, rows: slice) -> FloatArray:
         """Return these rows of the columns, (m, pairs)."""
@@ -100,7 +101,8 @@ def effect_columns(
 ) -> Mixture:
     """Return the columns of an effect's coefficients, in units of their `widths` (k,).
 
-    Its regressors are `phi` less `origin`: (r, n), a function from m rows to (r, m), or the effect's own.
+    The regressors are `phi` less `origin`. `phi` is (r, n) or a function from m rows to (r, m); None stands
+    for the regressors that the effect itself computes.
     """
     if phi is None and effect.remembers:
         # Single precision: a search tries dozens of histories, of 5 MB for a month each in double
@@ -125,57 +127,58 @@ def effect_columns(
 
 @dataclass(frozen=True, eq=False)
 class GridPoint:
-    """The nonlinear parameters of a candidate: a point of its cause's grid, and what profiling made of it."""
+    """Nonlinear parameters of a candidate: a point of its cause's grid, or its maximum after profiling."""
 
     shape: Mapping[str, tuple[float, str]] = field(default_factory=dict)
-    """Name -> (value, unit)."""
+    """Value and unit of each parameter, by name."""
     rebuild: Callable[..., Candidate] | None = None
-    """Shape's values -> the same candidate with those: for profiling."""
+    """Function that returns the candidate at other values of the parameters; None if there are none."""
     likelier: float = 0.0
-    """Log of its prior probability, relative to the mean of its grid."""
+    """Log of the prior probability of this point, relative to the mean of its grid."""
     narrow: float = 0.0
-    """Log of how much narrower than their grid's cells the parameters are by the data."""
+    """Log of the ratio of a grid cell's width to the width of the likelihood, summed over the parameters."""
     cells: tuple[float, ...] = ()
-    """Spacing of the grid's points, in each parameter."""
+    """Spacing of the grid's points in each parameter, in its unit; empty before profiling."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One hypothesis."""
+    """A hypothesis: one cause, at one point of the grid of its nonlinear parameters."""
 
     cause: str
-    """As in ``findings.json``."""
+    """Name of the cause, as in ``findings.json``."""
     channel: str | None
-    """Telemetry that it follows."""
+    """Telemetry channel that the effect follows; None if it follows none or several."""
     columns: Columns
-    """What its coefficients add to the residual, each in units of its width."""
+    """Changes of the residual, nT, by each coefficient, which is in units of its width."""
     width: FloatArray
     """(k,) plausible size (1-sigma) of each coefficient, in its unit."""
     names: tuple[str, ...]
     units: tuple[str, ...]
-    """`names`, `units`: of the coefficients."""
+    """`names`, `units`: name and unit of each coefficient."""
     effects: tuple[Effect, ...] = ()
-    """Effects to add to the calibration; empty if the reference is wrong, or the data of the fit."""
+    """Effects to add to the calibration; empty for an error of the reference or of the calibration's logs."""
     point: GridPoint = GridPoint()
-    """Its nonlinear parameters."""
+    """Nonlinear parameters of the candidate."""
     look_elsewhere: float = 1.0
-    """Number of independent hypotheses that this one was picked from (frequencies searched)."""
+    """Number of independent hypotheses from which this one was picked, such as frequencies searched."""
     positive: bool = False
-    """Its coefficients cannot be negative."""
+    """True if the coefficients cannot be negative."""
     parts: tuple[Candidate, ...] = ()
-    """Those that it was put together from, one after the other."""
+    """Candidates that this one joins, in the order of their coefficients; empty for a single candidate."""
     spectra: FloatArray | None = None
-    """(l, k) alternatives for the prior variances of coefficients of one common free size (:mod:`.joint`)."""
+    """(l, k) alternative prior variances up to a common factor (:mod:`.joint`); None: free coefficients."""
     since: bool = False
-    """It is absent from the logs that the calibration was fitted to."""
+    """True if the effect is zero in the logs that the calibration was fitted to."""
     regressors: Callable[[slice], FloatArray] | None = None
-    """Rows -> regressors (r, m) of its effect by central differences, where the live ones contain noise."""
+    """Function of m rows: regressors (r, m) of the effect with less noise than the live ones; or None."""
     about: About = "vehicle"
-    """``vehicle`` with its sensor; or how the reference is wrong: ``constant``, by ``place`` or ``time``."""
+    """``vehicle`` for vehicle and sensor; else how the reference errs: ``constant``, by ``place``,
+    ``time``."""
 
     @property
     def group(self) -> Group:
-        """The grid that it is a point of."""
+        """Cause and channel, which identify the grid of this candidate."""
         return self.cause, self.channel
 
     @property
@@ -185,26 +188,26 @@ class Candidate:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom of its test: coefficients of one common size are one."""
+        """Degrees of freedom of the test: 1 for coefficients of one common size, else their number."""
         return self.size if self.spectra is None else 1
 
     @property
     def tail(self) -> float:
-        """Share of a chi-square's tail that counts: half where no size is negative (Self & Liang 1987)."""
+        """Factor on a chi-square's tail: 0.5 for a size that cannot be negative (Self & Liang 1987)."""
         return 0.5 if self.positive or self.spectra is not None else 1.0
 
     @property
     def nonparametric(self) -> bool:
-        """Return True for a Gaussian process: it has a flexible shape, and leaves no idealised remnant."""
+        """Return True for a Gaussian process, whose shape is flexible and so leaves no remnant."""
         return self.spectra is not None and not self.effects
 
     @property
     def pieces(self) -> tuple[Candidate, ...]:
-        """Its parts, or itself."""
+        """Candidates that this one joins; the candidate itself if it joins none."""
         return self.parts or (self,)
 
     def joined_with(self, candidate: Candidate) -> Candidate:
-        """Return both as one: a cause that takes more than one regressor to describe."""
+        """Return this candidate and another one of the same cause as one candidate with all coefficients."""
         parts, one, two = (self, candidate), self.point, candidate.point
         # Names of the second piece are numbered, for people to tell them apart
         taken = self.names + tuple(one.shape)
@@ -228,12 +231,12 @@ class Candidate:
 
 
 def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
-    """Return the places of each candidate's coefficients among those of all, from `first` on."""
+    """Return the slice of each candidate's coefficients in the vector of all, which begins at `first`."""
     return places((candidate.size for candidate in candidates), first)
 
 
 def absent_before(candidate: Candidate, learned: BoolArray) -> Candidate:
-    """Return the same cause, absent from the samples (n,) that the calibration has `learned` from."""
+    """Return the candidate with zero effect in the samples (n,) of the calibration's own logs, `learned`."""
     rebuild, fresh = candidate.point.rebuild, ~learned
     return replace(
         candidate,
@@ -246,7 +249,7 @@ def absent_before(candidate: Candidate, learned: BoolArray) -> Candidate:
 
 
 def per(step: str, power: int = 1) -> str:
-    """Return the unit of the coefficient of a power of something that is counted in units of `step`."""
+    """Return the unit of a coefficient of ``(x / step)^power``: per("2 mm", 2) is ``nT per (2 mm)^2``."""
     return f"nT per {step}" if power == 1 else f"nT per ({step})^{power}"
 
 
@@ -262,9 +265,10 @@ def of_effect(
     origin: float = 0.0,
     **more: Any,
 ) -> Candidate:
-    """Make a candidate of an effect; `phi` and `origin` are those of :func:`effect_columns`.
+    """Return the candidate of an effect; `phi` and `origin` are arguments of :func:`effect_columns`.
 
-    `unit` is that of all its coefficients, or has one for each of as many equal parts of them.
+    `width` is the plausible size of the coefficients. `unit` is their common unit, or a sequence of units,
+    one for each of equal parts of the coefficients.
     """
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
     columns = effect_columns(problem, effect, phi, origin, widths)
@@ -286,6 +290,9 @@ def of_reference(
     names: tuple[str, ...],
     kind: About,
 ) -> Candidate:
-    """Make a candidate of an error of the reference, ``sum_k b_k basis_k(t)``, nT; `basis` returns (m, k)."""
+    """Return the candidate of an error of the reference, ``sum_k b_k basis_k(t)``, nT.
+
+    `basis` returns (m, k) for m rows. `width` (k,) is the plausible size of each b_k, nT.
+    """
     columns = lambda rows: problem.reference_jacobian[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
     return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=kind)

@@ -1,4 +1,4 @@
-"""The result of a diagnosis."""
+"""The result of a diagnosis: its findings, the extended calibration, and their improvement."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.estimation.residual import rms
 
 MIN_RMS_REDUCTION = 0.01
-"""Least fraction of the refitted calibration's RMS that the findings have to remove."""
+"""Least fraction of the refitted calibration's RMS that findings must remove, or they are negligible."""
 
 
 def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
-    """Return (n,) samples by which a gain is measured: new to the calibration, and not wrong."""
+    """Return the samples (n,) by which an improvement is measured.
+
+    Samples of the calibration's own logs and outliers are excluded, unless no other sample is left.
+    """
     # Where every sample was learned from, all of them count
     counts = ~problem.survey.learned
     if wrong is not None:
@@ -37,50 +40,54 @@ def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A cause that is named, with its part of the joint fit of all named causes."""
+    """A named cause, with its coefficients in the joint fit of all named causes."""
 
     hypothesis: Hypothesis
-    """The cause tested against the model without it."""
+    """The cause with its test against the model without it."""
     competing: tuple[CompetingHypothesis, ...]
-    """The causes that could take its place, the likeliest first."""
+    """Causes that the data do not exclude in its place, the likeliest first."""
     improvement: Improvement
-    """Improvement by this cause in addition to the others."""
+    """Held-out improvement by this cause in addition to the other named causes."""
     coefficients: FloatArray
-    """(k,) in units of their prior width."""
+    """(k,) coefficients, in units of their prior width."""
     covariance: FloatArray
-    """(k, k)."""
+    """(k, k) covariance of the coefficients, in the same units."""
     over_random_walk: float = np.inf
-    """Log odds over a sensor whose offsets wander (:mod:`.run`); infinite for a cause that is not slow."""
+    """Log odds over random-walk offsets (:func:`.odds_over_random_walk`); infinite if the cause is not
+    slow."""
     further: tuple[Candidate, ...] = ()
-    """Further causes of the same family that the fit contains: alternatives, not findings of their own."""
+    """Further causes of the same family in the fit: competing hypotheses, not findings of their own."""
 
     @property
     def candidate(self) -> Candidate:
-        """Its effects and columns."""
+        """The candidate of the cause, with its effects and columns."""
         return self.hypothesis.candidate
 
     @property
     def possible(self) -> list[Candidate]:
-        """The cause, and its competing hypotheses."""
+        """Candidates of the cause and of its competing hypotheses."""
         return [self.candidate, *(competitor.candidate for competitor in self.competing)]
 
     @property
     def signal_to_noise(self) -> float:
-        """With the calibration refitted."""
+        """Signal-to-noise ratio of the effect, with the calibration refitted."""
         return self.hypothesis.signal_to_noise
 
     @property
     def may_be_noise(self) -> bool:
-        """Return True if a random walk of the offsets explains the signal nearly as well."""
+        """Return True if a random walk of the offsets explains the signal within odds of 20:1."""
         return self.over_random_walk < ODDS
 
     def field(self, problem: Problem) -> FloatArray:
-        """Return the effect on the total field (n,), nT; its columns are in the sensor's nanotesla."""
+        """Return the effect of the cause on the total field (n,), nT."""
         columns = self.candidate.columns(slice(0, len(problem)))
         return np.asarray(columns @ self.coefficients / problem.reference_jacobian)
 
     def follows(self, problem: Problem, fit: Joint) -> Seen:
-        """Return the series that it follows in the residual of all other causes: none if noise hides it."""
+        """Return the series that the residual without the other causes follows, and the RMS of this cause.
+
+        The series is None if noise hides it.
+        """
         field = self.field(problem)
         found = seen(problem, field + fit.residual / problem.reference_jacobian, field)
         return found._replace(size=rms(field))
@@ -88,66 +95,66 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Everything that was found out."""
+    """Result of a diagnosis, from which the assessment and the report are made."""
 
     problem: Problem
     outcome: SearchOutcome
     findings: tuple[Finding, ...]
-    """The causes that are named."""
+    """The named causes."""
     wrong: Outliers | None
-    """Isolated wrong samples."""
+    """Isolated outliers; None if there are none."""
     unexplained: Leftover | None
     calibration: Calibration
-    """Extended."""
+    """Calibration to write: the extended one, or the given one without an extension or if it is refused."""
     fit: Joint
-    """At the extended calibration."""
+    """Joint fit at the extended calibration; without named causes, the fit without any cause."""
     before: FloatArray
     """Corrected field less reference (n,), nT, with the calibration as given."""
     after: FloatArray
-    """The same, held out, with the extended one, the named errors of the reference subtracted."""
+    """Held-out error (n,), nT, of the extended calibration, less the named errors of the reference."""
     total: Improvement
-    """Improvement by all findings together, with the named errors of the reference subtracted."""
+    """Improvement by all findings together, from `before` to `after`."""
     improvement: Improvement
-    """Improvement of the corrected field over the calibration as given, against the reference as given."""
+    """Improvement of the corrected field over the calibration as given; reference unchanged."""
     over_refit: Improvement
-    """Improvement of the corrected field over a refit of the calibration alone."""
+    """Improvement of the corrected field over a refit of the given calibration without new effects."""
     other_day: Improvement | None
-    """Improvement of the corrected field on whole days left out of the fit; None for a log of one day."""
+    """Improvement of the corrected field on held-out whole days; None for one day or no extension."""
     refused: str
-    """Code of the reason why the extension was refused; empty where it stands."""
+    """Code of the reason why the extension was refused; empty if it was not."""
     refusal_values: tuple[float, float]
-    """Allowed and found value behind a refusal, nT."""
+    """Allowed and actual value of the check that refused the extension, nT."""
     isolability: Isolability
     verdict: str
-    """Verdict of ``findings.json``: ``explained`` only if held-out parts show a gain."""
+    """Verdict of ``findings.json``, by :func:`verdict_of`."""
     negligible: bool
     """True if the findings hardly improve on a refit of the calibration's own coefficients."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
-    """The table of causes that were asked about."""
+    """The tested causes, by name."""
 
     @property
     def counts(self) -> BoolArray:
-        """(n,) samples by which an improvement is measured."""
+        """(n,) samples that count for an improvement (:func:`counted`)."""
         return counted(self.problem, self.wrong)
 
     @cached_property
     def residual(self) -> FloatArray:
-        """(n,) nT of the sensor, what the fit to the whole log leaves: noise of any kind."""
+        """(n,) residual of the fit to the whole log, slow noise included, in the sensor's nT."""
         return self.fit.residual + self.problem.slow_noise(self.fit.z)
 
     @property
     def named(self) -> list[Candidate]:
-        """The causes of the findings, with all of each family."""
+        """Candidates of all named causes, including further causes of a family."""
         return [candidate for one in self.findings for candidate in (one.candidate, *one.further)]
 
     @property
     def possible(self) -> list[Candidate]:
-        """The causes of the findings, and their competing hypotheses."""
+        """Candidates of the findings and of their competing hypotheses."""
         return [candidate for one in self.findings for candidate in one.possible]
 
 
 def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
-    """Return True if the unnamed remainder is negligible, too, and the residual (n,), nT, is noise."""
+    """Return True if the unnamed remainder `rest` is negligible and the residual (n,), nT, is noise."""
     if rest is not None and (
         rest.size is None or rest.size**2 > 2.0 * MIN_RMS_REDUCTION * rms(residual) ** 2
     ):
@@ -158,24 +165,27 @@ def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool
 def verdict_of(
     named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Improvement
 ) -> str:
-    """Return the verdict of ``findings.json``; names without a held-out gain explain only in part."""
+    """Return the verdict of ``findings.json``.
+
+    It is ``explained`` only if nothing unnamed remains and the named causes improve held-out dives.
+    """
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"
 
 
 def label(cause: str, channel: str | None) -> str:
-    """Return a cause as people read it."""
+    """Return the name of a cause for people, with its channel in brackets."""
     return cause.replace("_", " ") + (f" ({channel})" if channel else "")
 
 
 def names_of(candidates: Sequence[Candidate], joint: str = ", ") -> str:
-    """Return causes as a list in words."""
+    """Return the names of candidates' causes as a list, joined by `joint`."""
     return joint.join(label(candidate.cause, series_of(candidate)) for candidate in candidates)
 
 
 def series_of(candidate: Candidate) -> str | None:
-    """Return the telemetry that a candidate follows, as people read it; None where it follows none."""
+    """Return the name, for people, of the telemetry that a candidate follows; None if it follows none."""
     several = len({channel for effect in candidate.effects for channel in effect.channels()}) > 1
     return "several together" if candidate.channel is None and several else candidate.channel
 

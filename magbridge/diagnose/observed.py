@@ -1,18 +1,19 @@
-r"""Observed properties of a signal (the series that it follows, its memory) and of a track (its returns).
+r"""Properties of a signal (the series that it follows, its autocorrelation) and of a track (its returns).
 
 Notes
 -----
-*A signal* y is explained by a series q, late by a lag, along the axes of the body and along the field itself,
+*A signal* y is fitted by a series q, delayed by a lag, along the axes of the body and along the field,
 
 .. math:: y = c_0 + \sum_i b_i u_i + q\,\bigl(d_0 + \sum_i d_i u_i\bigr)
 
-u the direction of the field in the body. The series explains the share of y's power that the terms in q add.
-Where no series is followed, q are slow waves in time, which find the axis of a slow signal.
+with u the direction of the field in the body. The series explains the fraction of y's power that the terms in
+q add to the constants. If y follows no series, slow waves in time take the place of q, to find the axis of a
+slow signal.
 
-*A track.* A function of the place is the same on every pass. It can imitate the cell means of a trend and a
-bend in time, ``f = (x, x^2)``. With T the covariance of f and W that within the cells, the smallest
-eigenvalue of ``T^-1 W`` is the least share of the power of such a change that no function of the place
-imitates (one less the largest squared canonical correlation: Hotelling 1936, Biometrika 28:321).
+*A track.* A function of the place is the same on every pass. It can imitate the cell means of a parabola in
+time x, ``f = (x, x^2)``. With T the covariance of f and W the covariance within the cells, the smallest
+eigenvalue of ``T^-1 W`` is the smallest fraction of a parabola's power that no function of the place imitates
+(one less the largest squared canonical correlation: Hotelling 1936, Biometrika 28:321).
 """
 
 from __future__ import annotations
@@ -32,69 +33,75 @@ from magbridge.diagnose.survey import Survey
 from magbridge.estimation.residual import rms
 
 CORRELATION_LAGS_S = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
-"""Lags that are tried, s."""
+"""Lags of a signal behind a series that are tried, s."""
 MIN_EXPLAINED_FRACTION = 0.1
 """Least fraction of a signal's power that a series must explain to be reported."""
 MIN_AXIS_FRACTION = 0.8
-"""Least fraction, of the part that all axes explain, that one axis must explain alone to be reported."""
+"""Least ratio of the power that one axis explains to the power that all axes explain, for a report of the
+axis."""
 MIN_LAG_GAIN = 0.02
-"""Share of the signal's power that a lag must add over none."""
+"""Fraction of the signal's power that a series with a lag must explain in addition to one without."""
 CLEARLY = 0.1
-"""Least fraction of the unexplained part by which an axis must beat the next to be reported."""
+"""Least margin of the best axis over the second, as a fraction of the unexplained power, for a report."""
 WAVES, SLOW = 48, 0.5
-"""Half waves per log that describe a slow signal, and the fraction of its power that they must explain."""
+"""Number of half waves over the log that are fitted to a slow signal; fraction of its power to explain."""
 WHITE = 0.9
 """Ratio of the RMS of sample-to-sample changes to the RMS, from which on a residual counts as white."""
 EVERY = slice(None)
 FIELD_AND_AXES = ("field", "x", "y", "z")
 CORRELATION_ROWS = 20_000
-"""Most rows that are correlated."""
+"""Largest number of rows on which a signal is compared with the series."""
 RETURN_CELL_M = 250.0
 """Side of the cells, m: crustal sources are seldom nearer, and a map's own grid is seldom finer."""
 MIN_RETURN_TIME_S = 900.0
-"""s after which passing a place again is a return."""
+"""Time after which another pass of a place is a return, s."""
 SEPARABLE = 0.1
-"""Least fraction from which on place and time are distinguished: at S/N 10 it gives log odds of 5 (150:1)."""
+"""Least value of :attr:`Returns.separable` at which the track separates space from time: at S/N 10 the log
+odds are then 5 (150:1)."""
 
 
 class Seen(NamedTuple):
-    """What a signal follows."""
+    """The series that a signal follows, and how well."""
 
     channel: str | None
-    """Series that explains most: telemetry, ``time``, ``roll``, ``pitch``, ``heading``; None if none does."""
+    """Series that explains most: a channel, ``time``, ``roll``, ``pitch`` or ``heading``; None if none
+    does."""
     lag: float
     """Lag of the signal behind the series, s."""
     axis: str | None
-    """``x y z`` of the body, ``field`` along the field; None where several take part."""
+    """Axis of the signal: ``x``, ``y`` or ``z`` of the body, or ``field``; None if no axis is clear."""
     size: float
-    """RMS of the signal in the total field."""
+    """RMS of the signal in the total field, nT."""
     share: float
-    """Of its power, that the series explains."""
+    """Fraction of the signal's power that the series explains."""
 
 
 class Memory(NamedTuple):
-    """How far from white a residual is."""
+    """Autocorrelation of a residual: its deviation from white noise; `rms` in nT."""
 
     rms: float
     white: float
-    """RMS of the changes from one sample to the next, divided by the root of two."""
+    """RMS of the changes from one sample to the next, divided by the root of two, nT."""
     correlation_time: float
     """Time after which the autocorrelation has fallen to 1/e, s."""
     slow: float
-    """Fraction of the power that is left in means."""
+    """Fraction of the residual's power that remains in means over `samples` samples."""
     samples: int
-    """Samples of each mean."""
+    """Number of samples in each mean."""
     means: int
     """Number of means."""
 
     @property
     def lasts(self) -> bool:
-        """Return True if the residual is more than changes from one sample to the next."""
+        """Return True if the residual is correlated from one sample to the next."""
         return self.white < WHITE * self.rms
 
 
 def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = None) -> Seen:
-    """Return the series that a signal (n,), nT of the total field, and its part `component` (n,) follow."""
+    """Return the series that a signal (n,), nT of the total field, follows.
+
+    If a `component` (n,) of the signal is given, it must follow the series as well.
+    """
     part = slice(None, None, -(-len(signal) // CORRELATION_ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
     axes = np.column_stack([np.ones(len(u)), u])
@@ -140,7 +147,7 @@ def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = No
 
 
 def _by_chance(share: float, terms: int, residual: FloatArray) -> float:
-    """Return the p-value (Fisher's F) of a share that a series of `terms` functions explains.
+    """Return the p-value (F test) of the fraction `share` of power that a fit of `terms` functions explains.
 
     The correlation time of the `residual` (n, 4) gives the number of independent samples (Bartlett 1946).
     """
@@ -150,7 +157,7 @@ def _by_chance(share: float, terms: int, residual: FloatArray) -> float:
 
 
 def _remembered(e: FloatArray) -> int:
-    """Return the samples after which the autocorrelation of e (n,) has fallen to 1/e."""
+    """Return the number of samples after which the autocorrelation of e (n,) has fallen to 1/e."""
     # Wiener-Khinchin, padded against wrapping
     spectrum = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
     correlation = np.fft.irfft(spectrum)[: len(e)]
@@ -159,7 +166,7 @@ def _remembered(e: FloatArray) -> int:
 
 
 def _series(problem: Problem, part: slice) -> Iterator[tuple[str, float, FloatArray]]:
-    """Yield each series' name, lag, and functions (m, k), about their means."""
+    """Yield name, lag, s, and functions (m, k) of each series: zero mean, unit variance, rows `part`."""
     survey = problem.survey
     longest, shortest = 0.5 * float(np.ptp(survey.time)), 0.5 * survey.interval
     lags = [lag for lag in CORRELATION_LAGS_S if not lag or shortest <= lag <= longest]
@@ -181,7 +188,7 @@ def _scaled(*values: FloatArray) -> FloatArray:
 
 
 def memory(problem: Problem, residual: FloatArray) -> Memory:
-    """Return the deviation of a residual (n,), nT, from white noise."""
+    """Return the autocorrelation measures of a residual (n,), nT."""
     survey = problem.survey
     e = residual - residual.mean()
     size = max(rms(e), 1e-300)
@@ -195,23 +202,23 @@ def memory(problem: Problem, residual: FloatArray) -> Memory:
 
 
 class Returns(NamedTuple):
-    """The returns of a track."""
+    """How often a track returns to its places, and whether that separates space from time."""
 
     share: float
-    """Fraction of the samples that lie where the track passes again."""
+    """Fraction of the samples in cells that the track passes more than once."""
     longest: float
-    """Longest time between two passes of one place, s."""
+    """Longest time between the first and the last sample in a cell, s."""
     separable: float
-    """Least share of the power of a slow change with time that no function of the place imitates."""
+    """Smallest fraction of the power of a parabola in time that no function of the place imitates."""
 
     @property
     def distinguishable(self) -> bool:
-        """Return True if the log distinguishes place from time."""
+        """Return True if the log separates spatial from slow temporal changes of the field."""
         return self.separable >= SEPARABLE
 
 
 def returns(survey: Survey) -> Returns | None:
-    """Return where and when the track of a survey returns; None for a log without positions."""
+    """Return how the track of a survey returns to its places; None for a log without positions."""
     if survey.place is None:
         return None
     corner = np.floor(survey.place[:, :2] / RETURN_CELL_M).astype(int)

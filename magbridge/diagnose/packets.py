@@ -1,19 +1,19 @@
-r"""Transient signals: oscillations that ring, surge or burst, and the passage of a distant source.
+r"""Transient signals: wave packets (oscillations of limited duration), and the passage of a distant dipole.
 
 Notes
 -----
-A packet is a wave along the field under a Gaussian (Gabor 1946, J. IEE 93:429):
+A packet is an oscillation of the total field under a Gaussian envelope (Gabor 1946, J. IEE 93:429):
 
 .. math:: e^{-(t - t_0)^2 / 2 L^2} \left(a \cos 2 \pi f (t - t_0) + b \sin 2 \pi f (t - t_0)\right)
 
-Its moment t_0 is uniformly distributed, as are the logarithm of its length L and its cycles f L. With
-g the score of each single sample and h its information at that frequency, the likelihood ratio of a and b is
+The prior is uniform in the moment t_0, in the logarithm of the length L and in the number of cycles f L. With
+g the score of a single sample and h its information at the frequency, the likelihood ratio of a and b is
 ``R = |B|^2 / S``,
 
 .. math:: B = \sum_t g_t e^{-(t - t_0)^2 / 2 L^2 + 2 \pi i f (t - t_0)}, \qquad
           S = \tfrac12 \sum_t h_t e^{-(t - t_0)^2 / L^2}
 
-which is a short-time Fourier transform for each length. A place is a length, a frequency and a moment. A
+B is a short-time Fourier transform for each length. A *place* is a triple of length, frequency and moment. A
 packet is accepted if its Bayes factor, averaged over all places, is above one.
 """
 
@@ -34,40 +34,40 @@ from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem
 
 CYCLES = 0.75, 7.0
-"""Least and most cycles f L."""
+"""Smallest and largest number of cycles f L."""
 SHORTEST, LONGEST = 4, 1.0 / 6.0
-"""Shortest length and period, in intervals; longest length, as a share of the log."""
+"""Shortest length and shortest period, in sampling intervals; longest length, as a fraction of the log."""
 WINDOW, FINER = 6, 8
-"""Lengths in a window, and how many times finer than 1 / L frequencies are."""
+"""Width of the Fourier window in units of L; ratio of 1 / L to the step of the frequencies."""
 LEAST_RATIO = 6.0
 """Likelihood ratio below which a place is ignored."""
 MAX_PACKETS = 12
-"""Most packets in a log."""
+"""Largest number of packets in a log."""
 PACKET_SEPARATION = 2.5
-"""Lengths in time, and bandwidths in frequency, within which two places hold the same packet."""
+"""Distance, in lengths and in bandwidths, below which two places belong to one packet."""
 PACKET_CUTOFF_LENGTHS = 5.0
-"""Lengths from its moment beyond which a packet is cut off."""
+"""Distance from its moment, in lengths L, beyond which a packet is set to zero."""
 MAX_SAMPLE_INTERVALS = 8
-"""Intervals per sample; a log with fewer samples than one in so many is not searched for packets."""
+"""Largest mean number of sampling intervals per sample in a log that is searched for packets."""
 DURATIONS, BRIEFEST, SLOWEST = 12, 8.0, 0.125
-"""Durations of a passage: how many are tried, the shortest in samples, the longest as a share of the log."""
+"""Durations of a passage: their number, the shortest in samples, the longest as a fraction of the log."""
 QUARTERS = np.arange(-12, 13)
-"""Quarters of its duration over which it is evaluated."""
+"""Offsets from the nearest point, in quarters of the duration, at which a passage is evaluated."""
 
 
 class Packets(NamedTuple):
     """The accepted packets."""
 
     columns: Columns
-    """Two for each packet."""
+    """Two columns for each packet, a cosine and a sine."""
     look_elsewhere: float
-    """Number of sets of as many packets that they were chosen from."""
+    """Number of equally likely sets of places from which the packets were chosen."""
     period: float
-    """Period of the strongest, s."""
+    """Period of the strongest packet, s."""
 
 
 def packets(problem: Problem, fit: Joint) -> Packets | None:
-    """Find the packets in what a fit has left, the loudest first."""
+    """Return the packets in the residual of a fit, the strongest first; None if no packet is accepted."""
     survey = problem.survey
     # Lengths by powers of two; each has frequencies and moments of its own
     n = int(survey.slots[-1]) + 1
@@ -100,7 +100,7 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
 def _columns(
     problem: Problem, length: FloatArray, frequency: FloatArray, moment: FloatArray, rows: slice
 ) -> FloatArray:
-    """Return (m, 2 k) cosines and sines of k packets."""
+    """Return (m, 2 k) cosine and sine columns of k packets; lengths and moments are in intervals."""
     since = (problem.survey.slots[rows, None] - moment) / length
     turns = 2.0 * np.pi * length * frequency * since
     # divided by the root of the length, so that in white noise all packets have about one norm
@@ -110,7 +110,10 @@ def _columns(
 
 
 def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
-    """Return (5, m) length, frequency, moment (intervals), ratio and log prior of places that are tried."""
+    """Return the places of one `length`, in intervals, with a ratio above :data:`LEAST_RATIO`, (5, m).
+
+    The rows are length, frequency (per interval), moment (intervals), likelihood ratio and log prior.
+    """
     noise, slots, slope = fit.noise, problem.survey.slots, problem.reference_jacobian
     wide, every = WINDOW * length, length // 2
     window = np.exp(-0.5 * ((np.arange(wide) - wide // 2) / length) ** 2)
@@ -137,7 +140,7 @@ def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
 
 
 def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
-    """Return the power gain of whitening at frequencies (k,), away from gaps and after them, (2, k)."""
+    """Return the power gain of whitening (2, k), away from gaps and after, at frequencies (k,)."""
     # |1 - sum a_k e^(-2 pi i f k)|^2 away from gaps, and its mean over the patterns after them
     past, gaps = noise.past, noise.near_gaps
     lags = np.arange(1, past.order + 1)
@@ -148,11 +151,11 @@ def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
 
 
 def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
-    r"""Return three columns of the likeliest passage of a distant source, and the number of passages tried.
+    r"""Return three columns of the likeliest passage of a distant dipole, and the number of passages tried.
 
-    Along a straight course a dipole adds to the field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`, s
-    the time from its nearest point in units of the duration (Ginzburg, Frumkis & Kaplan 2002, Sens. Actuators
-    A 102:67).
+    A dipole near a straight course adds to the total field :math:`(b_0 + b_1 s + b_2 s^2) / (1 + s^2)^{5/2}`,
+    with s the time since its nearest point in units of the duration (Ginzburg, Frumkis & Kaplan 2002, Sens.
+    Actuators A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
     # Score and information of each quarter of a duration, then matched filters at all moments
@@ -177,17 +180,17 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
 
 
 def _passing(s: FloatArray) -> FloatArray:
-    """Return (3, n) functions of Anderson."""
+    """Return Anderson's functions ``(1, s, s^2) / (1 + s^2)^(5/2)`` of s (n,) as (3, n)."""
     return np.stack([np.ones_like(s), s, s * s]) / (1.0 + s * s) ** 2.5
 
 
 def _around(values: NDArray[Any]) -> FloatArray:
-    """Return, for every other quarter, the values in the window of :data:`QUARTERS` about it."""
+    """Return the windows (m, 25) of :data:`QUARTERS` about every other one of `values`, one per quarter."""
     return sliding_window_view(np.pad(values, len(QUARTERS) // 2), len(QUARTERS))[::2]
 
 
 def _ratio(S: FloatArray, b: FloatArray) -> FloatArray:
-    """Return (m,) likelihood ratios of scores b (m, k), information S (m, k, k)."""
+    """Return the likelihood ratios ``b^T S^-1 b`` (m,) of scores b (m, k) and information S (m, k, k)."""
     size = np.trace(S, axis1=1, axis2=2)[:, None, None] + 1e-300
     S = S + 1e-6 * size * np.eye(b.shape[1])
     return np.asarray(np.einsum("mi,mi->m", b, np.linalg.solve(S, b[:, :, None])[:, :, 0]))

@@ -1,6 +1,7 @@
-"""The causes: one class each, with its physics, equation and source in the docstring.
+"""The causes of error that a diagnosis tests: one class for each, with its equation in the docstring.
 
-Start with :mod:`.base`, the interface. A package adds a cause by an entry point of :data:`GROUP`.
+Start with :mod:`.base`, the interface. Another package adds a cause by an entry point of the group
+:data:`GROUP`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from magbridge.plugins import load, plugins
 __all__ = ["CAUSES", "Cause", "known"]
 
 GROUP = "magbridge.causes"
-"""Entry points that add a cause: each is a :class:`Cause`, and its name is that of ``findings.json``."""
+"""Group of entry points: each loads a :class:`Cause`, and its name is the name of the cause in
+``findings.json``."""
 
 CAUSES: dict[str, Cause] = {
     cause.name: cause
@@ -42,9 +44,9 @@ CAUSES: dict[str, Cause] = {
 
 
 def known() -> dict[str, Cause]:
-    """Return the table of causes, with those that other packages add.
+    """Return the causes by name: :data:`CAUSES`, and the causes that other packages add.
 
-    PluginError: one cannot be imported, is not a cause, or has the name of an existing one.
+    PluginError: an added cause cannot be imported, is not a :class:`Cause`, or has the name of one here.
     """
     added = {}
     for name, point in plugins(GROUP).items():

@@ -16,43 +16,43 @@ from magbridge.estimation.residual import residuals_of
 __all__ = ["Cause"]
 
 STEP_WIDTHS = 1e-3
-"""Change of a coefficient for a numerical derivative, in plausible sizes."""
+"""Change of a coefficient for a numerical derivative, as a fraction of its plausible size."""
 
 
 class Cause(ABC):
-    """A fault that a diagnosis looks for; the first line of its docstring is its physics."""
+    """A fault that a diagnosis tests; the report prints the first docstring line of each subclass."""
 
     name: ClassVar[str]
     """Name in ``findings.json``."""
     meaning: ClassVar[str]
-    """Meaning of the cause, as a clause."""
+    """Meaning of the cause for a reader of the report, as a clause without its full stop."""
     needs: ClassVar[str]
-    """What a log must contain for it to be tested."""
+    """Content that a log needs for a test of the cause, in words."""
     disambiguation: ClassVar[str]
     """Manoeuvre that distinguishes the cause from its competing hypotheses."""
     family: ClassVar[str] = ""
-    """Causes of one family describe each other's remnants: they are one finding."""
+    """Family of the cause, or empty. Causes of one family imitate each other, so they make one finding."""
     delays_telemetry: ClassVar[bool] = False
-    """Whether the effect is a delay of the telemetry, which ``[telemetry.NAME] delay`` corrects."""
+    """True if the effect is a delay of the telemetry, which ``[telemetry.NAME] delay`` corrects."""
 
     @abstractmethod
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the hypotheses over a grid of nonlinear parameters; none if the log cannot show the cause.
+        """Return a candidate for each point of a grid of nonlinear parameters; none if no test is possible.
 
-        Their widths are plausible sizes (1-sigma of a Gaussian prior), which set Occam's factor.
+        A candidate's widths are plausible sizes of its coefficients (1-sigma of a Gaussian prior).
         """
 
     @property
     def physics(self) -> str:
-        """First line of the docstring: the physics with its equation."""
+        """First line of the class docstring: the physics of the cause, with its equation."""
         return (getdoc(type(self)) or "").splitlines()[0]
 
     def jacobian_error(self, problem: Problem, candidate: Candidate) -> float:
-        """Return the largest error of a candidate's columns, as a fraction of their largest number.
+        """Return the largest error of a candidate's columns, as a fraction of their largest absolute value.
 
-        The columns are compared with numerical derivatives of the extended calibration's residual, at the
-        readings of :attr:`.Problem.reading`. 0 is returned for an error of the reference, and for an effect
-        whose regressors the search computes differently from the live correction.
+        The columns are compared with numerical derivatives of the residual of the calibration with the
+        effect, at :attr:`.Problem.reading`. Return 0 for an error of the reference, and for an effect whose
+        regressors the search computes differently from the live correction.
         """
         if not candidate.effects or candidate.regressors is not None or candidate.since:
             return 0.0

@@ -1,4 +1,4 @@
-"""Causes in the instrument: offsets that step, drift or oscillate, and responses that bend or clip."""
+"""Causes in the sensor: an offset that steps, drifts or oscillates; a nonlinear or clipped response."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import Problem
 
 ONSETS = 40
-"""Moments tried for a step, evenly over the samples. Four times as many gain only 0.6 in log odds."""
+"""Number of onsets of a step that are tried, evenly over the samples. Four times as many gain only 0.6 in log
+odds."""
 TONES = 5
-"""Peaks of the spectrum that are tried."""
+"""Number of peaks of the spectrum that are tried as tones."""
 MAX_BEND_NT = 50.0
-"""Most that a response may plausibly bend (RMS of its coefficients), nT: that of magnetoresistive sensors."""
+"""Largest plausible nonlinearity (RMS of its coefficients), nT: that of magnetoresistive sensors."""
 
 
 class OffsetStep(Cause):
     """The offset jumps, by a power cycle, a shock or a magnet: ``T += b`` from its onset on.
 
-    As likely at a power cycle as at all other times together. Between the calibration's own logs and these
-    there has been one.
+    All power cycles together are as likely beforehand as all other times together. One power cycle is
+    assumed between the calibration's own logs and the diagnosed ones.
     """
 
     name = "offset_step"
@@ -35,7 +36,7 @@ class OffsetStep(Cause):
     disambiguation = "log the power-cycle counter; fly one attitude before and after"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return a step at each moment of a grid, and at each power cycle."""
+        """Return a step at each of :data:`ONSETS` quantiles of the time, and at each power cycle."""
         survey = problem.survey
         t = survey.time
         fresh = t[~survey.learned]
@@ -65,7 +66,7 @@ class OffsetDrift(Cause):
     disambiguation = "return to one place and attitude hours later"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return a drift from the start, one about the middle, and one with a bend."""
+        """Return a linear drift from the start, a linear one about the middle, and a quadratic one."""
         t = problem.survey.time
         span = float(t[-1] - t[0])
         shapes = (1, t[0], span), (1, 0.5 * (t[0] + t[-1]), 0.5 * span), (2, t[0], span)
@@ -81,10 +82,11 @@ class OffsetDrift(Cause):
 
 
 class InterferenceTone(Cause):
-    """Machinery at a fixed frequency, seen through the sampling: ``T += b cos + c sin (2 pi t / period)``.
+    """Machinery at a fixed frequency, perhaps aliased: ``T += b cos + c sin (2 pi t / period)``.
 
-    Frequencies are the highest peaks of the differenced residual. The highest of m frequencies exceeds a high
-    u by chance as often as that of ``m sqrt(pi u / 6)`` independent ones (Davies 1987, Biometrika 74:33).
+    The frequencies are the highest peaks in the spectrum of the differenced residual. The largest of m
+    frequencies exceeds a high u by chance as often as the largest of ``m sqrt(pi u / 6)`` independent ones
+    (Davies 1987, Biometrika 74:33).
     """
 
     name = "interference_tone"
@@ -108,7 +110,7 @@ class InterferenceTone(Cause):
 
 
 def _loudest_periods(problem: Problem) -> list[float]:
-    """Return the periods, s, of the highest peaks in a residual's spectrum; none without even sampling."""
+    """Return the periods, s, of the highest peaks in the residual's spectrum; none without even sampling."""
     survey = problem.survey
     t = survey.time
     interval = float(np.median(np.diff(t)))
@@ -138,7 +140,7 @@ def _loudest_periods(problem: Problem) -> list[float]:
 
 
 def _top(power: FloatArray, peak: int) -> float:
-    """Return where, in bins, a parabola through a peak and its neighbours is highest."""
+    """Return the position, in bins, of the maximum of a parabola through a peak and its two neighbours."""
     low, top, high = power[[peak - 1, peak, peak + 1 if peak + 1 < len(power) else peak - 1]]
     return peak + (0.5 * (low - high) / (low - 2.0 * top + high) if top > max(low, high) else 0.0)
 
@@ -148,7 +150,7 @@ class Nonlinearity(Cause):
 
     With a feedback of finite gain the response is the inverse of the core's magnetisation curve, which also
     changes the sensitivity (p = 1). All nine coefficients have one common size, because the three axes have
-    the same design: nine free numbers could take a wrong reference and a mass' error for one bend.
+    the same design. Nine free coefficients could fit an error of the reference or of a mass instead.
     """
 
     name = "nonlinearity"
@@ -157,7 +159,7 @@ class Nonlinearity(Cause):
     disambiguation = "turn every axis of the sensor through the whole field"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the two single powers, and all three together."""
+        """Return a candidate for p = 2, one for p = 3, and one for p = 1 to 3 together."""
         # a common size is at most ten widths (:data:`~magbridge.diagnose.joint.PRIOR_SIZES`)
         common = [self._power(problem, power, 0.1 * MAX_BEND_NT) for power in (1, 2, 3)]
         every = replace(reduce(Candidate.joined_with, common), parts=(), spectra=np.ones((1, 9)))
@@ -179,7 +181,7 @@ class Saturation(Cause):
     disambiguation = "turn that axis away from the field: saturation occurs only near full scale"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return knees at the ends of each axis' range that the log comes near."""
+        """Return four knees for each end of an axis' range where its reading reaches 20 % of the field."""
         made = []
         for axis, sign in product(range(3), (1.0, -1.0)):
             reading = sign * problem.reading[:, axis]
@@ -189,7 +191,7 @@ class Saturation(Cause):
         return made
 
     def _clipped(self, problem: Problem, axis: int, knee: float) -> Candidate:
-        """Return the candidate for one axis, at one end of its range."""
+        """Return the candidate of one axis, 0 to 2, that saturates beyond `knee`, nT."""
         unit = problem.calibration.reference.field
         effect = ResponseEffect(cause=self.name, unit=unit, axis=axis, knee=knee)
         point = GridPoint({"knee": (knee, "nT")}, lambda other: self._clipped(problem, axis, other))

@@ -1,4 +1,4 @@
-"""Masses carry iron: those that the model lacks, has too few terms for, or that remember where they were."""
+"""Causes in moving masses: a mass that the model lacks, a mass with too few terms, and hysteresis."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import FALL, Problem
 
 SOURCE_DISTANCES = (0.25, 0.5)
-"""Distances of sources from a mass' path that are tried, in half travels; nearer iron would be struck."""
+"""Distances of sources from a mass' path that are tried, in half travels; the mass would hit nearer iron."""
 SOURCE_SPACING = 1.25
-"""Spacing of the sources, in units of their distance from the path: closer ones make the same field."""
+"""Spacing of the sources, in units of their distance from the path: closer ones add nothing to the field."""
 HYSTERESIS_BRANCHES = (
     *product((0.05, 0.15, 0.3), (0.0,), (4.0,)),
     *product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,)),
 )
-"""Branches of hysteresis that are tried, first of drives, which are practically straight, then of steel:
-their width in units of the whole travel, centre (from the middle) and scale in units of half of it."""
+"""Loops of hysteresis that are tried, of drives (practically linear), then of steel: width as a fraction of
+the whole travel; centre (from the middle) and scale as fractions of half the travel."""
 
 
 def _powers(problem: Problem, effect: PowersEffect, channel: str | None) -> Candidate:
-    """Return the powers of a mass' position."""
+    """Return the candidate of an offset that is a polynomial of a mass' position."""
     step = f"{effect.scale:.3g} {problem.survey.channels[effect.channel].unit}".rstrip()
     width = np.repeat(100.0 * FALL ** np.arange(effect.order), 3)
     units = [per(step, power) for power in range(1, effect.order + 1)]
@@ -33,9 +33,9 @@ def _powers(problem: Problem, effect: PowersEffect, channel: str | None) -> Cand
 
 
 class UnmodelledActuator(Cause):
-    """Something else that moves carries iron: ``T += G(r(p)) m``, to third order in p.
+    """Another moving part carries iron: ``T += G(r(p)) m``, to third order in its position p.
 
-    See :mod:`~magbridge.calibration.dipole`.
+    See :mod:`~magbridge.calibration.dipole` for G, the dipole field.
     """
 
     name = "unmodelled_actuator"
@@ -44,7 +44,7 @@ class UnmodelledActuator(Cause):
     disambiguation = "move it at one attitude"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return powers up to each order of every channel that may be a position."""
+        """Return a polynomial of order 1, 2 and 3 for each channel that may be a position."""
         made = []
         for name in problem.channels_of("position"):
             low, high = problem.survey.channels[name].extent
@@ -58,7 +58,7 @@ class UnmodelledActuator(Cause):
 
 
 class ActuatorOrder(Cause):
-    """A mass needs what its polynomial lacks: ``T += b prod P_e_k(x_k)``, P Legendre's, or sources."""
+    """A mass' polynomial lacks terms: ``T += b prod P_e_k(x_k)`` (Legendre), or sources near its path."""
 
     name = "actuator_order"
     meaning = "a mass that the calibration knows acts in a finer way than it describes"
@@ -67,10 +67,10 @@ class ActuatorOrder(Cause):
     family = "mass"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return each missing term, all orders of each mass together, and a row of sources along its path.
+        """Return each missing term, all orders of each mass together, and sources along each mass' path.
 
-        Missing terms up to the next order (paper, eq. 8) are Legendre polynomials, since the calibration has
-        absorbed the lower orders. Sources describe a mass that passes close to iron.
+        Missing terms up to the next order (paper, eq. 8) are Legendre polynomials, because the calibration
+        has absorbed the lower orders. Sources describe a mass that passes close to iron.
         """
         calibration = problem.calibration
         if not calibration.parameters:
@@ -99,7 +99,7 @@ class ActuatorOrder(Cause):
 
 
 def _sources(problem: Problem, cause: str, name: str, distance: float) -> Candidate:
-    """Return sources all along one mass' path, and a little beyond its ends, of one common size."""
+    """Return one candidate of sources along a mass' path and a little beyond, all of one common size."""
     low, high = problem.survey.channels[name].extent
     scale = 0.5 * distance * (high - low)
     # Sources at equal distances, from one end of the path to a little beyond the other
@@ -116,7 +116,7 @@ def _sources(problem: Problem, cause: str, name: str, distance: float) -> Candid
 class Hysteresis(Cause):
     """Backlash of a drive, or moving steel remagnetised: ``T += b (S(y) - S(p)) / width``, y the play of p.
 
-    S is straight for the backlash of a drive; for steel it is steep where the steel is: see
+    S is linear for the backlash of a drive. For steel S is steep only near the steel: see
     :class:`~magbridge.calibration.effects.PlayEffect`.
     """
 
@@ -129,7 +129,7 @@ class Hysteresis(Cause):
     disambiguation = "approach one position from both sides"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return drives and steel for each mass of the model."""
+        """Return each of :data:`HYSTERESIS_BRANCHES` for each mass of the model that moves."""
         made = []
         for parameter in problem.calibration.parameters:
             low, high = problem.survey.channels[parameter.name].extent

@@ -1,4 +1,4 @@
-"""The reference is wrong: an anomaly map from place to place; or with time, or by a constant."""
+"""Causes in the reference field: an error of the anomaly map, a variation with time, and a constant."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from magbridge.diagnose.columns import Candidate, of_reference
 from magbridge.diagnose.problem import Problem
 
 MAX_MAP_ERROR_CELLS = 300
-"""Most cells at which a map's error is described."""
+"""Largest number of cells of the track on which the error of a map is modelled."""
 FINEST = 125.0
 """Side of the smallest cell, m."""
 SCALES = np.array([1.0, 2.0, 4.0, 8.0, 32.0])
-"""Depths of sources below the deepest place of the track, and half the correlation lengths, in cells."""
+"""Depths of sources below the deepest point of the track, and half of correlation lengths, in cell sides."""
 ALTITUDE = 100.0
-"""Altitude of a map, m above the sea: aircraft survey at 60 to 150 m."""
+"""Altitude at which a map holds, m above the sea: aircraft survey at 60 to 150 m."""
 FAINT = 1e-6
-"""Share of a map's mean square error below which one of the functions that describe it is left out."""
+"""Fraction of a map's mean square error below which a Karhunen-Loeve function is left out."""
 ERROR = 20.0
 """Plausible error of a map (1-sigma), nT."""
 
 
 class MapError(Cause):
-    """The anomaly map is wrong: it holds at another height than the vehicle's, or is drawn wrong.
+    """The anomaly map is wrong: it holds at another height than the vehicle's, or contains errors.
 
-    *Another height*: the map gives the field T at an altitude a, the vehicle meets it at a depth z, and the
-    error is ``T(x, z) - T(x, -a)`` (:func:`_lacking`). *Drawn wrong*: a smooth function of the horizontal
-    position (Matern 3/2).
+    *Another height*: the map gives the field T at an altitude a, and the vehicle measures it at a depth z.
+    The error is ``T(x, z) - T(x, -a)`` (:func:`_lacking`). *Errors of the map* are a smooth function of the
+    horizontal position (Matern 3/2).
     """
 
     name = "map_error"
@@ -46,7 +46,10 @@ class MapError(Cause):
     family = "reference"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the map at another height, and the map drawn wrong, each as a Gaussian process."""
+        """Return two Gaussian processes: a map for another height, and a map with errors.
+
+        Return none for a log without positions, or with a track of less than 200 m.
+        """
         place = problem.survey.place
         if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
             return []
@@ -72,10 +75,11 @@ class MapError(Cause):
 def _expanded(
     covariances: Sequence[Callable[[FloatArray, FloatArray], FloatArray]], Z: FloatArray, x: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return Karhunen-Loeve functions (m, k) at places x (m, 3), variances (k,), relative ones (l, k).
+    """Return Karhunen-Loeve functions (m, k) at places x (m, 3), their variances (k,) and spectra (l, k).
 
-    With K the mean of all covariances and ``K(Z, Z) = V lambda V^T`` at the visited cells Z (c, 3), these are
-    ``K(x, Z) V / lambda``. The l-th covariance gives them the prior variances ``diag(V^T K_l V)``.
+    K is the mean of the l covariances, and ``K(Z, Z) = V lambda V^T`` at the visited cells Z (c, 3). The
+    functions are ``K(x, Z) V / lambda``, of variance lambda. Their variances under the l-th covariance,
+    ``diag(V^T K_l V)``, divided by lambda, are the spectra.
     """
     # Mean of all covariances, each scaled to unit mean variance, in its eigenfunctions
     each = np.array([K(Z, Z) for K in covariances])
@@ -89,7 +93,10 @@ def _expanded(
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:
-    """Return mean places (m, 3) in at most :data:`MAX_MAP_ERROR_CELLS` cells of the track and their side."""
+    """Return the mean position (c, 3), m, in each cell of the track, and the side of the cells, m.
+
+    The side is the smallest, from :data:`FINEST` on, that gives at most :data:`MAX_MAP_ERROR_CELLS` cells.
+    """
     # Coarser cells until there are few enough
     side = FINEST
     while (found := _each(np.floor(place / side)))[1].max() >= MAX_MAP_ERROR_CELLS:
@@ -99,7 +106,7 @@ def _cells(place: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Return the distinct rows (c, d) of whole numbers (n, d), and the place of each row among them (n,)."""
+    """Return the distinct rows (c, d) of whole numbers (n, d), and for each row (n,) its index among them."""
     low = corners.min(axis=0)
     box = np.ptp(corners, axis=0).astype(int) + 1
     keys, of = np.unique(np.ravel_multi_index((corners - low).astype(int).T, box), return_inverse=True)
@@ -107,7 +114,10 @@ def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
 
 
 def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
-    """Return (n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
+    """Return (n, c) weights that interpolate linearly between the corners of visited cells, and the corners.
+
+    `place` (n, d) and the corners (c, d) are in m, as is the `side` of a cell.
+    """
     low = np.floor(place / side)
     high = place / side - low
     # Trilinear weights of the corners of each sample's cell
@@ -119,15 +129,15 @@ def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArr
 
 
 def _interpolated(weights: csr_array, values: FloatArray, rows: slice) -> FloatArray:
-    """Return rows of columns that are interpolated from their values at a few nodes."""
+    """Return rows of the product of `weights` (n, c) and `values` (c, k): columns interpolated from nodes."""
     return np.asarray(weights[rows] @ values)
 
 
 def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
-    """Return the covariance (n, m), at places (n, 3), (m, 3), of a map's error by sources at a depth d.
+    """Return the covariance (n, m) of a map's height error between places a (n, 3) and b (m, 3), m.
 
-    Between places at a distance r the field has ``C(z, z') = (s^2 + r^2)^(-1/2)``, ``s = 2 d - z - z'``
-    (Moritz 1980, the reciprocal distance).
+    The sources are at a depth d. At a horizontal distance r and depths z and z' the field has the covariance
+    ``C(z, z') = (s^2 + r^2)^(-1/2)``, ``s = 2 d - z - z'`` (Moritz 1980, the reciprocal distance).
     """
     r2 = cdist(a[:, :2], b[:, :2], "sqeuclidean")
 
@@ -140,7 +150,7 @@ def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
 
 
 def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
-    """Return (n, m) correlation between positions, whatever their depths, Matern's of order 3/2."""
+    """Return the Matern 3/2 correlation (n, m) of the horizontal positions of places (n, 3) and (m, 3)."""
     r = np.sqrt(3.0) / length * cdist(a[:, :2], b[:, :2])
     found: FloatArray = (1.0 + r) * np.exp(-r)
     return found
@@ -156,7 +166,7 @@ class DiurnalVariation(Cause):
     family = "reference"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return all harmonics of a day of which the log has a quarter, and those without the slowest."""
+        """Return the harmonics of a day of which the log covers a quarter period, also less the slowest."""
         t = problem.survey.time
         span = float(t[-1] - t[0])
         # Harmonics of which the log has at least a quarter of a period
@@ -177,7 +187,8 @@ class DiurnalVariation(Cause):
 class ReferenceBias(Cause):
     """The reference is off by a constant: a main-field model lacks the crustal field.
 
-    At 68 % of sites each component is within 73 to 114 nT (Beggan 2022, Earth Planets Space 74:17).
+    Main-field models are within 73 to 114 nT in each component at 68 % of sites (Beggan 2022, Earth Planets
+    Space 74:17).
     """
 
     name = "reference_bias"
@@ -187,7 +198,7 @@ class ReferenceBias(Cause):
     family = "reference"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the constant, absent from the calibration's own logs."""
+        """Return a constant error, which is zero in the calibration's own logs."""
         ones = (~problem.survey.learned[:, None]).astype(np.float64)
         width = np.array([100.0])
         return [of_reference(problem, self.name, ones.__getitem__, width, ("bias",), "constant")]

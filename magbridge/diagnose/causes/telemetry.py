@@ -1,4 +1,4 @@
-"""Causes that follow a telemetry channel: temperatures, currents, pressures."""
+"""Causes that are functions of a telemetry channel: temperature, current, pressure."""
 
 from __future__ import annotations
 
@@ -16,16 +16,21 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import Problem, cached_per_problem
 
 TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
-"""Spaced so closely that any lag between two of them is matched to within a fifth (RMS), s."""
+"""Lags of a temperature effect that are tried, s. The nearest one imitates any lag between to within a fifth
+(RMS)."""
 STAGES = 2
-"""Equal lags in series, hull and core: one lag misses 10 to 30 % of a slab's temperature, two 4 to 9 %."""
+"""Number of equal lags in series, for hull and core: one lag is wrong by 10 to 30 % of a slab's temperature,
+two lags by 4 to 9 %."""
 MAX_JOINT_CURRENTS = 12
-"""Most currents that are also tried together."""
+"""Largest number of currents for which a candidate of all currents together is tried."""
 
 
 @cached_per_problem
 def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatArray]]:
-    """Return the lagged temperatures, cached: origins and causes share them, each of 3 MB for a month."""
+    """Return a function of channel and lag, s, that returns a cached lagged temperature by rows, (1, m).
+
+    Origins and causes share a temperature, of 3 MB for a month.
+    """
     survey = problem.survey  # a cache that referred to the problem would keep it alive
 
     @lru_cache(len(TELEMETRY_LAGS_S) * len(problem.channels_of("temperature")))
@@ -37,14 +42,14 @@ def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatA
 
 
 class _Thermal(Cause):
-    """An effect in proportion to a temperature that follows the logged one, late."""
+    """An effect proportional to the sensor's temperature, which follows the logged one with a lag."""
 
     needs = "a temperature that varies"
     family = "temperature"
     on: ClassVar[Literal["offset", "scale"]]
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return each temperature with each lag, from each value that it may have had when calibrated."""
+        """Return a candidate for each temperature channel, each lag, and each temperature of zero effect."""
         longest, made = 2.0 * float(np.ptp(problem.survey.time)), []
         for name in problem.channels_of("temperature"):
             values = problem.survey.channels[name].values
@@ -60,7 +65,7 @@ class _Thermal(Cause):
         return made
 
     def _lagged(self, problem: Problem, name: str, origin: float, lag: float) -> Candidate:
-        """Return the candidate of one temperature with one lag."""
+        """Return the candidate of temperature channel `name`, zero at `origin`, degC, with total `lag`, s."""
         lag, field = max(lag, 0.0), problem.calibration.reference.field
         effect = ChannelEffect(
             cause=self.name, channel=name, origin=origin, lag=lag, stages=STAGES, on=self.on
@@ -79,10 +84,10 @@ class _Thermal(Cause):
 class TemperatureOffset(_Thermal):
     """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - origin)``.
 
-    The core's temperature theta_2 follows through the heat capacity of the hull:
-    ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typically
-    0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated
-    from depth by the thermal hysteresis of dive and climb.
+    The core's temperature theta_2 lags behind the logged theta by the heat capacity of the hull, theta_1:
+    ``dtheta_1/dt = 2 (theta - theta_1) / lag``, ``dtheta_2/dt = 2 (theta_1 - theta_2) / lag``. Typical sizes
+    are 0.1 nT/degC for a good fluxgate and several nT/degC for a low-power one (Primdahl 1979, J. Phys.
+    E 12:241). The thermal hysteresis of dive and climb separates the effect from one of depth.
     """
 
     name = "temperature_offset"
@@ -106,10 +111,10 @@ class TemperatureScale(_Thermal):
 
 
 class _Proportional(Cause):
-    """An offset in proportion to a channel."""
+    """An offset proportional to a telemetry channel of one kind."""
 
     kind: ClassVar[str]
-    """Kind of the channels."""
+    """Kind of the channels, as :func:`.survey.kinds_of` returns it."""
     largest: ClassVar[float]
     """Plausible offset at the channel's extreme, nT."""
 
@@ -127,7 +132,7 @@ class _Proportional(Cause):
 
 
 class CurrentField(_Proportional):
-    """A current loop is a fixed source: ``T += sum_k b_k I_k(t)`` (Biot and Savart), zero when they are."""
+    """The field of a fixed current loop follows its current: ``T += sum_k b_k I_k(t)`` (Biot and Savart)."""
 
     name = "current_field"
     meaning = "an electric current makes a field of its own"
@@ -136,7 +141,7 @@ class CurrentField(_Proportional):
     kind, largest = "current", 100.0
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return each current by itself, and all together, of one common size: motors driven as one."""
+        """Return each current by itself, and all currents together with coefficients of one common size."""
         alone = super().candidates(problem)
         if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
             return alone
@@ -146,7 +151,7 @@ class CurrentField(_Proportional):
 
 
 class PressureOffset(_Proportional):
-    """Pressure strains the hull and its magnetisation (Villari effect), and the mount: ``T += b p``."""
+    """Pressure strains the mount and the hull, whose magnetisation changes (Villari effect): ``T += b p``."""
 
     name = "pressure_offset"
     meaning = "the sensor's zero shifts with depth or pressure"

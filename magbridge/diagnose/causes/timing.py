@@ -1,4 +1,4 @@
-"""Errors of timing, and currents induced by turns: rates of change of the field and of the masses."""
+"""Causes proportional to a rate of change of the field or of a mass: delays, and eddy currents."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, cached_per_problem, rates
 
 SHIFTS_S = (0.5, 2.0, 6.0, 20.0, 60.0)
-"""Shifts of the telemetry that are tried, s: those between half an interval and a fiftieth of the log."""
+"""Shifts of the telemetry, s. Those between half an interval and a fiftieth of the log are tried."""
 MIN_SHIFT = 0.1
-"""Shift, in sampling intervals, below which rates of change describe it."""
+"""Shift, in sampling intervals, up to which it is computed from rates of change."""
 CENTRAL_STEP_S = 0.01
-"""s by which masses are moved forward and back, for a central difference of the nine coefficients."""
+"""Time by which masses are moved forward and back for a central difference of the nine coefficients, s."""
 
 
 @cached_per_problem
 def field_rates(problem: Problem) -> FloatArray:
-    """Return (3, n) dH_r/dt, nT/s (:func:`~magbridge.diagnose.problem.rates`)."""
+    """Return the rates of change of the raw readings (3, n), nT/s, from a cubic spline."""
     return rates(problem.survey, problem.survey.field.T)
 
 
 @cached_per_problem
 def mass_rates(problem: Problem) -> FloatArray:
-    """Return (9, n) rates of change, per s, of the nine coefficients while masses move.
+    """Return the rates of change (9, n), per s, of the nine coefficients while masses move.
 
-    A drive runs evenly, and starts and stops between samples. So a mass is in motion at a sample if it moves
-    the same way in the intervals before and after, and its speed is the larger of the two.
+    A drive has a constant speed, and starts and stops between samples. A mass is taken to be in motion at a
+    sample if it moves in the same direction in the intervals before and after. Its speed is the larger of
+    the two.
     """
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
@@ -50,18 +51,21 @@ def mass_rates(problem: Problem) -> FloatArray:
 
 
 class _Rate(Cause):
-    """Offsets in proportion to the rate of change of the reading."""
+    """An offset proportional to the rate of change of the reading."""
 
     needs = "turns"
     family = "rate"
     on: ClassVar[Literal["skew", "eddy"]]
     width_s: ClassVar[float]
-    """Plausible coefficient, s."""
+    """Plausible size of a coefficient (1-sigma), s."""
     axes: ClassVar[tuple[str, ...]] = AXIS_NAMES
     """Names of the coefficients."""
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the one candidate, by central differences: the live ones contain their sample's noise."""
+        """Return the single candidate, whose rates come from a spline.
+
+        The live correction takes backward differences, which contain the noise of their own sample.
+        """
         effect, phi = RateEffect(cause=self.name, on=self.on), field_rates(problem)
         return [
             of_effect(
@@ -82,7 +86,7 @@ class EddyCurrent(_Rate):
 
 
 class ChannelSkew(_Rate):
-    """One digitiser takes the sensor's axes in turn: ``T_i += tau_i dH_i/dt``."""
+    """The sensor's axes are sampled one after the other: ``T_i += tau_i dH_i/dt``."""
 
     name = "channel_skew"
     meaning = "the sensor's three axes were not read when the log says"
@@ -92,17 +96,17 @@ class ChannelSkew(_Rate):
 
 @cached_per_problem
 def _legs(problem: Problem) -> tuple[FloatArray, IntArray]:
-    """Return positions of the masses (n, k) and the leg's number (n,), which all shifts share."""
+    """Return the positions of the masses (n, k), and for each sample the number of its leg (n,)."""
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
     return p, np.cumsum(~survey.follows(MAX_MISSING_SAMPLES))
 
 
 def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
-    """Return the mean rates of change of the nine coefficients theta over a shift d of the telemetry.
+    """Return a function of m rows: mean rates (9, m), per s, of the nine coefficients theta over a shift d.
 
-    They are ``(theta(p(t + d)) - theta(p(t))) / d``, with positions p interpolated between samples, and none
-    across a gap. A mass that moves within one sampling interval has no rate at any sample, but a shift.
+    The rates are ``(theta(p(t + d)) - theta(p(t))) / d``, with positions p interpolated between samples, and
+    0 across a gap. They are not zero where a mass moves within one sampling interval.
     """
     kernel, t = problem.calibration.kernel, problem.survey.time
     p, leg = _legs(problem)
@@ -122,16 +126,16 @@ def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
 
 
 class _Delay(Cause):
-    """A delay between the field and the positions of the masses."""
+    """A delay between the readings of the field and the positions of the masses."""
 
     family = "mass"
     sign: ClassVar[float] = 1.0
-    """-1 if the field is late, 1 if the telemetry is."""
+    """-1 if the field is delayed, 1 if the telemetry is."""
     width_s: ClassVar[float]
-    """Plausible delay, s."""
+    """Plausible delay (1-sigma), s."""
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the delay by the rates of the masses, and by shifts of their telemetry."""
+        """Return a delay by the rates of the masses, and one by each shift of their telemetry."""
         if not problem.calibration.parameters:
             return []
         # Shifts from half an interval to a fiftieth of the log; a filter delays only the field
@@ -168,10 +172,10 @@ class ClockOffset(_Delay):
 class FilterLag(_Delay):
     """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2``.
 
-    In a uniform field ``|H|`` shows the delay only where masses move: ``u^T A dH_r/dt = -dF/dtheta
-    dtheta/dt``, theta the nine coefficients, the signature of a clock offset of the opposite sign. A filter's
-    delay cannot be negative. It also shortens a field that turns, which shows if the calibration runs turned
-    faster.
+    In a uniform field ``|H|`` shows the delay only while masses move: ``u^T A dH_r/dt = -dF/dtheta
+    dtheta/dt``, theta the nine coefficients. This is the signature of a clock offset of the opposite sign,
+    but a filter's delay cannot be negative. A filter also attenuates a field that turns, which a log shows
+    if the calibration runs turned faster.
     """
 
     name = "filter_lag"
@@ -181,17 +185,18 @@ class FilterLag(_Delay):
     sign, width_s = -1.0, 2.0
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the delay and, in addition to the calibration's own runs, the attenuation."""
+        """Return the delays and, if the calibration's own runs are given, the attenuation of turns."""
         delayed = super().candidates(problem)
         return [*delayed, _shortened(problem)] if problem.survey.fitted.any() else delayed
 
 
 def _shortened(problem: Problem) -> Candidate:
-    """Return the attenuation of a field that turns.
+    """Return the candidate of a filter's attenuation of a field that turns.
 
-    A filter whose impulse response has the variance ``sigma^2`` about its mean passes on
-    ``H + sigma^2 / 2 d^2H/dt^2``. The calibration is fitted without it (``calibrate --filter-cutoff``), and
-    nothing is added live. The readings are free of noise, with which a second derivative would correlate.
+    A filter whose impulse response has the variance ``sigma^2`` about its mean returns
+    ``H + sigma^2 / 2 d^2H/dt^2``. The refit of the calibration excludes the attenuation (as ``calibrate
+    --filter-cutoff`` does), and the live correction does not undo it. The second derivative is taken of the
+    noise-free readings, because it would correlate with noise.
     """
     bend = rates(problem.survey, problem.reading.T, 2).T
     columns = -0.5 * np.einsum("ij,ij->i", problem.jacobian[:, 6:], bend)[:, None]
