@@ -1,9 +1,9 @@
-"""Measure the error of the heading out of sample, and whether its standard deviation covers it.
+"""Measure the error of the heading out of sample, and whether its stated standard deviation is right.
 
-Each row of the table is a calibration, and another log that is corrected with it. No calibration uses the
-log's headings, except in the row that says so. The peers have no boresight of their own: each gets
-magbridge's. The aircraft is flown by others (``$MAGBRIDGE_REAL_DATA``, or ``../shared/data``); its inertial
-heading is the truth.
+Each row of the table is a calibration, tested on another log. No calibration uses the headings of its log,
+except in the row that states it. Third-party methods estimate no boresight, so each gets magbridge's. The
+aircraft's log is third-party data (``$MAGBRIDGE_REAL_DATA``, or ``../shared/data``); its inertial heading
+is the truth.
 
     python tools/heading.py --seeds 6 --out heading.parquet
     python tools/heading.py --peers .venv-peers/bin/python        # adds magyc, see tools/peers.py
@@ -37,19 +37,19 @@ from sitl.dataset import channels, side_by_side
 from sitl.twin import Twin
 
 TILT_SIGMA_DEG = 0.1
-"""1-sigma of the simulated roll and pitch, white, deg."""
+"""1-sigma of the white noise of simulated roll and pitch, deg."""
 RUN_OFFSET_DEG = 0.2
-"""1-sigma of their offset in one run, deg."""
+"""1-sigma of the offsets of roll and pitch in a run, deg."""
 PAIRS = (1, 5)
-"""Pairs of spirals of which the boresight is estimated."""
+"""Numbers of pairs of spirals from which the boresight is estimated."""
 CUTOFF_HZ = 0.33
-"""Cut-off of the anti-alias filter of the row that has one, Hz; a spiral turns at 1.6 deg/s."""
+"""Cut-off of the simulated anti-alias filter, Hz; a spiral turns at 1.6 deg/s."""
 ANGLES = ("roll", "pitch")
 AIRCRAFT = "magnav_flt1002/Flt1002_1002.02.txt"
 FLOWN = 1_592_611_200.0
-"""s since 1970, the day of the aircraft's flight."""
+"""Start of the day of the aircraft's flight, s since 1970 UTC."""
 AIRCRAFT_STEP = 10
-"""Samples of the line, of 10 Hz, of which one is used."""
+"""Step between the samples of the aircraft's line (10 Hz) that are used."""
 SIMULATED = ("gliders", "gliders, tilt offsets", "gliders, filter", "Bonne Bay twin")
 
 
@@ -60,12 +60,12 @@ def run(name: str, seed: int, peers: str) -> list[Row]:
 
 
 def difference_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a - b on the circle, deg."""
+    """Return a - b, deg, wrapped to -180 to 180."""
     return np.asarray((a - b + 180.0) % 360.0 - 180.0)
 
 
 def score(method: str, heading: np.ndarray, sigma: np.ndarray | float, truth: np.ndarray) -> Row:
-    """Return the row of a method: `heading`, `sigma` and `truth` (n,), deg."""
+    """Return the row of a method: its heading and sigma (n,) against the true heading (n,), deg."""
     error = difference_deg(heading, truth)
     good = np.isfinite(error)
     error, stated = error[good], np.broadcast_to(sigma, truth.shape)[good]
@@ -73,7 +73,7 @@ def score(method: str, heading: np.ndarray, sigma: np.ndarray | float, truth: np
 
 
 def published(method: str, calibration: Calibration, log: xr.Dataset) -> Row:
-    """Score the columns that ``correct`` writes for a log whose own headings are true, on unflagged rows."""
+    """Score the heading columns of ``correct`` on unflagged rows; the log's own heading is the truth."""
     rows = mb.correct_rows(mb.Correction(calibration), log.drop_vars("heading"))
     good = rows["quality"].to_numpy() == 0
     magnetic, _, sigma, declination, its_sigma = (rows[column].to_numpy()[good] for column in HEADINGS)
@@ -83,7 +83,7 @@ def published(method: str, calibration: Calibration, log: xr.Dataset) -> Row:
 
 
 def with_tilt_errors(log: xr.Dataset, rng: np.random.Generator, offset_deg: float) -> xr.Dataset:
-    """Return a log with noise of roll and pitch, and with an offset in each run."""
+    """Return a log whose roll and pitch have white noise and an offset (1-sigma `offset_deg`) in each run."""
     _, runs = np.unique(log["run"], return_inverse=True)
     for angle in ANGLES:
         noise = rng.normal(0.0, TILT_SIGMA_DEG, len(runs)) + rng.normal(0.0, offset_deg, runs.max() + 1)[runs]
@@ -92,7 +92,7 @@ def with_tilt_errors(log: xr.Dataset, rng: np.random.Generator, offset_deg: floa
 
 
 def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
-    """Yield the rows of a simulated vehicle: spirals, then a survey with exact headings as the truth."""
+    """Yield the rows of a simulated vehicle, calibrated by spirals and tested on a survey's true headings."""
     exact = {"roll_pitch_sigma": 0.0, "heading_sigma": 0.0}
     rng = np.random.default_rng([seed, 5])
     if name == "Bonne Bay twin":
@@ -124,7 +124,7 @@ def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
 
 
 def levelled(vector: np.ndarray, log: xr.Dataset) -> tuple[np.ndarray, float]:
-    """Return the true heading (n,), deg, of vectors in body axes, and NaN: such a method states no sigma."""
+    """Return the true heading (n,), deg, of field vectors (n, 3) in body axes, and NaN as its sigma."""
     _, ned, _ = earth_field(log)
     assert ned is not None
     declination = np.degrees(np.arctan2(ned[:, 1], ned[:, 0]))
@@ -135,7 +135,7 @@ def levelled(vector: np.ndarray, log: xr.Dataset) -> tuple[np.ndarray, float]:
 def after_pairs(
     known: Calibration, learned: xr.Dataset, survey: xr.Dataset, blind: xr.Dataset
 ) -> Iterator[Row]:
-    """Yield the rows of boresights of the first pairs of spirals alone."""
+    """Yield the rows of boresights that are estimated only from the first pairs of spirals."""
     runs = np.unique(learned["run"])
     for pairs in PAIRS:
         first = blind.isel(time=np.isin(learned["run"], runs[: 2 * pairs]))
@@ -147,13 +147,13 @@ def after_pairs(
 
 
 def lagging(known: Observations, log: xr.Dataset) -> Iterator[Row]:
-    """Yield the rows of a vehicle whose anti-alias filter lags, with and without the filter's correction."""
+    """Yield the rows of a vehicle with an anti-alias filter, without and with the correction of its lag."""
     for method, data in (("auto, lag ignored", known), ("auto, lag undone", unfiltered(known, CUTOFF_HZ))):
         yield published(method, mb.fit(data).calibration, log)
 
 
 def aircraft() -> Iterator[Row]:
-    """Yield the rows of the aircraft: each half of its calibration line is fitted, the other is corrected."""
+    """Yield the rows of the aircraft: each half of its line is fitted and tested on the other half."""
     folder = Path(os.environ.get("MAGBRIDGE_REAL_DATA", "../shared/data"))
     if not (folder / AIRCRAFT).exists():
         yield {"method": "auto", "failed": "no measured data"}

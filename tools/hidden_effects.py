@@ -1,13 +1,13 @@
-"""Hide effects in logs that others measured, and examine what ``diagnose`` names and promises.
+"""Hide effects in third-party logs; measure the names that ``diagnose`` gives and the gain that it predicts.
 
     python tools/hidden_effects.py --data DIR [--snr 12] [--out FILE.parquet]
 
-Each vehicle is calibrated on the first part of its log. An effect is added to the rest, of which the first
-half is diagnosed; the second half is the later part. The size of an effect is its signal-to-noise ratio: the
-whitened norm of what the calibration's own freedom leaves of it, by the noise of the untouched log. The
-vehicle's own unexplained effects stay in the log. Promised is the held-out ratio of RMS errors that
-``diagnose`` reports; real is that ratio on the later part, which no fit has seen. Both are by the corrector.
-Sigma and error are those of the written calibration on the later part.
+Each vehicle is calibrated on the first part of its log. An effect is added to the rest. ``diagnose`` gets the
+first half of the rest; the second half is the later part. The size of an effect is its signal-to-noise
+ratio: its norm, whitened by the noise of the untouched log, with the calibration projected out. The log keeps
+the vehicle's own unexplained effects. "Promised" is the held-out ratio of RMS errors that ``diagnose``
+reports; "real" is this ratio on the later part, which no fit has used. Sigma and error are those of the
+extended calibration on the later part.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from magbridge.diagnose.survey import load_survey
 from magbridge.estimation.residual import rms
 
 TELEMETRY = {"sensor_temperature": "degC", "payload_current": "A"}
-"""Telemetry that is added to every log, and its unit."""
+"""Simulated telemetry that is added to every log, with its unit."""
 DELAYS_S = np.geomspace(0.1, 120.0, 40)
-"""Clock offsets among which the one of the asked size is taken, s."""
+"""Clock offsets that are tried to obtain the requested size, s."""
 FOREIGN = ("relay",)
 """Effects that no cause describes: any name is wrong."""
 
 
 def with_telemetry(log: xr.Dataset, seed: int) -> xr.Dataset:
-    """Return the log with a temperature that converges and varies, and a current that switches."""
+    """Return the log with a simulated temperature that warms up and varies, and a current that switches."""
     rng = np.random.default_rng([4, seed])
     time = log["time"].to_numpy() - float(log["time"][0])
     x = time / max(float(time[-1]), 1.0)
@@ -61,7 +61,7 @@ def with_telemetry(log: xr.Dataset, seed: int) -> xr.Dataset:
 
 
 def shape_of(effect: str, log: xr.Dataset, rng: np.random.Generator) -> FloatArray:
-    """Return the offset (n, 3) of an effect of unit amplitude along a random axis."""
+    """Return the offset (n, 3) of an effect along a random axis, per unit of its amplitude."""
     x: FloatArray = np.linspace(0.0, 1.0, log.sizes["time"])
     axis = rng.normal(size=3)
     series: FloatArray
@@ -77,7 +77,7 @@ def shape_of(effect: str, log: xr.Dataset, rng: np.random.Generator) -> FloatArr
 
 
 def delayed(log: xr.Dataset, names: tuple[str, ...], delay: float) -> xr.Dataset:
-    """Return the log with the telemetry of the masses late by a delay, s."""
+    """Return the log with the telemetry of the masses late by `delay`, s."""
     time, late = log["time"].to_numpy(), {}
     for name in names:
         known = log[name].interpolate_na("time").to_numpy()
@@ -86,7 +86,7 @@ def delayed(log: xr.Dataset, names: tuple[str, ...], delay: float) -> xr.Dataset
 
 
 def shifted(log: xr.Dataset, offset: FloatArray) -> xr.Dataset:
-    """Return the log with an offset (n, 3), nT, added to the sensor's axes."""
+    """Return the log with an offset (n, 3), nT, added to the readings in sensor axes."""
     axes = {
         f"mag_{axis}": ("time", log[f"mag_{axis}"].to_numpy() + offset[:, k], log[f"mag_{axis}"].attrs)
         for k, axis in enumerate("xyz")
@@ -95,7 +95,7 @@ def shifted(log: xr.Dataset, offset: FloatArray) -> xr.Dataset:
 
 
 def signal_to_noise(problem: Problem, null: Joint, change: FloatArray) -> float:
-    """Return the whitened norm of a change of the residual (n,), nT, beyond the calibration's freedom."""
+    """Return the whitened norm of a change (n,) of the residual, nT, with the calibration projected out."""
     noise = null.noise
     A = noise.filter(problem.calibration_rows(slice(None)))
     y = noise.whiten(change)
@@ -106,7 +106,7 @@ def signal_to_noise(problem: Problem, null: Joint, change: FloatArray) -> float:
 
 
 def residual_of(log: xr.Dataset, calibration: Calibration) -> Problem:
-    """Return the comparison of a log with a calibration."""
+    """Return the diagnosis problem of a log and a calibration, which holds the residual."""
     return pose(load_survey([log], calibration), calibration)
 
 
@@ -119,7 +119,7 @@ def hide(
     snr: float,
     seed: int,
 ) -> tuple[xr.Dataset, float] | None:
-    """Return the log with an effect of the requested size in its first part, and that size, or None."""
+    """Return the log with an effect of size `snr` in its part `first`, and the size; None if impossible."""
     rng = np.random.default_rng([7, seed])
     clean = residual_of(log.isel(time=first), calibration)
     rough = fit_joint(clean, [], 1, rounds=2)
@@ -140,14 +140,14 @@ def hide(
         return (delayed(log, names, delay), found) if found > 0.5 * snr else None
     offset = shape_of(effect, log, rng)
     scale = 10.0
-    for _ in range(4):  # the size is not quite linear in the amplitude
+    for _ in range(4):  # iterate, because the size is not exactly linear in the amplitude
         scale *= snr / size(shifted(log, scale * offset))
     changed = shifted(log, scale * offset)
     return changed, size(changed)
 
 
 def case(vehicle: str, effect: str, seed: int, snr: float, data: str) -> list[Row]:
-    """Hide one effect in one vehicle's log and diagnose it."""
+    """Hide one effect in one vehicle's log and diagnose it; return the row, or none if impossible."""
     warnings.simplefilter("ignore")
     known = VEHICLES[vehicle](Path(data))
     calibration = fit(observations(joined(known.known), known.parameters)).calibration
@@ -189,7 +189,7 @@ STUDY = Study(
 
 
 def cell(rows: pd.DataFrame, name: str) -> str:
-    """Return how many of the rows have a property."""
+    """Return the number of rows in which the column `name` is true, as text "k of n"."""
     return f"{int(rows[name].sum())} of {len(rows)}"
 
 

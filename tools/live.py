@@ -2,17 +2,17 @@
 
     python tools/live.py --seeds 10 --hours 12
 
-Each glider flies the paper's Table 1 and is calibrated; then it surveys a crustal field of 60 nT on another
-day, with one change. The reference is the IGRF. A sample's telemetry is two seconds old, so a motion begins
-before it is reported; samples in a motion are left out.
+Each glider is calibrated by the runs of the paper's Table 1. It then surveys a crustal field of 60 nT on
+another day, with one change. The reference is the IGRF. A sample's telemetry is two seconds old, so a motion
+begins before its report; the figures exclude samples during a motion.
 
-fixed, MagNav, bound, published   RMS error about its mean after three hours, over the noise floor: of the
+fixed, MagNav, bound, published   RMS error without bias after three hours, over the noise floor: of the
               fixed calibration, of MagNav.jl's online filter (:mod:`magnav_online`), of a filter that knows
-              the cause and its onset, and of the published field
+              cause and onset, and of the published field
 normalised    normalised error of the published field, from the alarm on
-delay         samples until the alarm, over those of an optimal detector, which knows cause and calibration
-among, alone  how often the true cause is among the named ones, and the only one
-false         alarms without a cause
+delay         samples until the alarm, over the delay of a detector that knows cause and calibration
+among, alone  fraction of the runs in which the true cause is among the named causes, or the only one
+false         number of alarms without a change
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from sitl.world import Geology
 
 CRUST = Geology(rms=60.0, top=1000.0, bottom=5000.0)
 AGE_S = 2.0
-"""Age of a sample's telemetry; the next telemetry comes as long after the sample."""
+"""Age of a sample's telemetry, s; the next telemetry arrives this time after the sample."""
 CHANGE_SIGMA_NT = 200.0
-"""1-sigma of a change on an axis, as the bound assumes it."""
+"""1-sigma of a change's amplitude on an axis that the bound assumes, nT."""
 Change = Callable[[xr.Dataset, np.random.Generator, float], np.ndarray]
-"""Takes the log, a generator and a size, nT; returns the field added to the channels (n, 3), nT."""
+"""Function of log, generator and size (nT) that returns the field added to the readings (n, 3), nT."""
 
 
 class Published(NamedTuple):
-    """Total field, sigma (nT) and quality of every sample, and each alarm with its row and its causes."""
+    """Published total field and sigma (n,), nT, quality (n,), and row and named causes of each alarm."""
 
     total: np.ndarray
     sigma: np.ndarray
@@ -76,41 +76,41 @@ def direction(rng: np.random.Generator) -> np.ndarray:
 
 
 def hours(log: xr.Dataset) -> np.ndarray:
-    """Return the hours since the start (n,)."""
+    """Return the time since the start (n,), h."""
     time = log["time"].to_numpy()
     return np.asarray((time - time[0]) / 3600.0)
 
 
 def nothing(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:  # noqa: ARG001
-    """Change nothing."""
+    """Return a zero field (n, 3): no change."""
     return np.zeros((log.sizes["time"], 3))
 
 
 def turn_on(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Change the offset from the start on."""
+    """Return a constant offset (n, 3) of `size` nT in a random direction."""
     return np.tile(size * direction(rng), (log.sizes["time"], 1))
 
 
 def bolt(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Change the offset after 40 % of the survey."""
+    """Return an offset step (n, 3) of `size` nT after 40 % of the survey."""
     return np.asarray((hours(log) > 0.4 * hours(log)[-1])[:, None] * size * direction(rng))
 
 
 def drift(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Add an offset that drifts from 20 % of the survey on."""
+    """Return an offset (n, 3) that drifts to three times `size` nT, from 20 % of the survey on."""
     later = np.maximum(hours(log) - 0.2 * hours(log)[-1], 0.0)
     return np.asarray((later / later[-1])[:, None] * 3.0 * size * direction(rng))
 
 
 def warming(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Warm the sensor from -10 to +2 degC within half an hour, as in the paper's trial 1."""
+    """Return the offset (n, 3) of a sensor that warms from -10 to +2 degC, as in the paper's trial 1."""
     warmer = 12.0 * (1.0 - np.exp(-hours(log) / 0.5))
     log["sensor_temperature"] = "time", -10.0 + warmer
     return np.asarray((warmer / 12.0)[:, None] * 3.0 * size * direction(rng))
 
 
 def pump(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Run a pump for two of every ten minutes; its wiring changes after 40 % of the survey."""
+    """Return the field (n, 3) of a pump, on for 2 of 10 min, whose wiring changes at 40 % of the survey."""
     current = 2.0 * ((hours(log) * 6.0) % 1.0 < 0.2)
     log["pump_current"] = "time", current, {"units": "A"}
     return np.asarray((current * (hours(log) > 0.4 * hours(log)[-1]))[:, None] * 0.5 * size * direction(rng))
@@ -127,7 +127,7 @@ def clock(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
 
 
 def sheet(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Shift the reference after 40 % of the survey, as another sheet of a map does."""
+    """Shift the reference by three times `size` nT after 40 % of the survey, as another map sheet does."""
     log["reference_error"] = "time", 3.0 * size * (hours(log) > 0.4 * hours(log)[-1])
     return nothing(log, rng, size)
 
@@ -143,13 +143,13 @@ CHANGES: dict[str, tuple[Change, str, float]] = {
     "map": (sheet, "map_error", 0.4),
     "straight over rock": (nothing, "", 0.0),
 }
-"""Name -> the change, its cause, and the fraction of the survey after which it begins."""
+"""Change by name: function, cause, and the fraction of the survey after which it begins."""
 
 # ---- the bounds --------------------------------------------------------------------------------------------
 
 
 def transitions(nuisance: Nuisance, log: xr.Dataset) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the nuisance's transition and its noise before each of the n samples."""
+    """Return the transition matrix and the process noise of the nuisance states before each of n samples."""
     latitude, longitude = (log[name].to_numpy() for name in ("latitude", "longitude"))
     north, east = separation(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:])
     metres, seconds = np.hypot(north, east), np.diff(log["time"].to_numpy())
@@ -159,10 +159,10 @@ def transitions(nuisance: Nuisance, log: xr.Dataset) -> list[tuple[FloatArray, F
 def best_delay(
     effect: FloatArray, log: xr.Dataset, rest: BoolArray, calibration: Calibration, since: int
 ) -> int:
-    """Return after how many samples `rest` a known `effect` (n,) on the total field, nT, is significant.
+    """Return the number of samples in `rest` (n,) until a known `effect` (n,), nT, is significant.
 
-    The effect begins with the sample `since`. It is significant when the expected log-likelihood ratio, half
-    the whitened energy of the effect, reaches the threshold of the bridge.
+    The effect on the total field begins at sample `since`. It is significant if the expected log-likelihood
+    ratio, half the effect's whitened energy, reaches the threshold of the bridge.
     """
     nuisance = Nuisance(calibration.noise, Align().reference_sigma)
     P, m, h = nuisance.initial.copy(), np.zeros(TRACK_STATES), -nuisance.row(1.0)
@@ -182,10 +182,10 @@ def best_delay(
 def best_field(
     added: FloatArray, log: xr.Dataset, rest: BoolArray, calibration: Calibration, reference: FloatArray
 ) -> FloatArray:
-    """Return the total field (n,), nT, by a Kalman filter that knows the time course of a change.
+    """Return the total field (n,), nT, of a Kalman filter that knows the time course of a change.
 
-    It knows neither amplitude nor direction of `added` (n, 3), nT. The field of a sample is computed before
-    the sample updates the filter. `reference` (n,), nT, is the main field.
+    The filter estimates the amplitude and direction of `added` (n, 3), nT. The field of a sample is computed
+    before the sample updates the filter. `reference` (n,), nT, is the main field.
     """
     seen, values, time = channels(log), side_by_side(log, MASSES), log["time"].to_numpy()
     total = correct(calibration, seen, values, time).total
@@ -214,7 +214,7 @@ def best_field(
 
 
 def fly(name: str, seed: int, length: float) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the calibration runs, and the survey with the telemetry between its samples."""
+    """Simulate a glider; return its runs, and its survey at twice the rate that :func:`sampled` keeps."""
     straight = Leg(
         duration=3600.0 * length,
         pitch=0.0,
@@ -232,7 +232,7 @@ def fly(name: str, seed: int, length: float) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def sampled(log: xr.Dataset) -> xr.Dataset:
-    """Return every second row, with the telemetry of the row before it."""
+    """Return every second row of a log, with the telemetry of the row before."""
     sent, samples = (log.isel(time=slice(k, log.sizes["time"] & ~1, 2)) for k in (0, 1))
     return samples.assign({name: ("time", sent[name].to_numpy()) for name in (*MASSES, *currents(log))})
 
@@ -245,7 +245,7 @@ def currents(log: xr.Dataset) -> tuple[str, ...]:
 def learn(
     learner: Learner | None, calibration: Calibration, log: xr.Dataset, age_s: float = AGE_S
 ) -> Published:
-    """Correct a survey as the bridge does, with or without a learner; its telemetry is `age_s` old, s."""
+    """Correct a survey as the bridge does, with or without a learner; its telemetry is `age_s` (s) old."""
     correction = Correction(calibration, learner=learner)
     n = log.sizes["time"]
     total, sigma, quality, alarms = np.empty(n), np.empty(n), np.empty(n, int), []
@@ -269,19 +269,19 @@ def learn(
 
 
 def at_rest(quality: np.ndarray) -> np.ndarray:
-    """Return whether the masses were at rest up to the next telemetry (n,)."""
+    """Return the samples (n,) at which the masses were at rest until the next telemetry."""
     rest = (quality & int(Quality.MOVING | Quality.STALE_TELEMETRY)) == 0
     rest[:-1] &= rest[1:]
     return np.asarray(rest)
 
 
 def wrong_by(log: xr.Dataset) -> np.ndarray | float:
-    """Return the error of the reference, nT (n,)."""
+    """Return the error of the reference (n,), nT; 0 if the log has no such error."""
     return log["reference_error"].to_numpy() if "reference_error" in log else 0.0
 
 
 def run(name: str, seed: int, length: float, size: float) -> list[Row]:
-    """Simulate, calibrate, change, correct while learning, and score."""
+    """Simulate and calibrate a glider, change it, and score the survey with in-flight calibration."""
     change, cause, begins = CHANGES[name]
     runs, log = fly(name, seed, length)
     calibration = fit(observations(runs, MASSES), "auto").calibration
@@ -353,7 +353,7 @@ STUDY = Study(
 
 
 def main() -> None:
-    """Run, and print a table."""
+    """Run the cases and print the table."""
     parser = study_options(__doc__)
     parser.add_argument("--seeds", type=int, default=10, help="gliders")
     parser.add_argument("--first", type=int, default=0, help="the first glider")

@@ -1,9 +1,9 @@
-"""Measure the accuracy of a bridge that starts without a calibration, against hours, and draw it.
+"""Measure and plot the accuracy of a bridge that starts without a calibration, as a function of time.
 
     python tools/live_nothing.py --seeds 4 --hours 24 -o docs/figures/learning.png
 
 Random gliders survey a crustal field of 60 nT in a criss-cross, with the IGRF as the only reference and no
-calibration run. *Error* is that of the published field about its mean over the noise floor, in each stretch
+calibration run. *Error* is the published field's error without bias over the noise floor, in each stretch
 of the survey; *mean* is its mean error, which is not observable; *normalised* includes both.
 """
 
@@ -69,7 +69,7 @@ STUDY = Study(
 
 
 def draw(rows: pd.DataFrame, file: Path) -> None:
-    """Draw error and sigma against hours."""
+    """Plot error and sigma against the time since the start, and write the plot to `file`."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - only here
 
     figure, axes = plt.subplots(figsize=(7.0, 4.0), constrained_layout=True)
@@ -89,7 +89,7 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
 
 
 def main() -> None:
-    """Run, print and draw."""
+    """Run the cases, print the table and write the plot."""
     parser = study_options(__doc__)
     parser.add_argument("--seeds", type=int, default=4, help="gliders")
     parser.add_argument("--first", type=int, default=0, help="the first glider")

@@ -1,9 +1,9 @@
-"""The peer of learning in flight: MagNav.jl's online filter, the linear one, on our samples.
+"""Python version of MagNav.jl's linear online filter, the third-party baseline of in-flight calibration.
 
-There (``ekf_online`` in MagNav.jl; Canciani 2022, IEEE Trans. Aerospace and Electronic Systems 58:420) the 18
-coefficients of Tolles and Lawson are states next to a first-order Gauss-Markov field: permanent, induced and
-eddy-current terms, which are products of the direction cosines, their squares and their rates. It has no
-terms for masses that move, so it gets the field corrected by the fixed calibration, and learns the rest.
+In ``ekf_online`` (MagNav.jl; Canciani 2022, IEEE Trans. Aerospace and Electronic Systems 58:420), the states
+are the 18 coefficients of Tolles and Lawson and a first-order Gauss-Markov field. The coefficients belong to
+permanent, induced and eddy-current terms: products of direction cosines and their rates. The filter has no
+terms for moving masses, so its input is the field after the fixed calibration.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 PERMANENT, INDUCED, EDDY = 20.0, 20.0, 5.0
-"""nT, prior 1-sigma of the three kinds: a power-on's change of offset; an eddy term at a turn of 1 deg/s."""
+"""Prior 1-sigma of the three kinds of terms, nT: a power-on's offset change; an eddy term at 1 deg/s."""
 WALK = 3.0 / 86_400.0**0.5
-"""nT per square root of a second, as ours."""
+"""Random walk of the coefficients, nT per square root of a second, as in magbridge."""
 PAIRS = tuple((i, j) for i in range(3) for j in range(i, 3))
 
 
 def features(vector: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return the terms (n, 18) of Tolles and Lawson of the measured vector (n, 3)."""
+    """Return the 18 terms (n, 18) of Tolles and Lawson for a measured vector (n, 3)."""
     u = vector / np.linalg.norm(vector, axis=1)[:, None]
     rate = np.gradient(u, time, axis=0) / np.radians(1.0)
     induced = [u[:, i] * u[:, j] for i, j in PAIRS]
@@ -35,11 +35,11 @@ def online(
     noise: float,
     field: tuple[float, float],
 ) -> np.ndarray:
-    """Return the total field (n,), nT, as the filter would have corrected it sample by sample.
+    """Return the total field (n,), nT, that the filter corrects sample by sample.
 
     `vector` (n, 3) and `total` (n,), nT, are corrected by the fixed calibration; `reference` (n,) is in nT,
-    `time` (n,) in s. Samples that the filter learns from are in `use` (n,); `noise` is in nT. `field` has the
-    1-sigma (nT) and the time constant (s) of the Gauss-Markov field.
+    `time` (n,) in s. The mask `use` (n,) selects the samples that update the filter; `noise` is in nT.
+    `field` is the 1-sigma (nT) and the time constant (s) of the Gauss-Markov field.
     """
     A = features(vector, time)
     x = np.zeros(19)

@@ -1,15 +1,15 @@
-"""Measure calibration, diagnosis and maps on logs of real vehicles, whose truth is not known.
+"""Measure calibration, diagnosis and maps on logs of real vehicles, for which the true field is unknown.
 
-    python tools/measured.py seaglider --data DIR       each dive corrected by a calibration of the others
-    python tools/measured.py halves --data DIR          the second half by a fit of the first; see --log
-    python tools/measured.py diagnose --data DIR        the second half diagnosed, and Tolles-Lawson's terms
-    python tools/measured.py survey --data DIR          tie lines of an airborne survey from its other lines
+    python tools/measured.py seaglider --data DIR       each dive corrected by a fit of the other dives
+    python tools/measured.py halves --data DIR          the second half by a fit of the first half; see --log
+    python tools/measured.py diagnose --data DIR        the second half diagnosed, and the Tolles-Lawson check
+    python tools/measured.py survey --data DIR          tie lines of an airborne survey by its other lines
 
 ``halves`` fits by ``nominal``, ``auto``, ``auto --parameter auto`` and, with ``--peers PYTHON`` (see
-tools/peers.py), MAVProxy's magfit. Tested are the samples whose field comes from a direction within 8 deg of
-one that the first half has. A scale far from 1 is a collapse, whatever the RMS, so it is printed.
-``diagnose`` has an independent check: Tolles & Lawson's terms (1950), fitted by least squares to the
-calibration's residuals, eighths of the log held out in turn.
+tools/peers.py), MAVProxy's magfit. It tests the samples whose field direction in the body is within 8 deg of
+a direction in the first half. The table also has the scales, because a fit with a scale far from 1 has
+collapsed even if its RMS is small. ``diagnose`` has an independent check: Tolles & Lawson's terms (1950),
+fitted by least squares to the calibration's residuals, with each eighth of the log held out in turn.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ from magbridge.survey.read import read_table
 from magbridge.survey.run import survey
 
 MIN_RUN_SAMPLES, MIN_HALF_SAMPLES = 30, 60
-"""Samples of a run that is held out, and of each half of a log."""
+"""Minimum number of samples of a held-out run, and of each half of a log."""
 MAX_DIRECTION_DEG = 8.0
-"""Greatest angle between a tested direction of the field and one that the fit has."""
+"""Maximum angle between a tested field direction and the nearest direction in the fitted half, deg."""
 SEAGLIDER_CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("nominal", (), 0),
     ("auto", ("pitchCtl", "vbdCC"), 1),
@@ -59,18 +59,18 @@ SEAGLIDER_CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("auto", ("pitchCtl", "rollCtl", "vbdCC"), 3),
     ("cubic", ("pitchCtl", "vbdCC"), 3),
 )
-"""Method, masses, order."""
+"""Method, masses and polynomial order of each calibration."""
 FLIGHT_MIDNIGHT_S = 1592611200.0
-"""Seconds since 1970 at the start of the flight's day (2020-06-20)."""
+"""Start of the day of the flight (2020-06-20), s since 1970 UTC."""
 FLIGHT_ROWS = 5
-"""Every fifth row of the flight (10 Hz) is used: an aircraft turns no faster."""
+"""Step between the rows of the flight (10 Hz) that are used; an aircraft turns slowly."""
 HELD_OUT_PARTS = 8
 MAX_LINE_DISTANCE_M = 60.0
-"""Half a step between a line's samples, about."""
+"""Maximum distance of a tie's sample from the nearest line, m: about half the sample spacing of a line."""
 
 
 class Vehicle(NamedTuple):
-    """Logs to calibrate from, logs to test, and the calibration's parameters."""
+    """Logs of a vehicle for calibration and for the test, and the parameters of the calibration."""
 
     known: list[xr.Dataset]
     asked: list[xr.Dataset]
@@ -78,7 +78,7 @@ class Vehicle(NamedTuple):
 
 
 def flight(folder: Path) -> Vehicle:
-    """Halve an aircraft's calibration flight: permanent, induced and eddy-current fields."""
+    """Return the halves of an aircraft's calibration flight, without parameters."""
     numbers = np.genfromtxt(folder / "magnav_flt1002" / "Flt1002_1002.02.txt", invalid_raise=False)
     numbers = numbers[::FLIGHT_ROWS]
     numbers = numbers[np.isfinite(numbers).all(axis=1)]
@@ -92,13 +92,13 @@ def flight(folder: Path) -> Vehicle:
 
 
 def seaglider(folder: Path) -> Vehicle:
-    """Return a Seaglider's first three dives, and its next two."""
+    """Return the first three dives of a Seaglider for calibration, and the other dives for the test."""
     dives = [read(path) for path in sorted((folder / "seaglider_sg167").glob("p*.nc"))]
     return Vehicle(dives[:3], dives[3:], ("pitchCtl", "vbdCC"))
 
 
 def ardusub(folder: Path) -> Vehicle:
-    """Halve the log of an underwater robot."""
+    """Return the halves of an underwater robot's log."""
     return _halves(read(folder / "ardusub" / "small.tlog"))
 
 
@@ -115,7 +115,7 @@ def _halves(log: xr.Dataset) -> Vehicle:
 
 
 def joined(logs: list[xr.Dataset]) -> xr.Dataset:
-    """Return logs one after the other, with the columns that all have."""
+    """Return logs joined in order of time, with the columns that all of them have."""
     return logs[0] if len(logs) == 1 else xr.concat(logs, "time", join="inner").sortby("time")
 
 
@@ -123,12 +123,12 @@ def joined(logs: list[xr.Dataset]) -> xr.Dataset:
 
 
 def hold_runs_out(data: Observations, method: str, order: int = 3) -> tuple[FloatArray, FloatArray]:
-    """Fit without each run in turn; return that run's errors (n,), nT in sensor axes, and normalised errors.
+    """Fit without each run in turn; return the held-out run's errors (n,), nT, and normalised errors (n,).
 
     Raises
     ------
     CalibrationError
-        There are not two runs, or a fit without one fails.
+        The data have fewer than two runs, or a fit fails.
     """
     labels, counts = np.unique(data.runs, return_counts=True)
     labels = labels[counts >= MIN_RUN_SAMPLES]
@@ -143,7 +143,7 @@ def hold_runs_out(data: Observations, method: str, order: int = 3) -> tuple[Floa
 
 
 def show_seaglider(data: Path, console: Console) -> None:
-    """Print the error of each choice of masses, dives held out in turn."""
+    """Print the error of each choice of masses, with each dive held out in turn."""
     log = read(sorted((data / "seaglider_sg167").glob("p*.nc")))
     shown = table("Seaglider, each dive held out", "method", "order", "masses", "nT", "normalised error")
     for method, masses, order in SEAGLIDER_CHOICES:
@@ -160,7 +160,7 @@ def show_seaglider(data: Path, console: Console) -> None:
 
 
 class HalfScore(NamedTuple):
-    """Result of one method on one compass: errors in nT, the claimed sigma over the RMS error."""
+    """Result of one method on one compass: errors in nT, and the claimed sigma over the RMS error."""
 
     method: str
     rms: float
@@ -171,7 +171,7 @@ class HalfScore(NamedTuple):
 
 
 def compare_halves(deployment: xr.Dataset, peers: str = "") -> list[HalfScore]:
-    """Fit every method on the first half of a log and test it on the second."""
+    """Fit every method to the first half of a log; return its scores on the second half."""
     bare = observations(deployment, ())
     half = float(np.median(bare.time))
     early, late = bare.part(bare.time <= half), bare.part(bare.time > half)
@@ -185,14 +185,14 @@ def compare_halves(deployment: xr.Dataset, peers: str = "") -> list[HalfScore]:
 
 
 def has_known_direction(late: Observations, early: Observations) -> BoolArray:
-    """Return which late samples have the Earth's field from a direction that early samples have."""
+    """Return the late samples (n,) whose field direction in the body is also among the early samples."""
     tree = cKDTree(np.nan_to_num(_directions(early), nan=5.0))
     distance, _ = tree.query(np.nan_to_num(_directions(late), nan=9.0))
     return np.asarray(distance < 2 * np.sin(np.radians(MAX_DIRECTION_DEG) / 2))
 
 
 def _directions(data: Observations) -> FloatArray:
-    """Return the directions (n, 3) of the Earth's field in the body, by attitude; NaN where not known."""
+    """Return the directions (n, 3) of the Earth's field in body axes, from the attitude; NaN if unknown."""
     found = np.full((len(data), 3), np.nan)
     known, attitude, earth = data.directed()
     roll, pitch, heading = attitude.T
@@ -204,7 +204,7 @@ def _directions(data: Observations) -> FloatArray:
 def _score_half(
     deployment: xr.Dataset, half: float, tested: FloatArray, method: str, names: tuple[str, ...] | None
 ) -> HalfScore:
-    """Return the score of a fit of the first half; `names` None: its parameters are chosen there."""
+    """Return the score of a fit of the first half, which also chooses the parameters if `names` is None."""
     label = method if names is not None else "auto --parameter auto"
     first = deployment.sel(time=deployment["time"] <= half)
     try:
@@ -226,7 +226,7 @@ def _score_half(
 def _magfits(
     deployment: xr.Dataset, early: Observations, late: Observations, peers: str
 ) -> Iterator[HalfScore]:
-    """Yield the scores of MAVProxy's magfit, fitted and tested on the same samples."""
+    """Yield the scores of MAVProxy's magfit, fitted and tested on the samples of the other methods."""
     if early.attitude is None or early.reference_ned is None:
         return
     time = deployment["time"].to_numpy()
@@ -251,7 +251,7 @@ def _magfits(
 
 
 def show_halves(paths: list[Path], peers: str, console: Console) -> None:
-    """Print a table for each compass of each log."""
+    """Print a table of all methods for each compass of each log."""
     for path in paths:
         for number in [str(one.number) for one in compasses_in(read(path))] or ["0"]:
             shown = table(
@@ -271,7 +271,7 @@ def show_halves(paths: list[Path], peers: str, console: Console) -> None:
 
 
 def tolles_lawson(u: FloatArray, time: FloatArray, field: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return permanent and induced terms (n, 9), and those of eddy currents (n, 9).
+    """Return the permanent and induced terms (n, 9), and the eddy-current terms (n, 9).
 
     `u` (n, 3) are the direction cosines of the field in the body; `time` in s, `field` in nT, (n,).
     """
@@ -282,7 +282,7 @@ def tolles_lawson(u: FloatArray, time: FloatArray, field: FloatArray) -> tuple[F
 
 
 def held_out_error(X: FloatArray, y: FloatArray) -> float:
-    """Return the RMS residual of y (n,) after least squares on X (n, k), parts held out in turn."""
+    """Return the RMS prediction error of y (n,) by least squares on X (n, k), parts held out in turn."""
     X = np.hstack([np.ones((len(X), 1)), X])
     part_of = np.arange(len(y)) * HELD_OUT_PARTS // len(y)
     missed = np.empty_like(y)
@@ -293,7 +293,7 @@ def held_out_error(X: FloatArray, y: FloatArray) -> float:
 
 
 def check_by_tolles_lawson(found: Diagnosis) -> tuple[float, float, float]:
-    """Return the residual about its mean, with permanent and induced terms, and with eddy currents, nT."""
+    """Return the residual without bias, with 9 Tolles-Lawson terms, and with 18 terms, nT RMS."""
     log, known = found.problem.survey, found.problem.calibration
     new = ~log.learned
     got = correct(known, log.field, log.values(known.channels), log.time)
@@ -306,13 +306,13 @@ def check_by_tolles_lawson(found: Diagnosis) -> tuple[float, float, float]:
 
 
 def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
-    """Return the fit of a vehicle's first logs, and the diagnosis of its others."""
+    """Return the fit of a vehicle's first logs, and the diagnosis of its test logs."""
     fitted = fit(observations(joined(vehicle.known), vehicle.parameters))
     return fitted, diagnose([joined(vehicle.asked)], fitted.calibration).diagnosis
 
 
 def show_diagnoses(data: Path, console: Console) -> None:
-    """Print the findings in each vehicle's log, and the independent check."""
+    """Print the findings in each vehicle's log, and the errors by Tolles-Lawson's terms."""
     shown = table(
         "Measured logs, nT RMS",
         "log", "scales", "verdict", "found", "before", "held out", "95 %", "about mean", "+ 9 terms",
@@ -334,7 +334,7 @@ def show_diagnoses(data: Path, console: Console) -> None:
 
 
 def show_survey(data: Path, console: Console) -> None:
-    """Print how well tie lines are predicted from the other lines, and the mis-ties of all."""
+    """Print the errors of tie lines predicted from the other lines, and the mis-ties of all lines."""
     samples = read_table(data / "rio_magnetic" / "rio-magnetic.csv.xz")
     done = survey(samples.part(~samples.tie))
     ties = samples.part(samples.tie)

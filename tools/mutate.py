@@ -1,13 +1,13 @@
-"""Small changes made to the heart of magbridge, one at a time, and whether its tests see them.
+"""Test the tests by mutation: change the code of important modules, and count the changes that tests detect.
 
     python3 tools/mutate.py                          ten changes to each module of the table below
-    python3 tools/mutate.py link/fixes -n 30         thirty to one
-    python3 tools/mutate.py --seed 2 -n 5            others
+    python3 tools/mutate.py link/fixes -n 30         thirty changes to one module
+    python3 tools/mutate.py --seed 2 -n 5            other random changes
 
-A comparison is turned, an operator exchanged, a number changed, a statement left out; then the tests of the
-module's own package run, until the first that fails. What lives is printed with its line: either nothing
-tests that, or the change changes nothing that matters, which only a reader can tell. Nothing is written:
-the change is made as the module is imported, in a fork of a process that has imported the libraries.
+A change reverses a comparison, exchanges an operator, alters a number or omits a statement. The module's
+tests then run until the first failure. The tool prints each undetected change with its line: either no test
+covers the line, or the change has no effect; a reader must decide. No file is written: a fork of a process
+that has imported the libraries imports the changed module.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ TESTS = {
     "health/scatter": "health/test_monitor.py",
     "health/trend": "health/test_monitor.py health/test_consistency.py",
 }
-"""The tests that have to see a change to each module."""
+"""Test files that must detect a change to each module."""
 SLOWER = 5.0
-"""Times the tests' own duration after which a change counts as seen: it made them hang."""
+"""Factor on the tests' normal duration after which a change counts as detected, because the tests hang."""
 LIBRARIES = (
     "msgspec",
     "numpy",
@@ -72,7 +72,7 @@ OTHER: dict[type[ast.AST], type[ast.AST]] = {
 
 
 def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str]]:
-    """Yield every node that may be changed, and how: an operator, a number, a condition or a statement."""
+    """Yield each node that can be changed, and its kind: operator, number, condition or statement."""
     skipped: set[ast.AST] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.AnnAssign | ast.arg):
@@ -113,10 +113,10 @@ def _is_for_types(node: ast.AST) -> bool:
 
 
 def change(tree: ast.Module, number: int, rng: random.Random) -> tuple[int, str]:
-    """Make the change of that number in a tree; return its line, and the change."""
+    """Make change `number` in a tree, in place; return its line and its description."""
     node, how = list(changes(tree))[number]
     before = ast.unparse(node).splitlines()[0]
-    new: Any = node  # of any kind: the attributes set below exist there
+    new: Any = node  # untyped, because the kind of the node decides its attributes
     match node, how:
         case ast.Compare(), _:
             new.ops[0] = OTHER[type(node.ops[0])]()
@@ -140,7 +140,7 @@ def change(tree: ast.Module, number: int, rng: random.Random) -> tuple[int, str]
 
 
 def _leave_out(tree: ast.Module, statement: Any) -> None:
-    """Put ``pass`` in place of a statement."""
+    """Replace a statement of a tree by ``pass``."""
     for parent in ast.walk(tree):
         for _, body in ast.iter_fields(parent):
             if isinstance(body, list) and statement in body:
@@ -148,24 +148,24 @@ def _leave_out(tree: ast.Module, statement: Any) -> None:
 
 
 class Changed(MetaPathFinder, Loader):
-    """Imports one module from a tree instead of its file."""
+    """Importer that executes a syntax tree in place of the file of one module."""
 
     def __init__(self, name: str, path: Path, tree: ast.Module) -> None:
         self.name, self.path, self.tree = name, path, tree
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:  # noqa: ARG002
-        """Answer for that module only."""
+        """Return the specification of the changed module; None for any other module."""
         if fullname != self.name:
             return None
         return spec_from_file_location(fullname, self.path, loader=self)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Run the tree."""
+        """Execute the tree in the namespace of the module."""
         exec(compile(self.tree, str(self.path), "exec"), module.__dict__)
 
 
 def run(module: str, tests: list[str], tree: ast.Module | None, limit: float) -> str:
-    """Run the tests in a fork with the tree in place of the module; return how they ended."""
+    """Run the tests in a fork, with the tree in place of the module; return their outcome."""
     child = os.fork()
     if not child:
         import pytest  # noqa: PLC0415 - imported before the fork
@@ -189,7 +189,7 @@ def run(module: str, tests: list[str], tree: ast.Module | None, limit: float) ->
 
 
 def main() -> int:
-    """Change each module so many times; print what lives, and the share that was seen."""
+    """Change each module; print undetected changes and the fraction detected; return the exit code."""
     parser = command_line(__doc__)
     parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {' '.join(TESTS)}")
     parser.add_argument("-n", type=int, default=10, help="changes to each")

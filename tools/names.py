@@ -1,11 +1,11 @@
-"""Check that a name in the package says something, and one thing only.
+"""Check that each name in the package is descriptive and has a single meaning.
 
     python tools/names.py [PACKAGE]   print each finding
     python tools/names.py --gate      compare the counts of each package with tools/limits.toml
 
-Findings: constants that have several values, classes defined in several places, functions and parameters
-named by a bare preposition, adverb or pronoun, modules that the pages name and that do not exist. Standard
-library only.
+Findings: constants with several values, classes defined in several places, functions and parameters named
+by a bare preposition, adverb or pronoun, and missing modules that the pages name. Standard library
+only.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
 GENERATED = "mavlink/dialect.py", "mavlink/enums.py"
-"""Modules that tools/dialect.py writes: their names are pymavlink's."""
+"""Modules that tools/dialect.py writes, with pymavlink's names."""
 PLUGIN_CLASSES = {"FileWriter"}
-"""Classes that every module of a plug-in interface defines: one meaning, several implementations."""
+"""Classes that each module of a plug-in interface defines, with one meaning and several implementations."""
 BARE = (
     "about after ago ahead alone among apart at back before behind below beside between beyond by down else "
     "even here inside instead near now of off often on once one other others ours out over own past since so "
@@ -52,7 +52,7 @@ def check(package: Path) -> dict[str, list[str]]:
                     functions.append(f"{path}:{node.lineno}: function {node.name}")
                 arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
                 names = [argument.arg for argument in arguments if argument.arg.strip("_") in BARE.split()]
-                if node.name.startswith("__") and names == ["other"]:  # of an operator, as Python names it
+                if node.name.startswith("__") and names == ["other"]:  # Python's name for an operand
                     names = []
                 parameters += [f"{path}:{node.lineno}: parameter {name} of {node.name}" for name in names]
     return {
@@ -86,7 +86,7 @@ def _constants(tree: ast.Module) -> Iterator[tuple[str, str]]:
 
 
 def missing_modules() -> list[str]:
-    """Return the modules that pages name in code and that the checkout does not have."""
+    """Return a line for each module that a page names in code and that the checkout lacks."""
     paths = [path.relative_to(ROOT) for path in ROOT.rglob("*") if path.suffix in {".md", ".py"}]
     paths = [path for path in paths if not path.parts[0].startswith(".")]
     modules = [f"/{path.as_posix()}" for path in paths if path.suffix == ".py"]
@@ -99,7 +99,7 @@ def missing_modules() -> list[str]:
 
 
 def gate() -> int:
-    """Print the kinds of findings above their limit; return 1 if there is one."""
+    """Print the kinds of findings above their limit, and missing modules; return 1 if there are any."""
     over = False
     for package, limits in tomllib.loads(LIMITS.read_text(encoding="utf-8"))["names"].items():
         for kind, findings in check(ROOT / package).items():

@@ -1,19 +1,19 @@
-"""Measure how accurate the navigator's position is on simulated maps, with its bound and with other programs.
+"""Measure the accuracy of the navigator's position on simulated maps, next to its bound and other programs.
 
     python tools/navigation.py [--runs 100] [--part accuracy] ... [--out FILE.parquet]
 
 accuracy      narrow and wide first positions, with the errors that an `auto` calibration leaves
-watch         how long a wrong position counts as valid
-misinformed   whether a position counts as valid when the field has an offset, or half of the map is missing
+watch         duration for which a wrong position counts as valid
+misinformed   validity of the position if the field has an offset, or half of the map's variance is missing
 unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 100 minutes
 smoothed      flights on a rough map, and on that map without its short wavelengths
 dived         gliders that dive under a map from 90 m, without and with its continuation
 calibrations  gliders, each calibrated by nominal, cubic and auto, that fly the same survey
-speed         one update, 100,000 samples, the start
+speed         processor time of an update, of 100,000 samples, and of the start
 peers         Stone Soup on the same measurements (--peers PYTHON); MagNav.jl's flight (--data DIR)
 
 Errors are those of the second half of each run, in m. *ratio* is the median of error / bound of the same run,
-*all* the RMS of all errors over that of all bounds, *lost* the share of the runs in which the truth was
+*all* the RMS of all errors over the RMS of all bounds, *lost* the fraction of the runs in which the truth was
 outside the 99.99 % ellipse for half an hour, and *NEES/2* is 1 if the claimed covariance is consistent.
 """
 
@@ -64,18 +64,18 @@ from magbridge.navigate.options import NavigationOptions
 
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))
 STARTS = {"narrow": 0.2, "wide": 1.0}
-"""1-sigma of the first position, in correlation lengths of the map."""
+"""1-sigma of the initial position, in correlation lengths of the map."""
 VEHICLES = {"6 h": SURVEYOR, "12 h": replace(SURVEYOR, hours=12.0), "aircraft": AIRCRAFT}
 PARTICLES = 20_000
 LEVEL_NT = 60.0
-"""Amount by which the field is measured too large in a misinformed run."""
+"""Offset of the field in a misinformed run, nT."""
 ROUGH = Map(40, 1000, rough=True)
 WAVELENGTHS_M = 1_000.0, 2_000.0
-"""Wavelengths of which half the amplitude stays on a smoothed map."""
+"""Wavelengths at which the smoothed maps keep half of the amplitude, m."""
 
 
 def rms_ratio(values: np.ndarray) -> float:
-    """Return the RMS of the first column over that of the second."""
+    """Return the RMS of the first column over the RMS of the second, of values (n, 2)."""
     return float(np.sqrt(np.mean(values[:, 0] ** 2) / np.mean(values[:, 1] ** 2)))
 
 
@@ -98,12 +98,12 @@ SCORES = {
 
 
 def run_accuracy(kind: Map, start: str, seed: int) -> list[Row]:
-    """Navigate with the errors of an auto calibration."""
+    """Navigate with the errors of an `auto` calibration; return the row."""
     return [{"map": str(kind), "start": start} | sail(*drawn_track(kind, seed, STARTS[start])).score()]
 
 
 def run_watch(case: str, kind: Map, seed: int) -> list[Row]:
-    """Measure for how long a wrong position counts as valid."""
+    """Measure the time for which a wrong position counts as valid; return the row."""
     silent, lost = {"carried": carried, "misled": misled}[case](kind, seed)
     row: Row = {"situation": case, "map": str(kind), "lost": float(lost > 0.0)}
     if lost > 0.0:
@@ -112,10 +112,10 @@ def run_watch(case: str, kind: Map, seed: int) -> list[Row]:
 
 
 def run_misinformed(case: str, kind: Map, seed: int) -> list[Row]:
-    """Measure the shares of the time in which a right and a wrong position count as valid.
+    """Measure the fractions of the time in which a right and a wrong position count as valid.
 
-    The field is measured 60 nT too large all along, where 0.5 nT is claimed (level); or the map holds half of
-    the variance of the field (half).
+    In the case "level", the field is always 60 nT too large, with a claimed sigma of 0.5 nT. In the case
+    "half", the map has half of the variance of the field.
     """
     field = None
     if case == "half":
@@ -129,13 +129,13 @@ def run_misinformed(case: str, kind: Map, seed: int) -> list[Row]:
 
 
 def run_dived(seed: int) -> list[Row]:
-    """Navigate a glider that dives under a map."""
+    """Navigate a glider that dives under a map, without and with the map's continuation; return the rows."""
     names = "as it was flown", "at the glider's depth"
     return [{"map": name} | found for name, found in zip(names, dived(seed), strict=True)]
 
 
 def run_smoothed(seed: int) -> list[Row]:
-    """Navigate one flight on a rough map and on smoothed ones."""
+    """Navigate one flight on a rough map and on smoothed maps; return the rows."""
     ds, raw, options = drawn_track(ROUGH, seed, 0.2)
     rows: list[Row] = [{"map": str(ROUGH)} | sail(ds, raw, options).score()]
     for length in WAVELENGTHS_M:
@@ -145,12 +145,12 @@ def run_smoothed(seed: int) -> list[Row]:
 
 
 def run_unmapped(name: str, kind: Map, seed: int) -> list[Row]:
-    """Localise a survey without a map."""
+    """Localise a survey without a map; return the row."""
     return [{"vehicle": name, "map": str(kind)} | located(VEHICLES[name], kind, seed)]
 
 
 def run_stone_soup(python: str, kind: Map, start: str, seed: int) -> list[Row]:
-    """Give Stone Soup's extended Kalman filter and particle filter the same measurements."""
+    """Compare the navigator with Stone Soup's Kalman and particle filters on the same measurements."""
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, start_sigma=STARTS[start] * grid.correlation_length)
     ds = track_over(grid, options, 1000 + seed)
@@ -286,7 +286,7 @@ def cases_of(part: str, options: argparse.Namespace) -> list[tuple[Any, ...]]:
 
 
 def show_speed(console: Console) -> None:
-    """Print the processor time of an update, of 100,000 samples, and of a sample of a wide start."""
+    """Print the processor time of an update, of 100,000 samples, and of a sample after a wide start."""
     grid = synthetic(Map(30, 1500), 3, 40_000.0)
     options = with_options(GLIDER, start_sigma=50.0)
     tracker = Bank(grid, *prior(options), np.inf, options.gate)
@@ -308,10 +308,10 @@ def show_speed(console: Console) -> None:
 
 
 def show_magnav(folder: Path, console: Console) -> None:
-    """Print the errors on MagNav.jl's simple example: its map, its magnetometer, its inertial track.
+    """Print the errors on MagNav.jl's simple example, with its map, magnetometer and inertial track.
 
-    The inertial track is 2 m off over 100 s. The filters cannot be compared: MagNav.jl's estimates the errors
-    of the inertial unit.
+    The inertial track has an error of 2 m after 100 s. MagNav.jl's filter is not comparable, because it
+    estimates the errors of the inertial unit.
     """
     grid, ds = magnav_flight(folder)
     names = ("gps_latitude", "gps_longitude", "dr_latitude", "dr_longitude")

@@ -1,4 +1,4 @@
-"""Compare in-flight calibration with the fixed calibration, in a world of its own.
+"""Compare in-flight calibration with the fixed calibration, in a simulation that does not use ``sitl``.
 
     python3 tools/never_worse.py                          every change, vehicles 1 to 4
     python3 tools/never_worse.py none --vehicles 11 12    vehicles that were not used for tuning
@@ -37,7 +37,7 @@ MU0_OVER_4PI_NT = 100.0
 
 @dataclass(frozen=True)
 class Track:
-    """A trajectory with its telemetry: `time` (n,) s, attitude (n, 3) rad, position (deg, m), masses."""
+    """Trajectory and telemetry: `time` (n,) s, attitude (n, 3) rad, position (deg, m) and masses."""
 
     time: FloatArray
     attitude: FloatArray
@@ -48,14 +48,14 @@ class Track:
     temperature: FloatArray
 
     def metres(self) -> FloatArray:
-        """Return north and east of the first position (n, 2), m."""
+        """Return the positions (n, 2), m north and east of the first position."""
         north = (self.latitude - self.latitude[0]) * METRES_PER_DEGREE
         east = (self.longitude - self.longitude[0]) * METRES_PER_DEGREE * np.cos(np.radians(self.latitude[0]))
         return np.stack([north, east], axis=1)
 
 
 class Crust:
-    """A random crustal anomaly (nT) of a standard deviation and a shortest wavelength (m)."""
+    """Random crustal anomaly with a given standard deviation (nT) and shortest wavelength (m)."""
 
     def __init__(self, seed: int, sigma_nt: float, wavelength_m: float, waves: int = 60) -> None:
         rng = np.random.default_rng([seed, 11])
@@ -66,12 +66,12 @@ class Crust:
         self._amplitude = sigma_nt * np.sqrt(2.0 / waves)
 
     def at_position(self, metres: FloatArray) -> FloatArray:
-        """Return the anomaly (n,) at north and east (n, 2), m."""
+        """Return the anomaly (n,), nT, at positions (n, 2), m north and east."""
         return np.asarray(self._amplitude * np.cos(metres @ self._k.T + self._phase).sum(axis=1))
 
 
 class Vehicle:
-    """Hard iron, soft iron and dipole masses of one vehicle, drawn from `seed`."""
+    """Magnetic model of a vehicle: hard iron, soft iron and dipole masses, drawn from `seed`."""
 
     def __init__(self, seed: int, masses: tuple[str, ...] = ("battpos", "ballast")) -> None:
         rng = np.random.default_rng([seed, 3])
@@ -116,7 +116,7 @@ def to_body(attitude: FloatArray, ned: FloatArray) -> FloatArray:
 
 
 def smooth(values: FloatArray, samples: float) -> FloatArray:
-    """Return a moving mean, which makes ramps of steps."""
+    """Return the moving mean of values (n,) over a number of samples, which turns steps into ramps."""
     width = max(round(samples), 1)
     padded = np.concatenate([np.full(width, values[0]), values, np.full(width, values[-1])])
     kernel = np.ones(width) / width
@@ -124,7 +124,7 @@ def smooth(values: FloatArray, samples: float) -> FloatArray:
 
 
 def wander(rng: np.random.Generator, n: int, step: float, tau: float, sigma: float) -> FloatArray:
-    """Return an Ornstein-Uhlenbeck process (n,)."""
+    """Return a smoothed Ornstein-Uhlenbeck process (n,) with time constant `tau` (s) and 1-sigma `sigma`."""
     keep = np.exp(-step / tau)
     out = np.empty(n)
     state = rng.normal()
@@ -186,7 +186,7 @@ def glider_track(
 
 
 def as_log(track: Track, field: FloatArray, unit: str = "in") -> xr.Dataset:
-    """Return the log of a track: the channels of a `field` (n, 3), nT, and all telemetry."""
+    """Return the log of a track, with the readings `field` (n, 3), nT, and all telemetry."""
     columns: dict[str, Any] = {
         f"mag_{axis}": ("time", field[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")
     }
@@ -217,27 +217,27 @@ def seconds(track: Track) -> FloatArray:
 
 
 def none(track: Track, direction: FloatArray) -> FloatArray:
-    """Change nothing."""
+    """Return a zero field (n, 3): no change."""
     return np.zeros((len(track.time), 3)) * direction
 
 
 def step(track: Track, direction: FloatArray) -> FloatArray:
-    """Change the offset by 60 nT in the middle of the survey."""
+    """Return an offset step (n, 3) of 60 nT in the middle of the survey."""
     return np.asarray(60.0 * (seconds(track) >= 0.0)[:, None] * direction)
 
 
 def drift(track: Track, direction: FloatArray) -> FloatArray:
-    """Add an offset that drifts by 60 nT over the survey."""
+    """Return an offset (n, 3) that drifts by 60 nT over the survey."""
     return np.asarray(60.0 * np.linspace(0.0, 1.0, len(track.time))[:, None] * direction)
 
 
 def temperature(track: Track, direction: FloatArray) -> FloatArray:
-    """Add an offset of 1 nT/degC."""
+    """Return an offset (n, 3) of 1 nT/degC."""
     return np.asarray((track.temperature - 10.0)[:, None] * direction)
 
 
 def current(track: Track, direction: FloatArray) -> FloatArray:
-    """Let a pump's current add 20 nT in two of every ten minutes, without telemetry."""
+    """Return the field (n, 3) of a pump without telemetry: 20 nT in two of every ten minutes."""
     return np.asarray(20.0 * ((track.time % 600.0) < 120.0)[:, None] * direction)
 
 
@@ -251,7 +251,7 @@ CHANGES: dict[str, Change] = {
 
 
 def run(name: str, seed: int, hours: float) -> list[Row]:
-    """Return the errors of the fixed calibration and of the one that is learned in flight."""
+    """Return the row of one vehicle: RMS errors of the fixed and of the in-flight calibration."""
     vehicle, rng = Vehicle(seed), np.random.default_rng([seed, 21])
     runs = glider_track(seed, 5.0, 0.25, spirals=True)
     calibration = calibrate(vehicle, runs, rng.normal(0.0, 1.0, (len(runs.time), 3)))
@@ -286,7 +286,7 @@ STUDY = Study(
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the cases and print the table."""
     parser = study_options(__doc__)
     parser.add_argument("names", nargs="*", metavar="CHANGE", help="; ".join(CHANGES))
     parser.add_argument("--vehicles", type=int, nargs="+", default=[1, 2, 3, 4])

@@ -1,6 +1,6 @@
-"""Public magnetometer calibrations on a glider's data: run by tools/accuracy.py in another interpreter.
+"""Run third-party magnetometer calibrations on a glider's data, for tools/accuracy.py in another interpreter.
 
-magyc (PyPI) needs numpy < 2 and gtsam, MAVProxy a desktop; neither belongs into magbridge's environment. So::
+magyc (PyPI) needs numpy < 2 and gtsam, MAVProxy needs a desktop. Neither fits magbridge's environment, so::
 
     python -m venv .venv-peers
     .venv-peers/bin/pip install magyc MAVProxy pymavlink
@@ -28,21 +28,21 @@ import numpy as np
 
 NT_PER_MILLIGAUSS = 100.0
 MAGFIT_SAMPLES = 250
-"""magfit sums in Python; it is given every n-th sample, as its own 'Reduce' does."""
+"""Maximum number of samples for magfit, which is slow; they are evenly spaced, as by its 'Reduce'."""
 
 
 def magfit(data: dict[str, np.ndarray], *, motors: bool = False) -> np.ndarray:
-    """Fit offsets, scale, diagonals and off-diagonals by attitude and the Earth's field with MAVProxy.
+    """Fit offsets, scale, diagonals and off-diagonals with MAVProxy; return the corrected field (n, 3), nT.
 
-    `motors`: also its compensation of the battery's current.
+    The fit uses the attitude and the Earth's field, and with `motors` also the battery's current.
     """
-    # it imports a desktop toolkit for its window; the fit itself does not use it
+    # replace the desktop toolkit, which magfit imports for its window and does not use in the fit
     desktop = types.SimpleNamespace(Dialog=object, Panel=object, Frame=object)
     for name in ("wx_loader", "wx_processguard", "grapher", "multiproc_util"):
         stand_in: Any = types.ModuleType(name)
         stand_in.wx, stand_in.MPDataLogChildTask = desktop, object
         sys.modules[f"MAVProxy.modules.lib.{name}"] = stand_in
-    from MAVProxy.modules.lib import magfit as peer  # noqa: PLC0415  once its desktop is stood in for
+    from MAVProxy.modules.lib import magfit as peer  # noqa: PLC0415  after its desktop is replaced
     from pymavlink.rotmat import Vector3  # noqa: PLC0415
 
     rows = slice(None, None, max(1, len(data["field"]) // MAGFIT_SAMPLES))
@@ -70,7 +70,7 @@ def magfit(data: dict[str, np.ndarray], *, motors: bool = False) -> np.ndarray:
 
 def _magyc(name: str) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
     def run(data: dict[str, np.ndarray]) -> np.ndarray:
-        import magyc  # noqa: PLC0415  so that one peer may be missing
+        import magyc  # noqa: PLC0415  magyc may be missing
 
         gauss = data["field"] * 1e-5
         method = getattr(magyc, name)
@@ -78,7 +78,7 @@ def _magyc(name: str) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
             found = method(gauss, data["reference_ned"] * 1e-5)
         elif name == "magfactor3":
             north, east, _ = data["reference_ned"]
-            west = -float(np.degrees(np.arctan2(east, north)))  # the sign it expects: the other is far worse
+            west = -float(np.degrees(np.arctan2(east, north)))  # magyc's sign: the opposite is far worse
             found = method(gauss, np.radians(data["attitude"]), west, data["reference_ned"] * 1e-5)
         elif name.startswith("ellipsoid"):
             found = method(gauss)
@@ -103,7 +103,7 @@ METHODS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
     "magyc magyc_nls": _magyc("magyc_nls"),
     "magyc magyc_bfg": _magyc("magyc_bfg"),
 }
-"""Each takes the data and returns the corrected field (n, 3), nT."""
+"""Functions that take the data and return the corrected field (n, 3), nT, by name."""
 
 
 def main() -> None:
@@ -121,13 +121,13 @@ def main() -> None:
                 corrected = method(data)
             if not np.isfinite(corrected).all():
                 raise ValueError("its answer is not finite")  # noqa: TRY301
-        # whatever a stranger's code raises is its result here
+        # any exception of third-party code is a result
         except (Exception, SystemExit) as error:  # noqa: BLE001
             results[name] = {"failed": f"{type(error).__name__}: {error}".splitlines()[0][:120]}
             continue
         affine = np.linalg.lstsq(design, corrected, rcond=None)[0]
         size = np.linalg.norm(design @ affine, axis=1)
-        affine *= (size @ reference) / (size @ size)  # most know no scale: give them the best
+        affine *= (size @ reference) / (size @ size)  # most methods estimate no scale, so use the best
         A, b, K = affine[:3].T, affine[3], affine[4]
         results[name] = {"A": A.tolist(), "T": (-np.linalg.pinv(A) @ b).tolist(), "K": K.tolist()}
     json.dump(results, sys.stdout)

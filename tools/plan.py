@@ -1,8 +1,8 @@
 """Compare planned calibration runs with the paper's Table 1 at the same flight time, on random gliders.
 
-One plan for all, made before the first flight from the prior alone: ten spirals as long as the table's,
-masses and pitch within the table's own ends, trimmed as the vehicle trims itself, banked as the paper's at
-most. Each glider is calibrated by `auto` on either, and flies the same survey.
+All gliders get one plan, which is computed from the prior before any data exist. It has ten spirals as long
+as the table's, with masses and pitch within the table's ranges, the vehicle's trim and at most the paper's
+bank. Each glider is calibrated by `auto` on both sets of runs, and surveys the same track.
 
     python tools/plan.py --seeds 12
 """
@@ -37,11 +37,11 @@ from sitl.mission import TABLE_1, Run, Spirals
 from sitl.scenario import Scenario
 
 BANK_DEG = 6.0
-"""Maximum bank to either side; the paper's spirals had it on one side."""
+"""Maximum bank to either side, deg; the paper's spirals have this bank to one side."""
 
 
 def plans(scenario: Scenario, noise: float) -> dict[str, tuple[list[PlannedRun], float]]:
-    """Return Table 1 and as many planned runs, each with the error expected over the mission, nT."""
+    """Return the runs of Table 1 and of the plan by name, each with its predicted RMS error, nT."""
     parts = segments(simulate(scenario, 0))
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
     before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=noise)
@@ -57,13 +57,13 @@ def plans(scenario: Scenario, noise: float) -> dict[str, tuple[list[PlannedRun],
 
 
 def observed(part: xr.Dataset) -> Observations:
-    """Return a part of a deployment with its true field's vector."""
+    """Return the samples of a part of a deployment at rest, with the true field vector as reference."""
     found = observations(at_rest(part, MASSES), MASSES)
     return dataclasses.replace(found, reference_ned=np.tile(main_field(part)[0], (len(found), 1)))
 
 
 def run(seed: int, noise: float, name: str, runs: list[PlannedRun], expected: float) -> list[Row]:
-    """Calibrate a glider on runs and score the calibration on its survey."""
+    """Calibrate a glider on `runs` and score the calibration on its survey; return the row."""
     scenario = load("random_glider").replace(instrument={"noise_sigma": noise})
     if name == "planned":
         spirals = tuple(

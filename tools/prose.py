@@ -4,7 +4,8 @@
     python tools/prose.py --gate      compare every area's findings per 1,000 words with tools/limits.toml
     python tools/prose.py --areas     print the table of all areas
 
-An area is a folder or a file of ``[prose]`` in the limits; the longest match counts. Standard library only.
+An area is a key of ``[prose]`` in the limits: a folder or a file. A file belongs to the longest key that
+matches. Standard library only.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ LIMITS = ROOT / "tools" / "limits.toml"
 MAX_SENTENCE_WORDS, MAX_SENTENCE_NUMBERS = 25, 4
 GENERATED = ("magbridge/mavlink/dialect.py", "magbridge/mavlink/enums.py")
 QUOTED = ("tools/prose.py", "tests/tools/test_gate.py")
-"""Files that hold the words in question, to find them."""
+"""Files that contain the forbidden words because they search for them."""
 
 RULES = {
     "said": (
@@ -95,7 +96,7 @@ NUMBER = re.compile(r"(?<![\w`./:-])[-−]?\d[\d,.]*")
 
 
 class Finding(NamedTuple):
-    """One finding of a rule."""
+    """Violation of a rule: line, rule, text around it, and advice."""
 
     line: int
     rule: str
@@ -129,7 +130,7 @@ def _lengths(line: int, sentence: str) -> Iterator[Finding]:
 
 
 def _page(text: str) -> Iterator[tuple[int, str]]:
-    """Yield line and sentence of a page; code blocks, tables and headings are left out."""
+    """Yield line and text of each sentence of a page, without code blocks, tables and headings."""
     text = re.sub(
         r"```.*?```|<!--.*?-->", lambda block: "\n" * block.group().count("\n"), text, flags=re.DOTALL
     )
@@ -145,7 +146,7 @@ def _page(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _sentences(line: int, text: str) -> Iterator[tuple[int, str]]:
-    """Yield the sentences of a paragraph; code becomes one word, a link its text."""
+    """Yield line and text of each sentence of a paragraph, with code as one word and links as text."""
     text = re.sub(r"`[^`]*`", "CODE", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)).replace("**", "")
     for sentence in re.split(r"(?<=[.!?])\s+(?=[A-Z(\"'*])", text):
         if sentence.strip():
@@ -153,7 +154,7 @@ def _sentences(line: int, text: str) -> Iterator[tuple[int, str]]:
 
 
 def _code(text: str) -> Iterator[tuple[int, str]]:
-    """Yield line and sentence of docstrings, attribute docstrings, comments and messages."""
+    """Yield line and text of each sentence in docstrings, attribute docstrings, comments and messages."""
     nodes = list(ast.walk(ast.parse(text)))
     documentation = {id(node.value): node.lineno for node in nodes if isinstance(node, ast.Expr)}
     for node in nodes:
@@ -170,7 +171,7 @@ def _code(text: str) -> Iterator[tuple[int, str]]:
 
 
 def files_of(paths: list[Path]) -> list[Path]:
-    """Return the pages and modules among the paths and under them."""
+    """Return the Markdown pages and Python modules among the paths and in their folders."""
     found: list[Path] = []
     for path in paths:
         found += [path] if path.is_file() else (p for p in path.rglob("*") if p.suffix in {".md", ".py"})
@@ -178,7 +179,7 @@ def files_of(paths: list[Path]) -> list[Path]:
 
 
 def checkout() -> list[Path]:
-    """Return the pages and modules of the checkout."""
+    """Return the Markdown pages and Python modules of the checkout, without generated and quoted files."""
     try:
         listed = subprocess.run(
             ["git", "ls-files", "*.md", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -204,7 +205,7 @@ def areas(limits: dict[str, float]) -> dict[str, tuple[int, int]]:
 
 
 def compare(*, verbose: bool) -> int:
-    """Print the areas above their limit, or all of them; return 1 if there is one above."""
+    """Print the areas above their limit, or all areas if `verbose`; return 1 if an area is above."""
     limits = tomllib.loads(LIMITS.read_text(encoding="utf-8"))["prose"]
     over = 0
     for area, (findings, words) in areas(limits).items():

@@ -2,11 +2,11 @@
 
     python tools/readers.py [--times 3] LOG...
 
-Each reader has a process of its own, its start and its imports included; Slocum's segments are read together.
-Printed are processor seconds (of all processes; the least of several runs), their ratio, and the largest
-memory. A peer reads the same as far as its options allow: pymavlink and rosbags are asked for the messages
-that magbridge reads, pyulog for its topics, dbdreader for its sensors; xarray loads all. A peer's process
-does not import magbridge: this one gives it the names.
+Each reader runs in its own process, whose start and imports count; Slocum segments are read together. The
+table has the processor time (all processes, least of several runs), its ratio, and the largest memory.
+Third-party readers read the same content as far as their options allow: pymavlink and rosbags read
+magbridge's messages, pyulog its topics, dbdreader its sensors, xarray all variables. Their processes do not
+import magbridge, but get the names from this process.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ OURS = "magbridge"
 
 
 def ours(paths: list[Path], wanted: Any) -> None:  # noqa: ARG001 - it knows what it reads
-    """Read as ``magbridge convert`` does."""
+    """Read the logs as ``magbridge convert`` does."""
     from magbridge.logs import read_each  # noqa: PLC0415 - its imports are part of what is measured
 
     read_each(paths)
 
 
 def by_xarray(paths: list[Path], wanted: Any) -> None:  # noqa: ARG001 - it has no such option
-    """Load every variable."""
+    """Load every variable of the files."""
     import xarray as xr  # noqa: PLC0415
 
     for path in paths:
@@ -73,7 +73,7 @@ def by_rosbags(paths: list[Path], wanted: Any) -> None:
 
 
 def by_dbdreader(paths: list[Path], wanted: Any) -> None:
-    """Read the sensors that magbridge reads, of flight and science files."""
+    """Read the sensors that magbridge reads, from flight and science files."""
     import dbdreader  # noqa: PLC0415
 
     partners = [path.with_suffix(wanted[0][path.suffix]) for path in paths if path.suffix in wanted[0]]
@@ -83,7 +83,7 @@ def by_dbdreader(paths: list[Path], wanted: Any) -> None:
 
 
 def wanted_by(name: str) -> Any:
-    """Return what magbridge reads of a format, in the terms of the peer."""
+    """Return the names that magbridge reads of a format, as the third-party reader expects them, or None."""
     from magbridge.logs import ardupilot, px4, rosbag, slocum, telemetry  # noqa: PLC0415
 
     return {
@@ -132,7 +132,7 @@ def main() -> None:
 
 
 def _groups(logs: list[Path]) -> list[tuple[str, list[Path]]]:
-    """Return the logs by format: each alone, but segments together."""
+    """Return format and paths of each reading task: one log each, but all Slocum segments together."""
     from magbridge.logs.registry import FORMATS, format_of  # noqa: PLC0415
 
     names = {id(form): name for name, form in FORMATS.items()}
@@ -150,7 +150,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _timed(reader: str, paths: list[Path], times: int) -> tuple[float, float]:
-    """Return the least processor time (s) and the memory (MB) of several runs."""
+    """Return the least processor time (s) and the largest memory (MB) of several runs of a reader."""
     wanted = "null" if reader == OURS else json.dumps(wanted_by(reader))
     command = [sys.executable, __file__, "--reader", reader, "--wanted", wanted, *map(str, paths)]
     found = []
@@ -161,7 +161,7 @@ def _timed(reader: str, paths: list[Path], times: int) -> tuple[float, float]:
 
 
 def _used() -> tuple[float, float]:
-    """Return the processor time (s) of this process and its children, and the memory (MB) of the larger."""
+    """Return the processor time (s) of this process and its children, and their largest memory (MB)."""
     parts = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in parts), max(one.ru_maxrss for one in parts) / 1e3
 
