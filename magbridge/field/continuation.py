@@ -1,14 +1,14 @@
 r"""Continuation of a field to another height, with an error estimate; one map from several surveys.
 
-A map is flown in the air, or continued to one altitude above the sea; the vehicle is below. Every wave of a
-field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
+A map holds at an altitude above the sea, but the vehicle is below. Every wave of a field whose sources lie
+deeper decays with height (Blakely 1995, eq. 12.8),
 
 .. math:: \hat T(\mathbf k, z + h) = \hat T(\mathbf k, z)\, e^{-|\mathbf k| h} .
 
-Downward, the inverse would amplify waves that the survey did not resolve. With p = 1 - exp(-|k| h) it is a
-series, exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ...: its first three terms, which are used, at most treble
-the map's own noise; the terms after them are counted as error. Above and below the level reached, the field
-is extrapolated by its vertical gradient, of spectrum |k| T.
+Downward, the inverse would amplify waves that the survey did not resolve. With p = 1 - exp(-|k| h) the
+inverse is the series exp(|k| h) = 1 / (1 - p) = 1 + p + p² + ... The module uses its first three terms, which
+at most treble the map's noise, and counts later terms as error. Above and below the new level, it
+extrapolates the field by its vertical gradient, of spectrum |k| T.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ __all__ = [
 ]  # fmt: skip
 
 SURE, TERMS = 3, 10
-"""Terms of the series that are used, and terms that stand for the true field when the error is estimated:
-later ones are waves that no survey from above resolves."""
+"""Number of terms of the series that the continuation uses, and that stand for the true field in the error
+estimate. Later terms are waves that no survey from above resolves."""
 DEPTH_QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Quantiles of the depth at which the error is estimated."""
+"""Quantiles of the depths at which the error is computed and averaged."""
 
 
 class Continued(NamedTuple):
-    """A grid at another height, and the error of the continuation."""
+    """Grid continued to another height, and the error of the continuation."""
 
     grid: AnomalyGrid
     sigma: float
-    """1-sigma of what the continuation leaves out, nT; 0 upward to one level."""
+    """1-sigma of the continuation's error, nT; 0 for an upward continuation to a single depth."""
     length: float
-    """Correlation length of that error, m: at short distances its correlation falls as exp(-r²/2 length²)."""
+    """Correlation length of the error, m: its correlation at a short distance r is exp(-r²/2 length²)."""
 
 
 def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     """Return a grid continued to the mean depth, with its vertical gradient there; holes stay holes.
 
-    `depth` (n,): all depths at which the grid will be used, m below the surface; negative is above. A grid of
-    unknown altitude is returned unchanged.
+    `depth` (n,) are all depths at which the grid will be used, m below the surface; negative is above. A grid
+    of unknown altitude is returned unchanged.
 
     Notes
     -----
@@ -72,7 +72,7 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     k = _wavenumber(grid)
     surveyed = dctn(filled(grid.anomaly), norm="ortho")
     gain = _growth(k, height, SURE)
-    # Spectrum of the error: what the truncated series and the linear term leave, over quantiles of depth.
+    # Spectrum of the error of the truncated series and of the linear term, over quantiles of depth.
     error2 = np.zeros_like(k)
     for below in np.quantile(used, DEPTH_QUANTILES) - level:
         linear = gain * (1 + k * below)
@@ -92,25 +92,25 @@ def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatAr
 
 
 def _filtered(values: FloatArray, gain: FloatArray) -> FloatArray:
-    """Return values (ny, nx), holes filled, with the terms of their cosine transform times a `gain`."""
+    """Return values (ny, nx), holes filled, after multiplying their cosine transform by `gain` (ny, nx)."""
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 
     return np.asarray(idctn(dctn(filled(values), norm="ortho") * gain, norm="ortho"))
 
 
 SIGN_WAVELENGTH_FRACTION = 0.25
-"""Fraction of the smoothed wavelength within which the removed part has one sign."""
+"""Correlation length of the part that smoothing removes, as a fraction of the smoothed wavelength."""
 
 
 def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
-    """Return a grid without its short waves; the removed part counts as its sigma. Holes stay holes.
+    """Return a grid without its short waves; the removed part adds to its sigma. Holes stay holes.
 
-    A wave of `wavelength` (m) keeps half its amplitude, one of twice that 84 %, one of half that 6 %.
+    A wave of `wavelength` (m) keeps half its amplitude, a wave twice as long 84 %, one half as long 6 %.
 
     Notes
     -----
-    The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The sigma added is the RMS
-    of the removed part, over the map: around a node it is that of a wave or two, and chance.
+    The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The added sigma is the RMS
+    of the removed part over the whole map, because around a node too few waves determine it.
     """
     gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
     anomaly = np.where(np.isnan(grid.anomaly), np.nan, _filtered(grid.anomaly, gain))
@@ -122,7 +122,7 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
 
 
 def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:
-    """Return exp(k height), downward the first `terms` of its series."""
+    """Return exp(k height), or for height > 0 (downward) the sum of the first `terms` of its series."""
     if height <= 0:
         return np.asarray(np.exp(k * height))
     # exp(k h) = 1 / (1 - p) = 1 + p + p^2 + ...: the first terms amplify noise least.
@@ -141,11 +141,11 @@ def _wavenumber(grid: AnomalyGrid) -> FloatArray:
 
 
 MAX_MERGED_NODES = 10_000_000
-"""Nodes of a merged map. As many, from two surveys that overlap, take 2 GB."""
+"""Largest number of nodes of a merged map; from two surveys that overlap, they take 2 GB of memory."""
 
 
 class PreparationStep(NamedTuple):
-    """A stage of the preparation and the grid that it left."""
+    """One step of the preparation of a map, with its resulting grid."""
 
     title: str
     grid: AnomalyGrid
@@ -160,10 +160,10 @@ def prepare(
 ) -> tuple[AnomalyGrid, list[PreparationStep]]:
     """Return one map from several surveys, and each intermediate step.
 
-    Every grid is continued upward to `altitude`, m, by default the highest of the grids'. `smooth` (km) is
-    the wavelength of which half the amplitude stays (:func:`smoothed`), 0 for none. Nodes outside the polygon
-    `mask` (k, 2), longitude and latitude in deg, become holes. `spacing` is that of the map, deg, by default
-    the finest of the grids'.
+    Every grid is continued upward to `altitude`, m; default: the highest altitude of the grids. `smooth` (km)
+    is the wavelength that keeps half its amplitude (:func:`smoothed`); 0 for no smoothing. Nodes outside the
+    polygon `mask` (k, 2), longitude and latitude in deg, become holes. `spacing` is the node distance of the
+    map, deg; default: the finest of the grids.
 
     OutOfRange: an altitude below a grid's; a grid of unknown altitude that is to be continued, or merged with
     one of known altitude; more than :data:`MAX_MERGED_NODES` nodes.
@@ -201,9 +201,9 @@ def prepare(
 
 
 def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> list[AnomalyGrid]:
-    """Return the grids, those of unknown altitude at `altitudes` (m): one for all, or one for each.
+    """Return the grids; those of unknown altitude get one of `altitudes` (m): one for all, or one for each.
 
-    WrongUse: there are more or fewer of them.
+    WrongUse: the number of altitudes is neither one nor that of the grids.
     """
     if len(altitudes) not in (1, len(grids)):
         count = f"{len(altitudes)} altitudes for {len(grids)} grids"
@@ -216,7 +216,7 @@ def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> lis
 
 
 def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
-    """Return the grid as a survey `height` m higher would have seen it, holes kept; OutOfRange: below 0 m."""
+    """Return the grid continued upward by `height` m; holes stay holes. OutOfRange: `height` is negative."""
     if height < 0.0:
         covered = f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward"
         raise OutOfRange("altitude", f"{grid.altitude + height:.0f} m", covered)
@@ -224,10 +224,10 @@ def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
 
 
 def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[AnomalyGrid, float]:
-    """Return the mean of the grids wherever at least one has a value; on the finest of their spacings.
+    """Return the mean of the grids at each node that any grid covers, and their RMS difference, nT.
 
-    And by how many nT RMS two of them differ where they overlap; NaN where none do. The differences show
-    their errors: the mean of their variances is taken as at least half of the mean squared difference.
+    `spacing` is in deg; default: the finest of the grids. The difference is over the overlaps, and NaN
+    without any. The variance of a grid in an overlap is at least half of the mean squared difference.
     OutOfRange: more than :data:`MAX_MERGED_NODES` nodes.
     """
     first = grids[0]
@@ -273,7 +273,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
 
 
 def draw_steps(steps: Sequence[PreparationStep], path: str | Path) -> None:
-    """Draw every step on one page, one colour scale, to `path` (PNG, PDF, SVG)."""
+    """Draw the grids of all steps with one colour scale, and write the page to `path` (PNG, PDF, SVG)."""
     from matplotlib.figure import Figure  # noqa: PLC0415  only drawing needs it
 
     columns = min(3, len(steps))
@@ -319,6 +319,6 @@ def _cover(axes: Sequence[FloatArray], step: float) -> FloatArray:
 
 
 def _reach(axis: FloatArray, grid_axis: FloatArray) -> slice:
-    """Return where on an axis a grid with its `grid_axis` axis has values, and a node more on either side."""
+    """Return the slice of `axis` that `grid_axis` covers, with one more node on either side."""
     first, last = np.searchsorted(axis, grid_axis[[0, -1]])
     return slice(max(int(first) - 1, 0), int(last) + 1)

@@ -17,13 +17,13 @@ __all__ = [
 EQUATORIAL_RADIUS = 6_378_137.0
 """Equatorial radius of WGS84, m."""
 ECCENTRICITY_SQUARED = 6.694_379_990_14e-3
-"""Of WGS84."""
+"""Squared first eccentricity of WGS84."""
 RADIAN = pi / 180.0
-"""A degree, in radians."""
+"""Radians in a degree."""
 ACROSS = EQUATORIAL_RADIUS * RADIAN
-"""m per degree of longitude, divided by w."""
+"""Metres per degree across the meridian for w = 1, before cos φ (:func:`metres_per_degree`)."""
 ALONG = ACROSS * (1.0 - ECCENTRICITY_SQUARED)
-"""m per degree of latitude, divided by w³."""
+"""Metres per degree of latitude for w = 1 (:func:`metres_per_degree`)."""
 
 Number = TypeVar("Number", float, FloatArray)
 
@@ -33,7 +33,7 @@ def metres_per_degree(latitude: float) -> tuple[float, float]: ...
 @overload
 def metres_per_degree(latitude: FloatArray) -> tuple[FloatArray, FloatArray]: ...
 def metres_per_degree(latitude: float | FloatArray) -> tuple[float | FloatArray, float | FloatArray]:
-    """Return the metres that a degree of latitude and one of longitude span at `latitude` (deg, or (n,)).
+    """Return the lengths, m, of a degree of latitude and of a degree of longitude at `latitude` (deg; (n,)).
 
     Notes
     -----
@@ -49,10 +49,10 @@ def metres_per_degree(latitude: float | FloatArray) -> tuple[float | FloatArray,
 
 
 def offset(latitude: float, longitude: float, north: Number, east: Number) -> tuple[Number, Number]:
-    """Return (latitude, longitude), deg, `north` and `east` m from a position; longitude in -180..180.
+    """Return (latitude, longitude), deg, at `north` and `east` m from a position; longitude in -180..180.
 
-    Both radii are those at the position one starts from, so :func:`separation` is its exact inverse;
-    over 20 km at 60 degrees that bends an east-west line by 50 m at most.
+    Both radii of curvature are those at the start, so that :func:`separation` is the exact inverse. The error
+    of an east-west line of 20 km at 60 degrees is at most 50 m.
     """
     per_latitude, per_longitude = metres_per_degree(latitude)
     return latitude + north / per_latitude, wrap(longitude + east / per_longitude)
@@ -70,16 +70,16 @@ def separation(
     to_longitude: FloatArray,
 ) -> tuple[FloatArray, FloatArray]: ...
 def separation(latitude: Any, longitude: Any, to_latitude: Any, to_longitude: Any) -> tuple[Any, Any]:
-    """Return m (north, east) from one position (deg) to another, from one to many (n,), or pair by pair.
+    """Return the separation, m (north, east), from one position (deg) to another; the inverse of `offset`.
 
-    The inverse of :func:`offset`.
+    Arrays (n,) give separations from one position to many, or pair by pair.
     """
     per_latitude, per_longitude = metres_per_degree(latitude)
     return (to_latitude - latitude) * per_latitude, wrap(to_longitude - longitude) * per_longitude
 
 
 def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
-    """Return a position's 1-sigma (m) along its ellipse's longer axis; the covariance is (north, east) in m².
+    """Return a position's 1-sigma (m) along the longer axis of its error ellipse; covariance elements in m².
 
     Notes
     -----
@@ -93,13 +93,13 @@ def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
 
 
 def wrap(degrees: Number) -> Number:
-    """Return an angle, or an array of them, in -180..180 deg."""
+    """Return an angle or an array of angles, deg, wrapped to -180..180."""
     return (degrees + 180.0) % 360.0 - 180.0
 
 
 def signed_longitude(longitude: float) -> float:
-    """Return a longitude up to 540 deg, of a map across the antimeridian, as -180 to 180: 180.01 is -179.99.
+    """Return a longitude of up to 540 deg, as of a map across the antimeridian, in -180 to 180 deg.
 
-    :func:`wrap` makes -180 of 180, a map's east edge.
+    180, the east edge of a map, stays 180; :func:`wrap` would return -180.
     """
     return longitude - 360.0 if longitude > 180.0 else longitude

@@ -1,8 +1,8 @@
-"""A map of the magnetic anomaly, and its value, slope and curvature anywhere on it.
+"""A map of the magnetic anomaly, with its value, slope and curvature at any place.
 
-The map is a bicubic B-spline through its nodes, with continuous second derivatives: a filter needs them to
-linearise the map and to know where it cannot. One look-up is a 4x4 patch of coefficients between two 3x4
-matrices of weights: value, gradient and Hessian in one product.
+The map is a bicubic B-spline through its nodes. Its second derivatives are continuous: a filter linearises
+the map, and the curvature shows where this fails. A look-up multiplies a 4x4 patch of coefficients by two 3x4
+matrices of weights, which yields value, gradient and Hessian.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from magbridge.field.spline import coefficients, filled, weights
 __all__ = ["HOLE", "AnomalyGrid", "Local", "T", "curvature"]
 
 EVEN = 1e-3
-"""Share of a step by which rounded coordinates may deviate from an even spacing."""
+"""Largest deviation of rounded coordinates from an even spacing, as a fraction of a step."""
 HOLE = 9.9e4
-"""Value beyond any anomaly, nT; 99999 and 1.7e38 are how formats without NaN write a hole."""
+"""Smallest value that is a hole, nT: formats without NaN write holes as 99999 or 1.7e38."""
 PLANE_TOLERANCE_NT = 1e-6
-"""Remainder of a plane after rounding, nT."""
+"""Largest RMS about a plane, nT, that counts as rounding: the map is then a plane."""
 NOT_AN_ANOMALY = 15_000.0
-"""Median from which on a grid holds the total field, not an anomaly, nT."""
+"""Largest absolute median of an anomaly, nT; a grid with a larger median holds the total field."""
 
 FEWEST, MIDDLE = 20, 400
-"""Nodes along an axis, with fewer of which the error between them is not asked for; and at most asked for."""
+"""Fewest nodes along an axis from which the interpolation error is estimated, and most that are used."""
 
 PARAMETERS = (
     "longitude", "latitude", "anomaly", "sigma", "altitude", "name", "vertical", "sigma_length",
     "typical_error", "level_sigma",
 )  # fmt: skip
-"""Names of a grid's variables."""
+"""Names of the parameters of :class:`AnomalyGrid`, which are also its attributes."""
 
 DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]
-"""Orders of derivative, north and east, in the order of Local."""
+"""Orders of the derivatives north and east of value, gradient and Hessian, in the order of :class:`Local`."""
 
 
 class AnomalyGrid:
@@ -51,26 +51,26 @@ class AnomalyGrid:
     Parameters
     ----------
     longitude : array_like, (nx,)
-        deg, evenly spaced, either direction, across the antimeridian if need be.
+        Longitude of the columns, deg, evenly spaced, in either direction; may cross the antimeridian.
     latitude : array_like, (ny,)
-        deg, evenly spaced, either direction.
+        Latitude of the rows, deg, evenly spaced, in either direction.
     anomaly : array_like, (ny, nx)
-        nT; NaN is a hole.
+        Anomaly at the nodes, nT; NaN is a hole.
     sigma : array_like, (ny, nx), or float, optional
-        nT, 1-sigma of the map at each node.
+        1-sigma of the map at each node, nT.
     altitude : float, optional
-        m above the ellipsoid at which the map holds.
+        Altitude of the map above the ellipsoid, m; NaN if unknown.
     name : str, optional
         Name of the grid in error messages: its file.
     vertical : array_like, (ny, nx), optional
-        nT/m, vertical gradient at that altitude, positive if the anomaly grows downward; without it the map
-        is the same at every depth.
+        Vertical gradient at `altitude`, nT/m, positive if the anomaly grows downward. Without it the map is
+        the same at every depth.
     sigma_length : float, optional
-        m, within which errors of that sigma are correlated; 0: those of any two samples are independent.
+        Correlation length of the errors that `sigma` describes, m; 0: errors of samples are independent.
     typical_error : float, optional
-        nT, of an error that lasts from sample to sample; `sigma` is then all of that kind.
+        1-sigma of a typical error, nT, if `sigma` is correlated between samples; 0 if it is not.
     level_sigma : float, optional
-        Common error of the whole map, nT, 1-sigma; `sigma` is without it.
+        1-sigma of the constant error of the whole map, nT; `sigma` does not include it.
 
     Raises
     ------
@@ -122,11 +122,14 @@ class AnomalyGrid:
         self._even_sigma = bool(np.ptp(self._variance) == 0.0)
 
     def replaced(self, **changes: Any) -> AnomalyGrid:
-        """Return this grid with other parameters."""
+        """Return a grid with the parameters of this grid, except for `changes`."""
         return AnomalyGrid(**{name: getattr(self, name) for name in PARAMETERS} | changes)
 
     def error(self, variance: T) -> tuple[T | float, T | float]:
-        """Split a local variance (nT²) into a multiple of the typical lasting error and a remainder."""
+        """Return a local variance (nT²) as a multiple of the typical correlated error, and as noise.
+
+        The multiple scales the filter's state of map error; the noise (variance, nT²) is independent.
+        """
         if not self.typical_error:
             return 1.0, variance
         return variance**0.5 / self.typical_error, 0.0
@@ -140,16 +143,17 @@ class AnomalyGrid:
         return None if self.vertical is None else coefficients(self.vertical)
 
     def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
-        """Return the map around one place, as :meth:`evaluate` does around many."""
+        """Return value and derivatives of the map at one place; arguments as :meth:`evaluate`."""
         local = self.evaluate(longitude, latitude, depth)
         return Local._make(float(values[0]) for values in local)
 
     def evaluate(
         self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan
     ) -> Local[FloatArray]:
-        """Return the map around n places as arrays (n,), NaN off the map and for NaN positions.
+        """Return value, derivatives and variance of the map at n places (deg) as arrays (n,).
 
-        `depth` is in m below the surface; default, and where it is NaN, the map's own height.
+        They are NaN off the map, in its holes and for NaN positions. `depth` is in m below the surface; NaN,
+        the default, stands for the map's own height.
         """
         lon, lat = np.broadcast_arrays(
             np.atleast_1d(np.asarray(longitude, float)), np.atleast_1d(np.asarray(latitude, float))
@@ -192,7 +196,7 @@ class AnomalyGrid:
         return Local._make([*parts, variance])
 
     def anomaly_at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> FloatArray:
-        """Return the anomaly at n places, nT, (n,): see :meth:`evaluate`.
+        """Return the anomaly (n,), nT, at n places; arguments as :meth:`evaluate`.
 
         OutOfRange: a place that the map does not cover.
         """
@@ -215,13 +219,13 @@ class AnomalyGrid:
 
     @property
     def spacing(self) -> float:
-        """Larger of the distances between nodes, in the map's middle, m."""
+        """Larger node distance of the two axes, at the map's middle latitude, m."""
         per_latitude, per_longitude = metres_per_degree(float(np.mean(self.latitude)))
         return max(self._dy * per_latitude, self._dx * per_longitude)
 
     @cached_property
     def correlation_length(self) -> float:
-        """Distance over which the anomaly changes by its own RMS, m; infinite for a map without slopes.
+        """Correlation length of the anomaly, m; infinite for a plane.
 
         Notes
         -----
@@ -237,14 +241,14 @@ class AnomalyGrid:
 
     @cached_property
     def interpolation_sigma(self) -> float:
-        """RMS error of the spline between nodes, as far as the nodes tell, nT; 0 on a small map.
+        """RMS error of the spline between nodes, nT, estimated from the nodes; 0 on a small map.
 
         Notes
         -----
-        Every second node is left out and predicted from the others: the error at twice the spacing, e(2h);
-        likewise e(4h). The field of sources at a depth d falls off as exp(-k d), and what a spacing misses
-        begins at k = π/h, so log e goes as 1/h: ``e(h) = e(2h) (e(2h) / e(4h))²``. Noise of the nodes has
-        e(h) = e(2h). That is at a cell's middle; over the cell, the mean of its square is half that.
+        The error e(2h) at twice the spacing h follows from a spline through every second node, at the others;
+        e(4h) likewise. The field of sources at depth d falls off as exp(-k d), and a spacing misses waves
+        beyond k = π/h. So log e is proportional to 1/h: ``e(h) = e(2h) (e(2h) / e(4h))²``, at most e(2h).
+        This is at a cell's middle; the mean square over the cell is half of that.
         """
         rows, columns = (slice((n - MIDDLE) // 2, (n + MIDDLE) // 2) if n > MIDDLE else slice(None)
                          for n in self.anomaly.shape)  # fmt: skip
@@ -260,7 +264,7 @@ class AnomalyGrid:
     def save(self, path: str | Path) -> None:
         """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read.
 
-        WriteError: the file cannot be written; it is as it was before.
+        WriteError: the file cannot be written; an existing file stays as it was.
         """
         write(self, path)
 
@@ -275,7 +279,7 @@ class AnomalyGrid:
 
 
 def _left_out(values: FloatArray, known: NDArray[np.bool_], step: int) -> float:
-    """Return the RMS error (nT) of a spline through every `step`-th node, halfway between them."""
+    """Return the RMS error (nT) of a spline through every `step`-th node, at the nodes halfway between."""
     from scipy.interpolate import RectBivariateSpline  # noqa: PLC0415  the live path runs without scipy
 
     # Spline through every `step`-th node; its error at the nodes halfway.
@@ -289,7 +293,7 @@ def _left_out(values: FloatArray, known: NDArray[np.bool_], step: int) -> float:
 
 
 def _axis(values: ArrayLike, name: str, axis_name: str) -> tuple[FloatArray, bool]:
-    """Return the axis ascending and exactly even, and whether it was descending."""
+    """Return the axis, ascending and exactly even, and True if `values` was descending."""
     axis = np.array(values, float).ravel()
     if axis.size < 4 or not np.isfinite(axis).all():
         raise FormatError(name, "expected at least 4 finite coordinates", column=axis_name)
@@ -317,10 +321,10 @@ T = TypeVar("T", float, FloatArray)
 
 
 class Local(NamedTuple, Generic[T]):
-    """The map around one place or n places; NaN outside the map and in its holes.
+    """Value and derivatives of the map at one place or n places; NaN outside the map and in its holes.
 
-    ``anomaly`` nT; ``north``, ``east`` nT/m, its gradient; ``north_north``, ``north_east``, ``east_east``
-    nT/m², its Hessian; ``variance`` nT², of the map's own error there.
+    ``anomaly`` is in nT; ``north``, ``east``, its gradient, in nT/m; ``north_north``, ``north_east``,
+    ``east_east``, its Hessian, in nT/m²; ``variance`` of the map's error in nT².
     """
 
     anomaly: T
@@ -333,10 +337,10 @@ class Local(NamedTuple, Generic[T]):
 
 
 def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
-    """Return the effect of curvature on mean (nT) and variance (nT²) of the map within a position's spread.
+    """Return the effect of the map's curvature on mean (nT) and variance (nT²) of the field at a position.
 
-    `local` is the map at the position's mean; `nn`, `ne`, `ee` are the position's covariance P, m², floats or
-    (n,).
+    The position is uncertain with the covariance P: `nn`, `ne`, `ee`, m², floats or (n,). `local` is the map
+    at its mean.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Anomaly grids in Surfer, Geosoft, ESRI ASCII, GeoTIFF and text files, and in MagNav's folder."""
+"""Readers of anomaly grids in Surfer, Geosoft, ESRI ASCII, GeoTIFF and text files, and in MagNav's folder."""
 
 from __future__ import annotations
 
@@ -30,18 +30,21 @@ from magbridge.wording import counted
 __all__ = ["ascii_grid", "folder", "geotiff", "grd", "libraries", "table"]
 
 BAD_GEOSOFT = (ValueError, NotImplementedError, OSError, IndexError, UnboundLocalError, OverflowError)
-"""Exceptions that harmonica raises for a file of another format or a damaged one, in addition to zlib's."""
+"""Exceptions that harmonica raises for a damaged file or another format, in addition to zlib's."""
 BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
-"""What Pillow, or a tag that is not as it should be, raises."""
+"""Exceptions that Pillow or a missing or malformed tag raises."""
 TEXT_OPTIONS: Any = {"encoding": "utf-8-sig", "errors": "replace"}
-"""How a text is opened: with a byte order mark or without, and whatever its comments are written in."""
+"""Options for opening a text file, with or without a byte order mark, whose comments may not be UTF-8."""
 LENGTH_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft", 9036: "km"}
-"""Units of a GeoTIFF's coordinates, by EPSG's numbers."""
+"""Units of a GeoTIFF's coordinates, by EPSG code."""
 NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
 
 def grd(path: Path) -> Parts:
-    """Read GMT's netCDF, Surfer 6 text or binary, Surfer 7, else Geosoft; FormatError: none, or damaged."""
+    """Read a ``.grd`` file: GMT's netCDF, Surfer 6 text or binary, Surfer 7, or Geosoft.
+
+    FormatError: the file is damaged or of another format.
+    """
     with path.open("rb") as file:
         start = file.read(4)
     if start in NETCDF:
@@ -64,7 +67,7 @@ def grd(path: Path) -> Parts:
 
 
 def libraries(path: Path) -> list[str]:
-    """Return the installed modules that a file with this suffix and beginning needs."""
+    """Return the installed third-party modules that reading a file needs, by its suffix and first bytes."""
     if path.suffix.lower().startswith(".tif"):
         names = ["PIL.Image"]
     else:
@@ -94,12 +97,12 @@ def _surfer_6(path: Path) -> Surfer:
 
 
 def _surfer_7(path: Path) -> Surfer:
-    """Tagged sections: DSRB header, GRID, DATA."""
+    """Read Surfer 7, a file of tagged sections: DSRB header, GRID, DATA."""
     raw = path.read_bytes()
     at = raw.index(b"GRID") + 8
     ny, nx = (int(n) for n in np.frombuffer(raw, "<i4", 2, at))
     x0, y0, dx, dy, _, _, rotation, blank = np.frombuffer(raw, "<f8", 8, at + 8).tolist()
-    if 0.0 < abs(rotation) < 360.0:  # or damaged, which is seen below
+    if 0.0 < abs(rotation) < 360.0:  # other values are damage, which a later check finds
         raise FormatError(path, f"rotated by {rotation:g} degrees: expected rows along x")
     start = raw.index(b"DATA", at) + 8
     values = np.frombuffer(raw, "<f8", _held(raw, start, 8, nx * ny), start).copy()
@@ -108,7 +111,7 @@ def _surfer_7(path: Path) -> Surfer:
 
 
 def _held(raw: bytes, start: int, size: int, claimed: int) -> int:
-    """Return the number of values, `size` bytes each from `start` on, that the file contains."""
+    """Return how many of `claimed` values, `size` bytes each from byte `start` on, the file contains."""
     return max(min(claimed, (len(raw) - start) // size), 0)
 
 
@@ -130,7 +133,7 @@ def _geosoft(path: Path) -> Parts:
 
 
 def ascii_grid(path: Path) -> Parts:
-    """Read ESRI ASCII: ``ncols nrows``, a corner or centre, ``cellsize``, then rows from the north.
+    """Read ESRI ASCII: ``ncols nrows``, a corner or centre, ``cellsize``, then rows from north to south.
 
     FormatError: a header or a number is missing.
     """
@@ -155,7 +158,7 @@ def ascii_grid(path: Path) -> Parts:
 
 
 def folder(path: Path) -> Parts:
-    """Read MagNav's example: longitudes, latitudes and altitude next to a matrix, each a CSV file.
+    """Read a folder as of MagNav's example: CSV files of longitudes, latitudes, altitude and the map.
 
     FormatError: one of the files is missing or is not a table of numbers.
     """
@@ -172,10 +175,10 @@ def folder(path: Path) -> Parts:
 
 
 def geotiff(path: Path) -> Parts:
-    """Read one band with a pixel scale and a tie point in geographic coordinates; FormatError: any other."""
+    """Read a GeoTIFF of one band with a pixel scale and a tie point; FormatError: any other file."""
     from PIL import Image  # noqa: PLC0415  comes with matplotlib
 
-    raw = BytesIO(path.read_bytes())  # what the system refuses is its own error, not the format's
+    raw = BytesIO(path.read_bytes())  # outside of try: an error of the system is not one of the format
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of damaged tags, and of a large image
@@ -187,7 +190,7 @@ def geotiff(path: Path) -> Parts:
         keys = np.array(tags.get(34735, ()), int).reshape(-1, 4)
         hole = float(str(tags.get(42113, "nan")).strip("\x00 "))
         scale, offset, unit = _gdal(str(tags.get(42112, "")))
-    except (*BAD_TIFF, Image.DecompressionBombError) as error:  # its size is damaged: no survey is so large
+    except (*BAD_TIFF, Image.DecompressionBombError) as error:  # no survey is so large: its size is damaged
         raise FormatError(path, "expected a GeoTIFF with a pixel scale and a tie point") from error
     settings = {int(key): int(value) for key, _, _, value in keys}
     if values.ndim != 2:
@@ -204,7 +207,7 @@ def geotiff(path: Path) -> Parts:
 
 
 def _gdal(text: str) -> tuple[float, float, str]:
-    """Return scale, offset and unit of the first band in GDAL's items, ``<Item role="scale">0.1</Item>``."""
+    """Return scale, offset and unit of the first band from GDAL's XML, ``<Item role="scale">0.1</Item>``."""
     declared = {}
     for attributes, value in re.findall(r"<Item([^>]*)>([^<]*)</Item>", text):
         role = re.search(r'role="(\w+)"', attributes)
@@ -214,20 +217,20 @@ def _gdal(text: str) -> tuple[float, float, str]:
 
 
 REMARK = re.compile(r"\s*([#%/]|(line|tie)[\s:]*[\w.:]+\s*$|$)", re.IGNORECASE)
-"""A comment, or what Geosoft writes above the rows of a line."""
+"""A comment, an empty line, or the heading of a survey line as Geosoft writes it."""
 NUMBER_PATTERN = re.compile(r"[-+.\deinfa]+")
 UNIT_SUFFIXES = ("nt", "ut", "µt", "deg", "m", "km")
-"""What a column's name may end in, after an underscore, to tell its unit."""
+"""Units that may end a column's name, after an underscore."""
 OTHERS = (
     "sigma", "error", "std", "line", "flight", "date", "time", "fid", "alt", "altitude", "height", "depth",
     "elev",
 )  # fmt: skip
-"""Columns that are not an anomaly, whatever other columns there are."""
+"""Names of columns that are never the anomaly."""
 HEADER_HINT = "name the columns in the first row: longitude,latitude,anomaly"
 
 
 class GridColumn(NamedTuple):
-    """A column's place, its name in small letters without unit, and the unit."""
+    """Column of a table: its index, its name in lower case without the unit, and its unit."""
 
     place: int
     name: str
@@ -235,9 +238,9 @@ class GridColumn(NamedTuple):
 
 
 def table(path: Path) -> Parts:
-    """Read a grid from columns, named or not; any order of rows; gaps are holes.
+    """Read a grid from a table of x, y and anomaly, with or without column names, rows in any order.
 
-    FormatError: no such columns, columns that may be this or that, or nodes that form no grid.
+    Missing nodes are holes. FormatError: missing or ambiguous columns, or nodes that do not form a grid.
     """
     words, delimiter, skip = _beginning(path)
     header = not all(NUMBER_PATTERN.fullmatch(word) for word in words)
@@ -266,7 +269,10 @@ def table(path: Path) -> Parts:
 
 
 def _beginning(path: Path) -> tuple[list[str], str | None, int]:
-    """Return the words of the headings or of the first row, the separator, and how many lines to skip."""
+    """Return the words of the header (else of the first row), the separator, and the number of lines to skip.
+
+    The header may be in a comment.
+    """
     remarks: list[str] = []
     with path.open(**TEXT_OPTIONS) as file:
         first = next((line for line in file if not _is_remark(line, remarks)), "")
@@ -283,7 +289,7 @@ def _beginning(path: Path) -> tuple[list[str], str | None, int]:
 
 
 def _is_remark(line: str, remarks: list[str]) -> bool:
-    """Return True and keep the line if it is neither a row nor headings."""
+    """Return True if the line is a comment, empty or a line's heading; append it to `remarks` then."""
     found = REMARK.match(line) is not None
     if found:
         remarks.append(line)
@@ -291,7 +297,7 @@ def _is_remark(line: str, remarks: list[str]) -> bool:
 
 
 def _named(path: Path, words: list[str]) -> tuple[GridColumn, GridColumn, GridColumn]:
-    """Return the columns of x, y and anomaly by their names."""
+    """Return the columns of x, y and anomaly, found by their names among `words`."""
     columns = [_column(place, word) for place, word in enumerate(words)]
     x, y, z = (
         next((c for name in names for c in columns if c.name == name), None)
@@ -310,7 +316,7 @@ def _named(path: Path, words: list[str]) -> tuple[GridColumn, GridColumn, GridCo
 
 
 def _column(place: int, word: str) -> GridColumn:
-    """Return the column of a word in the header: ``mag``, ``mag [uT]``, ``mag (uT)`` or ``mag_uT``."""
+    """Return the column that a header's `word` names: ``mag``, ``mag [uT]``, ``mag (uT)`` or ``mag_uT``."""
     name, *inside = re.split(r"\s*[\[(]\s*", word.strip("\"' "), maxsplit=1)
     name = re.sub(r"_(dd|wgs84|decimal_degrees)$", "", name.strip().replace(" ", "_"))
     unit = inside[0].rstrip("]) ") if inside else ""
@@ -321,7 +327,7 @@ def _column(place: int, word: str) -> GridColumn:
 
 
 def _order(path: Path, rows: RealArray) -> list[int]:
-    """Return the columns of longitude, latitude and anomaly without names: beyond 90 cannot be a latitude."""
+    """Return the indices of longitude, latitude and anomaly; values beyond 90 deg cannot be latitudes."""
     first, second = np.abs(rows[:, :2]).max(axis=0)
     if second > 90.0 >= first:
         return [1, 0, 2]
@@ -333,8 +339,8 @@ def _order(path: Path, rows: RealArray) -> list[int]:
 def _numbers(path: Path, delimiter: str | None, skip: int, places: tuple[int, int, int]) -> RealArray:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
-            with path.open(**TEXT_OPTIONS) as file:  # not numpy's: it takes a byte order mark for a number
+            warnings.simplefilter("ignore", UserWarning)  # for a file without rows; checked after this
+            with path.open(**TEXT_OPTIONS) as file:  # numpy would read a byte order mark as a number
                 rows = np.loadtxt(file, delimiter=delimiter, skiprows=skip, usecols=places, ndmin=2)
     except ValueError as error:
         # numpy counts rows from 0 below the header

@@ -1,8 +1,8 @@
 """Axes of a grid, and anomaly grids in netCDF by CF, GMT, and GMT before 2007.
 
-The file's statements decide whether axes are degrees or metres, else the numbers. Nothing is taken for
-degrees only because it stands first: metres, kilometres and indices all fit between -180 and 180, and a map
-that is read in them is wrong without a message.
+The file's statements decide whether axes are in degrees or metres; without statements, the numbers decide.
+Ambiguous axes are an error: metres, kilometres and indices may all lie between -180 and 180, and a map
+that takes them for degrees would be wrong without a message.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
 ]  # fmt: skip
 
 LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")
-"""What the axes are called; x and y may be degrees or not."""
+"""Names of geographic axes; x and y may also be projected coordinates."""
 PROJECTED = (
     ("easting", "projection_x_coordinate", "utm_x", "utm_e", "utme", "x_utm"),
     ("northing", "projection_y_coordinate", "utm_y", "utm_n", "utmn", "y_utm"),
@@ -39,17 +39,17 @@ METRES = {
     **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
     **dict.fromkeys(("us-ft", "ftus", "us_survey_foot"), 1200.0 / 3937.0),
 }
-"""Metres in a unit of length."""
+"""Length in m of each unit, by the unit's name in lower case."""
 MAX_REPROJECTED_NODES = 10_000_000
-"""Nodes of a grid that is reprojected."""
+"""Largest number of nodes of a reprojected grid."""
 EVEN = 1e-3
-"""Share of a step by which rounded coordinates may deviate from an even spacing."""
+"""Largest deviation of rounded coordinates from an even spacing, as a fraction of a step."""
 
 
 class Axes(NamedTuple):
-    """Statements of a file on its axes: ``unit`` ("" if none), and the reference system or None.
+    """Statements of a file on its axes: ``unit`` ("" if none), and ``crs``, the reference system, or None.
 
-    ``crs`` is what pyproj takes: an authority's code, WKT, or the attributes of CF's grid mapping.
+    ``crs`` is in a form that pyproj accepts: an authority's code, WKT, or attributes of a CF grid mapping.
     """
 
     unit: str = ""
@@ -57,7 +57,7 @@ class Axes(NamedTuple):
 
 
 def stated(unit: str, *names: str) -> str:
-    """Return the unit of an axis: as it is stated, or "deg" or "m" where one of its `names` implies it."""
+    """Return the stated unit of an axis; else "deg" or "m" if one of its `names` implies it; else ""."""
     called = {name.lower() for name in names}
     if unit.strip() and unit.strip() != "1":
         return unit.strip()
@@ -69,10 +69,10 @@ def stated(unit: str, *names: str) -> str:
 def geographic(
     path: Path, x: RealArray, y: RealArray, fields: dict[str, RealArray], axes: Axes
 ) -> tuple[RealArray, RealArray, dict[str, RealArray]]:
-    """Return longitudes, latitudes (deg) and fields (ny, nx): as they are, or reprojected.
+    """Return longitudes, latitudes (deg) and fields (ny, nx), reprojected if the axes are projected.
 
-    FormatError: lengths of no known projection; numbers that may be degrees or not; units of neither.
-    MissingExtra: a projection, and no pyproj.
+    FormatError: lengths without a known projection; axes that may or may not be degrees; a unit that is
+    neither angle nor length. MissingExtra: a reference system is stated, and pyproj is not installed.
     """
     crs = _reference_system(path, axes.crs)
     if _are_degrees(path, x, y, axes.unit.lower(), crs):
@@ -115,12 +115,12 @@ def _are_degrees(path: Path, x: RealArray, y: RealArray, unit: str, crs: Any) ->
 
 
 def _reference_system(path: Path, crs: str | dict[str, Any] | None) -> Any:
-    """Return pyproj's CRS of the file's own statement, or of the ``.prj`` next to it; None without either."""
+    """Return pyproj's CRS from the file's statement, else from the ``.prj`` next to it; None without both."""
     sidecar = path.with_suffix(".prj")
     if not crs and not sidecar.is_file():
         return None
     try:
-        from pyproj import CRS  # noqa: PLC0415  an extra of its own
+        from pyproj import CRS  # noqa: PLC0415  an optional dependency
         from pyproj.exceptions import CRSError  # noqa: PLC0415
     except ImportError:
         raise MissingExtra("pyproj", "grids") from None
@@ -136,7 +136,10 @@ def _reference_system(path: Path, crs: str | dict[str, Any] | None) -> Any:
 def _reprojected(
     path: Path, x: RealArray, y: RealArray, fields: dict[str, RealArray], crs: Any
 ) -> tuple[RealArray, RealArray, dict[str, RealArray]]:
-    """Return the fields on an even grid of degrees as fine as theirs, by cubic splines; outside are holes."""
+    """Return longitudes, latitudes (deg) and fields on an even grid of the same spacing, by cubic splines.
+
+    Nodes outside the projected grid are holes.
+    """
     from pyproj import Transformer  # noqa: PLC0415
 
     for axis in (x, y):
@@ -166,7 +169,7 @@ def _reprojected(
 
 
 def _sampled(values: RealArray, indices: RealArray) -> RealArray:
-    """Return values (ny, nx) at fractional rows and columns (2, m, n): NaN outside and next to a hole."""
+    """Interpolate values (ny, nx) at fractional rows and columns (2, m, n); NaN outside and at holes."""
     from scipy.ndimage import map_coordinates  # noqa: PLC0415  the live path runs without scipy
 
     hole = map_coordinates(np.isnan(values).astype(float), indices, order=1, mode="constant", cval=1.0)
@@ -176,20 +179,20 @@ def _sampled(values: RealArray, indices: RealArray) -> RealArray:
 
 
 Parts = tuple[RealArray, RealArray, RealArray, dict[str, Any]]
-"""Coordinates x and y of the nodes, values, options of AnomalyGrid; among them ``unit``, that of the values,
-and ``axes``, what the file states of x and y (:class:`~magbridge.field.grid_netcdf.Axes`)."""
+"""Contents of a file: coordinates x and y of the nodes, values (ny, nx), and options of AnomalyGrid. Further
+options are ``unit`` of the values, and ``axes``, the file's statements on x and y (:class:`Axes`)."""
 ANOMALY_VARIABLES = (
     "anomaly", "magnetic_anomaly", "mag_anomaly", "mag_anom", "total_field_anomaly", "tfa",
     "tmi_anomaly", "tmi", "mag", "residual", "nt", "value", "z",
 )  # fmt: skip
-"""What the anomaly is called, the surest first: z may be a height."""
+"""Names of the anomaly, the least ambiguous first: z may be a height."""
 SIGMA = ("sigma", "error", "uncertainty", "std")
 EASTWARD_NORTHWARD = ("east", (*LONGITUDE, *PROJECTED[0])), ("north", (*LATITUDE, *PROJECTED[1]))
-"""Direction of an axis, and its names."""
+"""Direction of each axis, and its names."""
 
 
 def netcdf(path: Path) -> Parts:
-    """Read CF or GMT netCDF, one two-dimensional variable on even axes; FormatError: any other."""
+    """Read CF or GMT netCDF with one two-dimensional variable on even axes; FormatError: any other file."""
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
     try:
@@ -231,7 +234,7 @@ def netcdf(path: Path) -> Parts:
 
 
 Coordinates = tuple[tuple[str, str], RealArray, RealArray, Axes]
-"""Dimensions north and east, x and y along them, and the attributes of the axes."""
+"""Names of the north and east dimension, coordinates x (nx,) and y (ny,), and statements on the axes."""
 
 
 def _along_its_axes(path: Path, grid: Any, data: Any) -> Coordinates:
@@ -247,7 +250,7 @@ def _along_its_axes(path: Path, grid: Any, data: Any) -> Coordinates:
 
 
 def _two_dimensional(path: Path, grid: Any, data: Any) -> Coordinates | None:
-    """Return the coordinates of a grid with longitudes and latitudes at each node, if it has them."""
+    """Return the coordinates of a grid that stores longitude and latitude at each node; None for others."""
     found = {}
     for names in (LONGITUDE[:-1], LATITUDE[:-1]):
         for name, variable in data.variables.items():
@@ -269,7 +272,7 @@ def _two_dimensional(path: Path, grid: Any, data: Any) -> Coordinates | None:
 
 
 def write(grid: AnomalyGrid, path: str | Path) -> None:
-    """Write a grid as CF netCDF; WriteError: the file cannot be written; it is as it was before."""
+    """Write a grid as CF netCDF; WriteError: the file cannot be written; an existing file stays as it was."""
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
     over = ("latitude", "longitude")
@@ -299,7 +302,7 @@ def _names(name: str, attrs: Any) -> set[str]:
 
 
 def _dimension(path: Path, grid: Any, kind: str, names: tuple[str, ...]) -> str:
-    """Return the dimension that runs `kind` ("east", "north"), by its unit or by one of its `names`."""
+    """Return the dimension in the direction `kind` ("east", "north"), by its unit or one of its `names`."""
     for dimension in map(str, grid.dims):
         attrs = grid[dimension].attrs if dimension in grid.coords else {}
         unit = str(attrs.get("units", "")).lower()
@@ -309,7 +312,7 @@ def _dimension(path: Path, grid: Any, kind: str, names: tuple[str, ...]) -> str:
 
 
 def _old_gmt(path: Path, data: Any) -> Parts:
-    """GMT's netCDF of before 2007: ranges and one long row, from the north-west corner."""
+    """Read GMT's netCDF from before 2007: axis ranges, and one row of all values from the north-west."""
     nx, ny = (int(n) for n in data["dimension"].to_numpy())
     if min(nx, ny) < 1 or nx * ny != data["z"].size:
         raise FormatError(path, f"expected {nx} x {ny} values, found {data['z'].size}: damaged")

@@ -1,13 +1,12 @@
-"""The International Geomagnetic Reference Field at every sample's own position, depth and time.
+"""The International Geomagnetic Reference Field at the position, depth and time of every sample.
 
-ppigrf carries the coefficients of the current generation; importing it costs a second (pandas), a call
-8 ms, and N dates at N positions give N x N fields. So its coefficient file is read as it stands, and the
-series is summed here: one pass over the degrees for a whole block of samples. ppigrf is the oracle of
-the tests.
+ppigrf carries the coefficients of the current generation. Its import takes a second (pandas) and a call 8 ms,
+and N dates at N positions give N x N fields. This module therefore reads ppigrf's coefficient file, and sums
+the series itself, degree by degree for a block of samples. Tests compare the results with ppigrf.
 
-Filters need the field at every sample: :class:`NearbyField` is a quadratic fit to the series. Its shortest
-wave is 3,000 km, so over some tens of kilometres and a dive that is exact to a thousandth of a nanotesla, at
-a hundredth of the cost.
+Filters need the field at every sample, for which :class:`NearbyField` is a quadratic fit to the series. The
+shortest wave of the series is 3,000 km. Over some tens of kilometres and a dive the fit is therefore exact to
+0.001 nT, at a hundredth of the cost.
 """
 
 from __future__ import annotations
@@ -32,11 +31,14 @@ __all__ = ["HeldField", "NearbyField", "coverage", "igrf", "magnitude", "total_f
 REFERENCE_RADIUS = 6_371_200.0
 """Radius of the model's sphere, m."""
 IGRF_BLOCK_SAMPLES = 2048
-"""Number of samples in a block, so that its working arrays stay in the cache."""
+"""Number of samples in a block, whose working arrays then fit into the processor's cache."""
 
 
 class Model(NamedTuple):
-    """Gauss coefficients: ``g[n - 1]`` (epochs, n + 1), ``h[n - 1]`` (epochs, n) nT, at `epochs` s."""
+    """Gauss coefficients of degree n, nT: ``g[n - 1]`` (epochs, n + 1) and ``h[n - 1]`` (epochs, n).
+
+    `epochs` is in s since 1970 UTC.
+    """
 
     epochs: FloatArray
     g: list[FloatArray]
@@ -44,21 +46,21 @@ class Model(NamedTuple):
 
 
 def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: ArrayLike) -> FloatArray:
-    """Return the main field, north-east-down.
+    """Return the main field vector, north-east-down, nT.
 
     Parameters
     ----------
     longitude, latitude : array_like, (n,) or scalar
-        deg, geodetic (WGS84), longitude -180 to 360.
+        Geodetic position (WGS84), deg; longitude -180 to 360.
     depth : array_like, (n,) or scalar
-        m below the ellipsoid; negative is height.
+        Depth below the ellipsoid, m; negative is height.
     time : array_like, (n,) or scalar
-        s since 1970-01-01 UTC.
+        Time, s since 1970-01-01 UTC.
 
     Returns
     -------
     field_ned : ndarray, (n, 3)
-        nT. NaN where a position or time is NaN.
+        Field, nT; NaN where a position or time is NaN.
 
     Raises
     ------
@@ -94,7 +96,7 @@ def total_field(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, tim
 
 
 def magnitude(field: FloatArray) -> FloatArray:
-    """Return the length (n,) of vectors (n, 3)."""
+    """Return the lengths (n,) of vectors (n, 3)."""
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", field, field)))
 
 
@@ -105,7 +107,7 @@ def coverage() -> tuple[float, float]:
 
 
 def newest() -> Path:
-    """Return the coefficient file of the latest generation that the installed ppigrf brings."""
+    """Return the coefficient file of the latest IGRF generation in the installed ppigrf."""
     spec = find_spec("ppigrf")  # locates the package without importing it, and pandas with it
     if spec is None or not spec.submodule_search_locations:
         raise MissingExtra("ppigrf", "analysis")
@@ -129,7 +131,7 @@ def _model(path: Path) -> Model:
 
 
 def _block(model: Model, lon: FloatArray, lat: FloatArray, depth: FloatArray, time: FloatArray) -> FloatArray:
-    """Sum the series for one block of samples."""
+    """Return the field (n, 3), nT, north-east-down, of one block of samples by summing the series."""
     # Coefficients are linear in time between epochs: sum the series at each epoch, then weight the sums.
     first, weights = _weights(model.epochs, time)
     nodes = slice(first, first + len(weights))
@@ -190,8 +192,8 @@ def _legendre(
 
 
 def _weights(epochs: FloatArray, time: FloatArray) -> tuple[int, FloatArray]:
-    """Return the first epoch that the block needs and each sample's weights on it and its successors."""
-    # Beyond the last epoch the last interval is extrapolated; the caller has checked the range.
+    """Return the index of the first epoch needed, and the samples' weights (k, n) on k epochs from there."""
+    # Beyond the last epoch, extrapolate the last interval; the caller has checked the range.
     index = np.clip(np.searchsorted(epochs, time, side="right") - 1, 0, epochs.size - 2)
     first = int(index.min())
     weights = np.zeros((int(index.max()) - first + 2, time.size))
@@ -203,7 +205,7 @@ def _weights(epochs: FloatArray, time: FloatArray) -> tuple[int, FloatArray]:
 
 
 def _geocentric(latitude: FloatArray, height: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return radius (m) and geocentric latitude (rad) of a point over the ellipsoid."""
+    """Return radius (m) and geocentric latitude (rad) of points at geodetic latitude (rad) and height (m)."""
     sin, cos = np.sin(latitude), np.cos(latitude)
     # Radius of curvature in the prime vertical, then distance from the axis and from the equator.
     normal = EQUATORIAL_RADIUS / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin * sin)
@@ -226,11 +228,11 @@ def _date(time: float) -> str:
 
 
 BOX_HALF_WIDTH_M = 20_000.0
-"""m from the middle of the box to its edge."""
+"""Half width of the box in which :class:`NearbyField` fits the field, m."""
 DEEP = 2_000.0
-"""Depth up to which it is fitted, m."""
+"""Depth and height up to which the field is fitted, m."""
 FITTED_TIME_S = 20 * 86_400.0
-"""s before and after the time that it is fitted at."""
+"""Time before and after the middle for which the field is fitted, s."""
 
 
 CACHE_TIME_US = 1_000_000
@@ -238,7 +240,7 @@ CACHE_TIME_US = 1_000_000
 
 
 class HeldField:
-    """Intensity of the main field at a vehicle's positions as they come: live and ashore the same bits."""
+    """Total main field at a vehicle's successive positions, with the same bits live and ashore."""
 
     def __init__(self) -> None:
         self._model = NearbyField()
@@ -248,7 +250,8 @@ class HeldField:
     def field_at(self, position: tuple[float, float, float], utc_us: int) -> float:
         """Return the total field, nT, at latitude and longitude (deg) and depth (m).
 
-        A value computed for this place less than a second ago is reused. OutOfRange: as :func:`igrf`.
+        `utc_us` is in µs since 1970 UTC. A value computed for the same place less than a second ago is
+        reused. OutOfRange: as :func:`igrf`.
         """
         if position != self._where or abs(utc_us - self._when_us) > CACHE_TIME_US:
             self._field = self._model.field_and_slopes(*position, utc_us * 1e-6)[0]
@@ -257,7 +260,7 @@ class HeldField:
 
 
 class NearbyField:
-    """Intensity of the main field around a moving vehicle; :meth:`field_and_slopes` refits it on the way."""
+    """Polynomial fit to the total main field around a vehicle, renewed when the vehicle leaves its range."""
 
     def __init__(self) -> None:
         self._middle = (np.nan, np.nan, np.nan)  # latitude, longitude, time
@@ -266,7 +269,10 @@ class NearbyField:
     def field_and_slopes(
         self, latitude: float, longitude: float, depth: float, time: float
     ) -> tuple[float, float, float]:
-        """Return the total field (nT) and its slopes north and east (nT/m); OutOfRange: as :func:`igrf`."""
+        """Return the total field (nT) and its slopes north and east (nT/m); `time` is in s since 1970 UTC.
+
+        OutOfRange: as :func:`igrf`.
+        """
         north, east = separation(self._middle[0], self._middle[1], latitude, longitude)
         later = time - self._middle[2]
         near = max(abs(north), abs(east)) < BOX_HALF_WIDTH_M and abs(later) < FITTED_TIME_S
@@ -285,7 +291,7 @@ class NearbyField:
         return field + t * ct, slope_north / BOX_HALF_WIDTH_M, slope_east / BOX_HALF_WIDTH_M
 
     def _fit(self, latitude: float, longitude: float, time: float) -> None:
-        """Fit the eleven coefficients to the series on 81 nodes."""
+        """Fit the eleven coefficients of the polynomial to the IGRF on 81 nodes around a place and time."""
         # Least squares on a 3 x 3 x 3 x 3 lattice.
         nodes = np.array(list(product((-1.0, 0.0, 1.0), repeat=4)))
         n, e, d, t = nodes.T

@@ -1,7 +1,7 @@
 """Read anomaly grids from all supported formats.
 
-A format is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``. The table
-:data:`READERS` chooses it by the file's suffix. The formats that share the suffix GRD are distinguished by
+A reader is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``. The table
+:data:`READERS` selects it by the file's suffix. Formats that share the suffix ``.grd`` are distinguished by
 their first bytes.
 """
 
@@ -27,11 +27,11 @@ from magbridge.guard import guarded
 __all__ = ["READERS", "read_grid", "read_polygon", "without_fill"]
 
 FILLS = tuple(sign * number for number in (99999.0, 9999.0, 32768.0, 32767.0, 999.0) for sign in (-1.0, 1.0))
-"""Numbers that files without NaN write for "not known"."""
+"""Missing-value codes of files without NaN."""
 CERTAIN = 9_000.0
-"""Value from which on a constant counts as a fill value, nT; -999 may be an anomaly."""
+"""Smallest absolute value of a missing-value code that is never an anomaly, nT; -999 may be an anomaly."""
 TINY = 1.0
-"""A map that does not say its unit, with nothing beyond this, is hardly in nT."""
+"""Smallest maximum of a map without a unit; a map with smaller values is hardly in nT."""
 NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
 """nT in one unit, by the unit's name in lower case."""
 
@@ -47,7 +47,7 @@ READERS: dict[str, Callable[..., Parts]] = {
     ".tiff": geotiff,
 }
 GUARDED = {".nc", ".grd", ".tif", ".tiff"}
-"""Formats that other libraries read, which damage may hang or crash: they are read in a child process."""
+"""Formats that third-party libraries read in a child process, because a damaged file may crash them."""
 
 
 def read_grid(path: str | Path) -> AnomalyGrid:
@@ -56,9 +56,9 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     Parameters
     ----------
     path : path
-        netCDF (CF, GMT), Surfer or Geosoft ``.grd``, ESRI ASCII ``.asc``, GeoTIFF, ``.csv`` or ``.xyz`` of
-        longitude, latitude, anomaly; or a folder of ``xx.csv yy.csv alt.csv map.csv`` as
-        MagNav's example has.
+        File in netCDF (CF, GMT), Surfer or Geosoft ``.grd``, ESRI ASCII ``.asc``, GeoTIFF, or ``.csv`` or
+        ``.xyz`` of longitude, latitude, anomaly; or a folder of ``xx.csv yy.csv alt.csv map.csv``, as in
+        MagNav's example.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     -----
     The units, names, reference system and range of the axes determine their meaning
     (:mod:`~magbridge.field.grid_netcdf`). If the file does not state its projection, a ``.prj`` file next to
-    it may. A library reads the file in a process of its own (:mod:`magbridge.guard`).
+    it may. Third-party libraries read files in a child process (:mod:`magbridge.guard`).
     """
     path = Path(path)
     if not path.is_dir():
@@ -81,14 +81,14 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     parts = partial(reader, path)
     if path.suffix.lower() in GUARDED:
         for library in libraries(path):
-            import_module(library)  # here, once, and not in every child
+            import_module(library)  # import in the parent once, not in every child process
         (found,) = guarded(path, lambda: [parts()])
     else:
         found = parts()
     x, y, values, options = found
     scale = _scale(path, options.get("unit", ""))
     anomaly = without_fill(path, values) * scale
-    # before they are reprojected: a spline would carry a hole of 1e32 over the whole map
+    # Mark holes before reprojection: a spline would spread a hole of 1e32 over the whole map.
     fields = {"anomaly": np.where(np.abs(anomaly) < HOLE, anomaly, nan)}
     if not options.get("unit") and 0.0 < np.nanmax(np.abs(fields["anomaly"]), initial=0.0) < TINY:
         raise FormatError(path, f"no value is beyond {TINY:g}: state the unit, nT, uT or T")
@@ -105,8 +105,8 @@ def read_grid(path: str | Path) -> AnomalyGrid:
 def without_fill(path: str | Path, values: RealArray) -> RealArray:
     """Return the values (...,) with undeclared missing-value codes as NaN.
 
-    One of :data:`FILLS` that lies beyond the others by more than half their range is a hole. FormatError,
-    which names `path`: values of -9999 or 9999 that lie among the others.
+    A value in :data:`FILLS` is a hole if it lies outside the other values by more than half their range.
+    FormatError, which names `path`: a value such as -9999 lies among the others (:data:`CERTAIN`).
     """
     for fill in FILLS:
         here = values == fill
@@ -125,11 +125,11 @@ def without_fill(path: str | Path, values: RealArray) -> RealArray:
 
 
 def read_polygon(path: str | Path) -> RealArray:
-    """Read a polygon: a text file with longitude and latitude (deg) in each row, (k, 2), k at least 3.
+    """Read a polygon (k, 2), k at least 3, from text rows of longitude and latitude, deg.
 
     A header that begins with ``longitude`` is skipped.
 
-    FormatError: it cannot be read or is not a polygon.
+    FormatError: the file is not UTF-8 text, or is not a polygon.
     """
     try:
         lines = contents(path).decode("utf-8-sig").splitlines()

@@ -1,7 +1,7 @@
 """Reference field at every sample of a deployment: equation 4 of the paper, and its variation in time.
 
-Over a day the field varies by tens of nT, in a storm by hundreds, nearly the same over a hundred kilometres.
-A log gets that as the column ``daily_variation``: a base station's field minus its median.
+The field varies by tens of nT in a day and by hundreds in a storm, nearly equally over a hundred kilometres.
+The column ``daily_variation`` of a log holds this variation: a base station's field minus its median.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ __all__ = [
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
-"""Range of the total field, nT: 22,000 to 67,000 at the surface (IGRF), and thousands of the crust."""
+"""Range of the total field, nT: 22,000 to 67,000 at the surface (IGRF), plus a crustal field of thousands."""
 SPHERE_TOLERANCE = 0.3
-"""Relative difference of the radius of the sphere through the readings from the field, at most: soft iron and
-noise cause less, and another unit causes a factor of 10 or more."""
+"""Largest relative difference between the field and the radius of the sphere through the readings. Soft iron
+and noise cause less; another unit causes a factor of 10 or more."""
 HOLE, SHORT, FEWEST = 20.0, 60.0, 3
-"""Intervals between positions that make a hole in them, s that never do, and fewest positions."""
+"""Shortest hole in the positions, in median intervals and at least in s; fewest positions for the test."""
 
 
 def reference_field(
@@ -52,16 +52,16 @@ def reference_field(
         On ``time`` (s or datetime64); the column ``reference_field`` is used where it holds a number,
         elsewhere the field is computed from ``latitude longitude depth``.
     grid : AnomalyGrid, optional
-        Added to the main field; if its altitude is known, continued to the deployment's depth.
+        Map that is added to the main field; if its altitude is known, continued to the deployment's depth.
     site_bias : float, optional
-        nT, what the main-field model misses at the site; added where the field is modelled.
+        Error of the main-field model at the site, nT; added where the field is modelled.
     main : (n, 3) array, optional
-        nT, :func:`main_field` of the deployment, where it is known already.
+        :func:`main_field` of the deployment, nT, if it has been computed already.
 
     Returns
     -------
     ndarray, (n,)
-        nT; NaN where neither a reference nor a position is known.
+        Total field, nT; NaN where neither a reference nor a position is known.
 
     Raises
     ------
@@ -72,9 +72,9 @@ def reference_field(
 
     Notes
     -----
-    ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``: eq. 4, whose anomaly is the map's
-    at its own altitude. Depth matters: about 0.02 nT/m in the main field, and far more in the anomalies of
-    shallow crustal sources.
+    ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``. In eq. 4 of the paper the anomaly is
+    the map's at its own altitude. The main field changes by about 0.02 nT/m of depth, and anomalies of
+    shallow crustal sources by far more.
     """
     deployment = in_seconds(deployment)
     size = deployment.sizes["time"]
@@ -102,13 +102,12 @@ def reference_field(
 
 
 def about_mean(deployment: xr.Dataset) -> xr.Dataset:
-    """Return a deployment with the mean length of its own readings as ``reference_field``, nT.
+    """Return a deployment with the mean length of its readings as the constant ``reference_field``, nT.
 
-    For a log that tells neither date nor place. The mean is the radius of the sphere through the raw field,
-    so that hard iron does not count; a gain that all axes share does.
+    This is for a log without date and place. The mean length is the radius of the sphere through the raw
+    vectors. Hard iron does not change this radius, but a gain error common to all axes does.
 
-    FormatError: the readings are on no sphere of the size of the Earth's field: too few attitudes, or another
-    unit.
+    FormatError: the radius is not that of the Earth's field: too few attitudes, or another unit.
     """
     raw = np.column_stack([deployment[f"mag_{axis}"].to_numpy() for axis in "xyz"])
     radius = sphere_radius(raw[np.isfinite(raw).all(axis=1)])
@@ -120,7 +119,7 @@ def about_mean(deployment: xr.Dataset) -> xr.Dataset:
 
 
 def sphere_radius(points: FloatArray) -> float:
-    """Return the radius of the sphere that fits points (n, 3) best: ``|m|² = 2 m·c + d`` is linear."""
+    """Return the radius of the best-fitting sphere through points (n, 3), by linear ``|m|² = 2 m·c + d``."""
     squared = np.einsum("ij,ij->i", points, points)
     (*centre, d), *_ = np.linalg.lstsq(np.column_stack([2 * points, np.ones(len(points))]), squared)
     return float(np.sqrt(max(d + np.dot(centre, centre), 1.0)))
@@ -129,10 +128,10 @@ def sphere_radius(points: FloatArray) -> float:
 def earth_field(
     deployment: xr.Dataset, grid: AnomalyGrid | None = None
 ) -> tuple[FloatArray, FloatArray | None, str]:
-    """Return the reference that a calibration is fitted to: total field, vector, and the name of both.
+    """Return the reference to which a calibration is fitted: total field, vector, and the name of the source.
 
-    The total field (n,), nT, is :func:`reference_field`. The vector (n, 3), nT, north-east-down, is the
-    IGRF's direction with that length; it is None without positions, or without a date.
+    The total field (n,), nT, is :func:`reference_field`. The vector (n, 3), nT, north-east-down, has this
+    length and the IGRF's direction; it is None without positions or without a date.
     """
     if not {"latitude", "longitude"} <= set(deployment.variables) or counts_from_boot(deployment):
         return reference_field(deployment, grid), None, "reference_field"
@@ -145,9 +144,9 @@ def earth_field(
 
 
 def other_units(channels: FloatArray, reference: float) -> str:
-    """Return a message if raw channels (n, 3) cannot be nT in a field of `reference`, nT, as gauss; else "".
+    """Return a message if raw channels (n, 3) cannot be in nT, given a field of `reference` nT; else "".
 
-    No iron changes the field tenfold.
+    Other units, such as gauss, differ by more than the factor of ten that iron may cause.
     """
     # A factor of ten covers any iron. Beyond it, only a sphere of the right radius proves nanoteslas.
     lengths = magnitude(channels)
@@ -155,7 +154,7 @@ def other_units(channels: FloatArray, reference: float) -> str:
     read = float(np.median(lengths[whole])) if whole.any() else reference
     if 0.1 * reference < read < 10.0 * reference:
         return ""
-    # a hard iron of many times the field: then the sphere through the readings has the field's radius
+    # Hard iron may be many times the field; the sphere through the readings still has the field's radius.
     if read > reference and abs(sphere_radius(channels[whole]) / reference - 1.0) < SPHERE_TOLERANCE:
         return ""
     return (
@@ -177,9 +176,11 @@ def main_field(deployment: xr.Dataset) -> FloatArray:
 
 
 def require_date(deployment: xr.Dataset) -> None:
-    """FormatError: the times of a deployment count from the boot, so that its day's field is not known.
+    """Check that a deployment's times are dates, which the main field needs.
 
-    In 1970, from which such times seem to count, the field was up to 10 % another.
+    Times since boot would read as 1970, when the field differed by up to 10 %.
+
+    FormatError: the times count from the boot.
     """
     if counts_from_boot(deployment):
         raise FormatError(
@@ -192,8 +193,8 @@ def require_date(deployment: xr.Dataset) -> None:
 def positions(deployment: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return longitude, latitude (deg) and depth (m, 0 if unknown) at every sample, (n,) each.
 
-    Rows that lack a position get it from their neighbours in time, along a straight line; before the first
-    and after the last one that is known, the vehicle is taken to have stood still.
+    Rows without a position are interpolated linearly in time. Rows before the first and after the last known
+    position get that position.
     """
     time = deployment["time"].to_numpy()
     longitude = _interpolated(time, deployment, "longitude", turn=360.0)
@@ -202,11 +203,10 @@ def positions(deployment: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def placed(deployment: xr.Dataset) -> BoolArray:
-    """Return at which samples (n,) a track's position is known.
+    """Return True for samples (n,) whose position, logged or interpolated, is known.
 
-    It is not in a hole of the positions that is far longer than those between the others, where a straight
-    line may lead anywhere. Where most samples lie in such holes, as between a glider's surfacings, the line
-    is all there is, and they count as known.
+    A position is unknown in a hole far longer than the usual interval, where a straight line may be wrong.
+    If most samples lie in such holes, as between a glider's surfacings, all positions count as known.
     """
     time = deployment["time"].to_numpy().astype(float)
     known = np.isfinite(deployment["latitude"].to_numpy().astype(float))
@@ -229,7 +229,7 @@ def _interpolated(
     known = np.isfinite(values)
     if not known.any():
         return np.full(time.size, np.nan)
-    # Longitudes are unwound before they are interpolated.
+    # Unwrap longitudes before the interpolation.
     path: FloatArray = values[known] if turn is None else np.unwrap(values[known], period=turn)
     if known.all():
         return path
@@ -240,13 +240,14 @@ def _interpolated(
 def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> xr.Dataset:
     """Return the deployment with ``heading`` (deg) measured from true north.
 
-    `reference` is the north that headings are measured from, "true" or "magnetic"; default: the attribute
-    ``heading_reference``. FormatError: magnetic headings on a day that is not known.
+    `reference` is the north of the logged headings, "true" or "magnetic"; default: the attribute
+    ``heading_reference``. A deployment without magnetic headings is returned unchanged. FormatError: magnetic
+    headings without a date.
 
     Notes
     -----
-    To magnetic headings the IGRF's declination at the position is added, ``D = atan2(B_east, B_north)``; any
-    other deployment is returned unchanged. Without a position a magnetic heading becomes NaN.
+    The true heading is the magnetic one plus the IGRF's declination ``D = atan2(B_east, B_north)``. Without
+    a position it is NaN.
     """
     reference = reference or deployment.attrs.get("heading_reference")
     if reference != "magnetic" or "heading" not in deployment:
@@ -261,20 +262,20 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
 
 
 MAX_EXTRAPOLATION_S = 600.0
-"""s beyond the station's log, for which its last value is held."""
+"""Longest time beyond the ends of a station's log for which its end value holds, s."""
 
 
 def separate_observatories(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
-    """Separate the vehicle's logs from those of an observatory."""
+    """Return the vehicle's logs, and the logs of observatories."""
     own = [log for log in logs if "observatory" not in log.attrs]
     return own, [log for log in logs if "observatory" in log.attrs]
 
 
 def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[xr.Dataset]:
-    """Return the vehicle's logs with a base station's variation as ``daily_variation``, nT.
+    """Return the vehicle's logs with the variation of a base station's field as ``daily_variation``, nT.
 
-    `base` has ``total_field`` (nT), ``reference_field`` or a raw vector. FormatError: it has none of them.
-    DataError: it does not cover the logs' time.
+    `base` has ``total_field`` (nT), ``reference_field`` or a raw vector. FormatError: `base` has none of
+    them. DataError: `base` does not cover the logs' time.
     """
     total = _total(base)
     known = np.isfinite(total)

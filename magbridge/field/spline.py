@@ -1,4 +1,4 @@
-"""Cubic B-splines through the nodes of a uniform grid without holes: coefficients, weights of four nodes."""
+"""Cubic B-splines through the nodes of a uniform grid without holes: their coefficients and weights."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from magbridge.arrays import FloatArray
 __all__ = ["WEIGHTS", "coefficients", "filled", "weights"]
 
 PAD_NODES = 16
-"""Nodes: that far inside, the influence of a cubic spline's end has fallen to 1e-9."""
+"""Number of mirrored nodes beyond each edge; over them the edge's influence on a spline falls to 1e-9."""
 
 # Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
 VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
 SPLINE_SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
 SPLINE_CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
 WEIGHTS = np.concatenate([VALUE, SPLINE_SLOPE, SPLINE_CURVATURE])
-"""Weights of four nodes for value, slope and curvature, (12, 4), times powers of t."""
+"""Matrix (12, 4) from the powers of t to the weights of four nodes for value, slope and curvature."""
 
 
 def filled(values: FloatArray) -> FloatArray:
-    """Return values (ny, nx), each hole (NaN) filled from the nearest node: a transform takes no holes."""
+    """Return values (ny, nx) with each hole (NaN) filled from the nearest node."""
     hole = np.isnan(values)
     if not hole.any():
         return values
@@ -32,7 +32,7 @@ def filled(values: FloatArray) -> FloatArray:
 
 
 def coefficients(values: FloatArray) -> FloatArray:
-    """Return B-spline coefficients (ny + 2, nx + 2) of values (ny, nx), without curvature at the edges."""
+    """Return B-spline coefficients (ny + 2, nx + 2) of values (ny, nx), with zero curvature at the edges."""
     from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
 
     pad = [(min(PAD_NODES, n - 1),) * 2 for n in values.shape]
@@ -43,6 +43,6 @@ def coefficients(values: FloatArray) -> FloatArray:
 
 
 def weights(t: FloatArray) -> FloatArray:
-    """Return value, slope and curvature weights of four nodes, (3, 4, n): n last, along which memory runs."""
+    """Return weights (3, 4, n) of four nodes for value, slope and curvature at cell fractions t (n,)."""
     found: FloatArray = (WEIGHTS @ np.stack([np.ones_like(t), t, t * t, t * t * t])).reshape(3, 4, -1)
     return found
