@@ -1,9 +1,9 @@
-"""Unknowns of a joint fit in addition to the coefficients: level, slow changes, offsets, position drift.
+"""Unknowns of a joint fit in addition to the coefficients: bias, slow changes, offsets, position drift.
 
-Each is a few functions of time with a Gaussian prior whose width the evidence chooses, and enters the fit as
-further unknowns behind the coefficients' own. Optional terms stay only if they make the log likelier: on a
-track that never crosses itself a slow change with time is as likely as a crustal anomaly, and its width may
-be any.
+The unknowns of a block multiply a few functions of time. They follow the unknowns of the coefficients and
+have a Gaussian prior, whose width maximises the evidence. An optional block stays only if it increases the
+evidence: on a track that never crosses itself, the fit cannot separate a slow change with time from a crustal
+anomaly, nor determine the width of either.
 """
 
 from __future__ import annotations
@@ -26,52 +26,52 @@ MAX_PAUSE_S = 3.0 * 3600.0
 SHORTEST_CHANGE_HALF_PERIOD_S = 1.5 * 3600.0
 """Half the period of the fastest slow change, s."""
 MAX_SLOW_FUNCTIONS = 60
-"""Slow functions of one stretch of a log, at most."""
+"""Largest number of slow functions in one stretch of a log."""
 BLOCK_ROWS = 16_384
-"""Rows at a time."""
+"""Number of rows that are computed at a time."""
 NO_COEFFICIENTS = PriorFamily(
     np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
 )
-"""A prior of no coefficients."""
+"""Prior of a fit without coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterBlock:
-    """Unknowns of one kind that share a width."""
+    """Block of unknowns of one kind, whose prior widths have a common factor."""
 
     name: str
     functions: FloatArray | SlowFunctions
-    """(n, r): What they add to the reference at every sample, nT a unit."""
+    """(n, r): Change of the reference at every sample per unit of each unknown, nT."""
     shape: FloatArray
-    """(r,): Width of each over the group's."""
+    """(r,): Prior width of each unknown divided by the width of the block."""
     width: float
     spread: float = 0.0
-    """`width`, `spread`: The group's width, in the unknowns' unit, and the 1-sigma of its logarithm; 0: it is
-    given."""
+    """`width`, `spread`: Prior width of the block, in the unknowns' unit, and 1-sigma of the width's
+    logarithm; 0 if the width is fixed."""
     offered: bool = False
-    """True for an optional term, which stays only if the log needs it."""
+    """True for an optional block, which stays only if the log needs it."""
 
 
 @dataclass(frozen=True, eq=False)
 class OffsetBlock(ParameterBlock):
-    """Unknowns that add to the sensor's offset along each axis, and not to the reference.
+    """Block of unknowns that change the sensor's offset along each axis, and not the reference.
 
-    `functions` are (n, r), the unknowns (3 r,), axis by axis. With a temperature `lag` is that through which
-    it acts, s; None: the offset creeps with time.
+    `functions` are (n, r), the unknowns (3 r,), axis by axis. `lag`: time constant with which the offset
+    follows a temperature, s; None for an offset that drifts with time.
     """
 
     lag: float | None = None
 
 
 class SlowFunctions:
-    """Functions of time that change slowly, as an array (n, r); computed for the rows that are indexed.
+    """Array (n, r) of functions that change slowly with time, computed only for the rows that are indexed.
 
     `time` (n,): s. `fastest`: half the period of the fastest function, s.
 
     Notes
     -----
-    A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
-    as 1/k (Karhunen-Loeve), and of its start. After a gap of :data:`MAX_PAUSE_S` it restarts.
+    A random walk over a time T is a constant plus the sum of ``sqrt(2) cos(pi k t/T)`` with independent
+    weights that decrease as 1/k (Karhunen-Loeve). It restarts after a gap of :data:`MAX_PAUSE_S`.
     """
 
     def __init__(self, time: FloatArray, fastest: float = SHORTEST_CHANGE_HALF_PERIOD_S) -> None:
@@ -79,15 +79,15 @@ class SlowFunctions:
         _, first, size = np.unique(self.stretch, return_index=True, return_counts=True)
         self.start = time[first]
         self.span = np.maximum(time[first + size - 1] - self.start, 1e-9)
-        # as many half waves as the stretch has periods of the fastest change
+        # as many half waves as the stretch has half periods of the fastest change
         self.count = np.minimum(self.span / fastest, MAX_SLOW_FUNCTIONS).astype(int)
         self.levels = len(first) > 1
-        """True if each has a level against the others, too."""
+        """True if each stretch also has a constant, relative to the others."""
         self.edges = np.cumsum([0, *(self.count + self.levels)])
 
     @property
     def shape(self) -> FloatArray:
-        """The functions' widths (r,)."""
+        """Prior widths (r,) of the functions' weights, relative to the first."""
         # weights of a random walk fall as 1/k
         level = [1.0] * self.levels
         return np.concatenate([[*(1.0 / np.arange(1, count + 1)), *level] for count in self.count])
@@ -97,7 +97,7 @@ class SlowFunctions:
         out = np.zeros((len(t), int(self.edges[-1])))
         for k in np.unique(of).tolist():
             mine, order = of == k, np.arange(1, self.count[k] + 1)
-            # Half waves of each stretch (Karhunen-Loeve of a random walk), and its level against the others.
+            # Half waves of each stretch (Karhunen-Loeve of a random walk), and its constant.
             phase = np.pi * (t[mine] - self.start[k])[:, None] / self.span[k]
             columns = [np.sqrt(2.0) * np.cos(order * phase), np.ones_like(phase)[:, : int(self.levels)]]
             out[mine, self.edges[k] : self.edges[k + 1]] = np.hstack(columns)
@@ -108,14 +108,14 @@ class SlowFunctions:
 
 
 class BlockColumns:
-    """The functions of several groups side by side, (n, p) as an array."""
+    """Array (n, p) of the functions of several blocks side by side, computed for the rows indexed."""
 
     def __init__(self, groups: Sequence[ParameterBlock]) -> None:
         self.parts = [group.functions for group in groups]
         self.edges = np.cumsum([0, *(part[:1].size for part in self.parts)])
 
     def __len__(self) -> int:
-        """How many columns there are."""
+        """Return the number of columns, p."""
         return int(self.edges[-1])
 
     def __getitem__(self, rows: IndexArray | slice) -> FloatArray:
@@ -128,14 +128,14 @@ class BlockColumns:
 
 
 def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
-    """Return the result (n, ...) of `made` for n rows, computed in chunks of bounded memory."""
+    """Return the values (n, ...) that `made` computes for slices of n rows, in chunks to bound memory."""
     return np.concatenate(
         [made(slice(start, start + BLOCK_ROWS)) for start in range(0, max(n, 1), BLOCK_ROWS)]
     )
 
 
 def with_blocks(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> PriorFamily:
-    """Return a family of priors with the groups' unknowns behind its own; they move no coefficient."""
+    """Return `family` with the unknowns of blocks after its own; these do not change the coefficients."""
     q, h = family.design.shape
     many = sum(len(group.shape) for group in groups)
     free = [group for group in groups if group.spread]

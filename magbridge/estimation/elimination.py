@@ -1,14 +1,15 @@
-r"""The algebra of a joint fit: few dense unknowns z, many sparse ones w, noise that is correlated in time.
+r"""Eliminate the sparse unknowns w of a joint fit, which leaves information about the few dense unknowns z.
 
-Linearised, the residual of every sample is :math:`e = y + D z + B w`: D dense (coefficients, level, slow
-changes with time), B sparse (splines in place). With AR(1) noise of size :math:`\sigma` and autocorrelation
-:math:`\rho`, and the prior precision :math:`Q / (r\sigma)^2` of w, r the field's size over the noise's,
+The linearised residual of a sample is :math:`e = y + D z + B w`, with D dense (coefficients, bias, slow
+changes with time) and B sparse (splines in space). The AR(1) noise has the standard deviation :math:`\sigma`,
+the autocorrelation :math:`\rho` and the correlation matrix R. The prior precision of w is
+:math:`Q / (r\sigma)^2`, with r the ratio of the field's standard deviation to the noise's. By Schur's
+complement the information about z (:class:`.GaussianInformation`) has the matrix H in
 
 .. math:: N = B^T R^{-1} B + Q / r^2, \quad H = D^T R^{-1} D - D^T R^{-1} B\, N^{-1} B^T R^{-1} D
 
-is what remains for z when w is eliminated (Schur's complement): a quadratic as any other fit has it
-(:class:`.GaussianInformation`). Its evidence gains :math:`\tfrac12 \log|Q / r^2| - \tfrac12 \log|N|`. The
-noise's autocorrelation enters by two more sums over the samples, so that trying another costs nothing.
+The elimination adds :math:`\tfrac12 \log|Q / r^2| - \tfrac12 \log|N|` to the log evidence. Three sums over
+the samples serve every autocorrelation, so a fit can try several values at little cost.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ from magbridge.estimation.sparse import SparseFactor
 __all__ = ["ColumnProducts", "FieldEliminated", "LinearisedRows", "SampleSums", "eliminate_field", "sum_rows"]
 
 WORST = 1e16
-"""Largest condition of a prior's precision: beyond it rounding changes the log evidence by 3 to 10, and the
-maximisation followed such steps to fields of ten times the length."""
+"""Largest condition number of a prior's precision. Beyond it, rounding changes the log evidence by 3 to 10,
+which can lead the maximisation to a field of ten times the length."""
 
 
 class LinearisedRows(NamedTuple):
-    """Linearised samples: ``V = [y | D]`` (n, 1 + q), B (n, nodes), and which follow the one before (n,).
+    """Linearised samples: ``V = [y | D]`` (n, 1 + q), B (n, nodes), and `follows` (n,).
 
-    The first row may be one that was counted already (`overlap`): then only its successor looks at it.
+    `follows`: True for a sample one interval after the previous row. `overlap`: True if the first row repeats
+    the last row of the previous piece and serves only as predecessor of the second.
     """
 
     V: FloatArray
@@ -53,7 +55,7 @@ class ColumnProducts:
     BB: csr_array
 
     def plus(self, products: ColumnProducts, factor: float = 1.0) -> ColumnProducts:
-        """Return the sum with `factor` times another."""
+        """Return these products plus `factor` times the other `products`."""
         return ColumnProducts(
             self.VV + factor * products.VV,
             self.VB + factor * products.VB,
@@ -61,12 +63,12 @@ class ColumnProducts:
         )
 
     def times(self, factor: float) -> ColumnProducts:
-        """Return them `factor` times."""
+        """Return these products multiplied by `factor`."""
         return ColumnProducts(factor * self.VV, factor * self.VB, csr_array(factor * self.BB))
 
     @classmethod
     def from_rows(cls, V: FloatArray, B: csr_array, weight: FloatArray | None = None) -> ColumnProducts:
-        """Return those of rows V (n, 1 + q) and B (n, nodes), each counted `weight` (n,) times."""
+        """Return the products of rows V (n, 1 + q) and B (n, nodes), each counted `weight` (n,) times."""
         if weight is None:
             return cls(V.T @ V, np.asarray((B.T @ V).T), csr_array(B.T @ B))
         C = csr_array(diags_array(weight) @ B)
@@ -75,20 +77,21 @@ class ColumnProducts:
 
 @dataclass(frozen=True, eq=False)
 class SampleSums:
-    r"""All samples in three sums, whatever their noise's autocorrelation.
+    r"""Three sums over all samples, from which the products follow for any autocorrelation of the noise.
 
     Attributes
     ----------
     every, ends, changes : ColumnProducts
-        T of all samples; X of those that follow none, and of those that none follows (of one that is both,
-        twice); C of the differences between a sample and the one it follows. With autocorrelation rho,
+        T of all samples; X of the first and last sample of each run, twice of a single sample; C of the
+        differences between successive samples of a run. With autocorrelation rho,
 
         .. math:: \sum r_i r_i^T = \frac{1}{1 + \rho}
                   \left[(1 - \rho)\, T + \rho\, X + \frac{\rho}{1 - \rho}\, C\right]
 
-        of the whitened rows :math:`r_i = (v_i - \rho v_{i-1}) / \sqrt{1 - \rho^2}`, and v where none came
-        before; nothing in it cancels.
+        for the whitened rows :math:`r_i = (v_i - \rho v_{i-1}) / \sqrt{1 - \rho^2}`, and :math:`r_i = v_i` at
+        the first sample of a run. No large terms cancel.
     samples, pairs : int
+        Number of samples, and of pairs of successive samples.
     """
 
     every: ColumnProducts
@@ -98,7 +101,7 @@ class SampleSums:
     pairs: int
 
     def whitened(self, rho: float) -> ColumnProducts:
-        """Return the products of the whitened rows."""
+        """Return the products of the rows whitened with autocorrelation `rho`."""
         if not rho:
             return self.every
         # The three terms of the formula above, for this rho.
@@ -107,7 +110,7 @@ class SampleSums:
 
 
 def sum_rows(pieces: Iterable[LinearisedRows]) -> SampleSums:
-    """Add up pieces of a log in order."""
+    """Return the sums over the pieces of a log, given in order."""
     total: list[ColumnProducts] | None = None
     samples = pairs = 0
     for V, B, followers, overlap in pieces:
@@ -117,7 +120,7 @@ def sum_rows(pieces: Iterable[LinearisedRows]) -> SampleSums:
         ahead = np.append(follows[1:], False)
         # 1 for a sample with one neighbour, 2 for one with none, 0 inside a stretch.
         ends = 2.0 - follows - ahead
-        if overlap:  # it was an end as long as nothing came after it
+        if overlap:  # the previous piece counted this row as an end
             ends[0] = -float(ahead[0])
         some, pair = np.flatnonzero(ends), np.flatnonzero(follows)
         found = [
@@ -134,18 +137,18 @@ def sum_rows(pieces: Iterable[LinearisedRows]) -> SampleSums:
 
 @dataclass(frozen=True, eq=False)
 class FieldEliminated:
-    """What remains for z, and how w follows from it."""
+    """Result of the elimination: information about z, and w as a function of z."""
 
     quadratic: GaussianInformation
-    """In z."""
+    """Information about z (q,)."""
     log_evidence: float
-    """What eliminating w and whitening add to it."""
+    """Contribution of the elimination of w and of whitening to the log evidence."""
     precision: csr_array
-    """N, in units of the noise's."""
+    """(nodes, nodes): N, the precision of w given z, in units of the noise's precision."""
     shift: FloatArray
-    """(nodes,), w at z = 0."""
+    """(nodes,): w at z = 0."""
     follow: FloatArray
-    """(nodes, q), dw/dz."""
+    """(nodes, q): dw/dz."""
 
     def field(self, z: FloatArray) -> FloatArray:
         """Return w (nodes,) at z (q,)."""
@@ -153,12 +156,12 @@ class FieldEliminated:
 
 
 def eliminate_field(sums: SampleSums, field: GaussianField, ratio: float, rho: float) -> FieldEliminated:
-    """Eliminate the field in place.
+    """Eliminate w, the coefficients of the field in space, from a joint fit.
 
-    `sums`: of the samples. `field`: the prior of w for a field of unit variance. `ratio`: the field's
-    standard deviation over that of the noise. `rho`: autocorrelation of the noise.
+    `sums`: sums over the samples. `field`: prior of w for unit variance. `ratio`: standard deviation of the
+    field divided by that of the noise. `rho`: autocorrelation of the noise.
 
-    LinAlgError: the precision is not positive definite in the machine's numbers, or the prior's may not be.
+    LinAlgError: a precision is not positive definite in floating point, or too badly conditioned.
     """
     if field.condition > WORST:
         raise np.linalg.LinAlgError("the nodes are too fine for so long a field")

@@ -1,25 +1,25 @@
-r"""A Gaussian random field in place with a sparse precision, and how a crustal field falls off upwards.
+r"""Gaussian random field in space with a sparse precision, and upward continuation of a crustal field.
 
 With coefficients w on nodes of spacing h and the nodes' Laplacian L,
 
 .. math:: Q = v\, K^\alpha, \quad K = \kappa^2 h^2 I + L, \quad \kappa = \sqrt{2 \nu} / \ell
 
 is the precision of a field with Matern's covariance of length :math:`\ell` and smoothness
-:math:`\nu = \alpha - 1` (Lindgren, Rue & Lindstrom 2011); v makes the field's variance 1. Large
-:math:`\nu` comes near a Gaussian of the same length.
+:math:`\nu = \alpha - 1` (Lindgren, Rue & Lindstrom 2011); v makes the field's variance 1. A large
+:math:`\nu` approximates a Gaussian covariance of the same length.
 
-Sources at a depth d have the spectrum :math:`e^{-2 |k| d}` (Spector & Grant 1970), and by the product
-:math:`\cosh 2 k d = \prod_i (1 + k^2 / \kappa_i^2),\ \kappa_i = (2 i - 1) \pi / 4 d`, a precision of factors
-whose kappas are 1 : 3 : 5 : 7.
+Sources at a depth d have the spectrum :math:`e^{-2 |k| d}` (Spector & Grant 1970). By the product
+:math:`\cosh 2 k d = \prod_i (1 + k^2 / \kappa_i^2),\ \kappa_i = (2 i - 1) \pi / 4 d`, their precision has
+factors with kappas in the ratio 1 : 3 : 5 : 7.
 
-Above its sources every wave of the field falls off upwards as :math:`e^{-|k| z}`, |k| its wave number, which
-no sparse matrix does to w. Such a field is written in u, :math:`w = (p I + L) u`, with the precision
-:math:`(p I + L)\, Q\, (p I + L)`; d deeper it is
+Above its sources, a wave of the field with wave number |k| decreases upwards as :math:`e^{-|k| z}`. No sparse
+matrix has this effect on w. So w is written as :math:`w = (p I + L) u`, and u has the precision
+:math:`(p I + L)\, Q\, (p I + L)`. At a depth d below the nodes the field is
 
 .. math:: e^{|k| d}\, w \approx (b_0 + b_1 L + b_2 L^2)\, u,
 
-the least squares over the field's spectrum, which are right to 0.2 to 1 % of the field over a sixth of its
-length (a polynomial in L alone, without the pole p: 2 to 4 %, more than a sensor's noise).
+with b from least squares over the field's spectrum. The error is 0.2 to 1 % of the field for d up to a sixth
+of its length (2 to 4 % for a polynomial in L alone, without the pole p: more than a sensor's noise).
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ from magbridge.estimation.sparse import SparseFactor
 __all__ = ["BURIED_FACTORS", "SMOOTHNESS_POWERS", "GaussianField"]
 
 SMOOTHNESS_POWERS = (2, 3, 4, 6, 10, 16)
-"""Powers alpha that are tried: from rough to as good as a Gaussian."""
+"""Powers alpha that a fit tries, from a rough field to nearly a Gaussian covariance."""
 BURIED_FACTORS, FIRST = 4, 0.6705
-"""Factors of sources at a depth, and their first kappa times the length: so the correlation begins to fall as
-that of a Gaussian of that length."""
+"""Number of factors for sources at a depth, and their first kappa times the length. With this value the
+correlation begins to decrease like a Gaussian of the length."""
 SPLINE, FALLING = 4, 8
-"""Strips of nodes that a spline reaches across, and one that falls off upwards."""
+"""Number of strips of nodes that a spline spans, and that a spline with upward continuation spans."""
 POLE = 0.2
-"""p: the approximation is best where the field's power ends, at about a node's spacing."""
+"""Pole p: with this value the approximation is best where the field's power ends, near a node's spacing."""
 MAX_LAPLACIAN_EIGENVALUE = 8.0
 """The Laplacian's largest eigenvalue."""
 DEPTHS = 33
-"""Depths at which b is found, between the shallowest and the deepest."""
+"""Number of depths, between the shallowest and the deepest, at which b is computed."""
 WAVES = 96
-"""Wave numbers an axis at which a spectrum is summed."""
+"""Number of wave numbers along each axis at which a spectrum is summed."""
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianField:
-    """A field of unit variance on nodes."""
+    """Gaussian random field of unit variance, given by coefficients on nodes."""
 
     nodes: Nodes
     length: float
@@ -66,9 +66,9 @@ class GaussianField:
     alpha: int
     """One of :data:`SMOOTHNESS_POWERS`."""
     harmonic: bool = False
-    """True if it falls off upwards by Laplace's equation; else it is the same at every depth."""
+    """True if the field decreases upwards by Laplace's equation; False if it is the same at every depth."""
     buried: bool = False
-    """True if its spectrum is that of sources at a depth, of alpha factors; else Matern's."""
+    """True if the spectrum is that of sources at a depth, with alpha factors; False if it is Matern's."""
 
     @property
     def _kappa2(self) -> FloatArray:
@@ -81,7 +81,7 @@ class GaussianField:
 
     @cached_property
     def _spectrum(self) -> tuple[FloatArray, FloatArray]:
-        """The Laplacian's eigenvalues, and the power of the field there before it is scaled to 1."""
+        """Eigenvalues of the Laplacian, and the field's power at each, before scaling to unit variance."""
         theta = np.pi * (np.arange(WAVES) + 0.5) / WAVES
         one = 4.0 * np.sin(0.5 * theta) ** 2
         # Power of a cubic B-spline at these wave numbers (Fourier transform of its values at the nodes).
@@ -113,7 +113,7 @@ class GaussianField:
 
     @cached_property
     def _roots(self) -> list[tuple[csr_array, int]]:
-        """The factors of the precision that differ, and how often each is in it."""
+        """Distinct factors of the precision, and the multiplicity of each."""
         kappas, times = np.unique(self._kappa2, return_counts=True)
         same = eye_array(self.nodes.size)
         return [
@@ -128,12 +128,12 @@ class GaussianField:
 
     @cached_property
     def _lift(self) -> csr_array:
-        """``p I + L``."""
+        """Matrix ``p I + L`` (nodes, nodes)."""
         return csr_array(POLE * eye_array(self.nodes.size) + self._laplacian)
 
     @cached_property
     def precision(self) -> csr_array:
-        """(nodes, nodes) precision of the coefficients."""
+        """Precision (nodes, nodes) of the coefficients."""
         power = reduce(matmul, (matrix_power(root, times) for root, times in self._roots))
         if self.harmonic:
             power = self._lift @ power @ self._lift
@@ -141,7 +141,7 @@ class GaussianField:
 
     @property
     def edges(self) -> IndexArray:
-        """(b + 1,) where blocks of nodes begin that couple to the next one only."""
+        """Limits (b + 1,) of blocks of nodes that couple only to the next block."""
         return self.nodes.edges(max(self.alpha + 2, FALLING) if self.harmonic else max(self.alpha, SPLINE))
 
     @cached_property
@@ -153,7 +153,7 @@ class GaussianField:
         return float(n * np.log(variance) + roots + lifted)
 
     def basis(self, place: FloatArray, deeper: FloatArray | float = 0.0) -> csr_array:
-        """Return the contribution of the coefficients at places (n, 2), m, `deeper` m below: (n, nodes)."""
+        """Return the field (n, nodes) per coefficient at `place` (n, 2), m, `deeper` (m) below the nodes."""
         flat = self.nodes.basis(place)
         if not self.harmonic:
             return flat
@@ -167,14 +167,14 @@ class GaussianField:
         return csr_array(rows)
 
     def slopes(self, place: FloatArray) -> tuple[csr_array, csr_array]:
-        """Return the basis' derivatives to north and east, 1/m, at places (n, 2), m, at the nodes' depth."""
+        """Return the basis' derivatives north and east, 1/m, at `place` (n, 2), m, at the nodes' depth."""
         north, east = self.nodes.slopes(place)
         if not self.harmonic:
             return north, east
         return csr_array(north @ self._lift), csr_array(east @ self._lift)
 
     def _deeper(self, deeper: FloatArray) -> FloatArray:
-        """Return b (3, n) at depths (n,), m below the nodes': exact at 0, interpolated between a few."""
+        """Return b (3, n) at `deeper` (n,), m below the nodes: exact at 0, interpolated elsewhere."""
         some = np.linspace(min(deeper.min(), 0.0), max(deeper.max(), 0.0), DEPTHS) if deeper.any() else [0.0]
         some = np.unique(np.append(some, 0.0))
         # Least squares of exp(-k h) by the three terms, weighted by the field's power at each wave number.

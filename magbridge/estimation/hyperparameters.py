@@ -1,8 +1,8 @@
-"""The marginal likelihood of the prior's widths, its gradient, and where it is largest.
+"""Compute and maximise the marginal likelihood (evidence) of the prior's widths and of the noise.
 
 Notes
 -----
-About the best coefficients the log likelihood is quadratic in z: ``-(c_0 - 2 b.z + z^T H z) / 2 sigma^2``.
+Near the best coefficients the log likelihood is quadratic in z: ``-(c_0 - 2 b.z + z^T H z) / 2 sigma^2``.
 With a Gaussian prior of widths ``w = exp(constant + design . eta)`` the evidence is known in closed form.
 With ``W = diag(w)``, ``M = I + W H W / sigma^2`` and ``y = M^-1 W b / sigma^2`` (so the posterior
 mean is ``W y``)::
@@ -27,21 +27,21 @@ from magbridge.estimation.priors import PriorFamily
 __all__ = ["Hyperparameters", "log_evidence", "maximise_evidence"]
 
 MAX_PRIOR_SIGMA = 10.0
-"""Sigmas of the prior of eta, and of log sigma from where it starts: nothing physical lies beyond, and exp
-must not overflow."""
+"""Largest distance of eta from its prior mean, in prior sigmas, and of log sigma from its start. Beyond it no
+value is physical, and exp could overflow."""
 LOG_SIGMA_SCALE = 0.1
-"""Scales log sigma as a prior's sigma scales eta."""
+"""Scale of log sigma in the maximisation; the scale of eta is its prior sigma."""
 
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """Where the evidence is largest: eta (h,), the noise (sensor nT), log Z."""
+    """Maximum of the evidence: eta (h,), the noise's standard deviation `sigma` (sensor nT), and log Z."""
 
     eta: FloatArray
     sigma: float
     log_evidence: float
     determined: float
-    """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
+    """Number of unknowns that the data, not the prior, determined: ``q - tr M^-1``."""
 
 
 def log_evidence(
@@ -49,8 +49,8 @@ def log_evidence(
 ) -> tuple[float, FloatArray, float]:
     """Return log evidence, its gradient by (eta, log sigma), and `Hyperparameters.determined`.
 
-    `eta` is (h,), the gradient (h + 1,); `log_sigma` that of the noise in sensor nT. If the evidence is not
-    finite, the first is -inf and the others are zero.
+    `eta` is (h,), the gradient (h + 1,). `log_sigma`: logarithm of the noise's standard deviation in sensor
+    nT. If the evidence is not finite, the first result is -inf and the others are zero.
     """
     # M = I + W H W / sigma^2, factorised in place.
     w = family.widths(eta)
@@ -83,13 +83,13 @@ def log_evidence(
 def maximise_evidence(
     information: GaussianInformation, family: PriorFamily, eta: FloatArray, sigma: float
 ) -> Hyperparameters:
-    """Climb from `eta` (h,) and `sigma` (sensor nT) to where the evidence is largest."""
+    """Maximise the evidence, starting from `eta` (h,) and `sigma` (sensor nT)."""
     # Climb in units of the hyperparameters' prior sigmas, so that BFGS starts from a good metric.
     middle = np.append(family.centre, np.log(sigma))
     scale = np.append(family.spread, LOG_SIGMA_SCALE)
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
-        # (where sigma vanishes the cost is but what rounding leaves of it, and the evidence has no end)
+        # bounds: as sigma vanishes, the cost is rounding error and the evidence grows without limit
         if np.abs(x[:-1]).max(initial=0.0) > MAX_PRIOR_SIGMA or abs(scale[-1] * x[-1]) > MAX_PRIOR_SIGMA:
             return 1e300, 0.0 * x
         at = middle + scale * x

@@ -41,7 +41,7 @@ class GaussianInformation:
     def from_derivatives(
         cls, z: FloatArray, hessian: FloatArray, gradient: FloatArray, cost: float, n: float
     ) -> GaussianInformation:
-        """Return the quadratic whose cost, half gradient and half Hessian at `z` (q,) are the ones given."""
+        """Return the quadratic with this cost, half gradient (q,) and half Hessian (q, q) at `z` (q,)."""
         constant = float(cost - 2.0 * gradient @ z + z @ hessian @ z)
         return cls(hessian, hessian @ z - gradient, constant, n)
 
@@ -51,15 +51,15 @@ class GaussianInformation:
     ) -> GaussianInformation:
         """Return the information of the data that moved a Gaussian prior to a Gaussian posterior.
 
-        `mean`, `covariance` (q,): the posterior. `prior_mean`, `prior_covariance` (q,): the prior;
-        directions in which the posterior is not narrower have no information.
+        `mean` (q,), `covariance` (q, q): the posterior. `prior_mean` (q,), `prior_covariance` (q, q): the
+        prior. Directions in which the posterior is not narrower than the prior have no information.
         """
         # work in units of the posterior's standard deviations, where both precisions are near 1
         scale = np.sqrt(np.diag(covariance))
         known = _scaled_inverse(prior_covariance, scale)
         found = _scaled_inverse(covariance, scale)
         # Posterior precision = prior precision + data precision. Rounding can make the difference slightly
-        # negative where the data said nothing: such eigenvalues are zero.
+        # negative where the data have no information: set such eigenvalues to zero.
         values, vectors = np.linalg.eigh(found - known)
         precision = (vectors * np.maximum(values, 0.0)) @ vectors.T
         vector = found @ (mean / scale) - known @ (prior_mean / scale)
@@ -75,7 +75,7 @@ class GaussianInformation:
         )
 
     def divided(self, sigma: float) -> GaussianInformation:
-        """Return the information of the same data with noise of `sigma` instead of 1."""
+        """Return the information of the same data if their noise has the 1-sigma `sigma` instead of 1."""
         factor = sigma**-2
         return GaussianInformation(
             factor * self.precision, factor * self.vector, factor * self.constant, self.n
@@ -88,7 +88,7 @@ class GaussianInformation:
         )
 
     def condition(self, rows: IndexArray, values: FloatArray) -> GaussianInformation:
-        """Return the information about the other unknowns, with those in `rows` (p,) at `values` (p,)."""
+        """Return the information about the other unknowns if the unknowns `rows` (p,) are `values` (p,)."""
         keep = np.setdiff1d(np.arange(len(self.vector)), rows)
         # -1/2 z^T L z + eta^T z with z_rows fixed: a constant, and a change of the vector
         precision, given = self.precision, np.asarray(values, float)
@@ -118,7 +118,7 @@ class GaussianInformation:
         return GaussianInformation(0.5 * (precision + precision.T), vector, float(constant), self.n)
 
     def blurred(self, direction: FloatArray, sigma: float) -> GaussianInformation:
-        """Return the information if a number N(0, `sigma`²) moves the unknowns along `direction` (q,).
+        """Return the information after adding `direction` (q,) times a ~ N(0, `sigma`²) to the unknowns.
 
         Notes
         -----
@@ -157,7 +157,7 @@ class GaussianInformation:
 def covariance_of(precision: FloatArray) -> FloatArray:
     """Return the inverse of a positive definite precision (q, q), symmetric to the last bit.
 
-    CalibrationError: the precision is singular: a combination of the unknowns is free.
+    CalibrationError: the precision is singular, so a combination of the unknowns is not determined.
     """
     # A precision with unit diagonal: unknowns in different units do not spoil the factorisation.
     scale = np.sqrt(np.diag(precision))

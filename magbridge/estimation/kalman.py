@@ -27,7 +27,7 @@ __all__ = ["KalmanFilter"]
 
 
 class KalmanFilter:
-    """Estimate a state from scalar residuals.
+    """Kalman filter that estimates a state from scalar residuals.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class KalmanFilter:
         noise: FloatArray | None = None,
         states: slice | IndexArray | None = None,
     ) -> None:
-        """Move some states on in time, by ``x <- F x`` and ``P <- F P F^T + Q``.
+        """Propagate some states in time, by ``x <- F x`` and ``P <- F P F^T + Q``.
 
         `transition` (m, m): F, of the `states`. `noise` (m, m): Q, covariance of the process noise. `states`
         (m,): the states that F moves; by default all.

@@ -17,7 +17,7 @@ __all__ = ["Nodes", "nodes_near"]
 MIN_BLOCK_NODES = 96
 """Fewest nodes of a block: smaller ones cost more in calls than in arithmetic."""
 MAX_BOX_CELLS = 4_000_000
-"""Cells of the box that holds a track, at most: beyond, the nodes are too fine for it."""
+"""Largest number of cells in the box around a track; with more cells, the nodes are too fine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +27,9 @@ class Nodes:
     spacing: float
     """Spacing of the nodes, m."""
     low: FloatArray
-    """(2,), m, north and east, of the box's first node."""
+    """(2,): North and east of the first node of the box, m."""
     number: IndexArray
-    """(a, b): The number of each of the box's nodes, -1 where there is none."""
+    """(a, b): Number of each node in the box, -1 where no node exists."""
     turned: bool
     """True if strips run north (the box is longer to the east)."""
 
@@ -40,15 +40,15 @@ class Nodes:
 
     @cached_property
     def places(self) -> FloatArray:
-        """(n, 2) m, north and east, of every node."""
+        """North and east (n, 2) of every node, m."""
         strip, along = np.nonzero(self.number >= 0)
         at = np.stack([strip, along][:: -1 if self.turned else 1], axis=1)
         return np.asarray(self.low + self.spacing * at)
 
     def edges(self, reach: int) -> IndexArray:
-        """Return where blocks begin (b + 1,) that couple to the next one only, if nothing reaches further.
+        """Return the limits (b + 1,) of blocks of nodes that couple only to the next block.
 
-        `reach` is in strips of nodes.
+        `reach`: largest distance between coupled nodes, in strips.
         """
         # Join strips until a block is as wide as the coupling reaches and large enough for dense algebra.
         count = (self.number >= 0).sum(axis=1)
@@ -63,7 +63,7 @@ class Nodes:
         return np.array(edges)
 
     def covers(self, place: FloatArray) -> BoolArray:
-        """Return which places (n, 2), m, have all the nodes that a spline there needs: (n,)."""
+        """Return a mask (n,) of the places (n, 2), m, at which all nodes that a spline needs exist."""
         return np.asarray((self._around(place)[0] >= 0).all(axis=(1, 2)))
 
     def basis(self, place: FloatArray) -> csr_array:
@@ -76,7 +76,7 @@ class Nodes:
         return (across, along) if self.turned else (along, across)
 
     def _around(self, place: FloatArray) -> tuple[IndexArray, FloatArray]:
-        """Return the numbers (n, 4, 4) of the nodes around places (n, 2), -1 outside; the cells' shares."""
+        """Return the numbers (n, 4, 4) of the nodes around places (n, 2), or -1, and positions in cells."""
         # Position in cells; the 4 x 4 nodes around it carry the cubic B-splines that are not zero there.
         u = (place - self.low) / self.spacing
         u = u[:, ::-1] if self.turned else u
@@ -106,7 +106,7 @@ class Nodes:
 
 
 def nodes_near(place: FloatArray, spacing: float, pad: float) -> Nodes:
-    """Return the nodes within about `pad` m of places (n, 2), m north and east."""
+    """Return the nodes within about `pad` m of `place` (n, 2), m north and east; ValueError: too many."""
     # Mark the cells of the track, dilate them by the pad, and number the marked cells, strip by strip.
     around = int(np.ceil(pad / spacing)) + 2
     cells = np.floor(place / spacing).astype(np.intp)

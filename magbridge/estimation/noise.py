@@ -23,18 +23,18 @@ __all__ = [
 ]  # fmt: skip
 
 OUTLIER_SIGMA = 5.0
-"""Robust standard deviations beyond which a residual is left out; Gaussian noise exceeds them once in 1.7
+"""Robust standard deviations beyond which a residual is an outlier; Gaussian noise exceeds them once in 1.7
 million samples."""
 CLIP_SIGMA = 3.0
 """Robust standard deviations at which residuals are clipped before the autocorrelation is estimated."""
 MIN_SLOW_AUTOCORRELATION = 0.2
-"""Autocorrelation of neighbours from which on noise may be a slow part and a white part."""
+"""Smallest autocorrelation of neighbours at which noise may have a slow and a white part."""
 MIN_LOG_LIKELIHOOD_GAIN = 5.0
 """Gain in log likelihood that a white part must bring over an AR(1) process alone."""
 MAX_AUTOCORRELATION = 0.99
 """Largest autocorrelation that :func:`estimate_noise` returns."""
 MIN_PAIRS = 30
-"""Pairs of successive samples from which on their autocorrelation is estimated."""
+"""Fewest pairs of successive samples from which their autocorrelation is estimated."""
 WINDOW_TIMES = 5.0
 """Integrated autocorrelation times up to which :func:`samples_per_independent` sums."""
 STEADY_STATE_TOLERANCE = 1e-13
@@ -56,7 +56,7 @@ class NoiseModel:
 
     @property
     def shape(self) -> tuple[float, float]:
-        """Autocorrelation and white fraction."""
+        """Autocorrelation of the slow part, and fraction of the variance that is white."""
         return self.autocorrelation, self.white
 
     @property
@@ -65,7 +65,7 @@ class NoiseModel:
         return 0 if self.weight is None else int((self.weight == 0.0).sum())
 
     def whiten(self, values: FloatArray, steps: FloatArray) -> FloatArray:
-        """Return values (n, ...) with their noise made white, of standard deviation `sigma`.
+        """Return values (n, ...) whitened, so that their noise is white with standard deviation `sigma`.
 
         `values` (n, ...): Residuals, or columns of their Jacobian. `steps` (n,): sampling intervals since
         the previous sample; infinite at the first of a run.
@@ -73,13 +73,13 @@ class NoiseModel:
         return Whitening(steps, *self.shape).apply(values)
 
     def log_det(self, steps: FloatArray) -> float:
-        """Return the logarithm of the determinant of the covariance of n samples, nT²; arguments as above."""
+        """Return the log-determinant of the covariance of n samples, nT²; `steps` (n,) as in `whiten`."""
         variance = Whitening(steps, *self.shape).variance
         return float(np.log(variance).sum() + 2.0 * len(steps) * np.log(self.sigma))
 
 
 class Whitening:
-    """Whitens noise of unit variance in blocks of rows, in order.
+    """Whitening of noise of unit variance, applied to successive blocks of rows.
 
     Parameters
     ----------
@@ -97,13 +97,13 @@ class Whitening:
 
     Notes
     -----
-    The innovations of a Kalman filter that follows the slow part s, of variance ``1 - f`` in addition to the
-    white noise's f, and predicts m (Harvey 1989, Forecasting, structural time series models, section 3.2)::
+    A Kalman filter estimates the slow part, of variance ``1 - f``, in white noise of variance f. It predicts
+    m and has innovations v (Harvey 1989, Forecasting, structural time series models, section 3.2)::
 
         v_t = y_t - m_t,   S_t = P_t + f,   K_t = P_t / S_t
         m_t+1 = r (m_t + K_t v_t),   P_t+1 = r^2 (1 - K_t) P_t + (1 - f)(1 - r^2),   r = rho^steps
 
-    and ``v / sqrt(S)`` is white, of unit variance. With f = 0 it is ``(y_t - r y_t-1) / sqrt(1 - r^2)``.
+    ``v / sqrt(S)`` is white, of unit variance. With f = 0 it is ``(y_t - r y_t-1) / sqrt(1 - r^2)``.
     """
 
     def __init__(self, steps: FloatArray, rho: float, white: float = 0.0) -> None:
@@ -115,7 +115,7 @@ class Whitening:
         self._slow: FloatArray | None = None  # the filtered slow part at the row before
 
     def apply(self, values: FloatArray) -> FloatArray:
-        """Whiten the next k rows, (k, ...)."""
+        """Return the next k rows (k, ...), which follow the rows of the previous call, whitened."""
         rows = slice(self._row, self._row + len(values))
         y = values.reshape(len(values), -1)
         r, K, S = self.decay[rows, None], self._gain[rows, None], self.variance[rows, None]
@@ -161,12 +161,12 @@ def _innovations(decay: FloatArray, white: float) -> tuple[FloatArray, FloatArra
 
 
 def whiten(values: FloatArray, steps: FloatArray, rho: float, white: float = 0.0) -> FloatArray:
-    """Return whitened noise (n, ...), gaps included; arguments as for :class:`Whitening`."""
+    """Return the values (n, ...) whitened, also across gaps; arguments as for :class:`Whitening`."""
     return Whitening(steps, rho, white).apply(values)
 
 
 def effective_fraction(rho: float, white: float = 0.0) -> float:
-    """Return the fraction of the samples that are independent in a mean.
+    """Return the number of independent samples in a mean, divided by the number of samples.
 
     Notes
     -----
@@ -178,16 +178,16 @@ def effective_fraction(rho: float, white: float = 0.0) -> float:
 def samples_per_independent(values: FloatArray, steps: FloatArray) -> float:
     """Return the number of correlated samples that count as one independent sample, at least 1.
 
-    `values` (n, q): residuals times the rows of their Jacobian, in units in which the q coefficients are
-    alike: what each sample contributes to the gradient. `steps` (n,): sampling intervals since the previous
-    sample; infinite at the first of a run.
+    `values` (n, q): contribution of each sample to the gradient by q coefficients, in comparable units:
+    residual times row of the Jacobian. `steps` (n,): sampling intervals since the previous sample; infinite
+    at the first of a run.
 
     Notes
     -----
     The integrated autocorrelation ``1 + 2 sum rho(l)``, summed up to the first lag that is
     :data:`WINDOW_TIMES` times as long as the sum so far (Sokal 1997, Monte Carlo methods in statistical
-    mechanics, section 3). The error of a model lasts as long as a manoeuvre, so the sum is a time: it does
-    not depend on the sampling rate, as the autocorrelation of neighbours does.
+    mechanics, section 3). The error of a model lasts as long as a manoeuvre. So the sum corresponds to a
+    time that does not depend on the sampling rate, unlike the autocorrelation of neighbours.
     """
     longest = max(len(values) // 4, 1)
     # place the samples on their intervals; the gap between runs exceeds the longest lag
@@ -234,9 +234,8 @@ def estimate_noise(
 def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> NoiseModel:
     """Return the noise as a slow and a white part, if that is likelier than the given AR(1) process.
 
-    The correlation time of noise is a property of the sensor. In a log that is sampled often, neighbours are
-    nearly equal whatever white noise is between them, and an AR(1) process alone then underestimates one of
-    the two.
+    The correlation time of noise is a property of the sensor. At a high sampling rate, the slow part of
+    neighbours is nearly equal. An AR(1) process alone then underestimates the slow or the white part.
 
     `e` (n,): Residuals, nT. `steps` (n,): sampling intervals since the previous sample. `noise`: the result
     of :func:`estimate_noise`.
@@ -272,13 +271,13 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> N
 
 
 def _clipped(e: FloatArray) -> FloatArray:
-    """Return the residuals with those beyond :data:`CLIP_SIGMA` moved there."""
+    """Return the residuals (n,) clipped at :data:`CLIP_SIGMA` robust standard deviations."""
     scale = _scale(e)
     return np.asarray(np.clip(e, -CLIP_SIGMA * scale, CLIP_SIGMA * scale))
 
 
 def _scale(e: FloatArray) -> float:
-    """Return the robust scale, or the mean magnitude if more than half of the residuals are zero."""
+    """Return the robust scale of residuals (n,), or their mean magnitude if more than half are zero."""
     return robust_scale(e) or float(np.abs(e).mean()) or 1e-9
 
 

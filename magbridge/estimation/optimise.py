@@ -1,13 +1,13 @@
 r"""Damped Gauss-Newton on the scalar residual with a Gaussian prior.
 
-Minimised over z, with coefficients ``c = E z + offset``, is
+The solver varies z, with coefficients ``c = E z + offset``, to minimise the objective
 
 .. math:: \frac{1}{2\sigma^2} \sum_i w_i e_i(c)^2 + \tfrac12 z^T P z,
 
-e the whitened residuals (:mod:`.residual`, :mod:`.noise`), w their weights and P the prior's precision. Each
-step solves ``(J^T J / sigma^2 + P) dz = -gradient`` and is shortened until the sum decreases (Nocedal &
-Wright 2006, Numerical optimization, sections 3.5 and 10.3). The normal equations of all samples are summed
-up once for each trial, so that the linear algebra is small.
+where e are the whitened residuals (:mod:`.residual`, :mod:`.noise`), w their weights and P is the prior's
+precision. Each step solves ``(J^T J / sigma^2 + P) dz = -gradient`` and is shortened until the objective
+decreases (Nocedal & Wright 2006, Numerical optimization, sections 3.5 and 10.3). Each trial sums the normal
+equations over all samples once, so the linear algebra is small.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ __all__ = ["NormalEquations", "Solution", "gauss_newton", "normal_equations"]
 MIN_STEP_FRACTION = 1e-6
 """Fraction of a Gauss-Newton step below which it is not shortened further."""
 MIN_SHORTENING = 0.1
-"""Factor by which a step that fails is shortened at most."""
+"""Smallest factor by which one trial shortens a step that fails."""
 MIN_EIGENVALUE_RATIO = 1e-11
 """Fraction of the largest eigenvalue of the scaled precision below which a direction is not determined."""
 
 
 class NormalEquations(NamedTuple):
-    """``cost = sum w e^2`` about a point: half its gradient, and half the Hessian of Gauss-Newton."""
+    """Normal equations at a point: ``cost = sum w e^2``, half its gradient, half its Gauss-Newton Hessian."""
 
     hessian: FloatArray
     gradient: FloatArray
     cost: float
 
     def reduced(self, E: FloatArray) -> NormalEquations:
-        """Return the same in z (q) where ``c = E z + offset``, E (K, q)."""
+        """Return the normal equations in z (q,), where ``c = E z + offset``, E (K, q)."""
         return NormalEquations(E.T @ self.hessian @ E, E.T @ self.gradient, self.cost)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where the solver ended: z (q,), the normal equations there (in z), whether it converged, its steps."""
+    """Result of the solver: z (q,), normal equations in z, `settled` (True if converged), number of steps."""
 
     z: FloatArray
     normal: NormalEquations
@@ -63,9 +63,9 @@ def normal_equations(
     rho: float = 0.0,
     white: float = 0.0,
 ) -> NormalEquations:
-    """Sum up the normal equations of the whitened residual, in bounded memory.
+    """Return the normal equations of the whitened residual, computed in bounded memory.
 
-    `samples`: n samples with m monomials. `coefficients` (9 m,): where to linearise, nT, monomial by
+    `samples`: n samples with m monomials. `coefficients` (9 m,): point of linearisation, nT, monomial by
     monomial. `weight` (n,): weight of each whitened residual; 1 if not given. `rho`, `white`:
     autocorrelation of the noise, as for :func:`.noise.whiten`.
     """
@@ -98,7 +98,7 @@ def gauss_newton(
     steps: int = 50,
     tolerance: float = 1e-3,
 ) -> Solution:
-    """Minimise from `start`.
+    """Minimise the objective in the module's docstring, starting from `start`.
 
     Parameters
     ----------

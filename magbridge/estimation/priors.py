@@ -2,16 +2,16 @@ r"""Physical priors of the coefficients: Gaussians whose widths are estimated.
 
 Notes
 -----
-A mass at distance |r| that travels q |r| either way (q small) adds a field ``~ |r_0 + t x|^-3``, whose
-n-th power of x has the size ``(n + 1)(n + 2)/2 q^n`` of the whole: against its first power::
+A mass at distance |r| that travels q |r| either way (q small) adds a field ``~ |r_0 + t x|^-3``. The term in
+``x^n`` is ``(n + 1)(n + 2)/2 q^n`` of the whole field. So the prior widths w_n of the terms are related by::
 
     w_n = w_1 (n + 1)(n + 2)/6 q^(n - 1)
 
-So each parameter has three widths, all logarithmic: the first power in T, the first power in A, and q. To
-first order masses do not affect each other: cross terms have widths of their own, expected to be far
-smaller. The constant terms have three: the gain common to all axes, soft iron, hard iron. Every width is
-``log w = constant + design . eta``. eta has a broad Gaussian prior about sizes found on vehicles and is
-chosen to maximise the evidence (:mod:`.hyperparameters`), so the data can overrule those sizes.
+Each mass has three widths, estimated by their logarithms: the first power in T, the first power in A, and q.
+To first order masses do not affect each other, so cross terms have separate, far smaller widths. The constant
+terms have three widths: the gain common to all axes, soft iron, hard iron. Every width is
+``log w = constant + design . eta``. The prior of eta is a broad Gaussian about values found on vehicles. The
+estimate of eta maximises the evidence (:mod:`.hyperparameters`), so the data can overrule these values.
 """
 
 from __future__ import annotations
@@ -40,47 +40,47 @@ HARD_IRON_SIGMA_NT = 3000.0
 WIDE_HARD_IRON_SIGMA = 0.6
 """Standard deviation of hard iron as a fraction of the field, for a fit that does not estimate its width."""
 FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05
-"""nT in T and in a over half the range seen, of a mass; its travel over its distance."""
+"""Prior medians for a mass: change of T and of a over half its range, nT; travel divided by distance."""
 CROSS_T, CROSS_A = 0.1, 0.1
-"""Prior sigma of cross terms, in T and in a, nT: masses hardly magnetise each other."""
+"""Prior medians of the widths of cross terms in T and in a, nT: masses hardly magnetise each other."""
 FACTOR_FIXED, FACTOR_MASS, FACTOR_RATIO = np.log(2.0), np.log(3.3), np.log(1.8)
 """1-sigma of the logarithms of the widths: of fixed iron, of a mass, of travel over distance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Gaussian prior of z about 0 with its precision (q, q); and ``c = E z + offset``, E (K, q)."""
+    """Gaussian prior of z with mean 0 and `precision` (q, q); coefficients are ``E z + offset``, E (K, q)."""
 
     precision: FloatArray
     E: FloatArray
     offset: FloatArray | float = 0.0
 
     def coefficients(self, z: FloatArray) -> FloatArray:
-        """Return (K,) ``c = E z + offset`` of z (q,)."""
+        """Return the coefficients (K,), nT, at z (q,)."""
         return np.asarray(self.E @ z + self.offset)
 
 
 @dataclass(frozen=True, eq=False)
 class PriorFamily:
-    """A hierarchical prior: coefficients follow from latent numbers z, whose widths follow from eta."""
+    """Hierarchical prior: eta determines the widths of the latent unknowns z, and z the coefficients c."""
 
     E: FloatArray
     """(K, q): ``c = E z + offset``; the prior of z is centred at 0."""
     offset: FloatArray
-    """(K,)."""
+    """(K,): Coefficients at z = 0, nT."""
     constant: FloatArray
     design: FloatArray
-    """`constant`, `design`, (q,): Log widths of z are ``constant + design @ eta``."""
+    """`constant` (q,), `design` (q, h): Log widths of z are ``constant + design @ eta``."""
     centre: FloatArray
     spread: FloatArray
-    """`centre`, `spread`, (h,): Prior of eta."""
+    """`centre`, `spread` (h,): Mean and 1-sigma of the prior of eta."""
     names: tuple[str, ...]
-    """What ``exp(eta)`` is the width of, number by number."""
+    """Name of each width in ``exp(eta)``."""
     renew: Callable[[FloatArray], PriorFamily] | None = None
-    """``z -> PriorFamily``: the family linearised at another z."""
+    """Function that returns the family linearised at another z; None if c is linear in z."""
 
     def widths(self, eta: FloatArray) -> FloatArray:
-        """Return (q,) prior 1-sigma of z at `eta` (h,)."""
+        """Return the prior 1-sigma of z (q,) at `eta` (h,)."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
 
     def nearest_latent(self, start: FloatArray) -> FloatArray:
@@ -93,21 +93,21 @@ class PriorFamily:
 
 
 def gain_rotation() -> FloatArray:
-    """Return an orthonormal matrix (3, 3): the common gain of three axes, then two differences."""
+    """Return an orthonormal matrix (3, 3): its columns are the common gain of the axes, two differences."""
     return np.array([[1, 1, 1], [1, -1, 0], [1, 1, -2]]).T / np.sqrt([3.0, 2.0, 6.0])
 
 
 def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F_0: float) -> PriorFamily:
-    """Return the prior of polynomials with physical widths, the masses' places being unknown.
+    """Return the prior of polynomial coefficients with physical widths, for masses at unknown places.
 
     Parameters
     ----------
     exponents : tuple of tuple of int
-        The monomials; the constant one first.
+        Powers of each monomial; the constant monomial first.
     names : tuple of str
-        Of the parameters.
+        Names of the masses' positions (regressors).
     F_0 : float
-        nT, as in :class:`~magbridge.estimation.residual.ResidualSamples`.
+        Total field, nT, as in :class:`~magbridge.estimation.residual.ResidualSamples`.
     """
     # widths of the constant terms, then three for each mass, then those of the cross terms
     labels = ["gain", "soft iron", "hard iron"]
@@ -139,7 +139,7 @@ def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F
 
 
 def _log_widths(powers: Exponents, constant: FloatArray, design: FloatArray) -> None:
-    """Fill one monomial's rows, in place: the constants and eta's weights of its nine log widths."""
+    """Fill, in place, the constants (9,) and the weights of eta (9, h) for one monomial's log widths."""
     degree = sum(powers)
     moved = [k for k, power in enumerate(powers) if power]
     # Monomials without a mass: gain and soft iron in A, hard iron in T.

@@ -2,7 +2,7 @@
 
 Notes
 -----
-Noise sits in the reading, inside ``A(.)``: least squares on ``|A(H_r - T)| - H_e`` would shrink A and bias T.
+The reading H_r inside ``A(.)`` is noisy: least squares on ``|A(H_r - T)| - H_e`` would shrink A and bias T.
 The errors-in-variables residual (Sampson's; Kukush, Markovsky & Van Huffel 2004) is in the sensor's
 own nanotesla::
 
@@ -38,23 +38,23 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, eq=False)
 class ResidualSamples:
-    """The samples that a fit compares with their reference."""
+    """Samples that a fit compares with their reference."""
 
     field: FloatArray
-    """(n, 3), nT, raw."""
+    """(n, 3): Raw field H_r, nT."""
     reference: FloatArray
-    """(n,), nT, H_e."""
+    """(n,): Reference of the total field H_e, nT."""
     phi: FloatArray
-    """(n, m): Monomials of the positions."""
+    """(n, m): Monomials of the masses' positions."""
     steps: FloatArray
-    """(n,): Sampling intervals since the previous sample; infinite where that belongs to another run."""
+    """(n,): Sampling intervals since the previous sample; infinite at the first sample of a run."""
     F_0: float
     """Total field that the coefficients of A refer to, nT: ``A = I + a / F_0``."""
     kappa: float = 0.0
     """Noise of the reference divided by the sensor's."""
 
     def part(self, rows: slice | BoolArray | IndexArray) -> ResidualSamples:
-        """Pick samples: an (n,) mask, places or a slice."""
+        """Return the samples `rows`, given as a mask (n,), indices or a slice."""
         return ResidualSamples(
             self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.F_0, self.kappa
         )
@@ -65,10 +65,10 @@ def residuals(samples: ResidualSamples, coefficients: FloatArray) -> tuple[Float
 
     Parameters
     ----------
-    samples : Samples
-        n of them, with m monomials.
+    samples : ResidualSamples
+        n samples with m monomials.
     coefficients : (9 m,) array
-        nT, monomial by monomial.
+        Coefficients, nT, monomial by monomial.
     """
     # A and T at the positions of every sample, then the corrected vector b and its direction u
     theta = samples.phi @ coefficients.reshape(-1, 9)
@@ -103,7 +103,7 @@ def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
 
 
 def residuals_of(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
-    """Return residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
+    """Return only the residual e (n,), in bounded memory; arguments as for :func:`residuals`."""
     # Chunks bound the memory of the Jacobian's intermediate arrays.
     pieces = [
         residuals(samples.part(slice(start, start + CHUNK_ROWS)), coefficients)[0]
@@ -113,7 +113,7 @@ def residuals_of(samples: ResidualSamples, coefficients: FloatArray) -> FloatArr
 
 
 def rms(values: FloatArray) -> float:
-    """Return root mean square of the values (n,)."""
+    """Return the root mean square of the values (n,)."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -123,14 +123,14 @@ def robust_scale(values: FloatArray) -> float:
 
 
 def scales_and_offsets(samples: ResidualSamples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
+    """Return the eigenvalues of A (n, 3) and the magnitude of T (n,), nT, at every sample."""
     theta = samples.phi @ coefficients.reshape(-1, 9)
     A = np.eye(3) + symmetric(theta) / samples.F_0
     return np.asarray(np.linalg.eigvalsh(A)), np.asarray(np.linalg.norm(theta[:, 6:], axis=1))
 
 
 def _times(A: FloatArray, x: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) times (n, 3)."""
+    """Return the products (n, 3) of matrices (n, 3, 3) and vectors (n, 3)."""
     return np.asarray(np.matmul(A, x[:, :, None])[:, :, 0])
 
 

@@ -1,8 +1,8 @@
-"""Selection of parameter blocks by the evidence.
+"""Select parameter blocks by the evidence.
 
-Blocks that are optional stay in a fit only if each of them gains more log evidence than its price. The
-information about all unknowns is computed once, with every block in it; leaving a block out means to leave
-its rows and columns out (Kass & Raftery 1995, Bayes factors, section 3).
+An optional block stays in a fit only if it gains more log evidence than its price. The information about all
+unknowns is computed once, with every block in it. Without the rows and columns of a block, it is the
+information of a fit without the block (Kass & Raftery 1995, Bayes factors, section 3).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from magbridge.estimation.priors import PriorFamily
 __all__ = ["BLOCK_LOG_EVIDENCE_PRICE", "select_blocks"]
 
 BLOCK_LOG_EVIDENCE_PRICE = 6.0
-"""Log evidence that an optional block must gain, 400:1. The best of several lags gains 3 by chance."""
+"""Log evidence that an optional block must gain: odds of 400:1. The best of many lags gains 3 by chance."""
 
 
 def select_blocks(
@@ -32,11 +32,11 @@ def select_blocks(
     sigma: float,
     price: float = BLOCK_LOG_EVIDENCE_PRICE,
 ) -> tuple[ParameterBlock, ...]:
-    """Return the groups without those that are offered and that the log does not need; one lag at most.
+    """Return the blocks without the optional blocks that the log does not need, and with one lag at most.
 
-    `quadratic`: in the unknowns of all groups, behind those of `family`. `family`: of the coefficients.
-    `groups`: all that are in the fit. `eta`, `sigma` (h,): hyperparameters and noise (nT), from which to
-    climb. `price`: nats that each must gain.
+    `quadratic`: information about the unknowns of `family`, then of all blocks. `family`: prior of the
+    coefficients. `groups`: all blocks of the fit. `eta` (h,), `sigma`: hyperparameters and noise (nT) at
+    which the maximisation starts. `price`: log evidence that each optional block must gain.
     """
     # Exhaustive search: evidence of each choice of blocks, less the price of every offered one.
     first, free = _starts(family, groups)
@@ -57,7 +57,7 @@ def select_blocks(
 
 
 def _choices(groups: tuple[ParameterBlock, ...]) -> Iterator[tuple[ParameterBlock, ...]]:
-    """Yield all choices: none first, so that it is taken where nothing is likelier."""
+    """Yield all choices of blocks; the first is without optional blocks, so it wins if none is likelier."""
     lags = [one for one in groups if isinstance(one, OffsetBlock) and one.lag is not None]
     others = [one for one in groups if one.offered and one not in lags]
     for chosen in product([None, *lags], *([None, one] for one in others)):
@@ -65,7 +65,7 @@ def _choices(groups: tuple[ParameterBlock, ...]) -> Iterator[tuple[ParameterBloc
 
 
 def _starts(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> tuple[dict[str, int], dict[str, int]]:
-    """Return where the unknowns of each group begin, and where its width stands."""
+    """Return the index of the first unknown of each block, and the index of its width in eta."""
     first, free, row, column = {}, {}, family.E.shape[1], len(family.centre)
     for one in groups:
         first[one.name], free[one.name] = row, column

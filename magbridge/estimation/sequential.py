@@ -45,22 +45,22 @@ ALARM_LOG_RATIO: Final = 18.0
 RESTART_PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
 """Measurements after which an onset is replaced by a new one."""
 PROMISING_LOG_RATIO: Final = 6.0
-"""L from which on an onset is not replaced."""
+"""Smallest L at which an onset is not replaced."""
 OUTSTANDING_SIGMA: Final = 3.0
 """Normalised innovation at which the shortest onset restarts."""
 EXCESS_NOISE_SAMPLES: Final = 3000
 """Measurements over which the ratio of the innovations' variance to S is estimated."""
 MAX_INNOVATION_SIGMA: Final = 8.0
-"""Normalised innovation that counts as it is; a larger one has a larger variance."""
+"""Largest normalised innovation for which S is used as it is; for a larger one, S is increased."""
 MAX_SQUARED_INNOVATION: Final = 9.0
-"""Normalised squared innovation that counts for that ratio, at most."""
+"""Largest normalised squared innovation that enters the estimate of the ratio of variances."""
 
 
 UNIT_MATRIX = np.eye(3)
 
 
 class SequentialTest:
-    """Test several kinds of change, each with several onsets.
+    """Sequential test for several kinds of change, each with several onsets.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class SequentialTest:
     retention_samples : float
         Measurements over which evidence is forgotten; infinite by default.
     noise_dof : float
-        Degrees of freedom with which S is known, if not 0.
+        Degrees of freedom with which S is known up to a factor; 0 if S is known.
 
     Attributes
     ----------
@@ -83,15 +83,15 @@ class SequentialTest:
     start : (rows,) array
         Regressor of each row at its onset; 0 where the effect is proportional to the regressor.
     log_ratio, statistic : (rows,) array
-        L, and L less that of what the model itself allows.
+        L, and L minus the L of changes that the model itself allows.
     amplitude : (rows, 3) array
         Estimated amplitudes.
     signature : (rows, 3) array
-        f, what one unit of each component adds to the last residual.
+        f, the change of the last residual per unit of each component.
     squared_residual : float
-        Square of what the likeliest change leaves of the last innovation, over S.
+        Square of the last innovation minus the effect of the likeliest change, divided by S.
     absorbed : (n, rows, 3) array
-        Xi, what the filter has absorbed of each component.
+        Xi, the change of the filter's state per unit of each component.
     """
 
     def __init__(
@@ -135,8 +135,8 @@ class SequentialTest:
 
         `estimator`: the filter, after :meth:`.KalmanFilter.innovate` and before its update. `time`: time of
         the measurement, s. `regressors` (kinds,): regressor of each kind of change. `effects` (kinds, 3):
-        what one unit of each component adds to the residual where the regressor is 1. `null` (kinds,):
-        1-sigma of the amplitude that the model itself allows, in units of the change.
+        change of the residual per unit of each component where the regressor is 1. `null` (kinds,): 1-sigma
+        of the amplitude that the model itself allows, in units of the change.
         """
         S, v = estimator.variance, estimator.innovation
         regressor, effect = regressors[self.kind], effects[self.kind]
@@ -176,9 +176,9 @@ class SequentialTest:
         return float(self.statistic.max())
 
     def _begin(self, time: float, residual: FloatArray) -> BoolArray:
-        """Restart the onsets whose period is over; return which rows those are (rows,).
+        """Restart the onsets whose period is over; return a mask (rows,) of the restarted rows.
 
-        `residual` (rows,) is what each row leaves of the innovation, normalised.
+        `residual` (rows,): innovation minus the effect of each row's change, normalised.
         """
         self.count += 1
         # an onset is replaced after its period, unless its change is likely; an innovation that no change
@@ -194,7 +194,7 @@ class SequentialTest:
         return np.asarray(begins)
 
     def _mixture(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return amplitudes (rows, 3) and L (rows,) for amplitudes of variance `prior` (rows,)."""
+        """Return the estimated amplitudes (rows, 3) and L (rows,) for a prior variance `prior` (rows,)."""
         W = prior[:, None, None] * self._M + UNIT_MATRIX
         amplitude = prior[:, None] * np.linalg.solve(W, self._y[:, :, None])[:, :, 0]
         explained = np.sum(self._y * amplitude, axis=1)
@@ -216,12 +216,12 @@ class SequentialTest:
         return np.asarray(np.linalg.inv(self._M[row] + np.eye(3)))
 
     def rms(self, row: int) -> float:
-        """Return the root mean square of what a row's change adds to the residual."""
+        """Return the root mean square of the effect of a row's change on the residual."""
         a = self.amplitude[row]
         return float(np.sqrt(max(float(a @ self._energy[row] @ a) / float(self.count[row]), 0.0)))
 
     def misfit(self, row: int) -> float:
-        """Return the mean normalised square that a row's change does not explain: 1 if it explains all."""
+        """Return the mean normalised square of innovations minus a row's change; 1 if only noise is left."""
         explained = float(self._y[row] @ self.amplitude[row])
         return (float(self._squares[row]) - explained) / max(float(self._samples[row]), 1.0)
 

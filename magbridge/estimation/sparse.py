@@ -1,9 +1,9 @@
-r"""Sparse precision matrices: solutions, determinant, and the inverse near the diagonal.
+r"""Compute solutions, determinant and part of the inverse of sparse precision matrices.
 
-Solutions and determinant come from SuperLU, whose fill-in on nodes along a track is small (20,000 nodes:
-0.2 s, where the blocks below take 3 s). Variances need blocks of the inverse. Nodes that are numbered strip
-by strip make matrices whose blocks couple to the next strip only: with :math:`D_i` on the diagonal and
-:math:`E_i` below it,
+Solutions and determinant come from SuperLU, whose fill-in on nodes along a track is small (0.2 s for 20,000
+nodes; the algorithm with blocks takes 3 s). Variances need blocks of the inverse. Nodes that are numbered
+strip by strip have matrices whose blocks couple only to the next block. With blocks :math:`D_i` on the
+diagonal and :math:`E_i` below it,
 
 .. math:: L_i L_i^T = D_i - M_i M_i^T, \quad M_i = E_i L_{i-1}^{-T}, \quad G_i = L_i^{-T} M_{i+1}^T
 
@@ -32,9 +32,9 @@ SMALL, FULL = 1_500, 0.02
 
 
 class SparseFactor:
-    """A symmetric positive definite sparse matrix (n, n), factorised; one that is nearly full as if it were.
+    """Factor of a symmetric positive definite sparse matrix (n, n), dense if the matrix is nearly full.
 
-    LinAlgError: it is not positive definite.
+    LinAlgError: the matrix is not positive definite.
     """
 
     def __init__(self, matrix: csr_array) -> None:
@@ -61,15 +61,15 @@ class SparseFactor:
         self.log_determinant = float(np.log(pivots).sum())
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return the inverse times b (n,) or (n, r)."""
+        """Return the inverse of the matrix times `right`, (n,) or (n, r)."""
         if self._full is not None:
             return np.asarray(dpotrs(self._full, right, lower=True)[0])
         return np.asarray(self._lu.solve(np.asfortranarray(right)))
 
     def draw(self, white: FloatArray) -> FloatArray:
-        """Return vectors (n, k) whose covariance is the inverse, of `white` ones (n, k) ~ N(0, 1).
+        """Return random vectors (n, k) with the inverse as covariance, from `white` (n, k) ~ N(0, 1).
 
-        With the matrix ``P^T L D L^T P`` they are ``P^T L^-T D^-1/2 white`` (Rue & Held 2005, section 2.4).
+        For the matrix ``P^T L D L^T P`` it is ``P^T L^-T D^-1/2 white`` (Rue & Held 2005, section 2.4).
         """
         if self._full is not None:
             return np.asarray(solve_triangular(self._full, white, lower=True, trans="T", check_finite=False))
@@ -81,14 +81,14 @@ class SparseFactor:
 
 @dataclass(frozen=True, eq=False)
 class InverseBlocks:
-    """Blocks of an inverse that begin at `edges`: those on the diagonal, and those right of it."""
+    """Blocks of an inverse at `edges` (b + 1,): `own` on the diagonal, `off_diagonal` right of it."""
 
     edges: IndexArray
     own: tuple[FloatArray, ...]
     off_diagonal: tuple[FloatArray, ...]
 
     def variances(self, rows: csr_array) -> FloatArray:
-        """Return the variance of each combination in `rows` (m, n), which reach two blocks at most: (m,)."""
+        """Return the variance (m,) of each combination in `rows` (m, n), which may span two blocks."""
         out = np.zeros(rows.shape[0])
         some = np.diff(rows.indptr) > 0
         if not some.any():
@@ -110,9 +110,9 @@ class InverseBlocks:
 
 
 def inverse_blocks(matrix: csr_array, edges: IndexArray) -> InverseBlocks:
-    """Return the inverse's blocks on and next to the diagonal, of a block-tridiagonal matrix (n, n).
+    """Return the blocks on and next to the diagonal of the inverse of a block-tridiagonal matrix (n, n).
 
-    LinAlgError: it is not positive definite.
+    LinAlgError: the matrix is not positive definite.
     """
     # Block Cholesky forward: D_i - M_i M_i^T = L_i L_i^T with M_i = B_i L_(i-1)^-T.
     diagonal: list[FloatArray] = []

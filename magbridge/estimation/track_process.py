@@ -8,8 +8,8 @@ Gauss-Markov process of Matern covariance with smoothness 3/2: its value b and s
           \begin{pmatrix} 1 + \lambda d & d \\ -\lambda^2 d & 1 - \lambda d \end{pmatrix}, \quad
           P_\infty = \sigma^2\, \mathrm{diag}(1, \lambda^2), \quad Q = P_\infty - F P_\infty F^T
 
-A fraction of the samples' noise is white, the rest is an AR(1) process. That is the third state, and the
-constant is the fourth.
+A fraction of the samples' noise is white; the rest is an AR(1) process, which is the third state. The
+constant is the fourth state.
 
 Where the course changes by :math:`\psi`, the slope along the track becomes
 :math:`b' \cos\psi + g \sin\psi`. The slope g across the track has the variance of b', and is independent of
@@ -27,9 +27,9 @@ from magbridge.arrays import FloatArray
 __all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "Course", "ReferenceSteps", "TrackProcess"]
 
 TRACK_STATES = 4
-"""Crustal field (nT) and its slope (nT/m), slow noise (nT), and the constant (nT)."""
+"""Number of states: crustal field (nT), its slope (nT/m), slow noise (nT), and the constant (nT)."""
 CORRELATION_LENGTH_M = 1_000.0
-"""Length over which the crustal field changes, where a survey does not tell it."""
+"""Correlation length of the crustal field if no survey provides it."""
 MIN_WHITE_NT = 0.05
 """1-sigma of the white noise that every sample has."""
 COURSE_LENGTH_M = 10.0
@@ -47,7 +47,7 @@ class Course:
         self._north = self._east = 0.0
 
     def move(self, north: float, east: float) -> float:
-        """Add a displacement, m; return the change of the course that it completes (rad), else 0."""
+        """Add a displacement, m; return the change of course, rad, if a new course is complete, else 0."""
         if not isfinite(north + east):
             return 0.0
         self._north += north
@@ -61,13 +61,13 @@ class Course:
 
 MAX_REFERENCE_STEP_NT = 20.0
 MAX_STEP_TIME_US = 60_000_000
-"""Change of a reference from one sample to the next, within so short a time, that no main field has."""
+"""`MAX_REFERENCE_STEP_NT`, `MAX_STEP_TIME_US`: Step that a main field does not have within this time."""
 
 
 class ReferenceSteps:
-    """Steps of a reference along a track that the field does not have, as from one sheet of a map to another.
+    """Detector of steps in a reference along a track that the field lacks, as between two sheets of a map.
 
-    `total`: sum of the steps, nT.
+    `total`: sum of the detected steps, nT.
     """
 
     def __init__(self) -> None:
@@ -75,7 +75,7 @@ class ReferenceSteps:
         self._reference, self._time_us = nan, 0
 
     def follow(self, time_us: int, reference: float) -> None:
-        """Add a sample's reference, nT; NaN where it is not known."""
+        """Compare a sample's reference, nT (NaN if unknown), with the previous; add a step to `total`."""
         step = reference - self._reference
         if abs(step) > MAX_REFERENCE_STEP_NT and time_us - self._time_us < MAX_STEP_TIME_US:
             self.total += step
@@ -92,11 +92,11 @@ class TrackProcess:
     spread : float
         1-sigma of the crustal field, nT.
     constant : float
-        1-sigma of the constant, nT.
+        1-sigma of the constant difference between field and reference, nT.
     length : float
         Correlation length of the crustal field, m.
     autocorrelation, interval : float
-        Autocorrelation of the slow noise from a sample to the next, `interval` (s) later; 0: all is white.
+        Autocorrelation of the slow noise after `interval` (s); 0 if all noise is white.
     white : float
         Fraction of the noise's variance that is white.
     reference : float
@@ -107,7 +107,7 @@ class TrackProcess:
     spread, constant : float
         As given.
     initial : (4, 4) array
-        Covariance at the start, and far from any sample.
+        Covariance of the states at the start, and far from any sample.
     white_variance : float
         Variance of the white noise, nT².
     """
@@ -133,7 +133,7 @@ class TrackProcess:
     def transition(self, metres: float, seconds: float, turn: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Return transition F and process noise Q, both (4, 4), over a distance and a time.
 
-        The course has changed by `turn`, rad, before that distance.
+        `metres`, `seconds`: distance and time. `turn`: change of course before the distance, rad.
         """
         # Matern 3/2 along the track, (value, slope): F = exp(-x) [[1 + x, x / l], [-l x, 1 - x]], x = l d.
         rate = self._lambda
