@@ -1,7 +1,7 @@
-"""Pages of the documentation that are made from the code: mkdocs calls this file as a hook.
+"""Generate the reference pages of the documentation from the code, as a hook of mkdocs.
 
-The commands come from their docstrings, the keys of files from the records that hold them, parameters and
-columns from their tables, the messages from the dialect's XML, so that a page cannot say otherwise than the
+The commands come from their docstrings, the keys of files from the structs that hold them, parameters and
+columns from their tables, and messages from the dialect's XML. So the pages always agree with the
 program.
 """
 
@@ -28,7 +28,7 @@ ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):(<code>)(?:~[\w.]*\.)?([\
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages made from the code."""
+    """Add the generated pages to the files of the site."""
     pages = {
         "commands": commands(),
         "configuration": "\n".join(configuration()),
@@ -43,23 +43,23 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Show a docstring's ``:func:`~a.b.c``` as the name alone, and ``::`` before a block as one colon."""
+    """Replace a docstring's ``:func:`~a.b.c``` by the last name, and ``::`` before a block by one colon."""
     return ROLE.sub(r"\1\2", html).replace("::</p>", ":</p>")
 
 
 def commands() -> str:
-    """Return the help of every command."""
+    """Return the Markdown page with the help of every command."""
     from magbridge.cli import app  # noqa: PLC0415 - imports the program only where pages are made
 
     page = app.generate_docs(output_format="markdown", recursive=True, include_hidden=False)
     start = page.index("\n## Table of Contents")
     listed = page.index("**Commands**", start)
-    # a usage of our own already says the command's name, which cyclopts puts before it
+    # remove the command's name where both cyclopts and the custom usage state it
     return "# Commands\n\n" + TWICE.sub(r"\1\2", page[listed:])
 
 
 def configuration() -> Iterator[str]:
-    """Yield the page of ``bridge.toml``: its tables as they are defined, and the options of every driver."""
+    """Yield the lines of the page of ``bridge.toml``: its tables in order, and the options of each driver."""
     from magbridge.config import Config  # noqa: PLC0415 - imports the program only where pages are made
     from magbridge.navigate import NavigationOptions  # noqa: PLC0415
     from magbridge.sensors import DRIVERS  # noqa: PLC0415
@@ -102,7 +102,7 @@ def _default(value: object) -> str:
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a table in Markdown."""
+    """Yield the lines of a Markdown table."""
     yield from (f"| {' | '.join(header)} |", "|---" * len(header) + "|")
     for row in rows:
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
@@ -110,7 +110,7 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str
 
 
 def parameters() -> Iterator[str]:
-    """Yield the page of the parameters on the link, for a bridge whose telemetry is ``battpos``."""
+    """Yield the lines of the page of MAVLink parameters, for a bridge with the telemetry ``battpos``."""
     from magbridge.config import Align, Telemetry  # noqa: PLC0415
     from magbridge.link.parameters import alignment, file_rate, rates, telemetry_ages  # noqa: PLC0415
     from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS  # noqa: PLC0415
@@ -143,7 +143,7 @@ def parameters() -> Iterator[str]:
 
 
 def columns() -> Iterator[str]:
-    """Yield the table of the columns that have a meaning of their own, and of the flags."""
+    """Yield the lines of the page of the columns with a defined meaning, and of the quality flags."""
     from magbridge.columns import COLUMNS, CORRECTED, NT_PER_UNIT  # noqa: PLC0415
     from magbridge.records import Quality  # noqa: PLC0415
 
@@ -163,7 +163,7 @@ def columns() -> Iterator[str]:
 
 
 def python() -> str:
-    """Return the page of the public Python names."""
+    """Return the Markdown page of the public Python names."""
     from magbridge import __all__ as names  # noqa: PLC0415
 
     public = (name for name in names if not name.startswith("_") and name != "plot")

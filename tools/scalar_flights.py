@@ -1,12 +1,12 @@
-"""Compensate a scalar magnetometer on simulated flights: fit one half, test the other half, both ways.
+"""Compensate a scalar magnetometer on simulated flights: fit each half and test the fit on the other half.
 
     python tools/scalar_flights.py [--flights 10] [--workers 2] [--out rows.parquet]
 
-The flights share no code with the model: a vehicle with iron, currents, a relay, control surfaces and a
-channel that moves in the second half only; 10 Hz, an hour, crustal field of 30 nT, flicker noise. The table
-has the RMS error of the half that was not fitted next to Tolles-Lawson: least squares, ridge, and band-passed
-with a ridge, and the first two with all telemetry channels. ``floor`` is this fit, tested on its own half.
-In the flights ``hidden`` a source of 3,000 nT that no channel shows is on for 65 s of the second half.
+The simulation shares no code with the model. The vehicle has iron, currents, a relay, control surfaces and a
+channel that moves in the second half only, for an hour at 10 Hz over a crustal field of 30 nT, with flicker
+noise. The table has the RMS error of the tested half, next to Tolles-Lawson: least squares, ridge, and ridge
+on band-passed data, and the first two with all telemetry channels. ``floor`` is this fit, tested on its own
+half. In the flights ``hidden``, an unlogged source of 3,000 nT is on for 65 s of the second half.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ METHODS = (
 
 
 def flight(seed: int, hidden: bool) -> ScalarSeries:
-    """Return a flight; its reference is the true field."""
+    """Return a simulated flight with the true field as reference; `hidden` adds an unlogged source."""
     random = np.random.default_rng(seed)
     n = int(MINUTES * 60 * RATE_HZ)
     t = np.arange(n) / RATE_HZ
@@ -80,7 +80,7 @@ def flight(seed: int, hidden: bool) -> ScalarSeries:
 
 
 def _pink(random: np.random.Generator, n: int) -> FloatArray:
-    """Return flicker noise, (n,), standard deviation 1."""
+    """Return flicker noise (n,) with standard deviation 1."""
     frequency = np.fft.rfftfreq(2 * n)[1:]
     parts = random.normal(size=(2, frequency.size)) / np.sqrt(frequency)
     series = np.fft.irfft(np.concatenate([[0], parts[0] + 1j * parts[1]]))[:n]
@@ -88,9 +88,9 @@ def _pink(random: np.random.Generator, n: int) -> FloatArray:
 
 
 def _linear(train: ScalarSeries, test: ScalarSeries, method: str, channels: Any, field: float) -> FloatArray:
-    """Return the field (n,), nT, that Tolles-Lawson leaves of the test half."""
+    """Return the field (n,) of the test half, nT, corrected by a Tolles-Lawson fit of the training half."""
     A, B = (scalar_design(part, channels, field) for part in (train, test))
-    columns = np.arange(A.shape[1]) != 18  # no lag
+    columns = np.arange(A.shape[1]) != 18  # without the lag's column
     columns[19:] = method.endswith("all")
     A, B, y = A[:, columns], B[:, columns], train.scalar - train.reference
     if method.startswith("band"):
@@ -106,7 +106,7 @@ def _linear(train: ScalarSeries, test: ScalarSeries, method: str, channels: Any,
 
 
 def compensate(seed: int, second: bool, known: bool, hidden: bool) -> list[dict[str, Any]]:
-    """Return a row for each method."""
+    """Fit one half of a flight by each method and test the other; return a row for each method."""
     whole = flight(seed, hidden)
     middle = len(whole.time) // 2
     halves = [

@@ -2,10 +2,10 @@
 
     python tools/second_world.py --cases 40
 
-Its forward model has dipoles with an induced part, eddy currents of a plate with a time constant, and
-currents in a loop. Nothing was tuned on it. A name is *right* if the hidden cause is named, *alone* if
-nothing else is named; *a second* is any further name. *Foreign* effects are not in the table of causes, and
-any name is wrong for them.
+The forward model has dipoles with an induced part, eddy currents of a plate with a time constant, and
+currents in a loop. The detector was not tuned on it. A diagnosis is *right* if it names the hidden cause,
+*alone* if it names nothing else; *a second* is any further name. *Foreign* effects are not in the table of
+causes, so any name for them is wrong.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from magbridge.diagnose.run import diagnose
 
 STEP, HOURS, EPOCH = 5.0, 4.0, 1.75e9
 EARTH = np.array([17_000.0, -4_600.0, 46_500.0])
-"""Main field in nT: north, east, down."""
+"""Main field, nT: north, east, down."""
 UNITS = {
     "mag_x": "nT", "mag_y": "nT", "mag_z": "nT", "reference_field": "nT", "roll": "deg", "pitch": "deg",
     "heading": "deg", "latitude": "deg", "longitude": "deg", "depth": "m", "battpos": "mm", "vbd": "cc",
@@ -41,14 +41,14 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Log:
-    """Telemetry and the true field of a log: (n,) each, and the field in the body (n, 3)."""
+    """Telemetry columns of a log, (n,) each, and the true field in body axes (n, 3), nT."""
 
     columns: dict[str, FloatArray]
     body: FloatArray
 
 
 def rotated(columns: dict[str, FloatArray], field: FloatArray) -> FloatArray:
-    """Rotate a field (n, 3) from north, east and down to body axes: about z, y, x."""
+    """Rotate a field (n, 3) from north-east-down to body axes, by heading, pitch and roll."""
     roll, pitch, heading = (np.radians(columns[name]) for name in ("roll", "pitch", "heading"))
     n, e, d = field.T
     x, y = np.cos(heading) * n + np.sin(heading) * e, np.cos(heading) * e - np.sin(heading) * n
@@ -57,7 +57,7 @@ def rotated(columns: dict[str, FloatArray], field: FloatArray) -> FloatArray:
 
 
 def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
-    """Fly saw-teeth round a triangle, twice; or turn about at one place with the masses moved."""
+    """Simulate saw-tooth dives around a triangle; or with `spins`, rotations in place with moving masses."""
     n = int(hours * 3600.0 / STEP)
     t = STEP * np.arange(n)
     swayed = sum(
@@ -106,13 +106,13 @@ def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
 
 
 def dipole(r: FloatArray, m: FloatArray) -> FloatArray:
-    """Return the field (n, 3), nT, of moments m (n, 3), A m², at r (n, 3), m, from them."""
+    """Return the field (n, 3), nT, of dipoles m (n, 3), A m², at displacements r (n, 3), m, from them."""
     far = np.linalg.norm(r, axis=1)[:, None]
     return np.asarray(100.0 * (3.0 * r * np.sum(r * m, axis=1)[:, None] / far**5 - m / far**3))
 
 
 class Glider:
-    """Hard and soft iron, and two masses that are permanent and induced dipoles."""
+    """Magnetic model of a glider: hard iron, soft iron, and two masses with permanent and induced dipoles."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.soft = 0.01 * rng.normal(size=(3, 3))
@@ -201,7 +201,7 @@ OWN: dict[str, Effect] = {
     "map_error": _chart,
     "diurnal_variation": lambda log, rng: np.cos(2 * np.pi * (_hours(log) - rng.uniform(0.0, 24.0)) / 24.0),
 }  # fmt: skip
-"""Effects by the cause that they are: an offset (n, 3), or an error of the reference (n,)."""
+"""Effects by their cause: each returns an offset (n, 3), or an error of the reference (n,)."""
 FOREIGN: dict[str, Effect] = {
     "relay": lambda log, rng: _along(_telegraph(log, rng, 20.0), rng),
     "connector": lambda log, rng: _along(_telegraph(log, rng, 2.0) * _onset(log, rng), rng),
@@ -209,7 +209,7 @@ FOREIGN: dict[str, Effect] = {
     "loose bolt": _bolt,
     "bursts": lambda log, rng: _along(_telegraph(log, rng, 15.0) * np.sin(log.columns["time"] / 11.0), rng),
 }  # fmt: skip
-"""Effects that are none of the table's causes."""
+"""Foreign effects by name: none is a cause of the table."""
 
 
 def dataset(log: Log, H: FloatArray, reference: FloatArray | float = 0.0) -> xr.Dataset:
@@ -222,13 +222,13 @@ def dataset(log: Log, H: FloatArray, reference: FloatArray | float = 0.0) -> xr.
 
 
 def case(number: int, name: str, snr: float) -> list[Row]:
-    """Calibrate a glider, hide one effect in its survey, and return what `diagnose` names."""
+    """Calibrate a glider, hide one effect in its survey, diagnose the survey, and return the row."""
     rng = np.random.default_rng([20_251, number])
     glider, spins, survey = Glider(rng), logged(rng, 1.0, spins=True), logged(rng, HOURS, spins=False)
 
     def noise(n: int) -> FloatArray:
         e = rng.standard_t(6.0, (n, 3)) * 0.8
-        return e + 0.6 * np.vstack([np.zeros(3), e[:-1]])  # a moving average, where the simulator has none
+        return e + 0.6 * np.vstack([np.zeros(3), e[:-1]])  # a moving average, unlike the simulator's noise
 
     clean = glider.reads(spins)
     calibration = fit(
@@ -244,7 +244,7 @@ def case(number: int, name: str, snr: float) -> list[Row]:
 
 
 def reported(name: str, found: Diagnosis, own: Container[str]) -> list[Row]:
-    """Return the row of a case; `own` are the effects that are causes of the table."""
+    """Return the row of a case; `own` holds the effects that are causes of the table."""
     named = cause_names(one.candidate.cause for one in found.findings)
     named |= {"outliers"} if found.wrong is not None else set()
     sets = named | cause_names(r.candidate.cause for one in found.findings for r in one.competing)
@@ -260,7 +260,7 @@ def reported(name: str, found: Diagnosis, own: Container[str]) -> list[Row]:
 
 
 def study(run: Callable[..., list[Row]], names: Sequence[str], doc: str | None) -> None:
-    """Run cases, each hiding one of `names` (nothing, where empty) in turn, and count the names."""
+    """Run cases, each of which hides one of `names` (none if empty), and print the counts of the names."""
     parser = study_options(doc)
     parser.add_argument("--cases", type=int, default=2 * len(names))
     parser.add_argument("--first", type=int, default=0, help="number of the first case")

@@ -20,21 +20,21 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
 GENERATED = "mavlink/dialect.py", "mavlink/enums.py"
-"""Modules that tools/dialect.py writes; the budget is for code that people maintain."""
+"""Modules that tools/dialect.py writes; they do not count."""
 
 NUMERICAL = "estimation", "calibration", "diagnose", "learning", "health", "survey", "field", "navigate"
-"""Packages of which a reader needs comments that lead from the equations to the lines."""
+"""Packages with a required number of comments, because readers must relate lines to equations."""
 INSTRUCTIONS = "# noqa", "# fmt:", "# type:", "# pragma", "# ruff"
 
 
 def count(folder: Path) -> tuple[int, int]:
-    """Return lines and modules of the Python files of a folder."""
+    """Return the numbers of lines and modules of the Python files in a folder."""
     paths = [path for path in folder.rglob("*.py") if not path.as_posix().endswith(GENERATED)]
     return sum(len(path.read_bytes().splitlines()) for path in paths), len(paths)
 
 
 def parts(groups: dict[str, list[str]]) -> dict[str, tuple[int, int]]:
-    """Return lines and modules of each part; the rest of ``magbridge`` is in the top level."""
+    """Return lines and modules of each part; modules of ``magbridge`` in no other part count as top level."""
     counts = {
         name: tuple(map(sum, zip(*(count(ROOT / folder) for folder in folders), strict=True)))
         for name, folders in groups.items()
@@ -72,7 +72,7 @@ def code_and_comments(source: str) -> tuple[int, int]:
 
 
 def print_comments(required: dict[str, float]) -> bool:
-    """Print code and comments of each numerical package; return whether one has too few comments."""
+    """Print code and comments of each numerical package; return True if a package has too few comments."""
     too_few = False
     print(f"{'package':34} {'code':>7} {'comments':>8} {'per 100':>7} {'required':>8} {'one in':>7}")
     for name in NUMERICAL:

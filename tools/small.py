@@ -1,4 +1,4 @@
-"""Small calibrations, and bridges without ports, for tests and studies."""
+"""Make small calibrations, and bridges without ports, for tests and studies."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def bridge_text(
 ) -> str:
     """Return the text of a ``bridge.toml`` with a sensor `driver`, its `options` in TOML, and its `port`.
 
-    `masses` is the telemetry by name, with its unit. With `calibration` the bridge has the file ``cal.json``,
-    with `log` it writes to the folder ``logs``. `publish` has rates of messages; `more` are further lines,
-    first more keys of ``[publish]``, if any.
+    `masses` is the unit of each telemetry name. With `calibration` the bridge uses the file ``cal.json``;
+    with `log` it writes to the folder ``logs``. `publish` has rates of messages. `more` is text after the
+    table ``[publish]``, so it can begin with keys of this table.
     """
     lines = ["[sensor]", f'driver = "{driver}"', f'port = "{port}"', f"options = {{{options}}}"]
     lines += ["[link]", f'url = "{url}"']
@@ -59,9 +59,9 @@ def polynomial(
     field_nt: float = 50_000.0,
     **more: Any,
 ) -> Calibration:
-    """Return a calibration with a polynomial in its parameters, of the order that its coefficients have.
+    """Return a polynomial calibration; the number of coefficients determines its order.
 
-    The coefficients are uncertain by the same `variance`; `more` are further fields of the calibration.
+    Each coefficient has the `variance`, nT²; `more` are further fields of the calibration.
     """
     size = len(coefficients)
     orders = (full_order(len(parameters), order) for order in count())
@@ -77,12 +77,12 @@ def polynomial(
 
 
 def aligned(variance: float = 1e-6) -> Boresight:
-    """Return the boresight of a sensor along the axes of the body; each angle has a `variance`, rad²."""
+    """Return the boresight of a sensor aligned with the body; each angle has a `variance`, rad²."""
     return Boresight((0.0, 0.0, 0.0), ((variance, 0.0, 0.0), (0.0, variance, 0.0), (0.0, 0.0, variance)))
 
 
 def write_bridge(folder: Path, known: Calibration, /, **settings: Any) -> Path:
-    """Write a calibration and a ``bridge.toml`` with `settings` of :func:`bridge_text`; return the latter."""
+    """Write a calibration and a ``bridge.toml`` with `settings` of :func:`bridge_text`; return its path."""
     save(known, folder / "cal.json")
     path = folder / "bridge.toml"
     path.write_text(bridge_text(**settings), encoding="utf-8")
@@ -97,11 +97,11 @@ def small_bridge(
     more: str = "",
     boresight: Boresight | None = None,
 ) -> Pipeline:
-    """Return a bridge that is configured in a folder; events are fed by hand.
+    """Return a bridge that is configured in a folder and to which the caller feeds events.
 
-    The mass `battery` is the telemetry column ``battpos``; the messages `publish` are sent with every sample.
-    `more` is that of :func:`bridge_text`. With the `boresight` of its calibration the bridge computes a
-    heading.
+    The mass `battery` is the telemetry column ``battpos``; the bridge sends the messages `publish` with every
+    sample. `more` is an argument of :func:`bridge_text`. With a `boresight` in the calibration, the bridge
+    computes a heading.
     """
     coefficients = np.random.default_rng(1).normal(size=4 * 9) * 300.0
     known = polynomial(coefficients, battery, boresight=boresight)

@@ -1,12 +1,12 @@
-"""Hours at 1 kHz, in accelerated time, with faults drawn at random: counts exact, memory flat, nothing wrong.
+"""Run a bridge for simulated hours at 1 kHz with random faults; check counts, memory and flags.
 
     python3 tools/soak.py                    2 minutes of the instrument's time
     python3 tools/soak.py --minutes 1440     a day: some hours of a core
 
-Bytes of an emulated digitizer and of an autopilot go straight into the bridge's pipeline. In the end,
-readings made = samples + lost, as MAG_STATUS tells; of the samples without a flag at most 0.3 % lie beyond
-three of their sigmas, as of a Gaussian error; and the most memory that the process ever held equals that at
-half time. Each hour of the instrument's time has its line.
+The tool feeds the bytes of an emulated digitizer and of an autopilot to the bridge's pipeline. In the end,
+readings made = samples + lost, as counted by MAG_STATUS. At most 0.3 % of the samples without a flag have an
+error above three sigmas, as a Gaussian error has. The process's peak memory equals the peak at half
+time. The tool prints a line for each hour of the instrument's time.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ BEGIN_US = 1_780_000_000_000_000
 TRUTH = np.array([20_000.0, 1_000.0, 40_000.0])
 """True field in sensor axes, nT."""
 SLOPE = np.array([300.0, -200.0, 100.0])
-"""nT that the mass adds from 0 to 1."""
+"""Change of the field by a motion of the mass from 0 to 1, nT."""
 FAULTS = ("unplugged", "damaged", "twice", "standstill", "spike", "moves")
 EVERY = 5_000
-"""Readings between two faults, on average."""
+"""Mean number of readings between two faults."""
 
 MOST_WRONG = 0.003
-"""Share of the samples without a flag beyond 3 sigma; a Gaussian error has 0.0027."""
+"""Maximum fraction of the samples without a flag beyond 3 sigma; a Gaussian error has 0.0027."""
 MOST_GROWN = 1000
-"""Kilobytes by which the process's peak may grow in the second half."""
+"""Maximum growth of the process's peak memory in the second half, kB."""
 HOUR = 3_600_000
-"""Readings."""
+"""Number of readings in an hour."""
 
 
 def calibration() -> Calibration:
-    """Return the right value for a mass whose field is `SLOPE` times its position."""
+    """Return the exact calibration for a mass whose field is `SLOPE` times its position."""
     return polynomial(
         np.array([0.0] * 15 + [*SLOPE]),
         Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),
@@ -58,7 +58,7 @@ def calibration() -> Calibration:
 
 
 class Soak:
-    """A bridge, its instrument and autopilot, and the account of all readings."""
+    """Bridge with emulated instrument and autopilot, and counts of all readings."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         options = "sensitivity = 5e-5, reference_voltage = 5.0"
@@ -74,14 +74,14 @@ class Soak:
         self._ear, self._autopilot = Codec(0, 0), Codec(1, 1)
 
     def reading(self, extra: float = 0.0) -> bytes:
-        """Return the bytes of the next reading, whether a receiver exists or not."""
+        """Return the bytes of the next reading, with `extra` nT on z; count the reading as made."""
         self.made += 1
         field = TRUTH + SLOPE * self.position + self.rng.normal(0.0, 1.0, 3) + [0.0, 0.0, extra]
         x, y, z = field.tolist()
         return self.encoder.encode(Reading((x, y, z), device_time=self.made * 1e-3 % 4294.967296, supply=3.7))
 
     def feed(self, channel: Channel, data: bytes) -> None:
-        """Send bytes to the bridge now, and check its messages."""
+        """Feed bytes to the bridge now, and check the messages that it sends."""
         event = Event(BEGIN_US + self.made * 1000 + 400 + self.later_us, channel, data)
         for _, frame in self.pipeline.feed(event):
             for message in self._ear.parse(frame):
@@ -96,19 +96,19 @@ class Soak:
                 self.wrong += flags == 0 and not error <= 3.0 * message["total_field_sigma"]
 
     def account(self) -> str:
-        """Return in words how many samples were flagged, and how many wrong."""
+        """Return a text with the numbers of flagged samples and of wrong samples without a flag."""
         return f"flagged {self.flagged}, wrong without a flag {self.wrong}"
 
     def telemetry(self) -> None:
-        """Send the mass's position."""
+        """Feed a message with the mass's position to the bridge."""
         frame = self._autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=self.position)
         self.feed(Channel.LINK, frame)
 
     def fault(self) -> None:
-        """Draw a fault and let it happen."""
+        """Cause a random fault."""
         which = FAULTS[self.rng.integers(len(FAULTS))]
         self.done[which] += 1
-        if which == "unplugged":  # mostly for seconds, at times for three turns of the number
+        if which == "unplugged":  # mostly for seconds, at times for three turns of the counter
             for _ in range(int(10 ** self.rng.uniform(0.0, 5.3))):
                 self.made += 1
                 self.encoder.sequence += 1
@@ -134,7 +134,7 @@ class Soak:
 
 
 def peak() -> int:
-    """Return the most memory that this process has held so far, kB."""
+    """Return the peak memory of this process so far, kB."""
     gc.collect()
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
@@ -157,13 +157,13 @@ def main() -> int:
             if soak.made >= told + HOUR:
                 told = soak.made
                 print(f"{told / HOUR:.1f} h: {soak.account()}, {peak()} kB", flush=True)
-            if not half and soak.made > last // 2:  # its caches are full by now
+            if not half and soak.made > last // 2:  # the caches are full by now
                 half = peak()
         for _ in range(3):
             soak.feed(Channel.SENSOR, soak.reading())
         grown = peak() - half
         soak.later_us = 2_000_000
-        soak.feed(Channel.STATE, b"")  # the last status
+        soak.feed(Channel.STATE, b"")  # to receive the last status
         assert soak.status is not None
         lost, samples = soak.status["samples_lost"], soak.status["samples"]
     print(f"made {soak.made}, published {samples}, lost {lost}: difference {soak.made - samples - lost}")

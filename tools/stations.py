@@ -1,10 +1,10 @@
-"""Install the programs that the interoperability tests talk to, into ``.peers``, separate from magbridge.
+"""Install the third-party programs of the interoperability tests into ``.peers``, separate from magbridge.
 
     python3 tools/stations.py
 
-MAVProxy, MAVSDK and pymavlink's tools (Python, ``.peers/python``), node-mavlink (npm, ``.peers/node``).
-Versions are pinned; programs of the right version stay. MAVProxy's maps and plots (1 GB) are
-left out: the modules that the tests load do without.
+They are MAVProxy, MAVSDK and pymavlink's tools (Python, ``.peers/python``) and node-mavlink (npm,
+``.peers/node``). Versions are pinned; programs of the right version are kept. The tool omits MAVProxy's maps
+and plots (1 GB), which the modules that the tests load do not need.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ NODE = ("node-mavlink@2.3.0",)
 
 
 def run(*command: str | Path) -> None:
-    """Run a command; end with its exit code when it fails."""
+    """Run a command; exit with the command's exit code if the command fails."""
     code = subprocess.call([str(part) for part in command])
     if code:
         sys.exit(code)
 
 
 def install(kind: str, wanted: tuple[str, ...], make: tuple[tuple[str | Path, ...], ...]) -> None:
-    """Run the commands of `make`, unless they ran for the same versions before."""
+    """Run the commands of `make`, unless they ran before for the same versions `wanted`."""
     done = PEERS / f"{kind}.txt"
     if done.is_file() and done.read_text() == "\n".join(wanted):
         return

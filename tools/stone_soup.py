@@ -1,6 +1,6 @@
-"""Stone Soup on the navigator's own problem: run by tools/navigation.py in an interpreter that has it.
+"""Run Stone Soup's filters on the navigator's measurements, for tools/navigation.py in another interpreter.
 
-Stone Soup (PyPI, MIT; Dstl) is a library of trackers, and brings a desktop's worth of packages, so::
+Stone Soup (PyPI, MIT; Dstl) is a library of trackers. It needs many packages, so install it separately::
 
     python -m venv .venv-peers
     .venv-peers/bin/pip install stonesoup
@@ -39,7 +39,7 @@ START = datetime(2013, 12, 5)
 
 
 class FieldOnMap(NonLinearGaussianMeasurement):
-    """Anomaly at the position, the main field's slope, two biases; the map is scipy's bicubic spline."""
+    """Measurement model: anomaly on the map (bicubic spline), slope of the main field, and two biases, nT."""
 
     spline: RectBivariateSpline
     position: np.ndarray
@@ -51,7 +51,7 @@ class FieldOnMap(NonLinearGaussianMeasurement):
         return 1
 
     def function(self, state: Any, noise: bool = False, **kwargs: Any) -> Any:  # noqa: ARG002  Stone Soup's signature
-        """Return the field at the position, without noise: the updaters add it."""
+        """Return the predicted measurement (1, n), nT, without noise, because the updaters add the noise."""
         x = np.asarray(state.state_vector, float)
         field = self.spline(self.position[0] + x[0], self.position[1] + x[1], grid=False)
         field = field + self.slope @ x[:2] + x[4] + x[5]
@@ -59,7 +59,7 @@ class FieldOnMap(NonLinearGaussianMeasurement):
 
 
 def problem(data: dict[str, np.ndarray]) -> Iterator[tuple[datetime, object, FieldOnMap, Detection]]:
-    """Yield time, transition, measurement model and measurement."""
+    """Yield time, transition model, measurement model and measurement of each step."""
     spline = RectBivariateSpline(data["north"], data["east"], data["map"])
     for k in range(len(data["anomaly"])):
         model = FieldOnMap(ndim_state=6, mapping=(0,), noise_covar=CovarianceMatrix([[data["variance"][k]]]))
@@ -72,7 +72,7 @@ def problem(data: dict[str, np.ndarray]) -> Iterator[tuple[datetime, object, Fie
 
 
 def ekf(data: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Filter with the extended Kalman filter."""
+    """Run the extended Kalman filter; yield mean (6,) and covariance (6, 6) after each measurement."""
     state = GaussianState(StateVector(data["prior_x"]), CovarianceMatrix(data["prior_P"]), START)
     for at, moved, model, seen in problem(data):
         ahead = ExtendedKalmanPredictor(moved).predict(state, timestamp=at)
@@ -81,7 +81,7 @@ def ekf(data: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def particles(data: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Filter with a bootstrap particle filter, resampled when half of the particles count."""
+    """Run a bootstrap particle filter, resampled at half of the effective particles; yield as :func:`ekf`."""
     size = int(data["particles"])
     rng = np.random.default_rng(int(data["seed"]))
     np.random.seed(int(data["seed"]))  # noqa: NPY002  Stone Soup draws from the global generator

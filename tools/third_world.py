@@ -1,11 +1,11 @@
-"""Test ``diagnose`` in a third world, with other physics than the simulator and the second world.
+"""Test ``diagnose`` in a third simulation, whose physics differ from ``sitl`` and from the second world.
 
     python tools/third_world.py --cases 22
 
-Its mission is a lawn-mower of yo-yos near the equator. Masses are bars with two poles, the noise is flicker
-noise, and the effects follow laws that neither the detector nor the other worlds have (Bouc and Wen's
-hysteresis, a damped filter of second order, a soft clip). Nothing was tuned on it. The table is that of
-:mod:`second_world`; where nothing is hidden, any name is false.
+The mission is a lawn-mower pattern of dives near the equator. Masses are bars with two poles, the noise is
+flicker noise, and the effects follow laws that neither the detector nor the other simulations have (Bouc and
+Wen's hysteresis, a damped filter of second order, a soft clip). The detector was not tuned on it. The table
+has the columns of :mod:`second_world`; in a log without a hidden effect, any name is false.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from magbridge.diagnose.run import diagnose
 
 HOURS, EPOCH = 4.0, 1.76e9
 EARTH = np.array([27_500.0, 1_900.0, -18_200.0])
-"""Main field in nT: north, east, down."""
+"""Main field, nT: north, east, down."""
 POLES = 20.0
-"""nT m² a pole of a mass gives, 1-sigma."""
+"""1-sigma of the strength of a mass' pole, nT m²."""
 
 
 def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
-    """Mow a lawn with yo-yos, across and then along; or turn about at one place with the masses moved."""
+    """Simulate dives on a lawn-mower track; or with `spins`, rotations in place with moving masses."""
     n = int(hours * 3600.0 / STEP)
     t = STEP * np.arange(n)
     wave = np.sin(2.0 * np.pi * t / rng.uniform(500.0, 800.0))
@@ -65,7 +65,7 @@ def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
 
 
 class Vehicle:
-    """Hard and soft iron, and two masses that are bars with two poles each: ``H = m r / |r|^3``."""
+    """Magnetic model: hard and soft iron, and two masses as bars with two poles each: ``H = m r / |r|^3``."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.soft, self.hard = 0.015 * rng.normal(size=(3, 3)), rng.normal(0.0, 200.0, 3)
@@ -74,7 +74,7 @@ class Vehicle:
         self.at = np.array([[-0.7, 0.05, 0.08], [-1.0, -0.04, 0.0]])
 
     def reads(self, log: Log, later: float = 0.0) -> FloatArray:
-        """Return the readings (n, 3), nT, with the masses as they will be `later`, s."""
+        """Return the noiseless readings (n, 3), nT, with the mass positions `later` s after each sample."""
         H = log.body + log.body @ self.soft.T + self.hard
         time = log.columns["time"]
         for at, pole, bar, name, scale in zip(
@@ -88,7 +88,7 @@ class Vehicle:
 
 
 Effect = Callable[[Vehicle, Log, np.random.Generator], FloatArray]
-"""The field added to the reading (n, 3), up to a factor."""
+"""Function that returns the field added to the reading (n, 3), in arbitrary units."""
 
 
 def _along(x: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -97,7 +97,7 @@ def _along(x: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _bouc_wen(log: Log) -> FloatArray:
-    """Return the hysteresis ``dz = dx - (0.6 |dx| z + 0.4 dx |z|)`` of a tray, x in units of 6 mm."""
+    """Return the hysteresis (n,) ``dz = dx - (0.6 |dx| z + 0.4 dx |z|)`` of a tray, x in units of 6 mm."""
     dx = np.diff(log.columns["battpos"], prepend=log.columns["battpos"][0]) / 6.0
     z = np.zeros(len(dx))
     for k in range(1, len(z)):
@@ -106,20 +106,20 @@ def _bouc_wen(log: Log) -> FloatArray:
 
 
 def _filtered(H: FloatArray) -> FloatArray:
-    """Filter by Bessel's filter of second order, 0.02 Hz."""
+    """Return H (n, 3) after a Bessel filter of second order, 0.02 Hz."""
     sections = bessel(2, 0.02, fs=1.0 / STEP, output="sos")
     return np.asarray(sosfilt(sections, H - H[0], axis=0) + H[0])
 
 
 def _shifted(log: Log, H: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Read each axis at a moment of its own."""
+    """Return H (n, 3) with each axis delayed by a random time of 0 to 2 s."""
     t = log.columns["time"]
     late = zip(rng.uniform(0.0, 2.0, 3), H.T, strict=True)
     return np.stack([np.interp(t - d, t, x) for d, x in late], axis=1)
 
 
 def _soaked(log: Log, seconds: float) -> FloatArray:
-    """Return the temperature of the electronics, which follows the water's with one lag."""
+    """Return the temperature change of the electronics (n,), degC: the water's with a first-order lag."""
     y = log.columns["sensor_temperature"].copy()
     for k in range(1, len(y)):
         y[k] += (y[k - 1] - y[k]) * np.exp(-STEP / seconds)
@@ -135,7 +135,7 @@ def _hours(log: Log) -> FloatArray:
 
 
 def _pendulum(log: Log) -> FloatArray:
-    """Return the angle of a cable that swings, with a period of 40 s, when the vehicle turns."""
+    """Return the angle (n,) of a cable that swings, with a period of 40 s, when the vehicle turns."""
     rate = np.gradient(np.unwrap(np.radians(log.columns["heading"])))
     x, v, found = 0.0, 0.0, np.zeros(len(rate))
     for k, push in enumerate(rate):
@@ -146,7 +146,7 @@ def _pendulum(log: Log) -> FloatArray:
 
 
 def _strokes(log: Log, rng: np.random.Generator) -> FloatArray:
-    """Return the magnetisation of a frame by shocks, each of which decays within minutes."""
+    """Return the magnetisation (n,) of a frame by shocks, which decays within minutes after each shock."""
     since = _hours(log)[:, None] - rng.uniform(0.2, 3.6, 7)
     fading = np.exp(-np.maximum(since, 0.0) / 0.05) * (since > 0.0)
     return np.asarray(fading @ rng.normal(size=7))
@@ -162,13 +162,13 @@ def _escort(log: Log, rng: np.random.Generator) -> FloatArray:
 
 
 def _heater(log: Log, rng: np.random.Generator) -> FloatArray:
-    """Return the state of a heater that is not logged: on in 30 % of a cycle that becomes longer."""
+    """Return the state (n,) of an unlogged heater: on in 30 % of a cycle whose period grows."""
     cycle = np.cumsum(1.0 / (300.0 + 400.0 * _hours(log) / HOURS)) * STEP
     return ((cycle + rng.random()) % 1.0 < 0.3).astype(float)
 
 
 def _step(log: Log, rng: np.random.Generator) -> FloatArray:
-    """Return the offset after a shock, which relaxes in part."""
+    """Return the offset (n,) after a shock, which relaxes partly."""
     since = _hours(log) - rng.uniform(0.8, 3.0)
     return (since > 0.0) * (0.6 + 0.4 * np.exp(-np.maximum(since, 0.0) / 0.2))
 
@@ -186,7 +186,7 @@ OWN: dict[str, Effect] = {
     "current_field": lambda _v, log, rng: _along(log.columns["motor_current"] ** 1.3, rng),
     "pressure_offset": lambda _v, log, rng: _along(np.sqrt(log.columns["depth"]), rng),
 }  # fmt: skip
-"""Effects by the cause that they are."""
+"""Effects by their cause."""
 FOREIGN: dict[str, Effect] = {
     "a cable that swings": lambda _v, log, rng: _along(_pendulum(log), rng),
     "shocks that are forgotten": lambda _v, log, rng: _along(_strokes(log, rng), rng),
@@ -194,31 +194,31 @@ FOREIGN: dict[str, Effect] = {
     "a heater": lambda _v, log, rng: _along(_heater(log, rng), rng),
     "a thermocouple": lambda _v, log, rng: _along(np.gradient(_soaked(log, 100.0)), rng),
 }  # fmt: skip
-"""Effects that are none of the table's causes."""
+"""Foreign effects by name: none is a cause of the table."""
 EVERY = (*OWN, *FOREIGN, "", *FOREIGN)
 
 
 def _colour(n: int) -> FloatArray:
-    """Return the noise's amplitude by frequency: 1/f in power below a tenth of the sampling frequency."""
+    """Return the noise's amplitude by frequency: white, plus 1/f power below a tenth of the sample rate."""
     f = np.fft.rfftfreq(n)
     return np.asarray(np.sqrt(1.0 + 0.1 / np.maximum(f, 1.0 / n)))
 
 
 def flicker(rng: np.random.Generator, n: int) -> FloatArray:
-    """Return noise (n, 3) of 1 nT RMS."""
+    """Return flicker noise (n, 3) of 1 nT RMS."""
     made = np.fft.irfft(np.fft.rfft(rng.normal(size=(n, 3)), axis=0) * _colour(n)[:, None], n, axis=0)
     return np.asarray(made / np.std(made))
 
 
 def loudness(x: FloatArray) -> float:
-    """Return the signal-to-noise of x (n,), nT: its norm after a filter that makes the noise white."""
+    """Return the signal-to-noise ratio of x (n,), nT: the norm of x after a filter that whitens the noise."""
     n, colour = len(x), _colour(len(x))
     white = np.fft.irfft(np.fft.rfft(x - x.mean()) / colour, n)
     return float(np.linalg.norm(white) * np.sqrt(np.mean(colour**2)))
 
 
 def case(number: int, name: str, snr: float) -> list[Row]:
-    """Calibrate a vehicle, hide one effect in its survey, and return what `diagnose` names."""
+    """Calibrate a vehicle, hide one effect in its survey, diagnose the survey, and return the row."""
     rng = np.random.default_rng([20_262, number])
     vehicle, spins, survey = Vehicle(rng), logged(rng, 1.0, spins=True), logged(rng, HOURS, spins=False)
     runs = dataset(spins, vehicle.reads(spins) + flicker(rng, len(spins.body)))

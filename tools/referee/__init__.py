@@ -1,8 +1,8 @@
 """Emulated autopilots that use position fixes by the rules of ArduPilot and PX4, for tests of the bridge.
 
-Each rule is a line that names its source file. Attitude, height and the delayed time horizon, which a fix
-does not change, are not emulated. :mod:`.autopilot` is the common part with the position filter, and
-:mod:`.loop` runs a bridge's navigation with one of them, by GNSS receivers that may be wrong.
+A comment at each rule names its source file. The emulation omits attitude, height and the delayed time
+horizon, which a fix does not change. :mod:`.autopilot` is the common part with the position filter;
+:mod:`.loop` runs a bridge's navigation with an emulated autopilot and with GNSS receivers that may be wrong.
 """
 
 from referee.ardupilot import ArduPilot

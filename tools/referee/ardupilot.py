@@ -1,4 +1,4 @@
-"""ArduPilot's EKF3, as of December 2025; each rule with its file under ``libraries/``."""
+"""Emulation of ArduPilot's EKF3 of December 2025; each rule names its file under ``libraries/``."""
 
 from __future__ import annotations
 
@@ -13,57 +13,57 @@ PLANE_RATES_HZ = dict.fromkeys(
     ("ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT"),
     1.0,
 )
-"""Hz after a start: ArduPlane/GCS_MAVLink_Plane.cpp, var_info (SRn_*); Rover's and Sub's are the same."""
+"""Rates of messages after a start, Hz: ArduPlane/GCS_MAVLink_Plane.cpp, var_info (SRn_*); also Rover, Sub."""
 COPTER_RATES_HZ: dict[str, float] = {}
-"""ArduCopter/GCS_MAVLink_Copter.cpp, var_info: all SRn_* are 0."""
+"""Rates of messages after a start, Hz: ArduCopter/GCS_MAVLink_Copter.cpp, var_info: all SRn_* are 0."""
 
 DECLARED = 1.0
-"""s without GPS after which it dead-reckons: AP_NavEKF3.h, deadReckonDeclare_ms."""
+"""Time without GPS until the EKF dead-reckons, s: AP_NavEKF3.h, deadReckonDeclare_ms."""
 POSITION_NOISE = 0.5
-"""m: EK3_POSNE_M_NSE, AP_NavEKF3.cpp."""
+"""Minimum 1-sigma of a position, m: EK3_POSNE_M_NSE, AP_NavEKF3.cpp."""
 VISO_QUAL_MIN = 0
-"""Percent: the parameter of that name."""
+"""Minimum quality of visual odometry, percent: the parameter VISO_QUAL_MIN."""
 VISO_NOISE = 0.2
-"""m: VISO_POS_M_NSE, AP_VisualOdom.cpp."""
+"""Minimum 1-sigma of visual odometry, m: VISO_POS_M_NSE, AP_VisualOdom.cpp."""
 AIDED = 15.0
-"""s without any aid after which it stops: AP_NavEKF3.h, tiltDriftTimeMax_ms."""
+"""Time without any aid until the EKF stops aiding, s: AP_NavEKF3.h, tiltDriftTimeMax_ms."""
 RETRY = 10.0
-"""s of refused positions after which it resets to them: AP_NavEKF3.h, posRetryTimeUseVel_ms."""
+"""Duration of rejected positions until the EKF resets to them, s: AP_NavEKF3.h, posRetryTimeUseVel_ms."""
 GATE = 5.0
-"""Sigmas: EK3_POS_I_GATE 500, AP_NavEKF3.cpp."""
+"""Gate of the position innovation, sigmas: EK3_POS_I_GATE 500, AP_NavEKF3.cpp."""
 ATTITUDE, VELOCITY_HORIZ, POS_HORIZ_ABS, CONST_POS_MODE = 1, 2, 16, 128
-"""EKF_STATUS_REPORT.flags"""
+"""Bits of EKF_STATUS_REPORT.flags."""
 UNHEALTHY = 0.3
-"""s without data: AP_VisualOdom_Backend.cpp, healthy()."""
+"""Time without data after which visual odometry is unhealthy, s: AP_VisualOdom_Backend.cpp, healthy()."""
 
 
 class ArduPilot(Autopilot):
-    """A Plane (or a glider) with airspeed; without, a Rover.
+    """Emulated Plane (or glider) with airspeed, or a Rover without.
 
     Its source set is switched to external navigation when GPS is lost, as a user or a script does.
-    `internal_errors` counts numbers that were none where the firmware does not expect it.
+    `internal_errors` counts NaN values where the firmware expects a number.
     """
 
     STACK = MAV_AUTOPILOT.ARDUPILOTMEGA
     STATUS = "EKF_STATUS_REPORT"
     WALK = 5e-4
-    """AP_NavEKF3_core.cpp: each 12 ms the variance grows by sq(dt * EK3_WIND_P_NSE), 0.2."""
+    """Random walk of the wind, (m/s)²/s: AP_NavEKF3_core.cpp, sq(dt * EK3_WIND_P_NSE), 0.2, every 12 ms."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
         self.internal_errors = 0
-        self._visual_us = self._fused_us = -(10**12)  # came; was fused
+        self._visual_us = self._fused_us = -(10**12)  # latest odometry, latest fused one
         self._reset_counter: int | None = None
         self._takes[spec("ODOMETRY").id] = self._odometry
 
     @property
     def healthy(self) -> bool:
-        """True if visual odometry came recently."""
+        """True if the latest visual odometry is at most `UNHEALTHY` old."""
         return (self._now_us - self._visual_us) * 1e-6 < UNHEALTHY
 
     @property
     def aiding(self) -> bool:
-        """AP_NavEKF3_Control.cpp, setAidingMode: without speed or position for 15 s it is AID_NONE."""
+        """True if speed or position aids the EKF, else AID_NONE: AP_NavEKF3_Control.cpp, setAidingMode."""
         fused = (self._now_us - self._fused_us) * 1e-6
         return self._airspeed or min(self.since_gps(), fused) < AIDED
 
@@ -73,8 +73,8 @@ class ArduPilot(Autopilot):
         super()._advance(time_us)
 
     def _gps_wins(self) -> bool:
-        # AP_NavEKF3_PosVelFusion.cpp: a position source that has timed out is reset to; and so is one of two
-        # that the source set was just switched to
+        # AP_NavEKF3_PosVelFusion.cpp: the filter resets to a position source that has timed out; also to the
+        # source to which the source set was just switched
         return self._refused_for() > RETRY
 
     def _external(self, message: Message) -> MAV_RESULT:
@@ -86,7 +86,7 @@ class ArduPilot(Autopilot):
             return MAV_RESULT.FAILED
         accuracy = message["param3"]
         sigma = max(0.0 if isnan(accuracy) else accuracy, POSITION_NOISE)
-        age = min(max(message["param2"], 0.0), 5.0)  # moved on by its own velocity, for 5 s at most
+        age = min(max(message["param2"], 0.0), 5.0)  # extrapolated by the velocity, at most 5 s
         north, east = self.local((message["x"] * 1e-7, message["y"] * 1e-7))
         vn, ve = self.filter.velocity
         self.filter.reset((north + vn * age, east + ve * age), sigma**2)
@@ -95,7 +95,7 @@ class ArduPilot(Autopilot):
 
     @property
     def can_arm(self) -> bool:
-        """True if it passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
+        """True if the autopilot passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
         return self.healthy
 
     def _status(self, truth: Truth) -> bytes:  # noqa: ARG002 - as the other messages
@@ -111,7 +111,7 @@ class ArduPilot(Autopilot):
         if not isnan(covariance[0]):
             sigma = (covariance[0] ** 2 + covariance[6] ** 2 + covariance[11] ** 2) ** (1 / 3)
             angle = covariance[15] + covariance[18] + covariance[20]
-            # AP_Math.cpp, constrain_value: a number that is none is an internal error, and becomes the middle
+            # AP_Math.cpp, constrain_value: NaN is an internal error, and becomes the middle of the range
             self.internal_errors += isnan(sigma) or isnan(angle)
             sigma = 50.0 if isnan(sigma) else sigma
         # AP_VisualOdom_MAV.cpp, handle_pose_estimate
@@ -129,7 +129,7 @@ class ArduPilot(Autopilot):
         place, unfused = (message["x"], message["y"]), (self._now_us - self._fused_us) * 1e-6
         reset = self._reset_counter not in (None, message["reset_counter"])  # get_reset_timestamp_ms
         self._reset_counter = message["reset_counter"]
-        if reset:  # ResetPositionNE: the claimed variance stays, and the position is fused as ever
+        if reset:  # ResetPositionNE: keep the claimed variance; the position is fused as usual
             self.filter.position = place
             self._resets += 1
         if unfused > RETRY:  # ResetPosition

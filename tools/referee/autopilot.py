@@ -1,4 +1,4 @@
-"""What both autopilots share: their motion, GPS, telemetry, and the commands that they answer."""
+"""Common part of both emulated autopilots: motion, GPS, telemetry and replies to commands."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Pair = tuple[float, float]
 
 
 class PositionFilter:
-    """Position and wind on two axes, which share one covariance: all inputs have equal variances on both.
+    """Kalman filter of position and wind, whose two axes share one covariance (inputs have equal variances).
 
-    `position` (m) and `wind` (m/s, what carries the vehicle besides its known motion) are north and east,
-    `velocity` (m/s) is over ground; `pp`, `pw`, `ww` (m², m²/s, m²/s²) are their covariance. `walk` is the
+    `position` (m) and `wind` (m/s, the unmeasured part of the velocity) are north and east, `velocity` (m/s)
+    is over ground; `pp`, `pw`, `ww` (m², m²/s, m²/s²) are the covariance of position and wind. `walk` is the
     spectral density, (m/s)²/s, of the wind's (or the velocity error's) random walk.
     """
 
@@ -32,15 +32,15 @@ class PositionFilter:
 
     @property
     def sigma(self) -> float:
-        """m, 1-sigma of the position on each axis."""
+        """1-sigma of the position on each axis, m."""
         return sqrt(self.pp)
 
     def predict(self, motion: Pair, dt: float) -> None:
-        """Move along for `dt` s with a known `motion`, m/s.
+        """Predict the state after `dt` s of a known `motion`, m/s.
 
         Notes
         -----
-        A position that integrates a random walk of density q: ``Q = q [[dt³/3, dt²/2], [dt²/2, dt]]``.
+        The position integrates a random walk of density q: ``Q = q [[dt³/3, dt²/2], [dt²/2, dt]]``.
         """
         self.velocity = motion[0] + self.wind[0], motion[1] + self.wind[1]
         self.position = (
@@ -53,12 +53,12 @@ class PositionFilter:
         self.ww += q * dt
 
     def distance(self, place: Pair, variance: float) -> float:
-        """Return how many sigmas a measured position is away."""
+        """Return the distance of a measured position (m) in sigmas of the innovation."""
         away = place[0] - self.position[0], place[1] - self.position[1]
         return hypot(*away) / sqrt(2.0 * (self.pp + variance))
 
     def fuse(self, place: Pair, variance: float) -> None:
-        """Fuse a measured position (m), as a Kalman filter does."""
+        """Update the filter with a measured position (m) of a `variance` (m²)."""
         s = self.pp + variance
         self._shift(place, self.pp / s, self.pw / s)
         self.pp, self.pw, self.ww = (
@@ -68,7 +68,7 @@ class PositionFilter:
         )
 
     def force(self, place: Pair, variance: float) -> None:
-        """Fuse a measured position with a position gain of 1, the wind learning from it as ever.
+        """Update the filter with a measured position: gain 1 for position, Kalman gain for wind.
 
         Notes
         -----
@@ -80,7 +80,7 @@ class PositionFilter:
         self.pp, self.pw, self.ww = variance, k * variance, ww
 
     def reset(self, place: Pair, variance: float) -> None:
-        """Put the position there; nothing else is learned."""
+        """Set position and variance to a measured position; keep the wind."""
         self.position = place
         self.pp, self.pw = variance, 0.0
 
@@ -96,21 +96,21 @@ class PositionFilter:
 GPS_SIGMA = 2.5
 """1-sigma of a GPS position on an axis, m."""
 FIX_3D, NO_FIX = 3, 1
-"""GPS_RAW_INT.fix_type"""
+"""Values of GPS_RAW_INT.fix_type."""
 HEARTBEAT_HZ = 1.0
 EARLY_US = 1_000
-"""µs by which a message may be early, so that steps of the time that are rounded do not skip one."""
+"""Time by which a message may be early, µs, so that rounded time steps skip none."""
 ARMED, IN_AIR = 128, 2
 """Flag of HEARTBEAT.base_mode, and value of EXTENDED_SYS_STATE.landed_state."""
 OPTIONAL = frozenset(("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY"))
-"""Messages that are sent only if they are named."""
+"""Messages that the autopilot sends only if `streams` names them."""
 Place = tuple[float, float]
 
 
 class Truth(NamedTuple):
-    """The vehicle at one moment: position (deg), speed through the water (m/s), angles (deg), depth (m).
+    """True state of a vehicle: position (deg), speed through the water (m/s), angles (deg), depth (m).
 
-    `gps` (deg) is what the receiver measures, None without reception; `accuracy` (m) is what it claims.
+    `gps` (deg) is the receiver's position, None without reception; `accuracy` (m) is the receiver's claim.
     """
 
     place: Place
@@ -123,26 +123,26 @@ class Truth(NamedTuple):
 
 
 class Autopilot:
-    """An autopilot without its attitude and height control: a position filter, and its telemetry.
+    """Emulated autopilot: a position filter and its telemetry, without attitude and height control.
 
-    The local frame has its `origin` (deg, deg, m above the sea); it boots at `start_us`, µs since 1970 UTC.
-    `streams` are the messages that it sends besides HEARTBEAT, ATTITUDE, GPS_RAW_INT and GLOBAL_POSITION_INT.
-    Without ``VFR_HUD`` its speed is unknown; with ``GLOBAL_POSITION_INT`` that message has a velocity, too.
-    With `airspeed` it measures its speed through the water or air. Unless it `obeys`, it does as if no fix
-    had come. `rates` are the rates of the messages after a start, Hz, which a request changes; None sends
-    each with every step. `vehicle` is the MAV_TYPE of its heartbeat.
+    The local frame has its `origin` (deg, deg, m above the sea); boot is at `start_us`, µs since 1970 UTC.
+    `streams` are the messages in addition to HEARTBEAT, ATTITUDE, GPS_RAW_INT and GLOBAL_POSITION_INT.
+    Without ``VFR_HUD`` the speed is unknown; ``GLOBAL_POSITION_INT`` in `streams` adds a velocity to this
+    message. With `airspeed` the autopilot measures its speed through water or air. Unless it `obeys`, it
+    ignores fixes. `rates` are the messages' rates after a start, Hz, which a request changes; with None, each
+    step sends every message. `vehicle` is the MAV_TYPE of the heartbeat.
 
-    `taken` counts how often which message was taken, and why others were not.
+    `taken` counts the outcomes of received fixes: fused, or the reason of a rejection.
     """
 
     STACK = 0
-    """MAV_AUTOPILOT"""
+    """MAV_AUTOPILOT of the heartbeat."""
     STATUS = ""
-    """Message in which it reports what its filter vouches for."""
+    """Message in which the autopilot reports the status of its filter."""
     WALK = 1e-3
-    """(m/s)²/s, of the wind."""
+    """Spectral density of the wind's random walk, (m/s)²/s."""
     GPS_GATE = 5.0
-    """Sigmas."""
+    """Gate of a GPS position, sigmas."""
 
     def __init__(
         self,
@@ -162,8 +162,8 @@ class Autopilot:
         self._start_us = self._now_us = start_us
         self._motion: Place = 0.0, 0.0
         self._truth: Truth | None = None
-        self._gps_us: int | None = None  # when GPS was last fused
-        self._gps_seen_us: int | None = None  # since when it was refused
+        self._gps_us: int | None = None  # time of the last fused GPS position
+        self._gps_seen_us: int | None = None  # start of its rejection
         self._resets = 0
         self._takes: dict[int, Callable[[Message], str]] = {}
         self._vehicle, self.rates = vehicle, None if rates is None else dict(rates)
@@ -177,19 +177,19 @@ class Autopilot:
 
     @property
     def place(self) -> Place:
-        """Its estimated position, deg."""
+        """Estimated position, deg."""
         return offset(*self.origin[:2], *self.filter.position)
 
     def local(self, place: Place) -> Place:
-        """Return a position (deg) in the local frame, m."""
+        """Return a position (deg) in the local frame, m north and east."""
         return separation(*self.origin[:2], *place)
 
     def since_gps(self) -> float:
-        """Return the seconds since GPS was last fused."""
+        """Return the time since GPS was last fused, s."""
         return 1e9 if self._gps_us is None else (self._now_us - self._gps_us) * 1e-6
 
     def step(self, time_us: int, truth: Truth) -> bytes:
-        """Advance the time to a new `truth`; return the telemetry."""
+        """Advance the autopilot to a time with a new `truth`; return its telemetry."""
         self._truth = truth
         along = radians(truth.heading)
         self._motion = truth.speed * cos(along), truth.speed * sin(along)
@@ -199,7 +199,7 @@ class Autopilot:
         return self._telemetry(truth)
 
     def receive(self, data: bytes, time_us: int) -> bytes:
-        """Receive frames; return the replies."""
+        """Process received frames; return the replies."""
         self._advance(time_us)
         answers = b""
         for message in self._codec.parse(data):
@@ -216,7 +216,7 @@ class Autopilot:
             self.filter.predict(self._motion, dt)
 
     def _gps(self, place: Place) -> None:
-        """Fuse GPS, or come back to it: the rules differ, see :meth:`_gps_wins`."""
+        """Fuse a GPS position (m), reset to it, or reject it, by the rule :meth:`_gps_wins`."""
         if self._gps_us is None or self._gps_wins():
             self.filter.reset(place, GPS_SIGMA**2)
             self._resets += 1
@@ -229,11 +229,11 @@ class Autopilot:
         self._gps_us, self._gps_seen_us = self._now_us, None
 
     def _gps_wins(self) -> bool:
-        """Return whether the position is put to that of GPS, which has been refused for long."""
+        """Return True if the position is to be reset to GPS, which the filter has rejected for long."""
         raise NotImplementedError
 
     def _refused_for(self) -> float:
-        """Return the seconds since GPS is there and refused."""
+        """Return the time for which GPS has been rejected, s."""
         return 0.0 if self._gps_seen_us is None else (self._now_us - self._gps_seen_us) * 1e-6
 
     # ---- commands ------------------------------------------------------------------------------------
@@ -259,14 +259,14 @@ class Autopilot:
         )
 
     def _external(self, message: Message) -> MAV_RESULT:
-        """Answer EXTERNAL_POSITION_ESTIMATE."""
+        """Process EXTERNAL_POSITION_ESTIMATE; return the result of the command."""
         raise NotImplementedError
 
     def _set_interval(self, message: Message) -> MAV_RESULT:
-        """Answer SET_MESSAGE_INTERVAL.
+        """Process SET_MESSAGE_INTERVAL; return the result of the command.
 
-        ``GCS_Common.cpp``, set_message_interval: from 1 ms to 60 s, FAILED for a message that is not known;
-        ``mavlink_receiver.cpp``, set_message_interval: FAILED for a stream that is not known.
+        ``GCS_Common.cpp``, set_message_interval: from 1 ms to 60 s, FAILED for an unknown message;
+        ``mavlink_receiver.cpp``, set_message_interval: FAILED for an unknown stream.
         """
         layout = MESSAGES.get(int(message["param1"]))
         if layout is None or layout.msgname not in self._messages:
@@ -277,7 +277,7 @@ class Autopilot:
         return MAV_RESULT.ACCEPTED
 
     def _status(self, truth: Truth) -> bytes:
-        """Return the report of its filter."""
+        """Return the frame with the status of the position filter."""
         raise NotImplementedError
 
     # ---- telemetry -----------------------------------------------------------------------------------
@@ -287,11 +287,11 @@ class Autopilot:
         return self._codec.pack("GPS_GLOBAL_ORIGIN", **where, altitude=round(self.origin[2] * 1e3))
 
     def _telemetry(self, truth: Truth) -> bytes:
-        """Return the messages that are due."""
+        """Return the frames of the messages that are due."""
         return b"".join(make(truth) for name, make in self._messages.items() if self._is_due(name))
 
     def _is_due(self, name: str) -> bool:
-        """Return True if a message is to be sent now; without rates, each is sent at every step."""
+        """Return True if a message is due now; without rates, each message is due at every step."""
         if self.rates is None:
             return name not in OPTIONAL or name in self._streams
         rate = HEARTBEAT_HZ if name == "HEARTBEAT" else self.rates.get(name, 0.0)
@@ -358,5 +358,5 @@ class Autopilot:
 
 
 def finite(*values: float) -> bool:
-    """Return whether all values are numbers."""
+    """Return True if all values are finite."""
     return all(isfinite(value) for value in values)

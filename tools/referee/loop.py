@@ -1,4 +1,4 @@
-"""A bridge's navigation and an autopilot that takes its fixes, each hearing what the other sends."""
+"""Run a bridge's navigation and an autopilot that uses its fixes in closed loop."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from referee.autopilot import GPS_SIGMA, Autopilot, Truth
 
 Place = tuple[float, float]
 Receiver = Callable[[float, Place], tuple[Place, float] | None]
-"""Takes s since the start and the true position (deg); returns the measured one and the accuracy (m) that the
-receiver claims, or None without a fix."""
+"""Function of the time (s since the start) and the true position (deg) that returns the measured position
+and the accuracy (m) that the receiver claims, or None without a fix."""
 
 
 def honest(second: float, place: Place) -> tuple[Place, float]:  # noqa: ARG001 - as the other receivers
-    """Measure the true position."""
+    """Return the true position and accuracy, as an undisturbed receiver does."""
     return place, GPS_SIGMA
 
 
 def carried_off(start: float, north: float, east: float) -> Receiver:
-    """Return a receiver that is led away at a velocity (m/s) from a time (s) on."""
+    """Return a receiver whose position drifts away at a velocity (m/s) from the time `start` (s) on."""
 
     def measure(second: float, place: Place) -> tuple[Place, float]:
         elapsed = max(second - start, 0.0)
@@ -66,12 +66,12 @@ def frozen(start: float, end: float) -> Receiver:
 
 
 def jammed(start: float, end: float, seed: int = 0, accuracy: float | None = None) -> Receiver:
-    """Return a receiver that is jammed between two times (s), as ArduPilot's simulator does it.
+    """Return a receiver that is jammed between two times (s), after ArduPilot's simulator.
 
-    ``libraries/SITL/SIM_GPS.cpp``, simulate_jamming: no fix for 1 to 6 s; then the number of satellites is
-    drawn again and again, with a fix in 11 of 30 cases; the position starts where the jamming began and walks
-    by up to 200 m on each axis about once a second; the accuracy is drawn between 0 and 300 m (or is
-    constant: `accuracy`, m).
+    ``libraries/SITL/SIM_GPS.cpp``, simulate_jamming: no fix for 1 to 6 s. Then the number of satellites is
+    drawn repeatedly, with a fix in 11 of 30 cases. The position starts where the jamming began and walks
+    by up to 200 m on each axis about once a second. The accuracy is random between 0 and 300 m, or is the
+    constant `accuracy`, m.
     """
     rng = np.random.default_rng(seed)
     silent = start + rng.uniform(1.0, 6.0)
@@ -94,11 +94,11 @@ SECOND_US = 1_000_000
 
 
 class Passage(NamedTuple):
-    """What a vehicle does, and what its corrected magnetometer gives; n samples, evenly spaced.
+    """True track of a vehicle, and the readings of its corrected magnetometer; n samples, evenly spaced.
 
     `time` (n,) is s since 1970 UTC, `latitude` and `longitude` (n,), deg, are true, `velocity` (n, 2), m/s
     north and east, is through the water until the next sample, `total_field` and `sigma` (n,) are in nT,
-    `depth` in m. `gps` returns whether there is reception at a time, s since the start; `receiver` is one of
+    `depth` in m. `gps` returns True if there is reception at a time, s since the start; `receiver` is one of
     the receivers above.
     """
 
@@ -114,13 +114,13 @@ class Passage(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Once a second (n,): who believes to be how far off.
+    """Errors and states of bridge and autopilot, once a second (n,).
 
-    `seconds` is since the start, `error` (m) that of the bridge's position, NaN while it has none.
+    `seconds` is the time since the start, `error` (m) the error of the bridge's position, NaN without one.
     `autopilot` (n, 2), m north and east, is the error of the autopilot's position, `claimed` (m) its 1-sigma
-    on each axis. `sent` is the number of fixes until then, `state` that of the bridge's navigator, `sigma`
-    (m) the 1-sigma of its position, root mean square of both axes, `gnss` the state of the receiver's
-    positions by the bridge. `texts` are the announced texts with their times, s since the start.
+    on each axis. `sent` is the number of fixes so far, `state` the state of the bridge's navigator, `sigma`
+    (m) the 1-sigma of the bridge's position (RMS of both axes), `gnss` the bridge's assessment of the
+    receiver. `texts` are the bridge's STATUSTEXTs with their times, s since the start.
     """
 
     seconds: FloatArray
@@ -145,9 +145,9 @@ def sail(
     step_s: float = 1.0,
     requests: bool = False,
 ) -> tuple[Run, Autopilot, NavigationService]:
-    """Sail a passage with the autopilot that ``make(origin, start_us)`` returns, by fixes of one `kind`.
+    """Run bridge and autopilot (from ``make(origin, start_us)``) over a passage, with fixes of one `kind`.
 
-    The autopilot sends its telemetry every `step_s`, at most; with `requests`, the bridge requests rates.
+    The autopilot sends telemetry at most every `step_s`; with `requests`, the bridge requests its rates.
     """
     start_us = round(passage.time[0] * 1e6) // 4 * 4
     needed = needed_rates(1, attitude=True, navigation=True) if requests else None
@@ -189,19 +189,19 @@ def sail(
 
 
 def due(samples: deque[tuple[float, float, float]], until_us: int) -> Iterator[tuple[int, Corrected]]:
-    """Remove the samples (s, nT, nT) until a time, and yield them."""
+    """Remove the samples (time in s, field and sigma in nT) until a time, and yield them."""
     while samples and samples[0][0] * 1e6 <= until_us:
         when, field, sigma = samples.popleft()
         yield round(when * 1e6), Corrected(field, sigma, (field, 0.0, 0.0), (sigma, sigma, sigma), 0)
 
 
 def exchange(component: Component, autopilot: Autopilot) -> bytes:
-    """Hand what the bridge sends to the autopilot; return its answers."""
+    """Deliver the bridge's queued frames to the autopilot; return its replies."""
     return b"".join([autopilot.receive(frame, time_us) for time_us, frame in component.outbox.drain()])
 
 
 def own_error(navigation: NavigationService, now_us: int, truth: Truth) -> float:
-    """Return m between the bridge's position and the true one."""
+    """Return the distance between the bridge's position and the true position, m; NaN without a position."""
     navigator = navigation.navigator
     if not navigator.estimate.begun:
         return float("nan")
@@ -210,7 +210,7 @@ def own_error(navigation: NavigationService, now_us: int, truth: Truth) -> float
 
 
 def truths(passage: Passage, seed: int, step_s: float = 1.0) -> Iterator[tuple[float, Truth]]:
-    """Yield the vehicle's state every `step_s` seconds, and when; between samples it moves evenly."""
+    """Yield time and true state of the vehicle every `step_s` seconds, interpolated between the samples."""
     rng = np.random.default_rng(seed)
     time, every = passage.time, float(passage.time[1] - passage.time[0])
     heading = np.degrees(np.arctan2(passage.velocity[:, 1], passage.velocity[:, 0])) % 360.0
@@ -218,7 +218,7 @@ def truths(passage: Passage, seed: int, step_s: float = 1.0) -> Iterator[tuple[f
     seconds = np.arange(0.0, time[-1] - time[0], step_s)
     latitude = np.interp(seconds, time - time[0], passage.latitude)
     longitude = np.interp(seconds, time - time[0], passage.longitude)
-    noise = rng.normal(size=(int(seconds[-1]) + 1, 2)) * GPS_SIGMA  # of a second: GPS is that slow
+    noise = rng.normal(size=(int(seconds[-1]) + 1, 2)) * GPS_SIGMA  # constant over each second
     for k, second in enumerate(seconds.tolist()):
         place = float(latitude[k]), float(longitude[k])
         i = int(second / every)
