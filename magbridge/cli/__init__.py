@@ -1,6 +1,6 @@
-"""The command line: one thin function per command; its docstring is the help.
+"""Run the commands of the command line; the docstring of a command's function is its help.
 
-Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. An error is one line on stderr.
+Exit codes: 0 success, 1 the data do not allow the command, 2 wrong use. An error is one line on stderr.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from magbridge.errors import MagbridgeError, MissingExtra
 __all__ = ["app", "main", "report_error"]
 
 ROOMS = ("bridge", "calibrate", "correct", "diagnose", "fleet", "logs", "navigate", "survey")
-"""Modules of commands: importing one makes its functions commands of `app`."""
+"""Modules with commands; importing a module adds its commands to `app`."""
 for _room in ROOMS:
     import_module(f"{__name__}.{_room}")
 EXTRAS = {
@@ -33,18 +33,18 @@ EXTRAS = {
     "nicegui": "monitor",
     **dict.fromkeys(["polars", "distributed"], "fleet"),
 }
-"""Package to the extra that installs it."""
+"""Name of a package -> extra of magbridge that installs the package."""
 ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
-"""Signals that end a command; SIGHUP comes when its terminal is gone."""
+"""Signals that end a command; the system sends SIGHUP when the terminal is closed."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; return its exit code."""
+    """Run a command and return its exit code; `arguments` defaults to those of the process."""
     with suppress(ValueError):  # signal handlers can be set on the main thread only
         _heed_signals()
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except BrokenPipeError:  # the reader of our output has gone, as `| head` does
+    except BrokenPipeError:  # the program that reads the output has ended, such as `| head`
         sys.stderr.close()
     except (CycloptsError, MagbridgeError, ImportError, UnicodeEncodeError, OSError, MemoryError) as error:
         as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
@@ -52,14 +52,14 @@ def main(arguments: list[str] | None = None) -> int:
     except _Terminated as end:
         signal.signal(end.number, signal.SIG_DFL)
         signal.raise_signal(end.number)
-    except SystemExit as end:  # raised by rich if the reader has gone while it prints the help
+    except SystemExit as end:  # raised by rich if that happens while it prints the help
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     return 0
 
 
 def report_error(error: Exception, *, as_json: bool = False) -> int:
-    """Print an error that ends a command; return the exit code."""
+    """Print an error that ends a command, also as JSON if `as_json`, and return the exit code."""
     sentence, code = _explained(error)
     if as_json and not isinstance(error, FailedResult):
         print_error(sentence, code)
@@ -67,7 +67,7 @@ def report_error(error: Exception, *, as_json: bool = False) -> int:
 
 
 def _explained(error: Exception) -> tuple[str, int]:
-    """Return the line and the exit code of an error; an ImportError within magbridge is raised again."""
+    """Return message and exit code of an error; raise an ImportError again if no extra has the module."""
     sentence, code = _no_handle(error), 1
     match error:
         case _ if sentence:
@@ -81,11 +81,11 @@ def _explained(error: Exception) -> tuple[str, int]:
             if extra is None:
                 raise error
             sentence, code = str(MissingExtra(str(error.name), extra)), 2
-        case UnicodeEncodeError():  # netCDF and JSON take no name that is not of the locale
+        case UnicodeEncodeError():  # netCDF and JSON reject names that the locale cannot encode
             sentence = f"{error.object}: expected a name in {error.encoding}; rename the file"
         case IsADirectoryError(filename=name) if name:
             sentence = f"{name}: expected a file, got a folder; name a file in it"
-        case OSError(strerror=str(reason)):  # the system refuses a file, a folder or memory
+        case OSError(strerror=str(reason)):  # the operating system denies a file, a folder or memory
             sentence = f"{error.filename}: {reason}" if error.filename else reason
         case _:
             sentence = str(error) or "not enough memory"
@@ -103,7 +103,7 @@ def _misuse(error: CycloptsError) -> str:
 
 
 class _Terminated(SystemExit):
-    """Raised so that half-written files are removed before the signal `number` ends the process."""
+    """Exception that removes partial files on its way up, before the signal `number` ends the process."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -112,7 +112,7 @@ class _Terminated(SystemExit):
 
 def _heed_signals() -> None:
     for number in ENDS:
-        if signal.getsignal(number) != signal.SIG_IGN:  # as under nohup
+        if signal.getsignal(number) != signal.SIG_IGN:  # for example, nohup sets SIG_IGN
             signal.signal(number, _terminated)
 
 
@@ -121,7 +121,7 @@ def _terminated(number: int, _: object) -> None:
 
 
 def _no_handle(error: BaseException) -> str:
-    """Return the message that no file handle is left, if that is the reason of an error; else empty."""
+    """Return a message about too many open files if they caused `error`; else an empty text."""
     reason: BaseException | None = error
     while reason is not None:
         if os.strerror(errno.EMFILE) in str(reason) or getattr(reason, "errno", None) == errno.EMFILE:
@@ -131,7 +131,7 @@ def _no_handle(error: BaseException) -> str:
 
 
 def _file_limit() -> str:
-    """Return the largest number of open files of the process, as text."""
+    """Return the largest allowed number of open files of the process, as text."""
     try:
         from resource import RLIMIT_NOFILE, getrlimit
     except ImportError:  # Windows

@@ -1,4 +1,4 @@
-"""Commands that run, attach or replay a bridge, or listen to one."""
+"""Define the commands that configure, run, replay, simulate and monitor a bridge."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 MIN_REPLAY_SPEED = 1e-3
-"""Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
+"""Lowest replay speed, as a multiple of real time: a log of one hour then takes six weeks."""
 
 
 @cli.command("demo [OPTIONS]")
@@ -34,25 +34,25 @@ def demo(
     show: Annotated[bool, Parameter(negative="--no-show")] = True,
     json: cli.Json = False,
 ) -> None:
-    """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
+    """Demonstrate calibration and correction on a simulated glider, without hardware, in under a minute.
 
-    Simulates a small deployment, fits a calibration to its spirals, replays the survey into the
-    bridge through a pty and a socket, listens as a ground station would, and draws the raw, corrected
-    and true field.
+    The command simulates a small deployment, and fits a calibration to its spirals. It replays the survey
+    into the bridge through a pty and a socket, receives the messages as a ground station would, and draws the
+    raw, corrected and true field.
 
     Parameters
     ----------
     out
         The folder to write to.
     seed
-        Which random glider.
+        Seed of the random glider.
     live
-        Fly the glider in real time instead, with its bridge on a pty and a socket, and show it in the ground
-        station's page until Ctrl-C.
+        Instead, simulate the glider in real time, with its bridge on a pty and a socket, and show it on the
+        ground station's page until Ctrl-C.
     port
-        With --live, the port to serve the page at.
+        With --live: the TCP port of the page.
     show
-        With --live, open the page in a browser.
+        With --live: open the page in a browser.
     """
     if live:
         if json:
@@ -67,7 +67,7 @@ def demo(
 
 
 def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
-    """Fly the demonstration's glider into the page until interrupted."""
+    """Simulate the demonstration's glider in real time and serve its page until interrupted."""
     from magbridge.monitor.serve import serve
     from sitl.live import MAP, flying
 
@@ -82,7 +82,7 @@ def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
 
 @cli.command("run --config bridge.toml [--check [--live] [--json]]")
 def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json = False) -> None:
-    """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
+    """Read the sensor and the autopilot link, and publish the corrected field until stopped.
 
     magbridge init writes a configuration, magbridge ports shows which device sends on which serial port, and
     magbridge drivers lists the drivers of sensors with their options.
@@ -92,7 +92,7 @@ def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json
     config
         The configuration (bridge.toml).
     check
-        Report everything that would go wrong, and exit; without --live, no port is opened.
+        Report every fault of the configuration, and exit; without --live, no port is opened.
     live
         With --check, open the ports for 20 s and list which messages arrive at which rate.
     """
@@ -108,11 +108,14 @@ def run(*, config: Path, check: bool = False, live: bool = False, json: cli.Json
 
 
 def _check(config: Path, *, live: bool, json: bool) -> None:
-    """Print all that would go wrong, and with `live` what arrives; WrongUse: the bridge would not start."""
+    """Print every fault of a configuration, and with `live` the arriving messages.
+
+    FailedResult: the bridge would not start.
+    """
     from magbridge.bridge.check import findings
     from magbridge.toml import load_toml
 
-    load_toml(config)  # a file that cannot be read is an error of its own
+    load_toml(config)  # an unreadable file is an error, not a finding
     found, arriving = findings(config), dict[str, Any]()
     errors = sum(one.fatal for one in found)
     if live and not errors:
@@ -132,7 +135,7 @@ def _check(config: Path, *, live: bool, json: bool) -> None:
 
 
 def _listen(config: Path, *, quiet: bool) -> tuple[list[ConfigFault], dict[str, Any]]:
-    """Listen on the ports; return the faults, and what arrived for JSON; print that unless `quiet`."""
+    """Listen on the ports; return the faults, and the received messages for JSON, printed unless `quiet`."""
     from magbridge.bridge.check import LISTEN_TIME_S, LiveCheck
     from magbridge.config import load
 
@@ -161,25 +164,25 @@ def replay(
     reading: cli.ReadingOptions = cli.AS_THEY_SAY,
     json: cli.Json = False,
 ) -> None:
-    """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.
+    """Replay logs through the unmodified bridge: sensor bytes through a pty, MAVLink through a socket.
 
-    A bridge's own log is published again bit for bit; if it was restarted in the middle of a run, the command
-    reports in how many samples the field is the same. Any other log is played through an emulated fluxgate
-    and autopilot, and the corrected field is compared with the reference field.
+    A bridge publishes its own log again bit for bit. If the bridge was restarted in the middle of a run, the
+    command reports the number of samples with an identical field. Any other log is replayed by an emulated
+    fluxgate and autopilot, and the corrected field is compared with the reference field.
 
     Parameters
     ----------
     files
-        The log, or its files in order.
+        The log, or the files of one log in order.
     config
-        The configuration (bridge.toml). Without one, a nominal calibration is fitted to all
-        files but the last.
+        The configuration (bridge.toml). If not given, a nominal calibration is fitted to all files except the
+        last.
     speed
-        A multiple of real time, or max: as fast as possible.
+        Replay speed as a multiple of real time, or max: as fast as possible.
     log
         A folder for the log that the bridge writes during the replay.
     reading
-        How to read logs that are not a bridge's own.
+        Options for reading logs that a bridge did not write.
     """
     cli.logs_to_read(files, None, config)
 
@@ -199,14 +202,15 @@ def replay(
 def dialect(
     *, output: Annotated[cli.Folder, Parameter(name=["--output", "-o"])], json: cli.Json = False
 ) -> None:
-    """Write the MAVLink dialect for other programs: the XML with all that it includes, modules for pymavlink.
+    """Write the MAVLink dialect for other programs: XML files and Python modules for pymavlink.
 
-    magbridge.xml holds the common messages and ours; magbridge_ardupilotmega.xml ArduPilot's as well.
+    magbridge.xml defines the common messages and the messages of magbridge; magbridge_ardupilotmega.xml also
+    those of ArduPilot. All included XML files are written, too.
 
     Parameters
     ----------
     output
-        The folder to write to; it is made if it does not exist.
+        The folder to write to; it is created if it does not exist.
     """
     from magbridge.mavlink.definitions import write_definitions
 
@@ -227,23 +231,23 @@ def monitor(
     map: Annotated[Path | None, Parameter(name="--map")] = None,  # noqa: A002 - as the other commands name it
     show: bool = False,
 ) -> None:
-    """Serve the ground station's page, which shows live the data and messages that a bridge sends by MAVLink.
+    """Serve a web page for the ground station that shows live the MAVLink data of bridges.
 
     Parameters
     ----------
     link
         The link to the bridge: udpin:HOST:PORT (or [IPV6]:PORT), udpout, tcp, tcpin, or a serial device.
     host
-        The address to serve the page at; 0.0.0.0 makes it visible to other machines, to those who have the
-        token that is printed with the address.
+        The address to serve the page at. With 0.0.0.0, other machines can open the page with the token in the
+        printed address.
     port
-        The port to serve the page at.
+        The TCP port to serve the page at.
     baudrate
         Baud rate of a serial link.
     signing_key
-        The file of 32 bytes that the bridge has: sent messages are signed, and unsigned ones are rejected.
+        The bridge's key, a file of 32 bytes: sent messages are signed, and unsigned messages are rejected.
     map
-        An anomaly grid to be shown beneath the track.
+        An anomaly grid to show beneath the track.
     show
         Open the page in a browser.
     """
@@ -255,7 +259,10 @@ def monitor(
 
 
 def speed_of(text: str) -> float:
-    """Return a replay speed relative to real time, infinite for ``max``; WrongUse: no positive number."""
+    """Return the replay speed as a multiple of real time, infinite for ``max``.
+
+    WrongUse: `text` is neither ``max`` nor a number of at least :data:`MIN_REPLAY_SPEED`.
+    """
     try:
         speed = inf if text == "max" else float(text)
     except ValueError:
@@ -281,14 +288,15 @@ def init(
     calibration: Path | None = None,
     json: cli.Json = False,
 ) -> None:
-    """Write a commented bridge.toml, from five questions or from options.
+    """Write a commented bridge.toml from options, or from the answers to five questions.
 
-    On a terminal it asks for each value without an option: sensor, port, link, system id, moving masses.
+    On a terminal the command asks for each value that no option gives: sensor, port, link, system id, moving
+    masses.
 
     Parameters
     ----------
     output
-        The configuration to write; one that is there is not overwritten.
+        The configuration to write; an existing file is not overwritten.
     driver
         The sensor's driver; magbridge drivers lists them.
     port
@@ -300,7 +308,8 @@ def init(
     system
         The vehicle's system id.
     parameter
-        A moving mass, as "battpos [in]"; may be repeated. Those of a calibration need not be named.
+        Telemetry name and unit of a moving mass, as "battpos [in]"; may be repeated. The masses of a
+        calibration need not be named.
     option
         An option of the driver, as sensitivity=5e-5; may be repeated.
     calibration
@@ -331,7 +340,7 @@ def init(
     with atomic_path(output) as path:
         path.write_text(text, encoding="utf-8")
         fatal = [one.text for one in findings(path) if one.fatal]
-        if fatal and PLACEHOLDER not in text:  # a setting to fill in is an error only when it is run
+        if fatal and PLACEHOLDER not in text:  # the user still has to fill in a setting
             raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
     found = [one.text for one in findings(output)]
     for finding in found:
@@ -341,7 +350,7 @@ def init(
 
 
 def _relative(file: Path | None, output: Path) -> str | None:
-    """Return how `output` is to name a file: paths in it are relative to it."""
+    """Return the path of `file`, relative to the folder of `output` if it is inside, else absolute."""
     if file is None:
         return None
     file, folder = file.absolute(), output.absolute().parent
@@ -384,7 +393,7 @@ def _ports_listed() -> str:
 
 
 def _options(texts: tuple[str, ...], driver: str) -> dict[str, Any]:
-    """Return the driver's options; WrongUse: the driver has no option of that name."""
+    """Return the driver's options (name -> value) from NAME=VALUE; WrongUse: the driver lacks an option."""
     from magbridge.sensors.options import options_of
     from magbridge.wording import one_of
 
@@ -417,17 +426,17 @@ def ports(
     """Listen on serial ports, and show which device sends on each.
 
     The command recognises sensors, autopilots and GPS receivers, and shows a line that it cannot parse. It
-    sends nothing, so that a sensor that waits for a command stays silent. The exit code is 1 if a named port
-    cannot be opened.
+    sends nothing, so it does not recognise a sensor that waits for a request. The exit code is 1 if a named
+    port cannot be opened.
 
     Parameters
     ----------
     names
-        The ports to listen on: devices or pyserial URLs; all of this computer's if none is given.
+        The ports to listen on: devices or pyserial URLs. By default all ports of this computer.
     baudrate
-        A baud rate to listen at; may be repeated. If not given: the usual ones, until one is understood.
+        A baud rate to listen at; may be repeated. By default the usual rates, until a device is recognised.
     seconds
-        How long to listen at each baud rate.
+        Listening time at each baud rate, in s.
     """
     from magbridge.bridge.ports import BAUDRATES, Recognised, SerialDevice, listen
     from magbridge.bridge.ports import ports as there
@@ -455,12 +464,12 @@ def ports(
 
 @cli.command("drivers [NAME] [OPTIONS]")
 def drivers(name: str | None = None, /, *, json: cli.Json = False) -> None:
-    """List the drivers of sensors, or the options of one for [sensor.options] of a bridge.toml.
+    """List the sensor drivers and their options, which belong into [sensor.options] of a bridge.toml.
 
     Parameters
     ----------
     name
-        The driver.
+        The only driver to list; by default all drivers.
     """
     from magbridge.sensors.options import driver_names, options_of
 

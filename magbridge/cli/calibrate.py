@@ -1,4 +1,4 @@
-"""Fit a calibration to logs: with or without a fleet's prior, of one compass or of each."""
+"""Define the command ``calibrate``, which fits a calibration to logs of calibration runs."""
 
 from __future__ import annotations
 
@@ -25,43 +25,44 @@ if TYPE_CHECKING:
     from magbridge.fleet.memory import FleetPrediction
 
 MAX_LISTED_CONTRIBUTIONS = 5
-"""Contributions to a scalar's reading that the summary lists."""
+"""Largest number of contributions to a scalar magnetometer's reading that the summary lists."""
 ALL_COMPASSES = "all"
-"""``--compass all``: a calibration for each compass."""
+"""Value of ``--compass`` that requests a calibration of each compass."""
 SCALAR_REFERENCE_SIGMA_NT = 1.0
-"""1-sigma of a scalar magnetometer's reading that serves as the reference, nT."""
+"""Default 1-sigma of a scalar magnetometer's reading as the reference field, nT."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ModelOptions:
-    """Terms and data of the fit.
+    """Options for the model of the calibration and its fit.
 
     Parameters
     ----------
     parameter
-        A column that gives the position of a moving mass, or a current; may be repeated. auto: the columns
-        of the log that predict held-out parts better (method auto).
+        A column with the position of a moving mass, or a current; may be repeated. auto: the columns of the
+        log that improve the prediction of held-out parts (method auto).
     order
         Highest total degree of the polynomials in the parameters.
     method
-        auto is the one to use: survey if only the main field or a map is known (the crustal field is
-        estimated with the calibration), else the fit to a known field. For comparison: nominal (one
-        ellipsoid), cubic (the paper's), runs (the paper's first stage: an ellipsoid for each run),
-        horizontal (one ellipsoid, levelled by roll and pitch).
+        Use auto. If only the main field or a map is known, auto uses survey, which estimates the crustal
+        field with the calibration; else it fits to the known field. For comparison: nominal (one ellipsoid),
+        cubic (the paper's method), runs (the paper's first stage: an ellipsoid for each run), horizontal (one
+        ellipsoid, levelled by roll and pitch).
     vehicle
-        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto); with
-        --fleet, the vehicle's name in the fleet, which is known for logs that are catalogued.
+        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto). With
+        --fleet: the vehicle's name in the fleet, by default from the catalogue's entries for the logs.
     position_sigma
         1-sigma in m of the slow drift of dead-reckoned positions (method survey); 0: positions are exact.
     filter_cutoff
         Cut-off frequency in Hz of the sensor's first-order anti-alias filter; 0: no filter. The fit undoes
         its attenuation; correct and the bridge undo its lag.
     fleet
-        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the prior is the prediction from the
-        vehicle's earlier deployments and its fleet (method auto). Two runs are then often enough.
+        The catalogue of a fleet, a folder or postgresql://USER@HOST/DATABASE. The prior of the fit is then
+        the prediction from the vehicle's earlier deployments and its fleet (method auto), so that two runs
+        are often enough.
     refit
-        Which refit it flies with, if its logs are not catalogued; by default a new one.
+        With --fleet: name of the vehicle's refit, if the logs are not catalogued; by default a new one.
     """
 
     parameter: tuple[str, ...] = ()
@@ -75,16 +76,19 @@ class ModelOptions:
 
     @property
     def masses(self) -> Path | None:
-        """The vehicle.toml, if one is given."""
+        """Path of the vehicle.toml; None if it is not given."""
         return Path(self.vehicle) if self.vehicle and not self.fleet else None
 
     @property
     def named(self) -> tuple[str, ...]:
-        """The parameters that are named, without ``auto``."""
+        """Names of the given parameters, without ``auto``."""
         return tuple(name for name in self.parameter if name != "auto")
 
     def check(self) -> None:
-        """WrongUse: options that do not go together."""
+        """Check that the options are compatible.
+
+        WrongUse: they are not.
+        """
         if self.masses and self.method != "auto":
             raise WrongUse(f"--vehicle: expected --method auto, got {self.method}, which has no use for it")
         if "auto" in self.parameter and (self.method != "auto" or self.fleet or self.masses):
@@ -98,23 +102,23 @@ class ModelOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ReferenceOptions:
-    """Reference field and heading reference.
+    """Options for the reference field and the heading reference.
 
     Parameters
     ----------
     grid
         An anomaly grid to add to the IGRF.
     base
-        A base station's log (total_field, or a vector): the Earth's field variation, to add to the reference.
-        A log of an observatory (IAGA-2002) among the logs is added in the same way.
+        A base station's log (total_field, or a vector), whose variation is added to the reference field. A
+        log of an observatory (IAGA-2002) among the logs is used in the same way.
     reference
-        mean: the mean of the log's own readings, if the Earth's field is not known; site_bias is then 2 % of
-        it by default. scalar: the column of --scalar, if that magnetometer is away from the vehicle's iron or
-        compensated; site_bias is then its sigma, by default 1 nT.
+        mean: the mean of the log's own readings, if the Earth's field is not known; site_bias is then by
+        default 2 % of the mean. scalar: the column of --scalar, if that magnetometer is compensated or far
+        from the vehicle's iron; site_bias is then its sigma, by default 1 nT.
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site; sigma and level_sigma
-        include it. By default 0 if the log has reference_field, the map's sigma with --grid (20 if it states
-        none), else 145 (error model of the World Magnetic Model 2020).
+        include it. By default 0 if the log has reference_field, the map's sigma with --grid (20 if the map
+        states none), else 145 (error model of the World Magnetic Model 2020).
     """
 
     grid: Path | None = None
@@ -124,7 +128,10 @@ class ReferenceOptions:
     heading_reference: cli.Heading = None
 
     def apply(self, deployment: xr.Dataset, scalar: str) -> tuple[xr.Dataset, float | None]:
-        """Return a log with the reference that is asked for, and the 1-sigma of its level, nT."""
+        """Return the log with the requested reference field, and the 1-sigma of its constant error, nT.
+
+        The 1-sigma is None if the default of the fit applies.
+        """
         if self.reference == "mean":
             return _about_mean(deployment, self.site_bias)
         if self.reference == "scalar":
@@ -136,12 +143,12 @@ class ReferenceOptions:
 
 PHYSICAL_MODEL = ModelOptions()
 MAIN_FIELD = ReferenceOptions()
-"""The defaults: method auto, and the field as the log or the IGRF gives it."""
+"""`PHYSICAL_MODEL`, `MAIN_FIELD`: Defaults: method auto, and the reference field of the log or the IGRF."""
 
 
 @dataclass
 class _Request:
-    """A call of ``calibrate`` for one compass."""
+    """Arguments of ``calibrate`` for one compass."""
 
     files: tuple[Path, ...]
     output: Path
@@ -154,7 +161,7 @@ class _Request:
     anomalies: AnomalyGrid | None = field(default=None)
 
     def of_compass(self, number: int) -> _Request:
-        """Return the same call for one of several compasses, with files of its own."""
+        """Return the arguments for the compass `number`; the names of written files then contain it."""
 
         def numbered(path: Path) -> Path:
             return path.with_name(f"{path.stem}_{number}{path.suffix}")
@@ -181,7 +188,7 @@ def calibrate(
 ) -> None:
     """Fit a calibration to logs of calibration runs.
 
-    With --compass all, every compass of the logs gets a calibration of its own: cal_0.json, cal_1.json.
+    With --compass all, a calibration is written for each compass of the logs: cal_0.json, cal_1.json.
 
     If the data do not support the fit, no file is written, and the exit code is 1; see --force.
 
@@ -192,10 +199,10 @@ def calibrate(
     output
         The calibration to write (cal.json).
     plot
-        A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
-        each parameter.
+        A PNG, PDF or SVG to write, with the error of each sample, raw and corrected, against time, heading
+        and each parameter.
     force
-        Write the calibration although the data do not support the fit.
+        Write the calibration even if the data do not support the fit.
     json
         Print the result, or the error, as one JSON object, with the paper's M, S and T at the middle of each
         parameter's range. With --compass all, one result for each compass.
@@ -214,7 +221,7 @@ def calibrate(
 
 
 def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
-    """Read the logs, fit and write the calibration of one compass; return the result as facts and text."""
+    """Fit and write the calibration of one compass; return the result as values for JSON and as text."""
     from magbridge.columns import CHANNELS, require
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
@@ -262,7 +269,7 @@ def _fit(
     site_bias: float | None,
     start: FleetPrediction | None,
 ) -> tuple[Fit, Observations, dict[str, Any]]:
-    """Return the fit, its samples and the benefit of a fleet's prior; print the warnings."""
+    """Return the fit, its samples and the benefit of a fleet's prior; print the warnings to stderr."""
     from magbridge.calibration.fitting.observations import unfiltered
     from magbridge.calibration.fitting.observe import observations
     from magbridge.calibration.fitting.pose import read_vehicle
@@ -302,7 +309,7 @@ def _fit(
 def _fitted(
     logs: list[xr.Dataset], data: Observations, model: ModelOptions, **options: Any
 ) -> tuple[Fit, list[str]]:
-    """Return the fit, and why several logs are not of one vehicle, if they are not."""
+    """Return the fit, and a list with a warning if several logs appear to be of different vehicles."""
     from magbridge.calibration.fitting.sources import heterogeneous_logs
 
     def refitted(part: Observations) -> Fit:
@@ -321,7 +328,7 @@ def _fitted(
 def _from_fleet(
     start: FleetPrediction, data: Observations, order: int, **options: Any
 ) -> tuple[Fit, list[str], dict[str, Any]]:
-    """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
+    """Return the fit with a fleet's prior, and its benefit over a fit without it, as lines and as values."""
     from magbridge.fleet.memory import gained
 
     found = mb.fit(data, order=order, known=start.known, **options)
@@ -334,7 +341,7 @@ def _from_fleet(
 
 
 def _undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) -> list[str]:
-    """Return a line for each column of the log that changes the field and is not a parameter."""
+    """Return a warning for each column of the log that affects the field but is not a parameter."""
     import numpy as np
 
     from magbridge.calibration.fitting.parameter_choice import undeclared
@@ -348,7 +355,7 @@ def _undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) 
 def _with_scalar(
     request: _Request, deployment: xr.Dataset, calibration: mb.Calibration, facts: dict[str, Any]
 ) -> tuple[mb.Calibration, str]:
-    """Return the calibration with its scalar sensor, and a summary; add to the facts to print as JSON."""
+    """Return the calibration with its scalar sensor, and a summary; add the results to `facts` for JSON."""
     from magbridge.calibration.figure_of_merit import merit_text
     from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns
 
@@ -388,7 +395,7 @@ def _with_scalar(
 
 
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
-    """Return a log whose reference is its own mean, and the 1-sigma of that mean, nT.
+    """Return a log with its mean reading as the reference field, and the 1-sigma of the reference, nT.
 
     WrongUse: the log has positions or reference_field.
     """
@@ -411,7 +418,10 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
 
 
 def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
-    """Calibrate every compass of the logs; DataError: not one could be."""
+    """Calibrate every compass of the logs; return number -> values and text of the result.
+
+    DataError: no compass could be calibrated.
+    """
     from magbridge.logs import read_each
     from magbridge.logs.compasses import compasses_in
 
@@ -464,7 +474,7 @@ def _summary(facts: dict[str, Any]) -> str:
 
 
 def _digests(files: tuple[Path, ...]) -> dict[str, str]:
-    """Return each file's name (its path where another has that name) and digest; warn of identical files."""
+    """Return file name (path if two names are equal) -> SHA-256; print a warning about identical files."""
     seen: dict[str, Path] = {}
     for file in files:
         first = seen.setdefault(digest(file), file)

@@ -1,4 +1,4 @@
-"""Share the application, common options and the printing of results among the commands."""
+"""Define the application, and the options, checks and messages that several commands use."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def _default(value: object) -> object:
-    """Return the default as the help shows it; None where it is not shown."""
+    """Return the default value for the help; None if the help is not to show it."""
     return None if value is False or value in {(), ""} else value
 
 
@@ -37,8 +37,8 @@ app = App(
     name="magbridge",
     help="A magnetometer bridge for vehicles whose own iron moves.",
     version=mb.__version__,
-    suppress_keyboard_interrupt=False,  # main() prints it
-    help_format="plaintext",  # markdown takes a tenth of a second to load, and a list needs none
+    suppress_keyboard_interrupt=False,  # main() reports the interrupt
+    help_format="plaintext",  # loading markdown takes 0.1 s, and the list of commands does not need it
     help_epilogue="Exit codes: 0 done, 1 the data do not allow it, 2 wrong usage.",
     default_parameter=Parameter(negative=(), show_default=_default),
 )
@@ -47,13 +47,13 @@ F = TypeVar("F", bound=Callable[..., None])
 
 
 def command(usage: str) -> Callable[[F], F]:
-    """Make a function a command; `usage` is its line of the help, its docstring the rest."""
-    # in markdown, paragraphs are wrapped as wide as the terminal is
+    """Return a decorator that makes a function a command with the given usage line in its help."""
+    # markdown paragraphs are wrapped at the width of the terminal
     return partial(app.command, usage=f"Usage: magbridge {usage}", help_format="markdown")
 
 
 def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
-    """Return a validator for a file to write, which is checked before any work is done."""
+    """Return a validator of a file to write: its folder is writable, and its suffix is one of `suffixes`."""
 
     def check(_: Any, path: Any) -> None:
         if path is None:
@@ -71,7 +71,10 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
 
 
 def folder_to_write(_: Any, path: Any) -> None:
-    """Validate a folder to write to, before any work is done."""
+    """Check that a folder to write to can be created or written.
+
+    ValueError: it cannot.
+    """
     if path is None:
         return
     there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
@@ -82,7 +85,7 @@ def folder_to_write(_: Any, path: Any) -> None:
 
 
 def _whole_number(_: Any, tokens: Sequence[Token]) -> int:
-    """Read a whole number; cyclopts would round 1.5 to 2."""
+    """Convert a word to an integer, without rounding 1.5 to 2 as cyclopts does."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -90,7 +93,7 @@ def _whole_number(_: Any, tokens: Sequence[Token]) -> int:
 
 
 def _day(_: Any, tokens: Sequence[Token]) -> dt.date:
-    """Read a date; cyclopts would also take a time of day, which no log counts from."""
+    """Convert a word to a date; in contrast to cyclopts, reject a time of day."""
     try:
         return dt.date.fromisoformat(tokens[0].value)
     except ValueError:
@@ -108,19 +111,20 @@ class ReadingOptions:
     Parameters
     ----------
     date
-        The day (UTC, YYYY-MM-DD) of a log whose times count from the boot: the Earth's field is that day's.
+        The day (UTC, YYYY-MM-DD) of a log whose times count from the boot; it dates the Earth's field.
     compass
-        Which of several compasses to use: its number, from 0, or its device id. If not given: the one that
-        the log declares as used.
+        Number, from 0, or device id of the compass to use. By default the compass that the log declares as
+        used.
     sensor_log
-        The log of a sensor with its own logger, to be combined with the vehicle's logs; may be repeated. If
-        not given: found by its columns.
+        The log of a sensor with its own logger, to combine with the vehicle's logs; may be repeated. If not
+        given, the command identifies sensor logs among the files by their columns.
     clock_offset
         Seconds to add to the times of a sensor's own log.
     strict
-        Refuse a log of which anything would be dropped, instead of dropping, counting and naming it.
+        Reject a log with unusable content, instead of skipping, counting and reporting the content.
     column
-        A column under our name, NAME="THEIRS [unit]", as mag_x="Bx [uT]"; may be repeated.
+        A column NAME of magbridge and the log's own name of it, NAME="THEIRS [unit]", such as
+        mag_x="Bx [uT]"; may be repeated.
     columns
         A columns.toml that renames and scales columns and declares units and the heading reference.
     """
@@ -135,7 +139,7 @@ class ReadingOptions:
 
     @property
     def options(self) -> Options:
-        """Options of the same meaning for :mod:`magbridge.logs`."""
+        """These options as an object of :mod:`magbridge.logs`."""
         boot = None if self.date is None else dt.datetime.combine(self.date, dt.time(), dt.UTC).timestamp()
         return Options(
             self.strict, boot, self.compass, self.sensor_log, self.clock_offset, self.column, self.columns
@@ -143,26 +147,27 @@ class ReadingOptions:
 
     @property
     def without_sensor_logs(self) -> Options:
-        """Options for a log that is read without the sensor's own logs."""
+        """These options without ``--sensor-log`` and ``--clock-offset``."""
         return replace(self.options, sensor_log=(), clock_offset_s=0.0)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ScalarOptions:
-    """A scalar magnetometer on the same vehicle.
+    """Options for a scalar magnetometer on the same vehicle.
 
     Parameters
     ----------
     scalar
-        The column of a scalar magnetometer, nT. calibrate adds its compensation to the file; survey makes the
-        map of it, and fits lag, lever arm and heading error. The channels that disturb it are those of
-        --parameter; auto, and in calibrate also no --parameter: all telemetry of the log.
+        The column of a scalar magnetometer, nT. calibrate adds its compensation to the calibration file;
+        survey maps it, and fits its lag, lever arm and heading error. The channels of --parameter are the
+        channels that disturb it. All telemetry of the log does with --parameter auto, and in calibrate also
+        without --parameter.
     lag
-        Time in s by which the scalar is behind the vector and the positions; auto estimates it.
+        Delay in s of the scalar relative to the vector and the positions; auto estimates it.
     lever
-        Position of the scalar sensor: m forward, starboard and down of the log's positions, as 1.5,0,-0.3. If
-        not given, survey estimates forward and starboard, and calibrate takes 0.
+        Position of the scalar sensor in m forward, starboard and down of the log's positions, such as
+        1.5,0,-0.3. If not given, survey estimates forward and starboard, and calibrate uses 0,0,0.
     """
 
     scalar: str = ""
@@ -170,7 +175,10 @@ class ScalarOptions:
     lever: str = ""
 
     def check(self, *, is_reference: bool = False) -> None:
-        """WrongUse: lag or lever arm are not numbers, or an option needs --scalar."""
+        """Check the options.
+
+        WrongUse: lag or lever arm are not numbers, or an option needs --scalar.
+        """
         if not self.scalar and (is_reference or self.lag != "auto" or self.lever):
             raise WrongUse("--reference scalar, --lag, --lever: expected --scalar COLUMN with them; add it")
         try:
@@ -185,12 +193,12 @@ class ScalarOptions:
 
     @property
     def lag_s(self) -> float | None:
-        """Lag, s; None: to be estimated."""
+        """Lag of the scalar, s; None if it is to be estimated."""
         return None if self.lag == "auto" else float(self.lag)
 
     @property
     def lever_m(self) -> tuple[float, float, float] | None:
-        """Forward, starboard and down, m; None if not given."""
+        """Lever arm forward, starboard and down, m; None if not given."""
         if not self.lever:
             return None
         forward, starboard, down = (float(part) for part in self.lever.split(","))
@@ -198,9 +206,9 @@ class ScalarOptions:
 
 
 AS_THEY_SAY = ReadingOptions()
-"""Logs are read as they declare themselves."""
+"""Default: logs are read as their own headers declare."""
 NO_SCALAR = ScalarOptions()
-"""No scalar magnetometer."""
+"""Default: the logs are not used for a scalar magnetometer."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 CalibrationOutput = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".json"))]
 SavedCalibration = Annotated[Path | None, Parameter(validator=file_to_write(".json"))]
@@ -220,7 +228,7 @@ Json = Annotated[bool, Parameter(help="Print the result, or the error, as one JS
 def check_inputs(
     files: tuple[Path, ...], output: Path | None = None, *others: Path | None
 ) -> tuple[Path, ...]:
-    """Return `files`; WrongUse: there is none, or `output` is one of them or of `others`."""
+    """Return `files`; WrongUse: `files` is empty, or `output` is one of `files` or `others`."""
     if not files:
         raise WrongUse("expected at least one FILE")
     read = [os.path.realpath(path) for path in (*files, *others) if path is not None]
@@ -230,11 +238,11 @@ def check_inputs(
 
 
 def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> None:
-    """Check, before anything heavy is imported, that logs are there and are not written over.
+    """Check that the logs exist and that `output` does not overwrite them, before slow imports.
 
-    `others` are other files to read; one of them may be a folder, as a grid is.
+    `others` are other files or folders to read, such as grids.
 
-    WrongUse: as :func:`check_inputs`. FormatError: one is not there, or a log is empty.
+    WrongUse: as :func:`check_inputs`. FormatError: a file does not exist, or a log is empty.
     """
     for path in check_inputs(files, output, *others):
         if not is_bag(path) and not existing(path).stat().st_size:
@@ -245,9 +253,9 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
 
 
 def without_dask() -> None:
-    """Import xarray without dask: a log has no dask arrays, and importing them takes 0.4 s.
+    """Import xarray without dask, because logs do not use dask arrays and importing dask takes 0.4 s.
 
-    xarray looks for dask when it is imported and with its first array, and keeps the result.
+    xarray looks for dask at its own import and with its first array, and remembers the result.
     """
     if {"xarray", "dask"} & sys.modules.keys():
         return
@@ -259,7 +267,7 @@ def without_dask() -> None:
 
 
 class FailedResult(DataError):
-    """An error that the result, which is already printed, describes: JSON output has no second object."""
+    """Error that the printed result already describes, so that no second JSON object is printed."""
 
     def __init__(self, sentence: str, exit_code: int = 1) -> None:
         self.exit_code = exit_code
@@ -267,7 +275,7 @@ class FailedResult(DataError):
 
 
 def print_result(result: Mapping[str, Any], sentence: str, as_json: bool) -> None:
-    """Print the result, for people or for machines."""
+    """Print the result to stdout: as one JSON object if `as_json`, else the text `sentence`."""
     from magbridge.arrays import plain
 
     if as_json:
@@ -277,23 +285,23 @@ def print_result(result: Mapping[str, Any], sentence: str, as_json: bool) -> Non
 
 
 def print_error(sentence: str, code: int) -> None:
-    """Print the JSON object of a command that has no result: its error message and its exit code."""
+    """Print the JSON object of a failed command: its error message and its exit code."""
     print(msgspec.json.encode({"error": " ".join(sentence.split()), "exit_code": code}).decode())
 
 
 def complain(sentence: str, code: int = 0) -> int:
-    """Print one line to stderr; return `code`, the exit code that goes with it."""
+    """Print a message as one line to stderr, and return the exit code `code`."""
     print("magbridge:", " ".join(sentence.split()), file=sys.stderr)
     return code
 
 
 MAX_NAMED_LOSSES = 5
-"""Losses that are named, a line each; the others are counted."""
+"""Largest number of skipped parts of a log that are reported one by one; the others are counted."""
 
 
 @contextmanager
 def naming(deployment: xr.Dataset) -> Iterator[None]:
-    """Raise errors of the block as :class:`DataError` whose message begins with the names of the logs."""
+    """Convert calibration and range errors in the block to a :class:`DataError` that names the logs."""
     try:
         yield
     except (CalibrationError, OutOfRange) as error:
@@ -301,7 +309,7 @@ def naming(deployment: xr.Dataset) -> Iterator[None]:
 
 
 def warnings_of(calibration: mb.Calibration, file: Path) -> list[str]:
-    """Return a line with the reasons why the data do not support a calibration; empty if they do."""
+    """Return a list with the warning that a calibration is not supported by its data; empty if it is."""
     warnings = "; ".join(calibration.warnings)
     return [f"{file}: the data it was fitted to do not support it: {warnings}"] if warnings else []
 
@@ -312,7 +320,7 @@ def read_log(
     heading_reference: str | None = None,
     required: Sequence[str] = (),
 ) -> xr.Dataset:
-    """Return logs as one, with headings from true north; report on stderr what reading skipped."""
+    """Read logs as one deployment with headings from true north, and report skipped content on stderr."""
     from magbridge.field.reference import with_true_heading
 
     with waiting("reading"):
@@ -322,7 +330,7 @@ def read_log(
 
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
-    """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
+    """Report skipped content of logs on stderr, from the attributes of a deployment or of its pieces."""
     from magbridge.logs.deployment import COUNTERS, GUESSED_ATTRIBUTE, named_losses, noted, passed_over
 
     for guess in dict.fromkeys(str(attrs.get(GUESSED_ATTRIBUTE, "")) for attrs in pieces):
@@ -341,11 +349,13 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
 
 
 def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:
-    """Return a vehicle's logs with what the field varied by.
+    """Return the logs of a vehicle with the column ``daily_variation`` from a base station.
 
-    That is by a file of its own, or by an observatory's log among the others.
+    The base station is the log `base`, or an observatory's log among `logs`; without both, the logs are
+    returned unchanged.
 
-    FormatError, DataError: the base station's log has no field, or not for the logs' time.
+    FormatError, DataError: the base station's log has no field, or does not cover the time of the logs.
+    WrongUse: there are logs of several observatories.
     """
     from magbridge.field.reference import separate_observatories, with_daily_variation
     from magbridge.logs.deployment import join
@@ -364,13 +374,13 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
 
 
 def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: Any) -> tuple[str, ...]:
-    """Return the parameters of a fit: those that are named, or for ``auto`` the columns that are worth it.
+    """Return the parameters of a fit: the names in `named`, or for ``auto`` the columns that improve it.
 
-    ``auto`` tries positions, currents, temperatures and pressures.
-    The improvement by each column on held-out parts is printed to stderr. `options` are of
+    ``auto`` tries positions, currents, temperatures and pressures, and prints to stderr how much each column
+    improves the prediction of held-out parts. `options` are the options of
     :func:`~magbridge.calibration.fitting.parameter_choice.best_parameters`.
 
-    WrongUse: ``auto`` among names.
+    WrongUse: `named` contains ``auto`` and other names.
     """
     from magbridge.calibration.fitting.parameter_choice import AUTO, best_parameters, lines
     from magbridge.logs.info import conditions, movers
@@ -391,7 +401,7 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
 
 
 def note_missing(calibration: mb.Calibration, deployment: xr.Dataset) -> None:
-    """Warn on stderr of columns that the calibration needs and a log does not have."""
+    """Warn on stderr of columns that the calibration needs but the log does not have."""
     for name in calibration.channels:
         if name not in deployment:
             lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
@@ -400,14 +410,14 @@ def note_missing(calibration: mb.Calibration, deployment: xr.Dataset) -> None:
 
 
 def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
-    """Warn on stderr of logs that hold a reference in every row: a grid is only added to the IGRF."""
+    """Warn on stderr of logs for which the grid is not used, as all rows have ``reference_field``."""
     for log in logs if grid else ():
         if "reference_field" in log and log["reference_field"].notnull().all():
             complain(f"{log.attrs['source']}: has reference_field in every row, so --grid {grid} is not used")
 
 
 def note_no_date(deployment: xr.Dataset) -> None:
-    """Warn on stderr that a log has no anomaly, since the field of its day is not known."""
+    """Warn on stderr if no anomaly can be computed because the log has no date."""
     from magbridge.columns import counts_from_boot
 
     if counts_from_boot(deployment):
@@ -416,7 +426,7 @@ def note_no_date(deployment: xr.Dataset) -> None:
 
 
 def note_settings(*pieces: Mapping[str, Any]) -> None:
-    """Warn on stderr where a bridge was tuned in the course of its log, from the attributes of its pieces."""
+    """Warn on stderr if MB_* parameters changed during a bridge's log, from the attributes of its pieces."""
     from magbridge.logs.deployment import CHANGES_SETTING
 
     for attrs in pieces:
@@ -430,7 +440,10 @@ def note_settings(*pieces: Mapping[str, Any]) -> None:
 
 
 def refuse_unsuited(calibration: mb.Calibration, deployment: xr.Dataset) -> None:
-    """FormatError: a log to be corrected is of another sensor, or parameters or channels in another unit."""
+    """Check that a log suits a calibration.
+
+    FormatError: the log is of another sensor, or a parameter or a channel is in another unit.
+    """
     from magbridge.columns import CHANNELS, require_units
     from magbridge.field.reference import other_units
 

@@ -1,4 +1,4 @@
-"""Correct a log, and write a calibration for other programs."""
+"""Define the commands ``correct`` and ``export``, which apply or convert a calibration."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COPIED_COLUMNS = (
     *("local_north", "local_east", "dr_latitude", "dr_longitude", "gps_latitude", "gps_longitude"),
     *("truth_latitude", "truth_longitude"),
 )
-"""Columns of a log that are copied to the output, with the calibration's parameters."""
+"""Columns of a log that are copied to the output, in addition to the calibration's parameters."""
 
 
 @cli.command("correct FILE... --calibration cal.json -o FILE [OPTIONS]")
@@ -48,28 +48,28 @@ def correct(
 ) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
 
-    The input is the log's rows. A bridge's own log has one row for each reading, with the latest telemetry
-    and its age, and the settings with which the bridge started. In another log every value of telemetry
-    counts as new, and rows without a reading are left out of the output. For the bridge's output bit for bit,
-    run magbridge replay LOG --config bridge.toml --log DIR.
+    A bridge's own log has a row for each reading, with the latest telemetry and its age, and the settings
+    with which the bridge started. In any other log, every telemetry value counts as new, and the output omits
+    rows without a reading. To get the bridge's output bit for bit, run
+    magbridge replay LOG --config bridge.toml --log DIR.
 
     Parameters
     ----------
     files
         The logs of one deployment.
     calibration
-        The calibration (cal.json); with --config by default that of the bridge.
+        The calibration (cal.json); with --config by default the bridge's calibration.
     output
-        The file to write: total field and sigma, vector, anomaly, flags, a compensated scalar if the
-        calibration has one, and the log's position, depth, attitude and parameters.
+        The file to write: total field and sigma, vector, anomaly, flags, the compensated scalar if the
+        calibration has a scalar sensor, and the log's position, depth, attitude and parameters.
     learn
-        Learn the calibration during the run, as a bridge with [learning] does; the log needs positions.
+        Update the calibration during the run, as a bridge with [learning] does; the log needs positions.
     config
-        With --learn: the bridge.toml with [learning]; its calibration, if it has one, is the first.
+        With --learn: the bridge.toml with [learning]; its calibration, if given, is the first calibration.
     save
-        With --learn: where to write the calibration that was published last.
+        With --learn: a file (cal.json) for the calibration that was published last.
     plot
-        A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and the flagged samples.
+        A PNG, PDF or SVG to write, with the corrected field, its 2-sigma band, and the flagged samples.
     """
     source = _source(calibration, config, learn=learn)
     cli.logs_to_read(files, output, source, reading.columns)
@@ -116,9 +116,10 @@ def correct(
 def _scalar_too(
     pieces: Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]], known: mb.Calibration
 ) -> Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]]:
-    """Yield the corrected pieces, with the compensated scalar where the calibration has one.
+    """Yield (log, corrected, correction) of each piece, with the compensated scalar if calibrated.
 
-    The swing of a channel is that of the whole log: with a scalar the pieces are one.
+    With a scalar sensor all pieces are joined, because its compensation needs the range of each channel over
+    the whole log.
     """
     if not known.sensors:
         yield from pieces
@@ -132,7 +133,10 @@ def _scalar_too(
 
 
 def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Path:
-    """Return the file that describes the vehicle: the calibration, or the configuration."""
+    """Return the file that messages name: the calibration, or without it the configuration.
+
+    WrongUse: both are missing, or `config` is given without `learn`.
+    """
     if config is not None and not learn:
         raise WrongUse(
             "--config: expected --learn with it, because only learning uses a bridge.toml; add --learn"
@@ -144,9 +148,9 @@ def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Pa
 
 
 def _known(file: Path | None, config: Path | None) -> tuple[mb.Calibration, Config]:
-    """Return the calibration to begin with, and a bridge's settings.
+    """Return the first calibration and the settings of the bridge; without `config`, default settings.
 
-    ConfigError: the configuration has no calibration, and no ``[learning]`` that could do without.
+    ConfigError: the configuration has no ``[learning]``, or neither a calibration nor a prior.
     """
     from magbridge.bridge.learning import first_calibration
     from magbridge.config import Config, Learning, Link, Sensor
@@ -172,7 +176,10 @@ def _corrected(
     file: Path,
     learn: Config | None,
 ) -> Iterator[tuple[xr.Dataset, xr.Dataset, mb.Correction]]:
-    """Yield each piece of a log, its corrected samples, and the correction; DataError: it has no field."""
+    """Yield each piece of a log, its corrected samples, and the correction.
+
+    DataError: no row of the log has all channels.
+    """
     from magbridge.rows import correct_rows
 
     correction, whole = None, False
@@ -194,7 +201,7 @@ def _corrected(
 
 
 def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learner:
-    """Return a learner with a bridge's settings, which knows of the currents in the log."""
+    """Return a learner with the bridge's settings; without ``[telemetry]`` it uses the log's currents."""
     from magbridge.bridge.learning import open_learner
 
     currents = tuple(str(name) for name in log.data_vars if log[name].attrs.get("units") == "A")
@@ -204,7 +211,7 @@ def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learne
 
 
 def _notify(correction: mb.Correction) -> None:
-    """Print the quality flags and the notifications of learning."""
+    """Print the messages about quality flags and learning to stderr, and delete them."""
     for text in correction.notices:
         cli.complain(text)
     correction.notices.clear()
@@ -215,7 +222,7 @@ def _notify(correction: mb.Correction) -> None:
 
 
 def _keep_learned(learner: Learner, known: mb.Calibration, facts: dict[str, Any], file: Path | None) -> str:
-    """Write the last published calibration, add to the facts to print as JSON, and return a summary."""
+    """Write the last published calibration to `file`, add results to `facts`, and return a summary."""
     from magbridge.calibration.file import calibration_id, save
 
     if file is not None:
@@ -233,7 +240,7 @@ def _keep_learned(learner: Learner, known: mb.Calibration, facts: dict[str, Any]
 def _with_log_columns(
     log: xr.Dataset, corrected: xr.Dataset, known: mb.Calibration, file: Path
 ) -> xr.Dataset:
-    """Return the corrected columns with the log's position, attitude, state and parameters."""
+    """Return the corrected columns with the copied columns and attributes of the log."""
     from magbridge.calibration.file import calibration_id
     from magbridge.logs.deployment import HISTORY_ATTRIBUTE, MEANING, lasting
 
@@ -251,25 +258,25 @@ def _with_log_columns(
 
 @dataclass
 class Tally:
-    """Statistics of a log so far."""
+    """Counts of the corrected samples of a log and of their flags."""
 
     samples: int = 0
     left_out: int = 0
-    """`samples`, `left_out`: Rows corrected, and rows that are not samples."""
+    """`samples`, `left_out`: Number of corrected rows, and of rows without a reading."""
     flagged: int = 0
-    """Samples whose total field is flagged."""
+    """Number of samples with a flag that concerns the total field."""
     flags: Counter[str] = field(default_factory=Counter)
-    """Name of a flag -> samples that carry it."""
+    """Name of a flag -> number of samples with the flag."""
     unearthly: int = 0
-    """Samples whose total field is outside the Earth's range."""
+    """Number of samples whose total field is outside the range of the Earth's main field."""
 
     def add(self, corrected: xr.Dataset, rows: int) -> None:
-        """Count the samples of a corrected piece of the log."""
+        """Add the samples of a corrected piece of the log, which had `rows` rows."""
         from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
         self.samples += corrected.sizes["time"]
         self.left_out += rows - corrected.sizes["time"]
-        of_total = ~Quality.NO_BORESIGHT  # which concerns the vector alone
+        of_total = ~Quality.NO_BORESIGHT  # NO_BORESIGHT concerns only the vector
         quality = corrected["quality"].to_numpy().astype(int)
         self.flagged += int((quality & of_total != 0).sum())
         self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in of_total})
@@ -277,7 +284,7 @@ class Tally:
         self.unearthly += int(((total < MAIN_FIELD_RANGE_NT[0]) | (total > MAIN_FIELD_RANGE_NT[1])).sum())
 
     def warning(self) -> str:
-        """Return a warning if most total fields are not the Earth's; else an empty text."""
+        """Return a warning if most total fields are outside the Earth's range; else an empty text."""
         from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
         if self.unearthly <= self.samples / 2:
@@ -289,12 +296,12 @@ class Tally:
         )
 
     def facts(self) -> dict[str, Any]:
-        """Return the numbers to print as JSON."""
+        """Return the counts for JSON."""
         left_out = {"left_out": self.left_out}
         return {"rows": self.samples, "flagged": self.flagged, "flags": +self.flags, **left_out}
 
     def summary(self) -> str:
-        """Return the numbers in a sentence."""
+        """Return the counts as a sentence."""
         named = ", ".join(f"{name} {count}" for name, count in (+self.flags).items())
         text = f"{counted(self.samples, 'sample')}, {self.flagged} of them flagged"
         text += f" ({named})" if named else ""
@@ -304,7 +311,7 @@ class Tally:
 
 
 SEAGLIDER_COUNT_NT = 100.0
-"""Field of one count of most compasses of Seagliders, nT."""
+"""Field of one count in most compasses of Seagliders, nT."""
 
 
 @cli.command(
@@ -336,21 +343,23 @@ def export(
     c
         A folder for magbridge_calibration.h and .c (C99, no allocation), and magbridge_scalar.h and .c.
     ardupilot
-        A .param file: offsets, diagonals, off-diagonals and the motors' current of a compass.
+        A .param file for ArduPilot: offsets, diagonals, off-diagonals and motor-current compensation of a
+        compass.
     px4
-        A parameter file of QGroundControl: the same for PX4.
+        A parameter file (.params) of QGroundControl with the same parameters for PX4.
     number
-        Which of the autopilot's compasses, from 0.
+        Number of the compass in the autopilot, from 0.
     seaglider
-        The compass coefficients (tcm2mat.cal) of a Seaglider: one offset and one matrix, with the boresight.
+        A file with the compass coefficients (tcm2mat.cal) of a Seaglider: one offset and one matrix, with the
+        boresight.
     nt_per_count
-        For --seaglider: nT in a count of its compass, 100 for most, 56 for type 4.
+        For --seaglider: field in nT of one count of its compass, 100 for most types, 56 for type 4.
     table
-        A table (.csv) of offset and matrix at positions of one mass, for loggers that can hold one.
+        A table (.csv) of offset and matrix at positions of one mass, for loggers that accept such a table.
     parameter
-        For --table: the mass; by default the first parameter.
+        For --table: name of the mass; by default the first parameter.
     dip
-        For --seaglider: the inclination of the Earth's field in deg, on which the heading error depends.
+        For --seaglider: inclination of the Earth's field in deg, for the reported heading error.
     """
     if not any((c, ardupilot, px4, seaglider, table)):
         raise WrongUse(
@@ -388,7 +397,7 @@ def export(
 def _autopilot(
     file: Path, known: mb.Calibration, ardupilot: Path | None, px4: Path | None, number: int
 ) -> dict[Path, str]:
-    """Return the autopilots' parameter files that are asked for; report what these cannot hold."""
+    """Return path -> text of the requested autopilot files; report on stderr what they cannot hold."""
     from magbridge.calibration import export_compass
 
     if ardupilot is None and px4 is None:
@@ -406,7 +415,7 @@ def _autopilot(
 
 
 def _in_c(known: mb.Calibration, folder: Path) -> dict[Path, str]:
-    """Return the C files of a calibration, with those of its first scalar magnetometer."""
+    """Return path -> text of the C files of a calibration and of its first scalar magnetometer."""
     from magbridge.calibration.export_c import c_header, c_source
     from magbridge.calibration.export_scalar import scalar_header, scalar_source
 
@@ -421,7 +430,7 @@ def _in_c(known: mb.Calibration, folder: Path) -> dict[Path, str]:
 
 
 def _seaglider(file: Path, known: mb.Calibration, nt_per_count: float, dip: float) -> str:
-    """Return a Seaglider's coefficients; report on stderr what they cannot hold, and its cost in degrees."""
+    """Return a Seaglider's coefficients; report on stderr the omitted effects and their heading error."""
     from magbridge.calibration.export_compass import heading_cost, seaglider
 
     text = seaglider(known, nt_per_count)

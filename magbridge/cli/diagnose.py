@@ -1,4 +1,4 @@
-"""Diagnose: what the calibration model gets wrong, and why."""
+"""Define the command ``diagnose``, which finds errors of the calibration model and their causes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 FILL_VALUES = (-9999.0, -99999.0)
-"""Numbers that logs commonly use for "not known", in any unit."""
+"""Numbers that logs commonly use in place of an unknown value, in any unit."""
 ITSELF = (
     "the calibration was fitted to this log and has absorbed part of its errors, so that the remaining part "
     "easily gets a wrong name, and nothing is held out; calibrate on separate calibration runs, with "
@@ -35,25 +35,25 @@ def diagnose(
     reading: cli.ReadingOptions = cli.AS_THEY_SAY,
     json: cli.Json = False,
 ) -> None:
-    """Find the errors of the calibration model and their causes, and measure how much an extension gains.
+    """Find the errors of the calibration model and their causes, and test an extended calibration.
 
-    Writes report.html, for people: the causes, how certain they are, and whether the extended calibration may
-    be used; findings.json, the same for programs; and calibration.json, the extended calibration, for
-    correct, run and replay.
+    The command writes three files. report.html states the causes, how certain they are, and if the extended
+    calibration may be used. findings.json has the same content for programs. calibration.json is the extended
+    calibration, for correct, run and replay.
 
     Parameters
     ----------
     files
-        Logs that the calibration was not fitted to. The improvement is measured on whole dives left out in
-        turn, or on eighths of a log with fewer than four dives.
+        Logs that the calibration was not fitted to. The improvement is measured by leaving out each dive in
+        turn, or each eighth of a log with fewer than four dives.
     calibration
         The calibration (cal.json).
     output
         The folder to write to.
     training_logs
-        A log that the calibration was fitted to, to find newer errors; may be repeated.
+        A log that the calibration was fitted to, to identify errors that appeared later; may be repeated.
     grid
-        An anomaly grid to add to the IGRF, where a log has no reference_field.
+        An anomaly grid to add to the IGRF, for logs without reference_field.
     """
     cli.logs_to_read(files, output / "calibration.json", calibration, grid)
     from magbridge.diagnose.report.findings import findings
@@ -96,14 +96,14 @@ def diagnose(
 
 
 def summary(facts: dict[str, Any], parts: str) -> str:
-    """Return the findings in lines: the verdict with its RMS, fit for use or why not, each cause.
+    """Return the findings as lines: the verdict with RMS errors, the fitness for use, and each cause.
 
     Parameters
     ----------
     facts : dict
         Contents of ``findings.json``.
     parts : str
-        Parts that were held out in turn to measure the RMS after; empty if none was.
+        Description of the parts that were held out to measure the RMS after extension; empty if none was.
     """
     from magbridge.diagnostics import number
 
@@ -123,7 +123,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
-    """Return a line for each cause found, with the alternatives to it, and for the unexplained residual."""
+    """Return a line for each cause found, with its alternatives, and a line for the unexplained residual."""
     from magbridge.diagnose.observed import WHITE
     from magbridge.diagnostics import number
 
@@ -148,7 +148,7 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
 
 
 def _followed(series: dict[str, Any] | None) -> str:
-    """Return the series that an effect follows, with lag and axis, without its interpretation."""
+    """Return the text about the series that an effect is correlated with: channel, lag and axis."""
     if not series:
         return ""
     late = f" {series['lag_s']:g} s late" * bool(series["lag_s"])
@@ -161,7 +161,7 @@ def _plain(cause: dict[str, Any]) -> str:
 
 
 def _suspect(log: xr.Dataset) -> Iterator[str]:
-    """Yield warnings of isolated values that may be codes for 'not known': they would look like an effect."""
+    """Yield a warning for each column with isolated values that may be codes for an unknown value."""
     for name, column in log.data_vars.items():
         values = column.to_numpy()
         for nothing in FILL_VALUES:

@@ -1,4 +1,4 @@
-"""Many vehicles, many logs: catalogue them, process new ones, show changes."""
+"""Define the commands ``fleet``: catalogue logs of many vehicles, process them, and show changes."""
 
 from __future__ import annotations
 
@@ -41,27 +41,28 @@ def add(
     catalogue: Where = HERE,
     json: cli.Json = False,
 ) -> None:
-    """Put vehicles and logs on record, in a new catalogue if there is none; nothing is added twice.
+    """Add vehicles and logs to a catalogue, which is created if missing; repeated additions do nothing.
 
     Parameters
     ----------
     files
         A fleet.toml with vehicles, deployments and patterns of logs; or the logs of one deployment; or a
-        calibration of it that was made elsewhere (cal.json).
+        calibration of one deployment that was made elsewhere (cal.json).
     vehicle
-        The logs' vehicle. It is new where --parameter is given.
+        Name of the logs' vehicle. With --parameter, the vehicle is added.
     deployment
-        The logs' deployment; the same vehicle may have several.
+        Name of the logs' deployment; a vehicle may have several deployments.
     refit
-        Which refit it flew with, any name. By default each deployment counts as its own.
+        Name of the vehicle's refit in the deployment. By default each deployment is a new refit.
     parameter
-        A column that moves one of the vehicle's masses; may be repeated.
+        A column with the position of one of the vehicle's masses; may be repeated.
     serial
-        The vehicle's serial number: distinguishes two of one name.
+        The vehicle's serial number, which distinguishes two vehicles of one name.
     sensor
-        Its sensor: logs of another are refused. Without --parameter, that of this deployment.
+        The vehicle's sensor; logs of other sensors are rejected. Without --parameter: the sensor of this
+        deployment only.
     date
-        When the deployment of a calibration began (YYYY-MM-DD).
+        Start of the deployment of a given calibration (YYYY-MM-DD).
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.memory import add_calibration
@@ -106,7 +107,7 @@ def add(
 
 
 def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
-    """Return the fleet.toml, the calibrations and the logs among files."""
+    """Return three lists of files by suffix: fleet.toml (.toml), calibrations (.json), and logs."""
     kinds: dict[str, list[Path]] = {".toml": [], ".json": [], "": []}
     for file in files:
         kinds.get(file.suffix.lower(), kinds[""]).append(file)
@@ -114,7 +115,7 @@ def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
 
 
 def _calibrations(files: Sequence[Path], date: dt.date | None) -> list[tuple[float, mb.Calibration]]:
-    """Return when each calibration's deployment began, s since 1970, and the calibration."""
+    """Return the start of the deployment, s since 1970, and the calibration in each file."""
     if files and date is None:
         raise WrongUse(f"{files[0]}: expected --date YYYY-MM-DD, the day on which its deployment began")
     start = dt.datetime.combine(date, dt.time(), dt.UTC).timestamp() if date else 0.0
@@ -134,7 +135,7 @@ def process(
     scheduler: str = "",
     json: cli.Json = False,
 ) -> None:
-    """Read, check, calibrate and correct new logs; continue where it was interrupted.
+    """Read, check, calibrate and correct new logs; a new call continues after an interruption.
 
     The logs of a deployment are calibrated together, as calibrate does. An error in one log is printed, and
     the other logs are processed.
@@ -142,20 +143,21 @@ def process(
     Parameters
     ----------
     results
-        Folder for corrected logs and maps; by default results in the catalogue's folder, and fleet-results
-        here for one on a server.
+        Folder for corrected logs and maps; by default results in the catalogue's folder, or fleet-results in
+        the working directory for a catalogue on a server.
     diagnose
         Also diagnose each deployment.
     maps
         Also make each deployment's anomaly map.
     retry
-        Also try deployments again in which something failed.
+        Also process deployments again that had failures.
     workers
-        Processes on this machine.
+        Number of processes on this machine.
     memory
-        Memory that each process may use.
+        Memory that each process may use, such as "4 GiB".
     scheduler
-        Address of a dask scheduler to use instead, as tcp://host:8786. Its workers see the same folders.
+        Address of a dask scheduler to use instead of local processes, such as tcp://host:8786. Its workers
+        must have access to the same folders.
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.memory import remember
@@ -190,7 +192,7 @@ def process(
 
 @fleet.command
 def status(*, catalogue: Where = HERE, json: cli.Json = False) -> None:
-    """Print the catalogued logs, the finished work, and the failures."""
+    """Print the numbers of catalogued, calibrated, failed and new logs of each vehicle, and the failures."""
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.register import status as of
 
@@ -217,9 +219,9 @@ def show(
     Parameters
     ----------
     vehicle
-        Its name; all vehicles, if none is given.
+        Name of the vehicle; by default all vehicles.
     html
-        Pages to write, with pictures: a file (.html) with all vehicles, or a folder with a page of each
+        Pages with charts to write: a file (.html) with all vehicles, or a folder with a page for each vehicle
         and all numbers as fleet.json.
     """
     from magbridge.fleet.catalogue import open_catalogue
@@ -256,16 +258,16 @@ def export(
     catalogue: Where = HERE,
     json: cli.Json = False,
 ) -> None:
-    """Write the prediction for a vehicle's next deployment as a calibration, before any run is flown.
+    """Write the predicted calibration of a vehicle's next deployment, before its calibration runs.
 
     Parameters
     ----------
     vehicle
-        Its name.
+        Name of the vehicle.
     output
         The calibration to write (cal.json).
     refit
-        The refit it will fly with; by default a new one.
+        Name of the vehicle's refit in that deployment; by default a new refit.
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.memory import fleet_of, unflown
@@ -284,7 +286,7 @@ def export(
 
 
 def _lines(facts_of: dict[str, dict[str, Any]]) -> list[str]:
-    """Return a line for each vehicle, and for each change of it."""
+    """Return a line for each vehicle, and a line for each change of its coefficients."""
     lines = []
     for name, one in facts_of.items():
         parts = one["deployments"]

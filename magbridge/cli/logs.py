@@ -1,4 +1,4 @@
-"""Look at, convert and simulate logs, and merge anomaly grids: commands that need no calibration."""
+"""Define the commands that describe, convert and simulate logs, and that merge anomaly grids."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ if TYPE_CHECKING:
 
 
 WIDE_TERMINAL = 110
-"""Characters of a terminal from which on the meanings are shown."""
+"""Width of a terminal, characters, from which the table of columns includes their meanings."""
 MAX_LISTED_LOGS = 3
-"""Largest number of logs whose names are listed above what they hold together."""
+"""Largest number of combined logs that the title lists by name."""
 
 
 @cli.command("info FILE... [OPTIONS]")
 def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.Json = False) -> None:
-    """Describe logs: columns, units, rates, gaps, ranges, and the commands that could use them.
+    """Describe logs: columns, units, rates, gaps, ranges, and the commands that can use them.
 
-    Several logs are described one after the other; a sensor's own log and a vehicle's logs also together.
+    The command describes several logs one after the other. It also describes the combination of a sensor's
+    own log with the vehicle's logs.
 
     Parameters
     ----------
@@ -82,7 +83,7 @@ def _show(file: str, facts: dict[str, Any]) -> None:
 
 
 def summary(facts: dict[str, Any]) -> str:
-    """Return a log's rows, its time, its rate and its gaps in a sentence."""
+    """Return a sentence with a log's number of rows, its time span, its rate and its gaps."""
     if not facts["rows"]:
         return "no rows"
     boot = facts["references"]["time_reference"] == "boot"
@@ -136,7 +137,7 @@ def _uses(facts: dict[str, Any]) -> Table:
 
 
 def _plain(text: str) -> str:
-    """Return a text whose brackets are not taken for rich's markup."""
+    """Return `text` with its brackets escaped, so that rich does not read them as markup."""
     from rich.markup import escape
 
     return escape(text)
@@ -160,7 +161,7 @@ def convert(
     output
         The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
     metadata
-        A metadata.toml with people, platform and sensor, for a netCDF of OceanGliders OG1.0.
+        A metadata.toml about people, platform and sensor, to write a netCDF in the format OceanGliders OG1.0.
     """
     cli.logs_to_read(files, output, metadata)
     if metadata and output.suffix.lower() != ".nc":
@@ -184,7 +185,7 @@ def convert(
 
 
 def _og(metadata: Path) -> Callable[[Path], None]:
-    """Return a function that completes a netCDF file to one of OG1.0 with this metadata."""
+    """Return a function that completes a netCDF file to the format OG1.0 with the given metadata."""
     from magbridge.logs.og import complete, read_metadata
 
     return partial(complete, metadata=read_metadata(metadata))
@@ -203,25 +204,26 @@ def simulate(
     map_output: Annotated[Path | None, Parameter(name="--map", validator=cli.file_to_write(".nc"))] = None,
     json: cli.Json = False,
 ) -> None:
-    """Simulate a deployment from the forward model.
+    """Simulate the log of a deployment with the forward model of field, vehicle and sensor.
 
     Parameters
     ----------
     scenario
-        A scenario file, or a built-in one: demo, survey, bonne_bay, random_glider; comet and seaglider, which
-        need --trajectory-from; turn_on, warming, bolt, pump and battery, in which the vehicle changes.
+        A scenario file, or the name of a built-in scenario: demo, survey, bonne_bay or random_glider; comet
+        or seaglider, which need --trajectory-from; turn_on, warming, bolt, pump or battery, in which the
+        vehicle changes.
     output
         The file to write.
     seed
-        Determines everything that the scenario leaves open; the same seed gives the same deployment.
+        Seed of the random numbers; the same scenario and seed give the same deployment.
     trajectory_from
-        A log whose attitude, position and masses replace the scenario's mission; may be repeated. All logs
-        of one call are in one world.
+        A log whose attitude, position and masses replace the scenario's mission; may be repeated. The logs of
+        one call share the same simulated world.
     reference
-        Content of reference_field, instead of the scenario's: none leaves it out; true is the true total
-        field; map is the main field with the anomaly of an airborne survey.
+        Content of reference_field, instead of the scenario's. none: the column is omitted; true: the true
+        total field; map: the main field plus the anomaly of a simulated airborne survey.
     map_output
-        Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
+        A file (.nc) for the anomaly grid that an aeromagnetic survey of the simulated world would produce.
     """
     from magbridge.logs import write
     from sitl.scenario import load
@@ -267,27 +269,28 @@ def map(  # noqa: A001 - the command's name
     plot: cli.Plot = None,
     json: cli.Json = False,
 ) -> None:
-    """Combine the grids of several surveys into one anomaly map: continue upward, merge, mask, smooth.
+    """Combine the grids of several surveys into one anomaly map: continue upward, merge, mask and smooth.
 
     Parameters
     ----------
     grids
-        The grids: netCDF, Surfer, Geosoft, ESRI ASCII, GeoTIFF or XYZ.
+        The grids to combine: netCDF, Surfer, Geosoft, ESRI ASCII, GeoTIFF or XYZ.
     output
         The map to write, netCDF.
     altitude
-        Altitude in m to which every grid is continued upward; by default that of the highest.
+        Altitude in m to which every grid is continued upward; by default the altitude of the highest grid.
     survey_altitude
-        Altitude in m of surveys whose grids do not state it: one for all grids, or repeated, one for each.
+        Altitude in m of surveys whose grids do not state it: one value for all grids, or repeated, one value
+        for each grid.
     smooth
-        Wavelength in km at which half of a wave is left; the removed part counts as the map's sigma. By
-        default nothing is smoothed.
+        Wavelength in km at which smoothing halves the amplitude; the removed part is included in the map's
+        sigma. By default the map is not smoothed.
     mask
-        A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
+        A CSV of longitude,latitude (deg) with the polygon outside which the map is blank.
     spacing
-        Node spacing in deg; by default that of the finest grid.
+        Node spacing in deg; by default the spacing of the finest grid.
     plot
-        A PNG, PDF or SVG to draw, with every step.
+        A PNG, PDF or SVG to write, with a map of every step.
     """
     from magbridge.field.continuation import draw_steps, prepare, surveyed_at
     from magbridge.field.read import read_grid, read_polygon

@@ -1,4 +1,4 @@
-"""Navigate: find the track by the field, or compute before a dive how accurate a map allows it to be."""
+"""Define the command ``navigate``, which estimates a track from the field, or its accuracy in advance."""
 
 from __future__ import annotations
 
@@ -36,31 +36,31 @@ def navigate(
 ) -> None:
     """Find the track by matching the corrected field to an anomaly map.
 
-    Writes the filtered and the smoothed track with covariance and innovations. Without --map, crossings of
-    the track in the field correct it, and the result is one smoothed track. With --bound, FILE is a planned
-    track (time, latitude, longitude of its corners), and the result is the smallest error that any filter can
-    reach.
+    The output is the filtered and the smoothed track with covariance and innovations. Without --map, the
+    command corrects the track where it crosses itself, and the output is one smoothed track. With --bound,
+    FILE is a planned track (time, latitude, longitude of its corners), and the output is the smallest error
+    that any filter can reach.
 
     Parameters
     ----------
     files
-        The logs of one deployment, with telemetry for dead reckoning; or the plan.
+        The logs of one deployment, with telemetry for dead reckoning; with --bound, the planned track.
     output
         The file to write.
     map
-        The anomaly grid. Without one: localisation in the survey's own field.
+        The anomaly grid. If not given, the field that the log itself measures serves as the map.
     calibration
-        The calibration (cal.json). A log with total_field, corrected or of a scalar magnetometer, needs none.
-        For a plan it gives the sensor noise; without it 1 nT.
+        The calibration (cal.json). It is not needed for a log with total_field, either corrected or of a
+        scalar magnetometer. With --bound, it gives the sensor noise; the default noise is 1 nT.
     config
-        A bridge.toml whose [navigation.options] give the uncertainty of start, current and map.
+        A bridge.toml whose [navigation.options] state the uncertainty of start, current and map.
     bound
         Compute the accuracy that the map allows along a planned track.
     sample_interval
-        Seconds between samples, for --bound. By default those of FILE where it is a log with a magnetometer,
-        else those of the calibration, else 4.
+        With --bound: time between samples in s. By default that of FILE if it is a log with a magnetometer,
+        else that of the calibration, else 4.
     plot
-        A PNG, PDF or SVG to draw: the tracks, on the map if there is one, errors and sigma; or the bound.
+        A PNG, PDF or SVG to write, with the tracks, the map if given, errors and sigma; or with the bound.
     """
     cli.logs_to_read(files, output, map, calibration, config)
 
@@ -100,7 +100,7 @@ def navigate(
 
 
 def _options_for(deployment: xr.Dataset, known: mb.Calibration | None) -> NavigationOptions:
-    """Return the filter's options as the calibration, or else the log's own level, gives them."""
+    """Return the filter's default options, with the noise and bias of the calibration or else of the log."""
     from magbridge.navigate import NavigationOptions
     from magbridge.navigate.options import informed, with_level
 
@@ -113,7 +113,7 @@ def _options_for(deployment: xr.Dataset, known: mb.Calibration | None) -> Naviga
 def _scalar(
     files: tuple[Path, ...], heading_reference: cli.Heading, reading: cli.ReadingOptions
 ) -> xr.Dataset:
-    """Return logs that hold the total field; WrongUse: they hold what must be corrected first."""
+    """Return the logs as one, with its total field; WrongUse: ``total_field`` is missing."""
     log = cli.read_log(files, reading, heading_reference)
     if "total_field" not in log:
         raise WrongUse(f"{log.attrs['source']}: expected a column total_field, or --calibration cal.json")
@@ -127,7 +127,7 @@ def _corrected(
     heading_reference: cli.Heading,
     reading: cli.ReadingOptions,
 ) -> xr.Dataset:
-    """Return the logs with their field corrected by the calibration `known`, which the file holds."""
+    """Return the logs as one, corrected with the calibration `known` from the file `calibration`."""
     from magbridge.columns import CHANNELS
     from magbridge.rows import correct_rows
 
@@ -141,7 +141,7 @@ def _corrected(
 
 
 def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
-    """Return a track's accuracy: by the filter's own sigma, and by the true track where the log has it."""
+    """Return values and text of a track's accuracy: its sigma, and its error if the truth is known."""
     from magbridge.navigate.findings import errors
 
     valid, rows = float(track["valid"].mean()), track.sizes["time"]
@@ -199,7 +199,7 @@ def _bound(
 
 
 def _sample_interval(plan: xr.Dataset, calibration: mb.Calibration | None) -> float:
-    """Return the s between samples: those of a log, else those that a calibration was fitted to."""
+    """Return the time between samples, s: of a log with a field, else of the calibration, else 4."""
     if plan.sizes["time"] > 2 and {"mag_x", "total_field"} & set(plan.variables):
         return float(plan["time"].diff("time").median())
     if calibration is not None and calibration.noise.interval > 0.0:
@@ -210,7 +210,7 @@ def _sample_interval(plan: xr.Dataset, calibration: mb.Calibration | None) -> fl
 def _continued(
     grid: AnomalyGrid, options: NavigationOptions, deployment: xr.Dataset
 ) -> tuple[AnomalyGrid, NavigationOptions]:
-    """Return the map continued to the deployment's depth, and options with the error of that; report it."""
+    """Return the map continued to the deployment's depth, and options with the error of the continuation."""
     from magbridge.navigate.options import at_depth
 
     there, known = at_depth(grid, options, deployment.get("depth", 0.0))
@@ -225,7 +225,10 @@ def _continued(
 
 
 def _options(config: Path | None) -> NavigationOptions | None:
-    """Return the options of a bridge's configuration; None where it has none."""
+    """Return ``[navigation.options]`` of a configuration; None without `config`.
+
+    ConfigError: the table is missing.
+    """
     from magbridge.navigate import NavigationOptions
     from magbridge.toml import convert, load_toml
 

@@ -1,4 +1,4 @@
-"""Make a survey's anomaly map from its logs, and plan the next survey or calibration runs."""
+"""Define the commands ``survey``, which makes an anomaly map, and ``plan``, which plans runs."""
 
 from __future__ import annotations
 
@@ -27,23 +27,24 @@ if TYPE_CHECKING:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class CorrectionOptions:
-    """Correction of raw logs.
+    """Options for the correction of raw logs.
 
     Parameters
     ----------
     parameter
-        A column that gives the position of a moving mass, or a current; may be repeated. auto: those of the
-        log that predict held-out parts better.
+        A column with the position of a moving mass, or a current; may be repeated. auto: the columns of the
+        log that improve the prediction of held-out parts.
     order
         Highest total degree of the polynomials in the parameters.
     calibration
-        A calibration (cal.json) to correct with instead; may be repeated, once for each raw log in order.
+        A calibration (cal.json) to use instead of fitting one; may be repeated, once for each raw log in
+        order.
     save
-        The calibration found, to write (cal.json).
+        A file (cal.json) for the fitted calibration.
     position_sigma
         1-sigma in m of the slow drift of dead-reckoned positions; 0: positions are exact.
     base
-        A base station's log (total_field, or a vector): its variation is subtracted. A log of an
+        A base station's log (total_field, or a vector), whose variation is subtracted. A log of an
         observatory (IAGA-2002) among the logs is used in the same way.
     """
 
@@ -58,25 +59,26 @@ class CorrectionOptions:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class MapOptions:
-    """Products of the corrected samples.
+    """Options for the map and other products of the corrected samples.
 
     Parameters
     ----------
     spacing
-        Distance between nodes of the map in m; by default an eighth of the crustal field's length.
+        Distance between nodes of the map in m; by default an eighth of the crustal field's correlation
+        length.
     altitude
-        Altitude in m to which the map is continued upward; by default that of the survey.
+        Altitude in m to which the map is continued upward; by default the altitude of the survey.
     predict
-        A table with longitude and latitude (and height or depth): anomaly and anomaly_sigma there are
-        written to the output, instead of a map.
+        A table of points with longitude and latitude (and height or depth). The output is then a table of
+        anomaly and anomaly_sigma at these points, instead of a map.
     geotiff
-        The map as GeoTIFF, too.
+        A file for the map as GeoTIFF, in addition.
     tracks
-        The tracks, as GeoJSON or KML.
+        A file for the tracks, GeoJSON or KML.
     crossovers
-        A table of the crossovers with their mis-ties before and after levelling.
+        A table (.csv) to write of the crossovers, with their mis-ties before and after levelling.
     plot
-        A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
+        A PNG, PDF or SVG to write, with map, sigma, track, residuals and crossovers.
     """
 
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None
@@ -102,20 +104,20 @@ def survey(
     reading: cli.ReadingOptions = cli.AS_THEY_SAY,
     json: cli.Json = False,
 ) -> None:
-    """Make an anomaly map, with its sigma, from a survey's own logs: no calibration runs, no map.
+    """Make an anomaly map and its sigma from the logs of a survey, without calibration runs or another map.
 
-    Raw logs are calibrated with an estimate of the crustal field, from the same data, unless a calibration is
-    given. Lines are levelled, slow changes with time are subtracted, and the field is gridded.
+    Unless a calibration is given, the command fits one to the raw logs together with the crustal field. It
+    levels the lines, subtracts slow changes with time, and grids the field.
 
-    With --strict, also exit with 1 when the data do not support the calibration.
+    With --strict, the exit code is also 1 if the data do not support the calibration.
 
     Parameters
     ----------
     logs
         The survey's logs: raw (mag_x mag_y mag_z), or corrected elsewhere (total_field or anomaly, with line
-        and line_type where there are any), also a plain table without times.
+        and line_type if available). A corrected log may be a table without times.
     output
-        The map, netCDF (.nc): what navigate --map takes. With --predict: the predictions (.csv).
+        The map to write, netCDF (.nc), for navigate --map. With --predict: the predictions (.csv).
     """
     from magbridge.survey.maps import write_crossovers, write_tracks
     from magbridge.survey.run import facts, summary
@@ -151,7 +153,7 @@ def _scalar_survey(
     correction: CorrectionOptions,
     reading: cli.ReadingOptions,
 ) -> Result:
-    """Return the survey of a scalar magnetometer."""
+    """Return the survey result from the column of a scalar magnetometer."""
     from magbridge.calibration.fitting.scalar_log import telemetry_columns
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
@@ -175,7 +177,7 @@ def _scalar_survey(
 
 
 def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cli.ReadingOptions) -> Samples:
-    """Return the corrected samples of all files."""
+    """Return the samples of all files, corrected; raw logs without a calibration are calibrated first."""
     from magbridge.columns import CHANNELS
     from magbridge.field.reference import placed
     from magbridge.logs import read_each
@@ -205,7 +207,7 @@ def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cl
 
 
 def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict: bool) -> Fit:
-    """Return the fit that the raw logs give themselves; write it where that is asked for."""
+    """Return the fit of a calibration to the raw logs of the survey; write the calibration if requested."""
     from magbridge.calibration.fitting.observe import observations
     from magbridge.columns import require
     from magbridge.logs.deployment import join
@@ -235,7 +237,7 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
 
 
 def _predict(done: Result, points: Path, output: Path) -> None:
-    """Write the anomaly at the user's points."""
+    """Write the anomaly and its sigma at the points in a table."""
     from magbridge.survey.maps import write_points
     from magbridge.survey.read import read_points
 
@@ -245,7 +247,7 @@ def _predict(done: Result, points: Path, output: Path) -> None:
 
 
 def _map(done: Result, output: Path, products: MapOptions) -> None:
-    """Write the map in every form that is asked for."""
+    """Write the map, and its GeoTIFF and plot if requested."""
     from magbridge.survey.maps import anomaly_map, write_geotiff
 
     spacing, altitude = products.spacing, products.altitude
@@ -273,25 +275,25 @@ def plan(
     reading: cli.ReadingOptions = cli.AS_THEY_SAY,
     json: cli.Json = False,
 ) -> None:
-    """Choose the calibration runs to fly next: those that make the mission's worst error smallest.
+    """Choose the next calibration runs so that the largest error of the mission becomes smallest.
 
-    With --survey: the patterns of a survey that calibrates itself, without runs and without a map, with the
-    expected accuracy of each.
+    With --survey, the command instead proposes patterns of a survey that calibrates itself, without runs and
+    without a map, with the expected accuracy of each pattern.
 
     Parameters
     ----------
     mission
-        A log, real or simulated, that flies as the mission will: attitude, position, moving masses.
+        A real or simulated log with the attitude, position and moving masses of the planned mission.
     calibration
-        The calibration so far (cal.json). A survey can be planned without one.
+        The present calibration (cal.json); with --survey it is optional.
     runs
-        Number of spirals.
+        Number of spirals to choose.
     survey
-        Hours that a survey may take.
+        Largest duration of a survey, in hours.
     parameter
-        With --survey and no calibration: a column that gives a moving mass's position; may be repeated.
+        With --survey and without --calibration: a column with the position of a moving mass; may be repeated.
     roll
-        Largest bank angle in deg that the vehicle can fly, either way.
+        Largest bank angle of the vehicle in deg, to either side.
     """
     from magbridge.calibration.planning import plan as flights
     from magbridge.calibration.planning import survey_patterns
