@@ -66,7 +66,7 @@ class OffsetBlock(ParameterBlock):
 class SlowFunctions:
     """Array (n, r) of functions that change slowly with time, computed only for the rows that are indexed.
 
-    `time` (n,): s. `fastest`: half the period of the fastest function, s.
+    `time` (n,): times of the samples, s. `fastest`: half the period of the fastest function, s.
 
     Notes
     -----

@@ -122,7 +122,7 @@ class GaussianField:
 
     @property
     def condition(self) -> float:
-        """The precision's largest eigenvalue over its smallest."""
+        """Ratio of the precision's largest eigenvalue to its smallest."""
         lifted = (1.0 + MAX_LAPLACIAN_EIGENVALUE / POLE) ** 2 if self.harmonic else 1.0
         return float(np.prod(1.0 + MAX_LAPLACIAN_EIGENVALUE / self._kappa2)) * lifted
 

@@ -1,9 +1,9 @@
-r"""The noise of residuals: size, autocorrelation, white fraction and outliers.
+r"""Model, remove and estimate the noise of residuals: standard deviation, autocorrelation and outliers.
 
 Noise is the sum of a slow part, a first-order autoregressive process AR(1) of autocorrelation :math:`\rho`
-at one sampling interval, and a white part with the fraction f of the variance. :class:`NoiseModel` states
-it, :class:`Whitening` removes its correlation, :func:`estimate_noise` and :func:`fit_slow_and_white` estimate
-it from the residuals of a fit.
+at one sampling interval, and a white part with the fraction f of the variance. :class:`NoiseModel` holds
+these numbers, :class:`Whitening` removes the correlation, and :func:`estimate_noise` and
+:func:`fit_slow_and_white` estimate the noise from the residuals of a fit.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STEADY_STATE_TOLERANCE = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """The noise of residuals, and which samples are outliers."""
+    """Noise of residuals: standard deviation, autocorrelation, white fraction and outliers."""
 
     sigma: float
     """Standard deviation of a sample, nT in sensor axes."""

@@ -1,9 +1,9 @@
 r"""Sequential test of a Kalman filter's innovations for changes of unknown onset, amplitude and kind.
 
 While its model holds, a filter's innovations v are white, of variance S. A change of amplitude a adds
-:math:`\phi^T a` to them. Here :math:`\phi` is the signature as the filter sees it: the signature f in the
-residual, and what the filter has already absorbed of the change (Willsky & Jones 1976, IEEE Trans. Automatic
-Control 21:108),
+:math:`\phi^T a` to them. Here :math:`\phi` is the signature in the innovation. It is the signature f in the
+residual plus the effect of the change :math:`\Xi` that the filter has already absorbed in its state (Willsky
+& Jones 1976, IEEE Trans. Automatic Control 21:108),
 
 .. math:: \phi = f + \Xi^T h, \qquad \Xi \leftarrow \Xi - k \phi^T
 
@@ -13,7 +13,7 @@ is
 .. math:: L = \tfrac12 y^T (I + M)^{-1} y - \tfrac12 \log \det(I + M), \quad
           M = \sum \phi \phi^T / S, \quad y = \sum \phi v / S
 
-It is a mixture over all amplitudes, so that none needs to be known. Each kind of change is tested with
+It is a mixture over all amplitudes, so the test needs no amplitude. Each kind of change is tested with
 several onsets at a time. They restart after 4, 16, 64 ... measurements. As L starts from 0, :math:`e^L` is a
 martingale of mean 1 each time, and it exceeds :math:`e^h` by chance with a probability of at most
 :math:`e^{-h}` (Ville's inequality).
@@ -40,8 +40,8 @@ from magbridge.estimation.kalman import KalmanFilter
 __all__ = ["ALARM_LOG_RATIO", "RESTART_PERIODS", "SequentialTest"]
 
 ALARM_LOG_RATIO: Final = 18.0
-"""Threshold h of L. Eight kinds of change have 2.7 onsets a measurement, so false alarms come at most once in
-``e^18 / 2.7`` measurements, 3 years at 0.25 Hz, if the noise is as stated."""
+"""Threshold h of L. Eight kinds of change start 2.7 onsets a measurement. So false alarms come at most once
+in ``e^18 / 2.7`` measurements, 3 years at 0.25 Hz, if the noise is as stated."""
 RESTART_PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
 """Measurements after which an onset is replaced by a new one."""
 PROMISING_LOG_RATIO: Final = 6.0
@@ -72,7 +72,7 @@ class SequentialTest:
     retention_samples : float
         Measurements over which evidence is forgotten; infinite by default.
     noise_dof : float
-        Degrees of freedom with which S is known up to a factor; 0 if S is known.
+        Degrees of freedom of the factor of S, if S is known up to a factor; 0 if S is known.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class SequentialTest:
         self.restart()
 
     def restart(self) -> None:
-        """Discard all evidence; the estimate of the excess noise stays."""
+        """Discard all evidence, but keep the estimate of the excess noise."""
         rows = len(self.kind)
         self._M, self._energy = np.zeros((rows, 3, 3)), np.zeros((rows, 3, 3))
         self._y = np.zeros((rows, 3))

@@ -81,7 +81,7 @@ class SparseFactor:
 
 @dataclass(frozen=True, eq=False)
 class InverseBlocks:
-    """Blocks of an inverse at `edges` (b + 1,): `own` on the diagonal, `off_diagonal` right of it."""
+    """Blocks of an inverse between `edges` (b + 1,): `own` on the diagonal, `off_diagonal` right of it."""
 
     edges: IndexArray
     own: tuple[FloatArray, ...]

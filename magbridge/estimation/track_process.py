@@ -61,7 +61,7 @@ class Course:
 
 MAX_REFERENCE_STEP_NT = 20.0
 MAX_STEP_TIME_US = 60_000_000
-"""`MAX_REFERENCE_STEP_NT`, `MAX_STEP_TIME_US`: Step that a main field does not have within this time."""
+"""`MAX_REFERENCE_STEP_NT`, `MAX_STEP_TIME_US`: The main field changes by less than this step in this time."""
 
 
 class ReferenceSteps:
@@ -105,7 +105,7 @@ class TrackProcess:
     Attributes
     ----------
     spread, constant : float
-        As given.
+        1-sigma of the crustal field and of the constant, nT.
     initial : (4, 4) array
         Covariance of the states at the start, and far from any sample.
     white_variance : float

@@ -6,9 +6,9 @@ compensation and soft-iron matrix (``COMPASS_DIA``, ``COMPASS_ODI``). The reader
 
     MAG = D (s raw + Ofs) + MO        with D of DIA and ODI; the scale s = ``COMPASS_SCALE`` is not undone
 
-The time is the median of UTC over the GPS fixes, which one damaged record does not change. The compass is the
-one that the estimator used (``XKFS``), or the first that is enabled (``COMPASS_USE``) and healthy. Survey
-magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) are numbered after the compasses.
+UTC minus the time since boot is the median over the GPS fixes, so a damaged record does not change it. The
+compass is the one that the estimator used (``XKFS``), or the first that is enabled (``COMPASS_USE``) and
+healthy. Survey magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) have the next numbers.
 
 The table :data:`ARDUPILOT_FIELDS` lists fields and their units. A log of ArduPilot 3.6 or later declares its
 units (``FMTU``, ``UNIT``, ``MULT``); declared units replace those of the table.
@@ -46,7 +46,7 @@ MIN_GPS_STATUS = 3
 MAX_KIND_NUMBER = 8
 """Highest number in the name of a kind of record, as ``ESC8``."""
 ID_PARAMETERS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
-"""Parameters that hold a compass's device id, in order of preference; the second has no number 1."""
+"""Parameters that hold a compass's device id, preferred first; the first compass is ``COMPASS_DEV_ID``."""
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
@@ -268,7 +268,7 @@ UNIT_FACTORS = {
 def _in_own_units(flash: Flash) -> tuple[Fields, list[str]]:
     """Return :data:`ARDUPILOT_FIELDS` in the units that the log itself declares, and notes for the user.
 
-    Logs up to 2015 hold voltage and current of ``CURR`` as integers in hundredths, and do not declare it.
+    Logs up to 2015 hold voltage and current of ``CURR`` as integers, in undeclared hundredths of V and A.
     """
     declared = _declared(flash)
     found = {

@@ -116,7 +116,7 @@ def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator
 def _times(
     faults: Faults, time: FloatArray, rows: Sequence[int], previous: float, next_times: FloatArray
 ) -> tuple[IndexArray, int]:
-    """Return the indices of the rows to keep, and the number of these that repeat the time before."""
+    """Return the indices of the rows to keep, and the number of kept rows that repeat the previous time."""
     faults.count("time", len(time))
     time = np.where(np.isfinite(time), time, np.nan)  # an infinite time has no difference from another
     whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
@@ -173,7 +173,7 @@ def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> t
 
 
 def _wrong(time: FloatArray, previous: float) -> IndexArray:
-    """Return the indices at which `time` (n,) is not a time, or does not increase."""
+    """Return the indices at which `time` (n,) is not a valid time, or does not increase from `previous`."""
     return np.flatnonzero(~((np.diff(time, prepend=previous) > 0) & (np.abs(time) < YEAR_10000)))
 
 
@@ -282,7 +282,7 @@ MEDIAN_ROWS = 5
 
 
 def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the rows to keep so that `time` (n,), s, increases and few rows are dropped.
+    """Return a mask (n,) of the rows to keep so that `time` (n,), s, increases; drop the fewest rows.
 
     A single time that is too early or too late costs only its own row. NaN is never kept. Of several rows
     with one time, `strictly` keeps only the first.

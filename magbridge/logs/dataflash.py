@@ -60,7 +60,7 @@ class Flash(NamedTuple):
     """Records read from a log."""
 
     records: dict[str, Records]
-    """By the name of the kind."""
+    """Name of the kind -> its records."""
     letters: dict[tuple[str, str], str]
     """Kind and field -> letter of the field's type."""
     skipped: int

@@ -273,8 +273,8 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
     Parameters
     ----------
     frame : DataFrame
-        Columns with other than standard names are telemetry. A heading may hold a unit: ``mag_x [uT]``. The
-        column ``time`` or the index has the times: timestamps (UTC if without zone), or s since 1970.
+        Columns outside :data:`magbridge.columns.COLUMNS` are telemetry. A heading may hold a unit, as
+        ``mag_x [uT]``. Column ``time`` or the index holds timestamps (UTC if without zone) or s since 1970.
     units : mapping of str to str, optional
         Units of columns; standard columns are converted to their standard unit.
     **attrs

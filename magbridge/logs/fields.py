@@ -117,7 +117,7 @@ def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: fl
 def linear(
     target: FloatArray, time: FloatArray, values: FloatArray, max_gap: float, column: str
 ) -> FloatArray:
-    """Return the values (m,) of a column at `time` (m,), s, interpolated linearly to `target` (n,), s.
+    """Return a column (n,) at `target` (n,), s, interpolated linearly from `values` (m,) at `time` (m,), s.
 
     A column in :data:`CIRCLES` follows the shorter arc. NaN is a missing value. The result is NaN in
     intervals longer than `max_gap`, s. Beyond an end, the end value is held for `max_gap`.

@@ -30,8 +30,7 @@ MAX_COLUMNS = 4_096
 """Largest number of columns that is read."""
 ATTRIBUTE_LINE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
 is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE).match
-"""Return a match if a line is not a row: a comment, or what Geosoft and others write between the lines of a
-survey."""
+"""Function that returns a match if a line is a comment or a mark such as ``LINE 100``, and not a row."""
 SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
 """Separator that stands for any number of blanks between fields."""

@@ -225,7 +225,7 @@ def is_unit(text: str) -> bool:
 def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
     """Return index -> standard name of the columns that have a common other name.
 
-    The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
+    The three axes are recognised together or not at all: a single `b_x` is ambiguous. Three columns in
     units of a magnetic field, with names that differ only in x, y and z, are the axes.
     """
     words = list(map(bare, names))
@@ -264,7 +264,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
 def _position(words: Sequence[str]) -> dict[int, str]:
     """Return index -> name of latitude and longitude in `words`, two names with equal prefix and ending.
 
-    A towed sensor's position is preferred to a position without prefix, and that to any other.
+    A towed sensor's position is preferred, then a position without prefix, then any other.
     """
     pairs: dict[tuple[str, str], dict[str, int]] = {}
     for k, word in enumerate(words):

@@ -56,7 +56,7 @@ def merge(
 
     The first piece of each log gives its start and its columns. A log is in memory from its start until the
     merged rows reach the start of the next log. Empty logs are left out. If sensors' own logs are combined
-    with a vehicle's (:func:`combine`), all logs are in memory. `named`, `clock_offset_s`: as there.
+    with a vehicle's, all logs are in memory. `named`, `clock_offset_s`: as for :func:`combine`.
     """
     firsts: list[xr.Dataset] = []
     opened: list[Callable[[], Iterator[xr.Dataset]]] = []
@@ -137,7 +137,8 @@ def _sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[lis
     """Return the indices of the sensors' own logs and of the vehicle's logs; both empty if a kind is missing.
 
     `named`: True for each log that the user declares as a sensor's. If none is, a log with field but without
-    position is a sensor's, and a log without magnetic column a vehicle's. FormatError: a named log lacks it.
+    position is a sensor's, and a log without magnetic column a vehicle's.
+    FormatError: a named log has no field.
     """
     if any(named):
         sensors = [k for k, is_named in enumerate(named) if is_named]
@@ -199,7 +200,10 @@ def _note(source: str, vehicle: xr.Dataset, covered: FloatArray, clock_offset_s:
 
 
 def _on_clock_of(vehicle: xr.Dataset, sensor: xr.Dataset, offset_s: float) -> xr.Dataset:
-    """Return a sensor's log with `offset_s` added, on the vehicle's clock; FormatError: one lacks UTC."""
+    """Return a sensor's log with `offset_s` (s) added to its times.
+
+    FormatError: only one of the logs has UTC, and `offset_s` is 0.
+    """
     from_boot, vehicle_from_boot = counts_from_boot(sensor), counts_from_boot(vehicle)
     if offset_s:
         sensor = shifted(sensor, offset_s)

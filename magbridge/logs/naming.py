@@ -260,7 +260,7 @@ SCALAR_NAME = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
 """Names of a scalar sensor in a file with a vector, whose magnitude may have the other names."""
 ANGLES = "roll", "pitch", "heading"
 NEAR_HALF_TURN_RAD = 0.1
-"""Largest distance of the largest heading below pi or 2 pi, rad, if headings are in radians."""
+"""Headings whose maximum is less than this below pi or 2 pi are taken as radians, rad."""
 
 
 def units_of_angles(layout: Layout, rows: Rows) -> Layout:

@@ -144,7 +144,7 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
 
 
 def _along(variable: Any) -> str | None:
-    """Return the only dimension of a variable that is not 1 long, else its last; None if several are not."""
+    """Return the dimension along which a variable lies: the only one not of length 1; None if ambiguous."""
     sizes = dict(zip(variable.dimensions, variable.shape, strict=True))
     long = [name for name, size in sizes.items() if size != 1] or [*variable.dimensions[-1:]]
     return long[0] if len(long) == 1 else None

@@ -6,7 +6,7 @@ scales of ``CAL_MAGn``. The oldest logs have the field in ``sensor_combined``. T
 ``vehicle_magnetometer`` names most often, if it is enabled (``CAL_MAGn_PRIO`` is not 0).
 
 ``heading`` is the estimator's yaw. ``depth`` is the local position's z, down from the place at which the
-vehicle was switched on. UTC is the median over the GPS messages.
+vehicle was switched on. UTC minus the time since boot is the median over the GPS messages.
 
 References
 ----------

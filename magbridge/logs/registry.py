@@ -196,7 +196,7 @@ def is_bag(path: Path) -> bool:
 
 
 def _start(path: Path) -> bytes:
-    """Return the first bytes of a file, unpacked."""
+    """Return the first bytes of a file, decompressed."""
     try:
         with opened(path) as file:
             return file.read(SIGNATURE_BYTES)

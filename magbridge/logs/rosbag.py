@@ -1,14 +1,13 @@
-"""Logs of robots, by rosbags: ROS 1 (``.bag``), ROS 2 (a folder with ``metadata.yaml``) and MCAP.
+"""Read robots' logs through rosbags: ROS 1 (``.bag``), ROS 2 (a folder with ``metadata.yaml``) and MCAP.
 
-A row is a ``sensor_msgs/MagneticField`` (tesla). ROS has x forward, y left, z up in the body (FLU) and east,
-north, up in the world (ENU); here it is forward, right, down (FRD) and north, east, down (NED). mavros'
-topics are in ROS' frames, too. An orientation is used as a heading only where its world is known: that of an
-``Imu`` (REP 145: east-north-up), or of an odometry whose frame is ``map``, ``earth``, ``utm`` or ``enu``;
-the frame ``odom`` begins with any heading. Times are those of the message's header where it has one, else
-the recorder's.
+Each row is a ``sensor_msgs/MagneticField`` (tesla). ROS and mavros use forward-left-up axes in the body
+(FLU) and east-north-up in the world (ENU). The reader converts both to forward-right-down (FRD) and
+north-east-down (NED). An orientation gives a heading only if its world frame is known: for an ``Imu`` (REP
+145: ENU), and for an odometry in the frame ``map``, ``earth``, ``utm`` or ``enu``. The frame ``odom`` starts
+at an arbitrary heading. Times come from the message's header, else from the recorder.
 
-Many drivers publish gauss or microtesla where the message says tesla. A field of such a size is recognised,
-since the Earth's is within a factor of ten everywhere: it is converted, with a word, never silently.
+Many drivers publish gauss or microtesla instead of tesla. The reader recognises this by the field's
+magnitude, since the Earth's varies by less than a factor of ten. It converts the field and adds a note.
 
 References
 ----------
@@ -49,22 +48,22 @@ if TYPE_CHECKING:
     from magbridge.logs.mapping import Options
 
 STORAGES = {".mcap": McapReader, ".db3": Sqlite3Reader}
-"""Readers of one file of a ROS 2 bag, without its folder."""
+"""Suffix of a single file of a ROS 2 bag, outside a bag's folder -> its reader."""
 ROSBAG_ERRORS = (AnyReaderError, ReaderError, SerdeError, TypesysError, sqlite3.Error)
 ROS_STAMP = np.dtype([("", "V4"), ("s", "<i4"), ("ns", "<u4")])
-"""Where both ROS 1 (after the sequence number) and ROS 2 (after the encapsulation) have a header's stamp."""
+"""Layout of the start of a message with a header: 4 bytes of sequence (ROS 1) or encapsulation, stamp."""
 LITTLE = b"\x00\x01"
 MIN_REAL_TIME_S = 315_532_800.0
-"""Earliest stamp of a real recording, s: a simulation begins at 0."""
+"""Earliest stamp of a real recording, s since 1970; the stamps of a simulation begin at 0."""
 EARTH = 15e3, 150e3
-"""nT: a median length within is the Earth's field with a vehicle's; a factor of ten, so one unit fits."""
+"""Range of a reading's median magnitude, nT: it spans a factor of ten, so that only one unit fits."""
 TESLA = 1e-6, 1e-2
-"""T: a median length within is believed to be in tesla."""
+"""Range of the median magnitude in which a field is accepted as tesla, T."""
 FIELD_UNITS = ("G", "uT", "mG", "mT", "nT")
 
 
 class _Stream(NamedTuple):
-    """The messages of a topic: times (n,), s, and values (n,) by name."""
+    """Messages of one topic: times (n,), s, and values (n,) by name."""
 
     topic: str
     kind: MessageKind
@@ -73,7 +72,7 @@ class _Stream(NamedTuple):
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the bag in pieces; the values that are read are held whole."""
+    """Yield the bag in pieces of at most `rows` rows; all values that are read are in memory."""
     try:
         with _opened(path) as bag:
             streams, lost = _streams(bag)
@@ -121,7 +120,7 @@ def _telemetry(streams: Sequence[_Stream]) -> Iterator[Series]:
 
 
 class _Bag(NamedTuple):
-    """An open bag of any kind."""
+    """Open bag of ROS 1 or ROS 2: its connections, and the functions that read its messages."""
 
     connections: Sequence[Any]
     messages: Any
@@ -131,7 +130,7 @@ class _Bag(NamedTuple):
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Bag]:
-    """Open a bag; a single file of a ROS 2 bag lacks the folder that rosbags expects."""
+    """Open a bag, or a single file of a ROS 2 bag, for which rosbags expects a folder."""
     default = get_typestore(Stores.LATEST)
     storage = STORAGES.get(path.suffix.lower()) if path.is_file() else None
     if storage is None:
@@ -152,7 +151,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
 
 
 def _streams(bag: _Bag) -> tuple[list[_Stream], int]:
-    """Return the topics, and the number of messages that could not be read."""
+    """Return the messages of each topic that is read, and the number of unreadable messages."""
     wanted = [one for one in bag.connections if _short(one.msgtype) in MESSAGE_KINDS]
     raw: dict[str, tuple[Any, list[int], list[bytes]]] = {one.topic: (one, [], []) for one in wanted}
     for connection, stamp, data in bag.messages(connections=wanted) if wanted else ():
@@ -177,7 +176,7 @@ def _short(name: str) -> str:
 
 
 def _times(kind: MessageKind, recorded: FloatArray, messages: Sequence[bytes]) -> FloatArray:
-    """Return the stamps of the headers, s; the recorder's without a header, or where it is empty."""
+    """Return the times (n,), s, of the headers, or of the recorder if a header is missing or empty."""
     if not kind.header:
         return recorded
     stamps = np.frombuffer(b"".join(one[: ROS_STAMP.itemsize] for one in messages), ROS_STAMP)
@@ -205,10 +204,10 @@ def _decoded(
 def _doubles(
     bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
 ) -> dict[str, FloatArray] | None:
-    """Return the values of messages that end with doubles only, read together; None for other messages.
+    """Return the values (n,) by name of messages that end with float64 numbers; None for other messages.
 
-    What stands before them is of any length (the frame's name). The first and the last message as rosbags
-    reads them prove the layout.
+    The bytes before these numbers vary in length (name of the frame). The first and the last message, as
+    rosbags reads them, verify the layout.
     """
     size = 8 * kind.doubles
     if not kind.doubles or any(len(one) < size + ROS_STAMP.itemsize for one in messages):
@@ -228,7 +227,7 @@ FRAMES_HISTORY = f"ROS frames turned: ENU to NED, FLU to FRD; {CURRENT_NOTE}"
 MAGNETIC_FIELD = "sensor_msgs/MagneticField"
 FIX = "sensor_msgs/NavSatFix"
 TOPIC = "@"
-"""Stands for the name of the topic in the name of a column."""
+"""Placeholder for the name of the topic in the name of a column."""
 ROS_FIELDS = field_maps("ros")
 ABSOLUTE = ("map", "earth", "utm", "enu")
 """Names of frames whose x axis points east."""
@@ -238,19 +237,19 @@ Columns = Iterator[tuple[str, str, FloatArray]]
 
 
 class MessageKind(NamedTuple):
-    """A type of message."""
+    """Type of message, with the functions that read its values and form its columns."""
 
     name: str
     """Name of the type."""
     row: Callable[[Any], dict[str, float]]
-    """Returns the values of a message by name."""
+    """Function that returns the values of a message by name."""
     columns: Callable[[str, int, Values], Columns]
-    """Returns column, unit and values of the topic's name, its number among those of this type (from 0), and
-    the values of all messages. The first of several topics with a column is taken."""
+    """Function of the topic's name, its number among topics of this type (from 0), and all values by name. It
+    yields column, unit and values (n,). If several topics have one column, the first is used."""
     header: bool = True
-    """It begins with a ``std_msgs/Header``."""
+    """True if the message begins with a ``std_msgs/Header``."""
     doubles: int = 0
-    """How many float64 the message ends with, of which the first are those of `row`; 0 where it does not."""
+    """Number of float64 at the end of the message, first the values of `row`; 0 for another layout."""
 
 
 def _name(topic: str, *more: str) -> str:
@@ -258,7 +257,7 @@ def _name(topic: str, *more: str) -> str:
 
 
 def _angles(v: Values) -> Columns:
-    """Yield roll, pitch and heading (deg) of the quaternion from FLU to ENU, if it is known."""
+    """Yield roll, pitch and heading, deg, from the quaternion of FLU to ENU; nothing if it is not known."""
     x, y, z, w = (v[f"q{axis}"] for axis in "xyzw")
     norm = x * x + y * y + z * z + w * w
     known = (np.abs(norm - 1) < 0.1) & (v["unknown"] != -1)  # the first covariance is -1: no orientation
@@ -274,7 +273,7 @@ def _angles(v: Values) -> Columns:
 
 
 def _axes(prefix: str, vector: Any, axes: str = "xyz") -> dict[str, float]:
-    """Return the components of a vector or a quaternion by name."""
+    """Return the components of a vector or a quaternion by name: `prefix` and axis."""
     return {f"{prefix}{axis}": getattr(vector, axis) for axis in axes}
 
 
@@ -302,7 +301,7 @@ def _odometry(topic: str, number: int, v: Values) -> Columns:
 
 
 def _fields(name: str, *, header: bool = True) -> MessageKind:
-    """Return a type of message that is read by :data:`ROS_FIELDS`."""
+    """Return the type of message `name`, whose fields and columns :data:`ROS_FIELDS` lists."""
     fields = ROS_FIELDS[name]
 
     def row(message: Any) -> dict[str, float]:
@@ -347,5 +346,4 @@ MESSAGE_KINDS = {
         *(_fields(name, header=not name.startswith("std_msgs/")) for name in ROS_FIELDS),
     )
 }
-"""Type to the values that are read. mavros' other topics are of these types, except its outputs to the
-servos."""
+"""Name of each type of message that is read -> the type. mavros publishes them; only ``RCOut`` is its own."""

@@ -1,10 +1,10 @@
-"""SeaExplorer gliders: ``.gli`` (navigation) and ``.pld1`` (payload), raw or sub-sampled, also gzipped.
+"""Read SeaExplorer files: ``.gli`` (navigation) and ``.pld1`` (payload), raw or sub-sampled, also gzipped.
 
-Text with semicolons, names and units as pyglider reads them; positions are degrees and minutes written
-together, 9999 is a code for "not known". ``LinPos`` (mm) and ``AngPos`` (deg) are where the battery is,
-``BallastPos`` (cc) is the ballast. A payload's columns keep their names in small letters, except the CTD's
-and a vector magnetometer's. Its rows get attitude and masses from the navigation file of the same dive, where
-that is in the same folder.
+The files are text with semicolons, with names and units as pyglider reads them. Positions are degrees and
+minutes written together; 9999 means "not known". ``LinPos`` (mm) and ``AngPos`` (deg) are the battery's
+position, ``BallastPos`` (cc) is the ballast. Columns of a payload keep their names in small letters, except
+the CTD's and a vector magnetometer's. The rows of a payload get attitude and mass positions from the
+navigation file of the same dive, if it is in the same folder.
 
 The file does not say whether ``Heading`` is true or magnetic. The reader uses it as true and adds a note. On
 SEA063 it differed by 14 deg (quartiles 12 and 16) from the compass of an acoustic profiler, at a declination
@@ -30,9 +30,9 @@ from magbridge.logs.mapping import aliases
 from magbridge.logs.registry import opened
 
 PAYLOAD = re.compile(r"(?P<mission>.+)\.pld\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
-"""Name of a payload's file: sea035.12.pld1.raw.36.gz. That of the navigation is sea035.12.gli.sub.36.gz."""
+"""Name of a payload file, as sea035.12.pld1.raw.36.gz; a navigation file is sea035.12.gli.sub.36.gz."""
 MAX_NAVIGATION_GAP_S = 120.0
-"""s between two samples of the navigation, between which it is interpolated: it writes each 10 to 30 s."""
+"""Longest interval between navigation samples that is interpolated, s; samples come every 10 to 30 s."""
 CLOCK_COLUMNS = "Timestamp", "PLD_REALTIMECLOCK"
 DATE = "%d/%m/%Y %H:%M:%S"
 UNKNOWN_CODES = 9999.0, -9999.0
@@ -42,11 +42,11 @@ SEAEXPLORER_FIELDS = {one.field: one for one in field_maps("seaexplorer")[""]}
 NAV_ONLY = {
     *("Altitude", "DesiredH", "BallastCmd", "LinCmd", "AngCmd", "NavState", "SecurityLevel", "Declination")
 }
-"""Columns of the navigation that are not measured."""
+"""Columns of the navigation file that are not read, such as commands and states."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file in pieces; it is held whole."""
+    """Yield the file in pieces of at most `rows` rows; the whole file is in memory."""
     whole = _read(path)
     if named := PAYLOAD.fullmatch(path.name):
         dive = re.compile(rf"{re.escape(named['mission'])}\.gli\.\w+\.{named['dive']}(\.gz)?")
@@ -57,7 +57,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) -> xr.Dataset:
-    """Return the payload's rows with the columns that only the navigation has."""
+    """Return the payload with the columns that only the navigation has, interpolated to its rows."""
     order = np.argsort(navigation["time"].to_numpy(), kind="stable")
     time, at = navigation["time"].to_numpy()[order], payload["time"].to_numpy()
     taken = {}
@@ -71,7 +71,7 @@ def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) ->
 
 
 def _read(path: Path) -> xr.Dataset:
-    """Return one file."""
+    """Return one navigation or payload file as a deployment."""
     table, lost = _table(path)
     clock = next((name for name in CLOCK_COLUMNS if name in table), None)
     if clock is None:
@@ -96,7 +96,7 @@ def _read(path: Path) -> xr.Dataset:
 
 
 def _table(path: Path) -> tuple[pd.DataFrame, int]:
-    """Return the file as text, and how many lines have more fields than its header."""
+    """Return the cells of a file as text, and the number of lines with more fields than its header."""
     with opened(path) as file:
         text = file.read().decode("utf-8", "replace")
     header, *lines = text.splitlines()

@@ -54,7 +54,7 @@ Payloads = NDArray[np.uint8]
 MAVLINK_FIELDS = field_maps("mavlink")
 """Message -> its fields; values that the dialect declares as invalid are missing as well."""
 SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": []}
-"""Messages that can make the rows, the best first -> fields of the message that the row has."""
+"""Messages that can make the rows, the best first -> fields of the message that fill columns."""
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
@@ -64,7 +64,7 @@ COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2
 """Message -> number of the compass whose field it holds; of several for one compass, the first is read."""
 AUTOPILOT = 1
 GIMBALS = {154, 171, 172, 173, 174, 175}
-"""Gimbals: components that send their own attitude and not the vehicle's."""
+"""Component ids of gimbals, which send their own attitude and not the vehicle's."""
 RESERVED_COLUMNS = {"time", *CHANNELS}
 """Columns that a named value never fills."""
 MAX_TELEMETRY_AGE_US = round(MAX_AGE * 1e6)
@@ -150,7 +150,7 @@ READ_MESSAGES = [*TELEMETRY, *SOURCE_FIELDS, NAMED_VALUE_FLOAT, COLUMN, STEP, ST
 
 
 def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
-    """Return the columns (n,) in messages of an id that makes rows; a bridge's messages have ``time``."""
+    """Return the columns (n,) that messages with id `number` fill in their rows; a bridge's fill ``time``."""
     columns = {one.column: one.values(payloads) for one in SOURCE_FIELDS[number]}
     if number not in SENSOR_IDS:
         return columns

@@ -30,7 +30,7 @@ ATTITUDE = ("roll", "pitch", "heading")
 POSITION_COLUMNS = ("latitude", "longitude", "depth")
 SAMPLE = (*CHANNELS, "sensor_temperature", "sensor_supply", "power_cycle")
 STANDARD = {*ATTITUDE, *POSITION_COLUMNS, *SAMPLE, *CHANNEL_TIMES, *CORRECTED, "level_sigma"}
-"""Columns that are a field of one of these messages, other than ``NAMED_VALUE_FLOAT``."""
+"""Columns that are fields of ``ATTITUDE``, ``GLOBAL_POSITION_INT``, ``MAG_RAW`` or ``MAG_FIELD``."""
 ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
 )
