@@ -1,8 +1,9 @@
 """Fit a calibration to logs.
 
-:func:`~.observe.observations` turns the columns of a log into :class:`~.observations.Observations`;
-:func:`~.fit.fit` fits them by one of the configurations of :mod:`.methods` (a known field) or by
-:mod:`.in_place` (a survey, with the crustal field below its track), and :func:`~.checks.judged` adds what the
-data leave open. Start reading at :func:`~.fit.fit`, then :mod:`.solve`, the loop of every fit. The package
-knows the model and :mod:`magbridge.estimation`, and no log format, MAVLink or live part.
+:func:`~.observe.observations` converts the columns of a log to :class:`~.observations.Observations`.
+:func:`~.fit.fit` fits them by one of the :mod:`.methods` (for a known field) or by :mod:`.in_place` (for a
+survey, together with the crustal field below its track). :func:`~.checks.judged` adds the boresight and
+warnings about undetermined quantities. Start reading at :func:`~.fit.fit`, then at :mod:`.solve`, the loop of
+every fit. The package depends on the model and on :mod:`magbridge.estimation`, but not on log formats,
+MAVLink or the live bridge.
 """

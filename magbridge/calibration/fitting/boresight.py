@@ -1,11 +1,11 @@
-"""The rotation that a scalar fit leaves free, from attitude telemetry and the reference's direction.
+"""Boresight: the rotation from sensor to body axes, from attitude telemetry and the reference's direction.
 
 Notes
 -----
-Corrected vectors b (sensor axes) and the Earth's field in body axes ``v = R(attitude)^T H_ned`` differ by
-one rotation: ``v = R b`` (Wahba's problem; scipy solves it). Attitude errors vary slowly, so successive
-samples are not independent: the covariance is estimated from the scatter between whole runs (sandwich
-estimate)::
+A fit to the magnitude does not determine this rotation R. Corrected vectors b (sensor axes) and the Earth's
+field in body axes ``v = R(attitude)^T H_ned`` differ by it: ``v = R b`` (Wahba's problem; scipy solves it).
+Attitude errors vary slowly, so successive samples are not independent. The covariance is therefore estimated
+from the scatter between whole runs (sandwich estimate)::
 
     I = sum (|v|^2 E - v v^T),   s_r = sum_(i in run r) v_i x (R b_i - v_i),   C = I^-1 (sum_r s_r s_r^T) I^-1
 
@@ -15,19 +15,20 @@ the field's vertical part ``F sin I``. A vehicle that dives, climbs and turns de
 
     e_i = (down_i . R b_i - F_i sin(I_i + dI)) / (H_i sigma_w)
 
-with dI, a common error of the inclination, normal about 0 with :data:`INCLINATION_SIGMA_DEG`. An error of the
-tilt of sigma_w (rad) moves ``down . v`` by ``H sigma_w``, hence the weight. One row sees the rotation about
-magnetic east only: its derivative is ``R b x down``. A full circle at one pitch gives ``(1 - down down^T)/2``
-a row, whose smallest eigenvalue is ``sin^2(pitch)/2``, so a level vehicle cannot find the third angle.
+with dI a common error of the inclination, normal about 0 with :data:`INCLINATION_SIGMA_DEG`. A tilt error of
+sigma_w (rad) changes ``down . v`` by ``H sigma_w``, with H the horizontal field; hence the weight. The
+derivative of one row by the rotation is ``R b x down``, so the row depends only on the rotation about
+magnetic east. A full circle at one pitch gives the information ``(1 - down down^T)/2`` per row. Its smallest
+eigenvalue is ``sin^2(pitch)/2``, so a level vehicle does not determine the third angle.
 
 The accelerometers' offsets differ between runs and do not average out within one. With t_i, the derivative of
 e_i by roll and pitch, the covariance is the sandwich
 
     C = N^-1 (s^2 N + sum_r (sum_(i in r) J_i^T t_i) diag(sigma_t^2) (...)^T) N^-1
 
-N the information of the rows, s^2 their measured variance. A few runs show little of sigma_t, so sigma_t^2 is
-its posterior mean, with a prior: the inverse gamma distribution about :data:`RUN_TILT_SIGMA_DEG` with the
-weight of :data:`RUN_TILT_PRIOR_COUNT` observations. Within a run, e has the covariance
+with N the information of the rows and s^2 their measured variance. A few runs hardly determine sigma_t, so
+sigma_t^2 is its posterior mean. Its prior is the inverse gamma distribution about :data:`RUN_TILT_SIGMA_DEG`
+with the weight of :data:`RUN_TILT_PRIOR_COUNT` observations. Within a run, e has the covariance
 ``s^2 I + sigma_t^2 T T^T``, T the rows t_i. Its eigenvectors give independent z_k of the variance
 ``s^2 + sigma_t^2 l_k``, l_k an eigenvalue of ``T^T T``.
 """
@@ -55,43 +56,45 @@ INCLINATION_SIGMA_DEG = 0.2
 RUN_TILT_SIGMA_DEG = 0.2
 """Expected 1-sigma of the offset of roll and of pitch in one run, deg."""
 RUN_TILT_PRIOR_COUNT = 2.0
-"""Observations that this expectation counts as."""
+"""Weight of the prior :data:`RUN_TILT_SIGMA_DEG`, as a number of observations."""
 MAX_RUN_TILT_SIGMA_DEG = 10.0
-"""Largest 1-sigma of that offset that is considered, deg."""
+"""Largest 1-sigma of the offset of roll and of pitch that the fit considers, deg."""
 MIN_SQUARED_LEVER = 1e-12
-"""Smallest sum of squared derivatives of a run, so that none divides by zero."""
+"""Lower limit of a run's eigenvalues l_k, which avoids a division by zero."""
 MIN_TILT_SIGMA_DEG = 0.02
 """Smallest 1-sigma of the tilt's noise, deg."""
 MAX_ITERATIONS = 50
 CONVERGED_RAD = 1e-8
+"""Length of a Gauss-Newton step below which the iterations have converged, rad."""
 MIN_SAMPLES = 30
 SEARCH_SAMPLES = 400
+"""Largest number of samples with which the search for the best start runs."""
 MAX_STEP_RAD = 0.5
 """Longest step over which the residual counts as linear in the rotation, rad."""
 LEAST_INFORMATION = 3.0 / np.pi**2
 """Information about an angle that is uniform over a full turn, 1/rad^2."""
 DAMPING = 1e-9
-"""Fraction of the information's trace that keeps an angle which the rows do not see where it is."""
+"""Damping of a step as a fraction of the information's trace: it fixes angles that no row determines."""
 AXIS_ANGLES = ("roll", "pitch", "heading")
 """Name of the mounting angle about each body axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class TiltBoresight:
-    """A boresight, its covariance, and what the fit left."""
+    """Boresight estimated from roll and pitch, with its covariance."""
 
     rotation: FloatArray
-    """(3,), rad, rotation vector from corrected sensor axes to body axes."""
+    """(3,): Rotation vector from corrected sensor axes to body axes, rad."""
     covariance: FloatArray
-    """(3, 3), rad^2, of a small rotation about the body axes."""
+    """(3, 3): Covariance of the error, a small rotation about the body axes, rad^2."""
     inclination_shift: float
     """Difference of the field's inclination from the reference's, deg; positive: steeper."""
     tilt_sigma: float
-    """Standard deviation of roll and of pitch, white noise and the run's offset together, deg."""
+    """Standard deviation of roll and of pitch, deg: white noise and the offset of a run together."""
 
     @property
     def open_angle(self) -> tuple[str, float]:
-        """The body axis about which the rotation is known least, and that axis' 1-sigma in deg."""
+        """Name of the least determined mounting angle (roll, pitch or heading), and its 1-sigma, deg."""
         sigma = np.degrees(np.sqrt(np.diag(self.covariance)))
         axis = int(np.argmax(sigma))
         return AXIS_ANGLES[axis], float(sigma[axis])
@@ -110,11 +113,11 @@ def boresight_from_tilt(
     inclination: FloatArray,
     runs: IndexArray,
 ) -> TiltBoresight:
-    """Estimate the rotation from corrected sensor axes to body axes from roll and pitch alone.
+    """Estimate the rotation from corrected sensor axes to body axes from roll and pitch, without headings.
 
-    `vector` (n, 3): corrected field in sensor axes, nT. `roll`, `pitch` (n,): rad. `total`, `inclination`
-    (n,): of the reference field, nT and rad, positive downwards. `runs` (n,): run of each sample, with one
-    offset of the tilt.
+    `vector` (n, 3): corrected field in sensor axes, nT. `roll`, `pitch` (n,): rad. `total` (n,): reference of
+    the total field, nT. `inclination` (n,): of the reference, rad, positive downwards. `runs` (n,): run of
+    each sample; roll and pitch have one offset in each run.
 
     CalibrationError: fewer than :data:`MIN_SAMPLES` samples.
     """
@@ -129,7 +132,7 @@ def boresight_from_tilt(
     prior[3, 3] = 1.0 / np.radians(INCLINATION_SIGMA_DEG) ** 2
 
     def rows(x: FloatArray, start: Rotation, part: IndexArray | slice) -> tuple[FloatArray, FloatArray]:
-        """Return residuals (n,), rad of tilt, and derivatives (n, 4) by a further rotation and by dI."""
+        """Return residuals (n,), as rad of tilt, and derivatives (n, 4) by the rotation and dI in x (4,)."""
         turned = (Rotation.from_rotvec(x[:3]) * start).apply(vector[part])
         steep = inclination[part] + x[3]
         e = ((down[part] * turned).sum(axis=1) - total[part] * np.sin(steep)) / horizontal[part]
@@ -147,13 +150,13 @@ def boresight_from_tilt(
     turned = rotation.apply(vector)
     e, J = rows(np.array([0.0, 0.0, 0.0, shift]), rotation, slice(None))
     tilt_sigma = max(float(np.sqrt(np.mean(e * e))), np.radians(MIN_TILT_SIGMA_DEG))
-    # derivative of gravity's direction by roll and by pitch; t_i is what they do to the row
+    # derivatives of gravity's direction by roll and by pitch; from them t_i, the derivatives of the row
     by_roll = np.stack([np.zeros(len(roll)), np.cos(roll) * np.cos(pitch), -np.sin(roll) * np.cos(pitch)], 1)
     by_pitch = np.stack(
         [-np.cos(pitch), -np.sin(roll) * np.sin(pitch), -np.cos(roll) * np.sin(pitch)], axis=1
     )
     offsets = np.stack([(turned * by_roll).sum(1), (turned * by_pitch).sum(1)], axis=1) / horizontal[:, None]
-    # Noise of the tilt moves J, too, and looks like a change of attitude: take its part out of N.
+    # Noise of the tilt changes J as a change of attitude does, which inflates N: subtract its part.
     noise = sum(
         turn.T @ turn for turn in (np.cross(turned, d) / horizontal[:, None] for d in (by_roll, by_pitch))
     )
@@ -177,9 +180,10 @@ def boresight_from_tilt(
 
 
 def _tilt_variances(residuals: list[FloatArray], levers: list[FloatArray]) -> tuple[float, float]:
-    """Return s^2 and sigma_t^2 of the module's notes, rad^2.
+    """Return the variances of the tilt's white noise and of its offset in a run, rad^2.
 
-    `residuals`: (m,) of each run, rad. `levers`: (m, 2) of each run, the derivatives by roll and by pitch.
+    They are s^2 and sigma_t^2 of the module's notes. `residuals`: array (m,) of each run, rad. `levers`:
+    array (m, 2) of each run, the derivatives of its residuals by roll and by pitch.
     """
     squares, eigenvalues, white = np.empty((0,)), np.empty((0,)), 0.0
     for e, T in zip(residuals, levers, strict=True):
@@ -207,7 +211,7 @@ def _gauss_newton(
     rotation: Rotation,
     shift: float,
 ) -> tuple[Rotation, float, float]:
-    """Iterate from one start; return the rotation, dI (rad) and the cost."""
+    """Minimise the cost by Gauss-Newton steps from a start; return the rotation, dI (rad) and the cost."""
     sigma, x = np.radians(RUN_TILT_SIGMA_DEG), np.array([0.0, 0.0, 0.0, shift])
     for _ in range(MAX_ITERATIONS):
         e, J = rows(x, rotation)
@@ -215,7 +219,7 @@ def _gauss_newton(
         hessian += DAMPING * np.trace(hessian) * np.eye(4)
         step = -np.linalg.solve(hessian, J.T @ e / sigma**2 + prior @ x)
         step *= min(MAX_STEP_RAD / max(float(np.linalg.norm(step[:3])), 1e-300), 1.0)
-        # the rotation so far becomes the start, so that the derivative is always taken at none
+        # apply the step to the start, so that the derivative is always taken at a zero rotation
         rotation, x[3] = Rotation.from_rotvec(step[:3]) * rotation, x[3] + step[3]
         if np.linalg.norm(step) < CONVERGED_RAD:
             break
@@ -226,34 +230,36 @@ def _gauss_newton(
 # ---- With headings, and the choice ----
 
 MAX_OPEN_ANGLE_DEG = 2.0
-"""1-sigma of the angle that roll and pitch determine least, above which headings are used, deg."""
+"""1-sigma of the least determined angle above which the boresight uses headings, deg."""
 MIN_BORESIGHT_SAMPLES = 30
-"""Samples with attitude and direction that a boresight takes."""
+"""Smallest number of samples with attitude and reference direction for a boresight."""
 MISMATCH = 10.0
-"""Median angle that no rotation removes, deg: masses leave less, a reversed channel or angle more."""
+"""Largest accepted median angle between the directions after the best rotation, deg. Masses cause a smaller
+angle, a reversed channel or angle a larger one."""
 NEAR, LEAST = 2.0, 0.5
-"""Largest difference of equal angles, and smallest mismatch of a compass to compare with, deg."""
+"""Difference below which two angles count as equal, and lower limit of the mismatch to compare with, deg."""
 COMPASS_SIGMA = np.radians(0.5)
-"""Compass error common to all runs, which their scatter does not show, rad."""
+"""1-sigma of a compass error that is common to all runs and does not show in their scatter, rad."""
 
 
 def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
-    """Turn a field from world to body axes.
+    """Return a field in body axes, (n, 3), nT.
 
-    `attitude` (n, 3): rad, roll, pitch, heading (3-2-1). `field_ned` (n, 3): nT, north-east-down.
+    `attitude` (n, 3): roll, pitch, heading (3-2-1 rotation), rad. `field_ned` (n, 3): the field north-east-
+    down, nT.
     """
     body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
     return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
 
 
 def _vectors(calibration: Calibration, data: Observations) -> FloatArray:
-    """Return the corrected vectors (n, 3) in sensor axes, nT."""
+    """Return the corrected vectors of `data` (n, 3) in sensor axes, without a boresight, nT."""
     k = len(calibration.parameters)
     return correct(replace(calibration, boresight=None), data.field, data.parameters[:, :k], data.time).vector
 
 
 def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
-    """Return the rotation of vectors b to v, (n, 3) each, and the median angle that it leaves, deg."""
+    """Return the best rotation R of vectors b to v, (n, 3) each, and the median angle from R b to v, deg."""
     # Wahba's problem: the rotation that minimises the sum of |v - R b|^2
     rotation, _ = Rotation.align_vectors(v, b)
     turned = rotation.apply(b)
@@ -265,10 +271,12 @@ def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
 def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnostic | None:
     """Return a warning if headings seem to be measured from magnetic north; else None.
 
-    Notes ----- Headings short of the declination D turn every vector by D about the vertical. For a level
-    vehicle that is a boresight of D. For one that dives and climbs at a pitch p, in a field of inclination I,
-    the best rotation is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 + sin^2 I) / 2)`` about z (7.4 deg
-    of 17.6 at p = 24 and I = 70 deg), and leaves angles that a correct heading does not.
+    Notes
+    -----
+    Headings without the declination D turn every vector by D about the vertical. For a level vehicle this
+    looks like a boresight of D. For a vehicle that dives and climbs at a pitch p, in a field of inclination
+    I, the best rotation is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 + sin^2 I) / 2)`` about z. The
+    remaining angles are then larger than with correct headings.
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
@@ -289,12 +297,12 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnosti
 
 
 def choose_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
-    """Return the boresight from roll and pitch alone where they determine it, else one that uses headings.
+    """Return the boresight from roll and pitch if they determine it, else the boresight from headings.
 
-    A heading that comes from the magnetometer itself contains the error that the boresight is to remove.
+    Headings are the second choice, because a heading from the magnetometer itself contains the error that the
+    boresight should remove. None: as for :func:`find_boresight`.
 
-    CalibrationError: as :func:`find_boresight`: headings are used to notice a reversed channel or angle in
-    any case.
+    CalibrationError: as for :func:`find_boresight`, which always checks the headings.
     """
     with_headings = find_boresight(calibration, data)
     if data.attitude is None or data.reference_ned is None or calibration.effects:
@@ -305,7 +313,7 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
     part = data.part(known)
     assert part.attitude is not None
     assert part.reference_ned is not None
-    # tilt needs the size and the inclination of the field, not the heading
+    # the tilt method needs the magnitude and inclination of the field, but no heading
     total = np.linalg.norm(part.reference_ned, axis=1)
     inclination = np.arcsin(part.reference_ned[:, 2] / total)
     _, runs = np.unique(part.runs, return_inverse=True)
@@ -320,11 +328,13 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
 
 
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
-    """Find the rotation from corrected sensor axes to body axes from attitude with headings.
+    """Return the rotation from corrected sensor axes to body axes, from roll, pitch and heading.
 
-    Returns None if too few samples have attitude and reference direction, or the calibration has effects.
+    The result is None if too few samples have attitude and reference direction, or the calibration has
+    effects.
 
-    CalibrationError: no rotation takes the corrected vectors to where attitude and main field say they point.
+    CalibrationError: after the best rotation, the corrected vectors and the reference still differ by more
+    than :data:`MISMATCH`.
     """
     known, attitude, reference_ned = data.directed()
     if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:

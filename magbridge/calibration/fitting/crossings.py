@@ -1,4 +1,4 @@
-"""Test whether a track separates crustal field and heading by returning to places on other courses."""
+"""Test if a track returns to places on other courses, to separate the crustal field from heading errors."""
 
 from __future__ import annotations
 
@@ -15,38 +15,39 @@ from magbridge.diagnostics import Diagnostic
 from magbridge.wording import counted
 
 MIN_CROSSING_DEG = 30.0
-"""deg between two courses that cross."""
+"""Smallest difference of two courses that cross, deg."""
 REVERSED_COURSE_DEG = 150.0
-"""Difference of two courses from which on the second is the reverse of the first, deg."""
+"""Smallest difference of two courses of which the second is the reverse of the first, deg."""
 FEW = 3
-"""Number of crossed places below which a survey does not test itself."""
+"""Smallest number of crossed places with which a survey is not warned about."""
 PLACE_LENGTH_FRACTION = 0.25
-"""Distance within which places count as one, as a fraction of the crustal field's length."""
+"""Side of the cells that count as one place, as a fraction of the crustal field's correlation length."""
 FARTHEST, NEAR = 5.0, 1000.0
-"""Multiple of the distance from the middle within which 99 % of the samples stay, and its least value, m."""
+"""A position is implausible beyond FARTHEST times the distance from the middle within which 99 % of samples
+lie; this distance is at least NEAR, m. FARTHEST also limits steps, in multiples of the usual speed."""
 PLACES = (125.0, 250.0, 500.0)
-"""Distances within which places count as one before the length is known, m."""
+"""Sides of the cells that count as one place while the correlation length is unknown, m."""
 OFTEN, TWICE = 0.08, 2
-"""Least fraction and number of the places that a survey has to meet again on another course: six hours of a
-glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
+"""Smallest fraction and number of places that a survey must pass again on another course. Six hours of a
+glider's criss-cross pass 11 to 17 % again at 500 m, dives along one line 5 %."""
 AHEAD, LEGS = 0.8, 6
 """Mean resultant length of the courses (Mardia & Jupp 2000, eq. 2.3.3) below which legs have different
-courses, and number of the widest places to which they must lead. A zigzag of 3 h without crossings has 0
-to 0.6, dives along one line 0.93."""
+courses, and smallest number of the largest cells that the track must visit. A zigzag of 3 h without crossings
+has 0 to 0.6, dives along one line 0.93."""
 AREA = 120.0
-"""Extent below which the crustal field is nearly constant, m."""
+"""Extent of a track below which the crustal field is nearly constant, m."""
 LEAP = 100.0
-"""Distance beyond what the vehicle can have moved that is a jump in position, m."""
+"""Smallest jump in position: excess of a step over the distance that the vehicle can have moved, m."""
 MIN_LENGTH_SPACINGS = 0.5
-"""Fraction of the distance between tracks: a shorter field differs from track to track."""
+"""Smallest correlation length that neighbouring tracks resolve, as a fraction of their spacing."""
 MIN_COURSE_M = 5.0
 """Smallest distance between samples that gives a course, m."""
 
 
 def tells_rock(data: Observations) -> bool:
-    """Return True if the track separates the crustal field from the vehicle's.
+    """Return True if the track separates the crustal field from the vehicle's field.
 
-    It came back to places on other courses, or legs on other courses follow each other.
+    The track must return to places on other courses, or have enough legs with different courses.
     """
     if data.place is None:
         return False
@@ -67,14 +68,20 @@ def tells_rock(data: Observations) -> bool:
 
 
 def left_open(data: Observations, length: float) -> Iterator[Diagnostic]:
-    """Yield advice for separating a crustal field of a `length`, m, from the vehicle's field."""
+    """Yield a warning if the track of `data` hardly crosses itself, over an unmapped crustal field.
+
+    `length`: correlation length of the crustal field, m.
+    """
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
     yield from left_open_by(data.place[:, :2], length)
 
 
 def left_open_by(track: FloatArray, length: float) -> Iterator[Diagnostic]:
-    """Yield what a track (n, 2), m, cannot separate over an unmapped crustal field of a `length`, m."""
+    """Yield a warning if a `track` (n, 2), m, passes too few places again on another course.
+
+    `length`: correlation length of the unmapped crustal field, m.
+    """
     place, course = courses(track)
     if not len(place) or np.ptp(place, axis=0).max() < PLACE_LENGTH_FRACTION * length:
         return  # all at one place: the crustal field is a constant
@@ -86,15 +93,18 @@ def left_open_by(track: FloatArray, length: float) -> Iterator[Diagnostic]:
 
 
 def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[Diagnostic]:
-    """Yield a warning if a fit's crustal field exceeds the `noise`, nT, and is too rough for the track."""
+    """Yield a warning if a fit's crustal field exceeds the `noise`, nT, and is too rough for the track.
+
+    `rock`: details of the crustal field of a fit; None if the fit has no crustal field.
+    """
     if rock and data.place is not None and rock["amplitude_nT"] > noise:
         yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 
 def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[Diagnostic]:
-    """Yield a warning if a crustal field of a `length`, m, changes too fast for a track (n, 2), m.
+    """Yield a warning if the correlation `length` (m) of a crustal field is too short for a `track` (n, 2).
 
-    `shortest`: least length that was tried, m; a fit that ends there has not found the length.
+    `shortest`: shortest length that the fit tried, m; a fit that ends there has not found the length.
     """
     place = courses(track)[0]
     if len(place) < FEW:
@@ -109,7 +119,7 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
 
 
 def far_off(place: FloatArray) -> BoolArray:
-    """Return a mask (n,) of places (n, 2), m, that are too far from all others to be right."""
+    """Return a mask (n,) that is True for positions (n, 2), m, implausibly far from the others, or NaN."""
     # robust: the median is the middle, and the 99 % quantile the usual distance
     distance = np.linalg.norm(place - np.nanmedian(place, axis=0), axis=1)
     usual = max(float(np.nanquantile(distance, 0.99)), NEAR)
@@ -117,7 +127,10 @@ def far_off(place: FloatArray) -> BoolArray:
 
 
 def jumped(place: FloatArray, time: FloatArray) -> Iterator[Diagnostic]:
-    """Yield notes on dropped places (n, 2), m, at times (n,), s, and on jumps of the track."""
+    """Yield messages about unknown and implausible positions, and about jumps of the track.
+
+    `place` (n, 2): positions, m. `time` (n,): s.
+    """
     without = ~np.isfinite(place).all(axis=1)
     far = far_off(place) & ~without
     for left_out, code in ((without, "without_position"), (far, "far_position")):
@@ -134,7 +147,10 @@ def jumped(place: FloatArray, time: FloatArray) -> Iterator[Diagnostic]:
 
 
 def jumps(place: FloatArray, time: FloatArray) -> IndexArray:
-    """Return the indices of places (n, 2), m, at times (n,), s, after which the track jumps."""
+    """Return the indices of the positions after which the track jumps.
+
+    `place` (n, 2): positions, m. `time` (n,): s.
+    """
     # a jump is a step that the usual speed does not explain
     step = np.linalg.norm(np.diff(place, axis=0), axis=1)
     usual = float(np.median(step / np.maximum(np.diff(time), 1e-3)))
@@ -143,9 +159,9 @@ def jumps(place: FloatArray, time: FloatArray) -> IndexArray:
 
 
 def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, int]:
-    """Return at how many places courses (n,), rad, cross, and at how many others they are reversed.
+    """Return the number of cells in which courses cross, and of other cells in which they are reversed.
 
-    `place` (n, 2), `cell`: places, and size of one, m.
+    `place` (n, 2): positions, m. `course` (n,): rad. `cell`: side of a cell, m.
     """
     # number the cells, and go through the samples cell by cell
     _, of = np.unique(np.floor(place / cell).astype(np.int64), axis=0, return_inverse=True)
@@ -167,13 +183,19 @@ def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, in
 
 
 def courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the places (m, 2) between which the vehicle moved, and the courses there (m,), rad."""
+    """Return positions (m, 2) at steps of at least :data:`MIN_COURSE_M`, and the courses from them (m,), rad.
+
+    `place` (n, 2): positions, m.
+    """
     moved = _thinned(place)
     step = np.diff(place[moved], axis=0)
     return place[moved][:-1], np.arctan2(step[:, 1], step[:, 0])
 
 
 def _thinned(place: FloatArray) -> BoolArray:
-    """Return a mask (n,) of places (n, 2) at least :data:`MIN_COURSE_M` m of travel after the last one."""
+    """Return a mask (n,) that selects about one position in each :data:`MIN_COURSE_M` m of travel.
+
+    `place` (n, 2): positions, m.
+    """
     way = np.cumsum(np.hypot(*np.diff(place, axis=0, prepend=place[:1]).T))
     return np.asarray(np.diff(np.floor(way / MIN_COURSE_M), prepend=-1) > 0)

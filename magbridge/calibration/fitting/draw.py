@@ -1,4 +1,4 @@
-"""Plot of a fit: the error of the total field, raw and corrected, against its possible correlates."""
+"""Plot the residual of a fit, raw and corrected, against time, heading and each parameter."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from magbridge.estimation.residual import rms, robust_scale
 from magbridge.pictures import save
 
 PANEL_POINTS = 5_000
-"""Points drawn in a panel; more only make a blot."""
+"""Approximate number of points in a panel; with more the points merge."""
 PANEL_HALF_HEIGHT_SIGMA = 6.0
-"""Half the height of the lower row, in robust standard deviations; samples beyond are drawn at its edge."""
+"""Half the height of the lower panels, in robust standard deviations; larger errors are drawn at the edge."""
 
 
 def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> None:
-    """Draw each sample's deviation from the reference, as read and corrected, a colour for each run.
+    """Write a plot of each sample's deviation from the reference, nT, with one colour for each run.
 
-    The abscissae are time, heading (where attitude is known) and each parameter: a trend left in the lower
-    row is something that the calibration does not describe.
+    The upper panels show the deviation as read, the lower panels as corrected. The abscissae are time,
+    heading (if attitude is known) and each parameter. A trend in a lower panel shows an error that the
+    calibration does not describe.
 
     WriteError: the file cannot be written.
     """
@@ -69,7 +70,7 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
 
 
 def _abscissae(data: Observations) -> dict[str, FloatArray]:
-    """Return the quantities that deviations are drawn against, by name and unit."""
+    """Return the abscissae (n,) of the plot by their label, which states name and unit."""
     since = data.time - data.time[0]
     shown = {"hours": since / 3600.0} if since.max() > 7200.0 else {"minutes": since / 60.0}
     if data.attitude is not None and np.isfinite(data.attitude[:, 2]).any():

@@ -1,4 +1,4 @@
-"""Fit a calibration: one function, and a table of methods behind it."""
+"""Fit a calibration to observations by one of several methods."""
 
 from __future__ import annotations
 
@@ -32,21 +32,22 @@ METHODS: dict[str, str] = {
     "runs": "magbridge.calibration.fitting.methods:fit_per_run",
     "horizontal": "magbridge.calibration.fitting.methods:fit_horizontal",
 }
-"""Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
+"""Function of each method as ``module:function``; its signature is ``(observations, order, **options) ->
+Fit``."""
 
 ONE_ATTITUDE = 5.0
-"""Largest angle from the mean direction within which all samples are one attitude, deg."""
+"""Angle from the mean field direction within which 95 % of the samples count as a single attitude, deg."""
 UNKNOWN_LENGTH = 500.0
-"""Length assumed for the crustal field without a field in place, m."""
+"""Correlation length assumed for the crustal field by fits that do not estimate this field, m."""
 MAIN_FIELD_SIGMA_NT = 145.0
-"""1-sigma by which the total field at a site differs from a main-field model's, nT: what its degrees do not
-reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
+"""1-sigma of the total field at a site about a main-field model, nT. The model lacks high degrees, mainly the
+crustal field (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 MAX_FIT_SAMPLES = 250_000
-"""Samples at most that are fitted: more only cost time, because the model's error does not average out."""
+"""Largest number of samples of a fit: more cost time, but the model's error does not average out."""
 MAX_CRUST_NT = 3.0 * MAIN_FIELD_SIGMA_NT
-"""RMS that an unmapped crustal field never exceeds over a whole track, nT."""
+"""Largest plausible RMS of an unmapped crustal field over a whole track, nT."""
 CRUST_TEST_SAMPLES = 3000
-"""Samples that suffice to see whether the crustal field may show."""
+"""Number of samples with which :func:`_rock_may_show` tests for a crustal field."""
 
 
 def fit(
@@ -64,30 +65,29 @@ def fit(
     data : Observations
         The calibration runs; :func:`~.observe.observations` reads them from a deployment.
     method : str
-        One of :data:`METHODS`. If the reference lacks the crustal field and the track crosses itself or
-        turns, which separates it from heading, ``auto`` is ``survey``. (The last of five dives of a Seaglider
-        along one line, left out: 88 nT without a field in place, 94 with it.)
+        One of :data:`METHODS`. ``auto`` uses ``survey`` if the reference lacks the crustal field and the
+        track separates this field from heading errors, because it crosses itself or turns.
     order : int
         Highest total degree of the polynomials.
     site_bias : float
-        nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site separates
-        it from the gain, so it goes into the covariance. By default none of a true field, of a map that of
-        the map, and of a main-field model alone :data:`MAIN_FIELD_SIGMA_NT`.
+        1-sigma of a constant bias of the reference over the site, nT. A scalar fit at one site cannot
+        separate the bias from the gain, so the bias enters the covariance. Default: 0 for a true field, the
+        map's sigma for a map, and :data:`MAIN_FIELD_SIGMA_NT` for a main-field model without a map.
     **options
-        Further arguments of the method's own function, as ``vehicle`` of
+        Further arguments of the method's function, such as ``vehicle`` of
         :func:`~magbridge.calibration.fitting.methods.fit_auto`.
 
     Raises
     ------
     CalibrationError
-        The data do not support the fit, or there is no such method.
+        The data do not support the fit, or the method does not exist.
 
     Notes
     -----
-    If ``auto`` is ``survey`` and that fit has no solution, the fit is one without a field in place. If
-    ``auto`` has no solution, it is ``nominal``, and conversely. The calibration warns of either. Of a log
-    of more than :data:`MAX_FIT_SAMPLES` samples every second, third ... sample is fitted, except by
-    ``survey``, which needs all passes over a place.
+    If ``auto`` used ``survey`` and this fit has no solution, the function fits without a crustal field. If
+    ``auto`` has no solution, the function uses ``nominal``, and conversely. The fit has a warning in both
+    cases. If a log has more than :data:`MAX_FIT_SAMPLES` samples, the function fits every second, third ...
+    sample. ``survey`` uses all samples, because it needs all passes over a place.
     """
     if method not in METHODS:
         raise CalibrationError(f"method: {one_of(method, METHODS)}")
@@ -107,7 +107,7 @@ def fit(
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would converge
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
-        # positions that jump would put one place's field into another
+        # positions that jump would assign the field of one place to another
         away: tuple[Diagnostic, ...] = ()
         if method in ("auto", "survey") and data.place is not None:
             known = np.isfinite(data.place[:, :2]).all(axis=1) | (method == "survey")
@@ -128,9 +128,12 @@ def fit(
 def _first_solution(
     data: Observations, method: str, order: int, bias: float, in_place: bool, options: dict[str, Any]
 ) -> tuple[Fit, str, tuple[Diagnostic, ...]]:
-    """Return the fit of the first method that has a solution, that method, and the reasons of the others.
+    """Return the fit of the first method with a solution, this method's name, and notes on the choice.
 
-    CalibrationError: no method has one; the message is that of the first.
+    The notes state why the first choice was not used. `bias`: 1-sigma of the reference's constant bias, nT.
+    `in_place`: True if ``survey`` is the first choice.
+
+    CalibrationError: no method has a solution; the message is that of the first method.
     """
     # each attempt: method, data, options, and the notes that explain why it is not the first choice
     bare = data.without_parameters()
@@ -162,7 +165,7 @@ def _first_solution(
 
 
 def _refuse_large_crust(found: Fit) -> None:
-    """Refuse a field in place that is larger than any crust's: it is the sensor's own error."""
+    """Raise NoSolutionError if the fitted crustal field is so large that it must be an error of the sensor."""
     if (size := found.details.get("crustal_field", {}).get("rms_nT", 0.0)) > MAX_CRUST_NT:
         raise NoSolutionError(
             f"survey: a crustal field of {size:.0f} nT RMS was fitted, larger than any crust's"
@@ -176,7 +179,10 @@ def _function(method: str) -> Callable[..., Fit]:
 
 
 def _rock_may_show(data: Observations, order: int) -> bool:
-    """Return True if a fit without the crustal field leaves a residual that this field can explain."""
+    """Return True if the residual of a fit without a crustal field is small enough to be crustal field.
+
+    The result is also True if this fit has no solution.
+    """
     few = data.thinned(CRUST_TEST_SAMPLES)
     for method in ("nominal", "auto"):
         try:
@@ -189,14 +195,17 @@ def _rock_may_show(data: Observations, order: int) -> bool:
 
 
 def _default_bias(data: Observations) -> float:
-    """Return the default uncertainty of the reference's level, nT."""
+    """Return the default 1-sigma of the reference's constant bias, nT."""
     if not data.lacks_rock:
         return 0.0
     return MAIN_FIELD_SIGMA_NT if data.map_sigma is None else data.map_sigma
 
 
 def _biased(found: Fit, sigma: float) -> Fit:
-    """Carry an unknown bias of the reference into the covariance: ``dA = A dF / F`` at all positions."""
+    """Return the fit with its covariance enlarged by an unknown bias of the reference, of 1-sigma `sigma` nT.
+
+    A bias dF changes A by ``A dF / F`` at all positions.
+    """
     if not sigma:
         return found
     calibration = found.calibration
@@ -212,7 +221,7 @@ def _biased(found: Fit, sigma: float) -> Fit:
 
 
 def _refuse_one_attitude(data: Observations) -> None:
-    """Refuse samples of one attitude, or axis: they cannot separate the sensor's errors from the field."""
+    """Raise CalibrationError if all samples have one attitude, or a channel is stuck."""
     if 0 < (stuck := np.flatnonzero(np.ptp(data.field, axis=0) == 0.0)).size < 3:
         which = CHANNELS[int(stuck[0])]
         raise CalibrationError(

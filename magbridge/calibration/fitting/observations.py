@@ -1,4 +1,4 @@
-"""The observations of a fit, and their monomials."""
+"""Observations of a fit as arrays, and the monomials of their positions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
 
 RARE = 0.001
-"""Fraction of the samples at either end that does not count for the range of a condition."""
+"""Fraction of the samples at each end that the range of a condition excludes."""
 COMMON, FAR = 0.005, 10.0
 """A position is implausible if it is farther from the median than FAR times the span between the quantiles
 COMMON and 1 - COMMON."""
@@ -35,44 +35,49 @@ def _nothing() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Calibration data as arrays, without the rows that lack a value or hold an impossible field."""
+    """Calibration data as arrays.
+
+    The constructor removes samples without field, reference, position or time, or with an impossible field.
+    """
 
     field: FloatArray
-    """(n, 3), nT, raw channels, sensor axes."""
+    """(n, 3): Raw readings in sensor axes, nT."""
     reference: FloatArray
-    """(n,), nT, the true total field."""
+    """(n,): Reference of the total field, nT."""
     parameters: FloatArray
-    """(n, k): Actuator positions; k may be 0."""
+    """(n, k): Value of each parameter, such as an actuator's position; k may be 0."""
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    """`names`, `units`: of the parameters."""
+    """`names`, `units`: Name and unit of each parameter."""
     runs: NDArray[np.generic] = attribute(default_factory=_nothing)
-    """(n,): label of each sample: dive, spiral, file; default: one run. Whole runs are left out."""
+    """(n,): Label of each sample's run: a dive, spiral or file; default: one run. Cross-validation holds out
+    whole runs."""
     time: FloatArray = attribute(default_factory=_nothing)
-    """(n,), s since 1970 UTC; if not given, one sample a second."""
+    """(n,): Time of the samples, s since 1970 UTC; default: one sample per second."""
     attitude: FloatArray | None = None
-    """(n, 3), rad, roll, pitch, heading (true)."""
+    """(n, 3): Roll, pitch and true heading, rad; NaN where unknown."""
     reference_ned: FloatArray | None = None
-    """(n, 3), nT, the true field vector, north-east-down."""
+    """(n, 3): Reference field vector, north-east-down, nT."""
     place: FloatArray | None = None
-    """(n, 3), m north, east, down of `origin`."""
+    """(n, 3): Position north, east and down of `origin`, m."""
     unmapped: FloatArray | None = None
-    """(n,): 1 where the reference lacks the crustal field, or what a map misses; 0 where it is true."""
+    """(n,): 1 where the reference lacks the crustal field or a part of it, 0 where it is the true field."""
     temperature: FloatArray | None = None
-    """(n,), degC, of the sensor; NaN where unknown."""
+    """(n,): Temperature of the sensor, degC; NaN where unknown."""
     depth: FloatArray | None = None
-    """(n,), m; NaN where unknown."""
+    """(n,): Depth, m; NaN where unknown."""
     map_sigma: float | None = None
     """1-sigma of the map in the reference, nT; None without a map."""
     origin: tuple[float, float] = (0.0, 0.0)
     """Latitude and longitude of the origin of `place`, deg."""
     sensor: str = ""
+    """Name of the sensor; empty if unknown."""
     filter_cutoff: float = 0.0
-    """Cutoff frequency of the anti-alias filter that is undone in `field`, Hz; 0: none."""
+    """Cutoff frequency (Hz) of the anti-alias filter whose effect has been removed from `field`; 0: none."""
     inputs: dict[str, str] = attribute(default_factory=dict)
-    """File -> SHA-256."""
+    """SHA-256 of each input file, by the file's name."""
     model: str = ""
-    """Name of the reference."""
+    """Name of the reference's field model."""
 
     def __post_init__(self) -> None:
         n = len(self.field)
@@ -93,7 +98,7 @@ class Observations:
         time = np.asarray(self.time, float) if len(self.time) else np.arange(n, dtype=float)
         runs = np.asarray(self.runs) if len(self.runs) else np.zeros(n, int)
         field = np.asarray(self.field, float)
-        # a missing or impossible reading is NaN from here on, and its row is left out
+        # a missing or impossible reading becomes NaN, and its row is removed below
         absent = (field == 0.0).all(axis=1, keepdims=True)  # what an absent sensor reads
         field = np.where((np.abs(field) < MAX_MEASURED_NT) & ~absent, field, np.nan)
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
@@ -116,24 +121,24 @@ class Observations:
         return len(self.field)
 
     def part(self, rows: BoolArray) -> Observations:
-        """Pick rows: an (n,) mask."""
+        """Return the samples at which the mask `rows` (n,) is True."""
         columns = ((name, getattr(self, name)) for name in _PER_SAMPLE)
         picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
         return replace(self, **picked)
 
     def thinned(self, most: int) -> Observations:
-        """Return every second, third ... sample, so that there are at most so many."""
+        """Return every second, third ... sample, so that at most `most` samples remain."""
         step = -(-len(self) // most)
         return self if step <= 1 else self.part(np.arange(len(self)) % step == 0)
 
     def without_parameters(self) -> Observations:
-        """Return the same samples as those of a vehicle without moving masses."""
+        """Return the samples without their parameters, as if the vehicle had no moving masses."""
         return replace(self, parameters=self.parameters[:, :0], names=(), units=())
 
     def channels(self, calibration: Calibration) -> FloatArray:
-        """Return the channels (n, c), in order, that a calibration of these data needs for correction.
+        """Return the values (n, c) of the channels with which a calibration of these data corrects.
 
-        The first columns are the positions; of effects' channels, the temperature is known.
+        The first columns are the parameters; the temperature follows if one of the effects needs it.
         """
         positions = self.parameters[:, : len(calibration.parameters)]
         if TEMPERATURE not in calibration.channels[positions.shape[1] :] or self.temperature is None:
@@ -141,9 +146,10 @@ class Observations:
         return np.column_stack([positions, self.temperature])
 
     def directed(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Return True for samples (n,) with attitude and reference direction, and those of the m samples.
+        """Return a mask, and the attitude and reference vector of the m samples that have both.
 
-        The attitude (m, 3) is in rad, the reference (m, 3) in nT.
+        The mask (n,) is True for these samples. The attitude (m, 3) is in rad, and the reference (m, 3),
+        north-east-down, in nT.
         """
         if self.attitude is None or self.reference_ned is None:
             return np.zeros(len(self), bool), np.empty((0, 3)), np.empty((0, 3))
@@ -157,10 +163,10 @@ class Observations:
 
     @property
     def steps(self) -> FloatArray:
-        """(n,) whole sampling intervals since the run's previous sample; infinite at the first of a run.
+        """Number of sampling intervals since the run's previous sample, (n,); infinite at its first sample.
 
-        A shorter step counts as one interval: the noise's correlation is estimated at one interval, and not
-        extrapolated to less.
+        It is an integer of at least 1, because the noise's correlation is estimated at one interval and not
+        extrapolated to shorter times.
         """
         # in units of the median interval; independent across runs
         steps = np.full(len(self), np.inf)
@@ -171,7 +177,7 @@ class Observations:
         return steps
 
     def conditions(self) -> tuple[CalibratedRange, ...]:
-        """Return the ranges of depth and temperature, as far as they are known."""
+        """Return the ranges of depth and temperature in the data, for each condition that is known."""
         found = []
         for name, values in (("depth", self.depth), (TEMPERATURE, self.temperature)):
             known = np.empty(0) if values is None else values[np.isfinite(values)]
@@ -183,9 +189,9 @@ class Observations:
         return tuple(found)
 
     def ranges(self) -> tuple[Parameter, ...]:
-        """Return the parameters with the range seen, scaled to [-1, 1].
+        """Return the parameters with their ranges in the data, and scales that map these to [-1, 1].
 
-        CalibrationError: a parameter that never moves.
+        CalibrationError: a parameter is constant.
         """
         found = []
         for name, unit, column in zip(self.names, self.units, self.parameters.T, strict=True):
@@ -207,7 +213,10 @@ def _enough(
     names: Sequence[str],
     reference: FloatArray,
 ) -> None:
-    """Refuse data that cannot be fitted; name the responsible column."""
+    """Raise CalibrationError if fewer than 10 of n samples are `complete` (n,), or a reference is <= 0.
+
+    The message names the columns that lack values.
+    """
     if complete.sum() >= 10:
         if not (reference[complete] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
@@ -229,7 +238,10 @@ def _enough(
 
 
 def _plausible(names: Sequence[str], positions: FloatArray) -> None:
-    """Refuse a position far from all others, such as an undeclared missing-value code."""
+    """Raise CalibrationError if a position is far from all others, such as an undeclared missing-value code.
+
+    `positions` (n, k): one column for each of `names`.
+    """
     for name, column in zip(names, positions.T, strict=True):
         # the span of 99 % of the positions is the scale: a code such as -999 lies many spans away
         low, middle, high = np.quantile(column, [COMMON, 0.5, 1.0 - COMMON])
@@ -244,7 +256,7 @@ def _plausible(names: Sequence[str], positions: FloatArray) -> None:
 def monomials(
     positions: FloatArray, parameters: Sequence[Parameter], exponents: Sequence[Exponents]
 ) -> FloatArray:
-    """Return (n, m) monomials of positions (n, k), scaled as the k `parameters` say."""
+    """Return the m monomials (n, m) of positions (n, k), scaled by centre and scale of the k `parameters`."""
     # each monomial is the product of the scaled positions to its powers
     x = (positions - [p.centre for p in parameters]) / [p.scale for p in parameters]
     return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
@@ -256,20 +268,21 @@ def polynomial_samples(
     kappa: float = 0.0,
     ranges: Sequence[Parameter] | None = None,
 ) -> ResidualSamples:
-    """Return the samples of `data` with the monomials of their positions.
+    """Return the samples of `data` for a fit of polynomials, with the monomials of their positions.
 
-    The positions are scaled to the range seen, unless `ranges` are given.
+    `kappa`: 1-sigma of the reference over that of a sensor channel. `ranges`: parameters whose scales apply;
+    default: the ranges in the data.
     """
     phi = monomials(data.parameters, data.ranges() if ranges is None else ranges, exponents)
     return ResidualSamples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
 
 
 MIN_SLOPE_TIME_CONSTANTS = 4.0
-"""Time constants that a slope spans at least: over less it would be noise."""
+"""Smallest number of time constants over which a slope is computed, because shorter slopes are noise."""
 
 
 def unfiltered(data: Observations, corner: float) -> Observations:
-    """Return `data` as they would be without a first-order filter of cutoff `corner`, Hz.
+    """Return `data` with the effect of a first-order filter of cutoff `corner` (Hz) removed from the field.
 
     CalibrationError: the time constant of the filter is longer than the data.
     """

@@ -24,41 +24,40 @@ if TYPE_CHECKING:
 
 
 MAP_ERROR = 20.0
-"""1-sigma of a map that does not state its own, nT."""
+"""1-sigma assumed for a map that does not state one, nT."""
 MIN_GAP_INTERVALS = 10.0
-"""Intervals without a sample, after which a sample is independent of the previous one."""
+"""Number of median sampling intervals; a longer gap begins a new run."""
 FOLLOWED = (TEMPERATURE, "depth")
-"""Columns that move no mass but may be fitted as if they did."""
+"""Columns that do not move a mass but may be parameters of a fit."""
 
 
 def observations(
     ds: xr.Dataset, parameters: str | Sequence[str] = (), *, grid: AnomalyGrid | None = None
 ) -> Observations:
-    """Make the observations of a fit from a deployment's columns.
+    """Return the observations of a fit, with arrays such as the field (n, 3), from a deployment's columns.
 
     Parameters
     ----------
     ds : Dataset
-        A deployment, with times in s or as datetime64. Its reference is
-        :func:`~magbridge.field.reference.earth_field`; headings that it declares to be magnetic are made
-        true.
+        A deployment, with times in s or as datetime64. :func:`~magbridge.field.reference.earth_field` gives
+        its reference. Headings that it declares as magnetic are converted to true headings.
     parameters : str or sequence of str
-        Columns that move masses.
+        Names of the columns that report positions of masses.
     grid : AnomalyGrid, optional
-        Added to the IGRF where there is no ``reference_field``.
+        Anomaly map that is added to the IGRF in rows without ``reference_field``.
 
     Raises
     ------
     FormatError
-        A column is missing, or there is neither a reference nor a position.
+        A column is missing, or the deployment has neither a reference nor a position.
     CalibrationError
-        A column does not hold numbers; a parameter is a column with another meaning.
+        A column does not hold numbers, or a parameter is a column with another meaning.
     """
     parameters = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
-    # channels that were read in turn first, because everything else refers to the rows' times
+    # interpolate sequentially sampled channels first, because all other columns refer to the rows' times
     ds = at_one_time(in_seconds(ds))
     columns = {name: _column(ds, name) for name in names}
     total, vector, model = earth_field(ds, grid)
@@ -98,9 +97,9 @@ def observations(
 def at_one_time(ds: xr.Dataset) -> xr.Dataset:
     """Return a log whose channels were sampled sequentially, with all channels at the rows' times.
 
-    See :func:`~magbridge.one_time.interpolate_to_rows`. In a spiral a delay of 0.3 s is a rotation by a
-    degree, always in the same direction: the coefficients would absorb it, and keep it when the vehicle flies
-    straight.
+    :func:`~magbridge.one_time.interpolate_to_rows` interpolates them. In a spiral a delay of 0.3 s equals a
+    rotation by one degree, always in the same direction. The coefficients would absorb this rotation and be
+    wrong when the vehicle flies straight.
     """
     late = [axis for axis in "xyz" if {f"mag_{axis}", f"mag_time_{axis}"} <= set(ds.variables)]
     channels = {f"mag_{axis}": ("time", _at_rows(ds, axis), ds[f"mag_{axis}"].attrs) for axis in late}
@@ -108,17 +107,19 @@ def at_one_time(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _at_rows(ds: xr.Dataset, axis: str) -> FloatArray:
-    """Return a channel (n,), nT, at the rows' times."""
+    """Return the magnetometer channel of an `axis`, interpolated to the rows' times, (n,), nT."""
     time = np.asarray(ds["time"].values, float)
     return interpolate_to_rows(time, _column(ds, f"mag_time_{axis}"), _column(ds, f"mag_{axis}"))[0]
 
 
 def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple[float, float]]:
-    """Return m north, east and down of an origin (n, 3), where the true field is not known (n,), the origin.
+    """Return positions (n, 3), a flag (n,) for an unknown true field, and the positions' origin.
 
-    The first two are None without positions, or if the true field is known all along.
+    Positions are north, east and down of the origin, m. The flag is 1 in rows without ``reference_field``.
+    The origin is latitude and longitude, deg. Positions and flag are None if the log has no position, or
+    every row has a ``reference_field``.
     """
-    # a true field at a row makes its place irrelevant
+    # the position of a row does not matter if its true field is known
     known = ds["reference_field"].notnull().to_numpy() if "reference_field" in ds else np.array(False)
     if not {"latitude", "longitude"} <= set(ds.variables) or known.all():
         return None, None, (0.0, 0.0)
@@ -134,7 +135,7 @@ def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple
 
 
 def grid_sigma(grid: AnomalyGrid) -> float:
-    """Return the error of a map, nT: its own (RMS) with its level's, or a plausible one if it states none."""
+    """Return the 1-sigma of a map, nT: of its cells (RMS) and its constant bias, or else a default."""
     return hypot(float(np.sqrt(np.nanmean(grid.sigma**2))), grid.level_sigma) or MAP_ERROR
 
 
@@ -147,7 +148,7 @@ def _column(ds: xr.Dataset, name: str) -> FloatArray:
 
 
 def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
-    """Return the column ``run`` or ``dive``; without them, a new run begins after a gap of ten intervals."""
+    """Return the run of each row (n,): column ``run`` or ``dive``, else numbers that gaps separate."""
     for name in ("run", "dive"):
         if name in ds:
             return np.asarray(ds[name].values)

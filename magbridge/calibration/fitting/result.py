@@ -1,4 +1,4 @@
-"""The result of a fit: a calibration, its residuals, and its warnings."""
+"""Result of a fit: a calibration, its residuals, and its warnings."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from magbridge.wording import counted
 
 @dataclass(frozen=True, eq=False)
 class Creep:
-    """Drift of the offset during a survey."""
+    """Drift of the sensor's offset during a survey."""
 
     time: FloatArray
-    """(n,), s since 1970 UTC."""
+    """(n,): Time of the samples, s since 1970 UTC."""
     offset: FloatArray
-    """(n, 3), nT, sensor axes, about the mean."""
+    """(n, 3): Offset relative to the calibration's T, sensor axes, nT."""
     calibration: Calibration
-    """Calibration without the walk; beyond the survey the offset may have any value of it."""
+    """Calibration without the variance of this drift in T."""
 
     def offset_at(self, time: FloatArray) -> FloatArray:
         """Return the offset (m, 3), nT, at times (m,), s since 1970 UTC."""
@@ -40,45 +40,45 @@ class Creep:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The result of a fit."""
+    """Result of a fit."""
 
     calibration: Calibration
     residual: FloatArray
-    """(n,), nT in the sensor's own units: ``(F - H_e) / |A^T u|``."""
+    """(n,): Residual ``(F - H_e) / |A^T u|``, nT as the sensor measures (before the scale factors of A)."""
     warnings: tuple[Diagnostic, ...]
-    """What the data could not determine, and which samples were left out."""
+    """Warnings about undetermined quantities and excluded samples."""
     details: dict[str, Any]
-    """Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
-    each estimable combination from the data alone (nT)."""
+    """Results of the method by name: evidence, prior widths, number of determined coefficients, rank, and the
+    1-sigma of each estimable combination from the data alone (nT)."""
     samples: ResidualSamples
-    """The data as fitted, for :mod:`.checks`."""
+    """Samples of the fit, for :mod:`.checks`."""
     open: tuple[Diagnostic, ...] = ()
-    """What the track leaves open, which is a reason for an error that is large."""
+    """Quantities that the track does not determine; they become warnings, and reasons for a large error."""
     information: GaussianInformation | None = None
-    """What the data alone say of the coefficients; None where the method's prior is none of all of them."""
+    """Information about the coefficients from the data alone; None if the method does not provide it."""
     creep: Creep | None = None
-    """How the sensor's offset crept meanwhile, where the data show that it did."""
+    """Drift of the sensor's offset during the data; None if the data do not show a drift."""
 
     def __repr__(self) -> str:
         count = f", {counted(len(self.calibration.warnings), 'warning')}" if self.calibration.warnings else ""
         return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{count}; {self.calibration!r}>"
 
     def _repr_html_(self) -> str:
-        """Return the same for a notebook, with the warnings."""
+        """Return the fit as HTML for a notebook, with its warnings."""
         warnings = "".join(f"<li>{escape(warning.text)}</li>" for warning in self.warnings)
         return f"<p>{escape(repr(self))}</p>" + f"<ul>{warnings}</ul>" * bool(warnings)
 
     @property
     def supported(self) -> bool:
-        """Return True without a reason against the calibration: ``--strict`` demands it.
+        """Return True if the data support the calibration, as the option ``--strict`` requires.
 
-        The error expected elsewhere is not large against the noise, and the headings have no wide gap.
+        The calibration then has no warning, such as that of a large expected error or a gap in the headings.
         """
         return not self.calibration.warnings
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Smallest and largest scale of A at the samples: a fit can reduce its residual by shrinking them."""
+        """Smallest and largest scale factor of A at the samples; values far from 1 suggest a collapse."""
         # 1,000 samples show the range of the scales over the positions
         step = max(len(self.samples.phi) // 1000, 1)
         scales, _ = scales_and_offsets(
@@ -88,7 +88,7 @@ class Fit:
 
     @property
     def rms(self) -> float:
-        """RMS of the residual, nT."""
+        """RMS of the residual, nT as the sensor measures."""
         return rms(self.residual)
 
 
@@ -102,10 +102,10 @@ def assemble(
     *,
     informative: bool = False,
 ) -> Fit:
-    """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
+    """Return a fit with its calibration, from the posterior of the coefficients.
 
-    `left_out`: what the fit is worth on parts left out: the sigmas grow by its ratio. `informative`: keep
-    what the data alone say of the coefficients, without the prior.
+    `posed`: problem of the fit. `found`: posterior. `left_out`: held-out errors; all sigmas grow by their
+    ratio. `informative`: also compute the information from the data alone, without the prior.
     """
     # sigma and covariance grow by the ratio of held-out errors to claimed ones
     e, samples, noise, covariance = found.residual, found.samples, found.noise, found.covariance
@@ -147,7 +147,7 @@ def _without_prior(found: CoefficientPosterior) -> GaussianInformation:
 
 
 def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:
-    """Return each run's samples, RMS residual (nT) and mean positions."""
+    """Return a summary of each run: number of samples, RMS of the residuals `e` (n,), nT, mean positions."""
     labels, which = np.unique(data.runs, return_inverse=True)
     count = np.bincount(which)
     squares = np.bincount(which, e * e)

@@ -1,14 +1,14 @@
-"""The loop of every fit: coefficients, widths of the prior and noise in turn, from several starts.
+"""Loop of every fit: it alternates coefficients, prior widths and noise, from several starts.
 
 Notes
 -----
-A fit is a problem: samples, a family of priors, and what its residuals say of the noise. :func:`settle`
-alternates coefficients (Gauss-Newton at fixed widths) and noise; :func:`climb` chooses the widths, too, by
-the evidence of the quadratic that it finds. Residuals are outliers, white noise and an AR(1) process once the
-model has converged; until then they are the model's error, and look correlated for long.
+:func:`settle` alternates coefficients (Gauss-Newton with a fixed prior) and noise. :func:`climb` also
+estimates the prior widths, which maximise the evidence of a quadratic approximation. After convergence the
+residuals consist of outliers, white noise and an AR(1) process. Before, they are mainly the model's error,
+which has a long correlation time.
 
-The error of a model that cannot describe the vehicle lasts. It is not whitened, but so many residuals in a
-row count as one (:func:`lasting_noise`; Newey & West 1987, Econometrica 55:703).
+If a model cannot describe the vehicle, its error remains correlated. :func:`lasting_noise` does not whiten
+such an error, but counts several successive residuals as one (Newey & West 1987, Econometrica 55:703).
 """
 
 from __future__ import annotations
@@ -44,47 +44,50 @@ from magbridge.estimation.residual import (
 
 @dataclass(frozen=True, eq=False)
 class CoefficientPosterior:
-    """The result of a fit."""
+    """Gaussian posterior of the coefficients ``c = E z + offset``, with the fit's samples, prior and noise."""
 
     samples: ResidualSamples
     prior: Prior
     z: FloatArray
-    """(q,): the unknowns behind the coefficients."""
+    """(q,): Unknowns z of the fit at the maximum of the posterior."""
     spread: FloatArray
-    """(q, q): covariance of z."""
+    """(q, q): Covariance of z."""
     noise: NoiseModel
-    """Noise of a sample."""
+    """Noise of a single sample."""
     weighted: NoiseModel
-    """Noise that weighs the samples: larger where several residuals count as one."""
+    """Noise with which the fit weights the samples; its sigma is larger if several residuals count as one."""
     settled: bool
-    """True if the last step found a minimum."""
+    """True if the last Gauss-Newton solution converged to a minimum."""
     objective: float
-    """Negative log posterior at z, with the weights of the last step."""
+    """Negative log posterior at z (without its constant), with the weights of the last step."""
 
     @property
     def coefficients(self) -> FloatArray:
-        """(9 m,) nT."""
+        """Coefficients c, (9 m,), nT."""
         return self.prior.coefficients(self.z)
 
     @property
     def covariance(self) -> FloatArray:
-        """(9 m, 9 m) of the coefficients, nT²."""
+        """Covariance of the coefficients, (9 m, 9 m), nT²."""
         return np.asarray(self.prior.E @ self.spread @ self.prior.E.T)
 
     @property
     def residual(self) -> FloatArray:
-        """(n,), nT in the sensor's units."""
+        """Residual of each sample, (n,), nT as the sensor measures."""
         return residuals_of(self.samples, self.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
 class Climbed(CoefficientPosterior):
-    """A posterior whose prior's widths maximise the evidence."""
+    """Posterior of the coefficients with the prior widths that maximise the evidence."""
 
     family: PriorFamily
     widths: Hyperparameters
+    """Prior widths (their logarithms eta) and noise that maximise the evidence."""
     quadratic: GaussianInformation
+    """Quadratic approximation of the samples' cost at the solution."""
     log_evidence: float
+    """Natural logarithm of the evidence of all samples."""
 
 
 # ---- Coefficients and noise at fixed widths ----
@@ -94,7 +97,8 @@ MAX_START_ITERATIONS = 16
 MIN_APPROACH = 0.2
 """Relative decrease of the residuals by a step below which the solution is near."""
 Estimate = Callable[[Prior, Solution, NoiseModel], tuple[NoiseModel, NoiseModel]]
-"""Prior, solution, noise so far -> noise of a sample, and noise that weighs the samples next."""
+"""Function that takes the prior, the solution and the present weighting noise. It returns the noise of a
+sample, and the noise that weights the samples in the next iteration."""
 
 
 def settle(
@@ -109,9 +113,11 @@ def settle(
     steps: int = 50,
     tolerance: float = 1e-3,
 ) -> CoefficientPosterior:
-    """Alternate coefficients and noise from z (q,) until the noise's size changes by less than `change`.
+    """Alternate coefficients and noise, starting at z (q,), and return the posterior.
 
-    `rounds`: largest number of alternations; `steps`, `tolerance`: of each Gauss-Newton solution.
+    `estimate`: function that estimates the noise. `noise`: initial noise. `rounds`: largest number of
+    iterations. `change`: relative change of the noise's sigma at which they stop. `steps`, `tolerance`:
+    limits of each Gauss-Newton solution.
     """
     weighted = noise
     for _ in range(rounds):
@@ -126,7 +132,7 @@ def settle(
 
 
 def approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> CoefficientPosterior:
-    """Approach the solution from z (q,): after each step, set the noise to the bulk of the residuals."""
+    """Return an approximate posterior after steps from z (q,); the bulk of the residuals sets the noise."""
     # far from the solution a small noise would make steps that overshoot
     white = np.full(len(samples.field), np.inf)
 
@@ -143,10 +149,10 @@ def approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> Coefficie
 def lasting_noise(
     samples: ResidualSamples, prior: Prior, found: Solution, weighted: NoiseModel
 ) -> tuple[NoiseModel, NoiseModel]:
-    """Return the noise of a sample, and the noise that weighs it where model errors last.
+    """Return the noise of a sample, and the noise that weights it if model errors are correlated.
 
-    The noise of a sample is white noise plus an AR(1) process with as many independent samples and the same
-    autocorrelation of neighbours as the residuals.
+    The noise of a sample is white noise plus an AR(1) process. It has the residuals' autocorrelation at one
+    sample, and their number of independent samples.
     """
     e, g = residuals(samples, prior.coefficients(found.z))
     noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
@@ -162,10 +168,10 @@ def lasting_noise(
 
 
 def _slow_and_white(lasting: float, neighbours: float) -> tuple[float, float]:
-    """Return autocorrelation rho and white fraction w of white noise and an AR(1) process.
+    """Return autocorrelation rho and white fraction w of the sum of white noise and an AR(1) process.
 
-    `lasting` is the sum of the autocorrelations at all lags, ``(1 - w) rho / (1 - rho)``, and `neighbours` is
-    the autocorrelation of neighbours, ``(1 - w) rho``.
+    `lasting`: sum of the autocorrelations at all lags, ``(1 - w) rho / (1 - rho)``. `neighbours`:
+    autocorrelation of successive samples, ``(1 - w) rho``.
     """
     if not 0.0 < neighbours < lasting:  # no slow part, or none that lasts beyond the next sample
         return max(lasting / (1.0 + lasting), 0.0), 0.0
@@ -185,9 +191,10 @@ def climb(
     *,
     shaped: bool = False,
 ) -> Climbed:
-    """Alternate coefficients, widths and noise until the evidence converges.
+    """Alternate coefficients, prior widths and noise until the evidence converges; return the posterior.
 
-    `z` (q,), `eta` (h,): start. `noise`: given if z is near the solution. `shaped`: keep its autocorrelation.
+    `z` (q,), `eta` (h,): initial unknowns and log widths. `noise`: initial noise if z is near the solution.
+    `shaped`: keep the autocorrelation and white fraction of `noise`.
     """
     score, white = -np.inf, noise is None
     shape = noise.shape if noise is not None and shaped else None
@@ -197,7 +204,7 @@ def climb(
     for step in range(MAX_START_ITERATIONS):
         if family.renew is not None and step:
             family = family.renew(z)
-        # the first widths are a guess, and not worth settling at
+        # the first widths are a guess, so a few steps suffice
         solution = gauss_newton(samples, family.prior(eta), noise, z, steps=50 if step else 3)
         kept = len(samples.field) - noise.rejected
         quadratic = GaussianInformation.from_derivatives(solution.z, *solution.normal, kept)
@@ -210,7 +217,7 @@ def climb(
             break
         # residuals of a wrong model look correlated for long, so the autocorrelation waits for convergence
         white = white and not still and step < MAX_START_ITERATIONS // 2
-        # at last the noise's autocorrelation and outliers are kept, so that the rest converges
+        # in the last iterations keep the noise's autocorrelation and outliers, so that the rest converges
         if step < MAX_START_ITERATIONS - 4:
             prior = family.prior(eta)
             e = residuals_of(samples, prior.coefficients(z))
@@ -226,7 +233,10 @@ def climb(
 
 
 def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
-    """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
+    """Return the log evidence of all samples.
+
+    An outlier counts as a sample at the outlier limit. The Jacobian of the whitening is included.
+    """
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
     variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
     whitening = 0.5 * np.log(variance).sum()
@@ -234,7 +244,7 @@ def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples)
 
 
 def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
-    """Return the answer with the largest evidence among several starts.
+    """Return the converged posterior with the largest evidence among several starts.
 
     NoSolutionError: no start converged.
     """
@@ -255,7 +265,7 @@ def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
 
 
 def with_slow_noise(answer: Climbed) -> Climbed:
-    """Return the answer with slow and white noise if the residuals have both."""
+    """Return the posterior, fitted again with slow and white noise if the residuals have both."""
     for _ in range(2):
         noise = fit_slow_and_white(answer.residual, answer.samples.steps, answer.noise)
         if noise is answer.noise:
@@ -267,17 +277,19 @@ def with_slow_noise(answer: Climbed) -> Climbed:
 # ---- Where a fit begins, and with which samples ----
 
 ENOUGH, BLOCK = 6000, 50
-"""Number of samples that choose the start, and size of the blocks of neighbours they are taken in."""
+"""Largest number of samples that choose the start, and number of successive samples in each of their
+blocks."""
 MIN_END_SAMPLES = 20
-"""Smallest number of samples of an end of the log that is cut."""
+"""Smallest number of samples that :func:`flown` removes from an end of the log."""
 MIN_OUTLIER_FRACTION = 0.7
-"""Fraction of outliers among the samples of such an end."""
+"""Smallest fraction of outliers among the samples that :func:`flown` removes."""
 
 
 def starts(samples: ResidualSamples) -> list[FloatArray]:
-    """Return two starts (9,), nT: without iron, and the best sphere by linear least squares.
+    """Return two initial sets of coefficients (9,), nT: zeros, and the offset of the best sphere.
 
-    ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
+    The sphere follows from linear least squares, because ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T
+    and one constant.
     """
     h = samples.field
     design = np.column_stack([2.0 * h, np.full(len(h), samples.F_0)])
@@ -291,7 +303,10 @@ def starts(samples: ResidualSamples) -> list[FloatArray]:
 
 
 def thinned_rows(n: int) -> IndexArray:
-    """Return the rows (k,) of blocks of neighbours, spread evenly over n samples; all rows if n is small."""
+    """Return the rows (k,) of blocks of successive samples, spread evenly over n samples.
+
+    Returns all rows if n is at most :data:`ENOUGH`.
+    """
     if n <= ENOUGH:
         return np.arange(n)
     first = np.linspace(0, n // BLOCK - 1, ENOUGH // BLOCK).astype(int) * BLOCK
@@ -299,7 +314,7 @@ def thinned_rows(n: int) -> IndexArray:
 
 
 def thinned(samples: ResidualSamples) -> ResidualSamples:
-    """Return blocks of neighbours, spread evenly over all samples, to choose a start."""
+    """Return the samples of :func:`thinned_rows`, with which a fit chooses its start."""
     n = len(samples.field)
     if n <= ENOUGH:
         return samples
@@ -309,9 +324,10 @@ def thinned(samples: ResidualSamples) -> ResidualSamples:
 
 
 def flown(residual: FloatArray) -> BoolArray:
-    """Return a mask (n,) without samples at an end of the log that contradict the others.
+    """Return a mask (n,) that is False for samples at the ends of the log that contradict the others.
 
-    `residual` (n,): of a robust fit, in the order of the log, nT.
+    Such samples are a crash or a launch. `residual` (n,): residual of a robust fit, in the order of the log,
+    nT.
     """
     # an end is cut where most of its samples are outliers
     off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
@@ -322,7 +338,7 @@ def flown(residual: FloatArray) -> BoolArray:
 
 
 def _end(outlier: BoolArray) -> int:
-    """Return the number of samples at the start that are mostly outliers; 0 if they are few."""
+    """Return the number of samples at the start of `outlier` (n,) that are mostly outliers; 0 if few."""
     share = np.cumsum(outlier) / np.arange(1, len(outlier) + 1)
     until = np.flatnonzero((share > MIN_OUTLIER_FRACTION) & outlier)
     return int(until[-1]) + 1 if until.size and until[-1] + 1 >= MIN_END_SAMPLES else 0
@@ -331,15 +347,15 @@ def _end(outlier: BoolArray) -> int:
 # ---- A fit that collapsed ----
 
 ALL_AROUND = 0.05
-"""Least variance of the field along any axis, over its square: 1/3 where all attitudes are seen, and 1 % on a
-glider that never rolls."""
+"""Variance of the field along its least varied axis, over the field's square, below which the attitudes are
+narrow. It is 1/3 if all attitudes occur, and 0.01 on a glider that never rolls."""
 
 
 def check_scales(samples: ResidualSamples, coefficients: FloatArray) -> None:
-    """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
+    """Raise NoSolutionError if a fit collapsed, as its scales and offset at the samples show.
 
-    NoSolutionError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,
-    where the attitudes do not separate it from a scale. With all attitudes, the noise alone limits T.
+    NoSolutionError: a scale of A is outside 0.5 to 2; or T exceeds twice the field and the attitudes are too
+    narrow to separate T from a scale. `coefficients` (9 m,): nT.
     """
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
     scales, T = scales_and_offsets(seen, coefficients)

@@ -1,4 +1,4 @@
-"""Contributions of several logs to a fit, and the test whether one calibration fits all of them."""
+"""Contribution of each log to a fit, and a test whether one calibration fits all logs."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 MAX_JOINT_RMS_RATIO = 3.0
-"""RMS of a fit to all logs over that of a fit to each, from which on they differ."""
+"""RMS of a fit to all logs over that of separate fits, above which the logs are not of one vehicle."""
 JUDGED = 10
-"""Number of logs, the largest, that are fitted each on its own."""
+"""Largest number of logs that are fitted separately; the largest logs are taken."""
 
 
 def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
-    """Return the index (n,) of the log of the sample at each `time` (n,), s; -1 for none.
+    """Return the index (n,) of the log with a complete sample at each `time` (n,), s; -1 if no log has one.
 
-    Of logs with all channels at the same time it is the first, as when they are joined.
+    If several logs have a complete sample at this time, the first log counts.
     """
     # from the last log to the first, so that the first one wins
     which = np.full(len(time), -1)
@@ -58,10 +58,10 @@ def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[Diag
 def heterogeneous_logs(
     logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, refit: Callable[[Observations], Fit]
 ) -> Diagnostic | None:
-    """Return a warning if logs are not of one vehicle in one state.
+    """Return a warning if logs are not from one vehicle in one state; else None.
 
-    `data`: samples of the fit. `found`: the fit to all; None if it collapsed. `refit`: fits a part of the
-    data in the same way.
+    `data`: samples of the fit. `found`: the fit to all logs; None if it collapsed. `refit`: function that
+    fits a part of the data in the same way.
     """
     if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
         return None  # the residuals are noise from one sample to the next
@@ -86,7 +86,7 @@ def heterogeneous_logs(
 
 
 def _sampled(log: xr.Dataset) -> FloatArray:
-    """Return the times at which a log has all channels."""
+    """Return the times (n,), s, at which a log has all channels of the magnetometer."""
     if not all(name in log for name in CHANNELS):
         return np.empty(0)
     whole = np.logical_and.reduce([log[name].notnull().to_numpy() for name in CHANNELS])
@@ -94,7 +94,7 @@ def _sampled(log: xr.Dataset) -> FloatArray:
 
 
 def _scatter(residual: FloatArray) -> float:
-    """Return the robust sigma of a residual's steps from sample to sample, as if they were white noise."""
+    """Return the robust 1-sigma of a residual, nT, from its steps between samples, as for white noise."""
     return float(np.median(np.abs(np.diff(residual)))) / (0.6745 * 2.0**0.5) if len(residual) > 1 else 0.0
 
 

@@ -1,11 +1,11 @@
-"""How good a calibration is: on data, over a mission, and the part of its sigma that is its level.
+"""Error of a calibration: on data, over a mission, and the part that is a constant bias (the level).
 
 Notes
 -----
 A part of a corrected sample's variance is common to all samples: the mean of the field at a site is only as
-certain as its reference. A survey determines the rest. With j the mean slope of the corrected field by the
-coefficients and P their covariance, the level's sigma is ``sqrt(j^T P j)``, and the coefficients move with it
-by ``P j / sqrt(j^T P j)``.
+certain as its reference. This part is called the level; a survey determines the rest. With j the mean
+derivative of the corrected field by the coefficients and P their covariance, the level's sigma is
+``sqrt(j^T P j)``. A change of the level by this sigma moves the coefficients by ``P j / sqrt(j^T P j)``.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
 
 CONTRADICTS = 2.0
-"""Largest departure of an estimated level from the reference's, in its sigmas, that is accepted."""
+"""Largest accepted bias of the reference that a fit estimates, in prior sigmas of this bias."""
 LEVEL_ROWS = 5_000
-"""Largest number of samples that the mean is taken over."""
+"""Approximate number of samples over which the mean derivative is computed."""
 
 
 def with_level(
     calibration: Calibration, samples: ResidualSamples, bias: float, bias_sigma: float
 ) -> Calibration:
-    """Compute how much of a calibration's covariance is level.
+    """Return the calibration with the part of its covariance that is common to all samples (the level).
 
-    A level beyond :data:`CONTRADICTS` sigmas of its prior does not come from the log: a fit that claims to
-    determine it has absorbed another effect. The level is then the reference's, with the sigma of its prior,
-    and the coefficients move back by as much.
+    If the estimated bias exceeds :data:`CONTRADICTS` sigmas of its prior, the fit has absorbed another effect
+    into it. The function then sets the bias to 0, with the sigma of its prior, and moves the coefficients
+    back accordingly.
 
-    `samples`: those of the fit, without what its effects explain. `bias`, `bias_sigma`: level of the
-    reference as found, and its prior 1-sigma, nT.
+    `samples`: samples of the fit, with its effects subtracted. `bias`, `bias_sigma`: estimated bias of the
+    reference, and its prior 1-sigma, nT.
     """
     part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
     own = calibration.coefficients[: 9 * part.phi.shape[1]]
@@ -68,12 +68,12 @@ def with_level(
 
 
 def contradicts(bias: float, bias_sigma: float) -> bool:
-    """Return True if a level found by a fit (nT) contradicts the reference's prior, of `bias_sigma` nT."""
+    """Return True if an estimated `bias` of the reference contradicts its prior 1-sigma `bias_sigma` (nT)."""
     return abs(bias) > CONTRADICTS * bias_sigma
 
 
 def apart_from_level(calibration: Calibration) -> Calibration:
-    """Return the calibration with the covariance that is left where the level is known."""
+    """Return the calibration with its covariance for a known level: the level's part is subtracted."""
     if not calibration.level:
         return calibration
     w = np.zeros(len(calibration.coefficients))
@@ -84,7 +84,10 @@ def apart_from_level(calibration: Calibration) -> Calibration:
 def level_of(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return the part of each sample's sigma (n,), nT, that is level; arguments as for ``correct``."""
+    """Return the part (n,), nT, of each corrected sample's sigma that is common to all samples (the level).
+
+    Arguments as for :func:`~magbridge.calibration.correct.correct`.
+    """
     if not calibration.level:
         return np.zeros(len(field))
     up, here = (correct(one, field, channels, time).total for one in (calibration.at_level(), calibration))
@@ -92,7 +95,10 @@ def level_of(
 
 
 def sizes(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
-    """Return ``sqrt(kappa^2 + |A u|^2)`` (n,): nT of the corrected field in one of the sensor's."""
+    """Return ``s = sqrt(kappa^2 + |A u|^2)`` (n,), by which the residual divides errors of the total field.
+
+    `coefficients` (9 m,): nT.
+    """
     theta = samples.phi @ coefficients.reshape(-1, 9)
     A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
     b = np.matmul(A, (samples.field - theta[:, 6:])[:, :, None])
@@ -101,19 +107,19 @@ def sizes(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
 
 
 MISSION_SAMPLES = 600
-"""Samples that represent a mission."""
+"""Approximate number of samples that represent a mission."""
 ROLL = 10.0
-"""Angle by which a survey rolls further than the runs, deg."""
+"""Angle by which a survey is assumed to roll further than the runs, deg."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """The fields and positions that a mission meets."""
+    """Fields and positions of a mission, over which the error of a calibration matters."""
 
     field_body: FloatArray
-    """(n, 3), nT, the true field in body axes."""
+    """(n, 3): True field in body axes, nT."""
     parameters: FloatArray
-    """(n, k): Actuator positions at the same samples, in their units."""
+    """(n, k): Value of each parameter at the same samples, in its unit."""
 
     @classmethod
     def from_observations(cls, data: Observations) -> Mission:
@@ -132,9 +138,9 @@ class Mission:
 
 
 def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
-    """Return the calibration's own attitudes and positions, rolled a little further, on all headings.
+    """Return a mission with the attitudes and positions of `data`, on all headings and with 10 deg more roll.
 
-    Without attitude, which gives the vertical, only the runs' headings are used.
+    If the data have no attitude, which gives the vertical, the mission has only the headings of the runs.
     """
     rows = np.arange(0, len(data), max(3 * len(data) // MISSION_SAMPLES, 1))
     k = len(calibration.parameters)
@@ -156,8 +162,11 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
 
 
 def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
-    """Return the 1-sigma of the corrected total field from the position terms alone (n,), nT."""
-    # forward to the reading and back: the sigma of the way back is that of the position terms
+    """Return the 1-sigma (n,), nT, of the corrected total field at a mission's points.
+
+    It includes the covariance of the position terms only, without effects and noise.
+    """
+    # compute readings, then correct them: the resulting sigma is that of the position terms
     model = replace(calibration.without_effects(), noise=Noise(0.0), boresight=None)
     truth = mission.field_body
     if calibration.boresight is not None:
@@ -168,9 +177,10 @@ def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
 
 
 def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return the error of the total field over ``|A^T u|`` (n,), nT of the sensor, and over its sigma (n,).
+    """Return the error of the total field over ``|A^T u|`` (n,), nT, and over its sigma (n,), dimensionless.
 
-    A fit that shrinks A reduces every error of the corrected field, but none in the sensor's units.
+    The first is the error in nT as the sensor measures: unlike the error of the corrected field, a fit cannot
+    reduce it by shrinking A.
     """
     got = correct(calibration, data.field, data.channels(calibration), data.time)
     A, T = calibration.matrices(data.parameters[:, : len(calibration.parameters)])
@@ -184,8 +194,8 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
 def expected_heading_sigma(calibration: Calibration, data: Observations) -> float:
     """Return the RMS over the samples of the magnetic heading's standard deviation, deg.
 
-    Roll and pitch have the default sigma of :mod:`magbridge.calibration.heading`. NaN without a boresight, or
-    without roll and pitch.
+    Roll and pitch have the `tilt_sigma` of the boresight. The result is NaN without a boresight, or without
+    roll and pitch.
     """
     if calibration.boresight is None or data.attitude is None:
         return float("nan")
