@@ -165,7 +165,7 @@ def _first_solution(
 
 
 def _refuse_large_crust(found: Fit) -> None:
-    """Raise NoSolutionError if the fitted crustal field is so large that it must be an error of the sensor."""
+    """Raise NoSolutionError if a fitted crustal field is so large that it must be a sensor error."""
     if (size := found.details.get("crustal_field", {}).get("rms_nT", 0.0)) > MAX_CRUST_NT:
         raise NoSolutionError(
             f"survey: a crustal field of {size:.0f} nT RMS was fitted, larger than any crust's"

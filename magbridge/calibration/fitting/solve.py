@@ -44,7 +44,7 @@ from magbridge.estimation.residual import (
 
 @dataclass(frozen=True, eq=False)
 class CoefficientPosterior:
-    """Gaussian posterior of the coefficients ``c = E z + offset``, with the fit's samples, prior and noise."""
+    """Gaussian posterior of the coefficients ``c = E z + offset``, with samples, prior and noise."""
 
     samples: ResidualSamples
     prior: Prior
