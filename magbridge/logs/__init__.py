@@ -1,7 +1,7 @@
 """Read and write deployments: a module for each format, a table of formats, one reader and one writer.
 
 A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). Each row is one sample of the
-magnetometer. Every other column holds its value at the row's time, which depends on the kind of log:
+magnetometer. Every other column has a value at the row's time, obtained according to the kind of log:
 
 - in logs of a live link (``.tlog``, ``.BIN``, ``.ulg``) it is the last value received at or before the row,
   and NaN once older than 30 s. A live bridge uses the same value, so a calibration is fitted to the kind of

@@ -96,7 +96,7 @@ def read_chunks(
     """Yield the result of :func:`read` in pieces of about `rows` rows with the same columns.
 
     A single CSV, netCDF or Parquet file is streamed in bounded memory. A file of another format is in memory
-    as a whole. Each of several files is in memory until the times of the next file begin.
+    as a whole. Each of several files is in memory from its first time to its last.
     """
     from magbridge.logs.merge import merge, refuse_offset  # noqa: PLC0415 - xarray is for ashore
 
@@ -179,7 +179,7 @@ def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[i
     if len(formats) < 2:
         return {}
     for form in {form.module: form for form in formats.values()}.values():
-        form.load()  # once here, and not in every child
+        form.load()  # import each module once here, and not in every child
     jobs = [GuardedJob(paths[k], partial(_raw, paths[k], form, rows, options)) for k, form in formats.items()]
     child = Guarded(jobs)
     return {k: child.pieces(number) for number, k in enumerate(formats)}
@@ -260,7 +260,7 @@ def _origin(source: str) -> str:
     """Return the source in brackets, as ``a.csv`` of ``b.nc (a.csv)``; without brackets, `source` itself."""
     name, opened, inside = source.partition(" (")
     depths = list(accumulate((char == "(") - (char == ")") for char in inside))
-    # one pair of brackets around the rest, and not several files
+    # one pair of brackets encloses the rest; several sources have several pairs
     is_whole = opened and "," not in name and min(depths, default=0) == -1 == depths[-1]
     return inside[:-1] if is_whole and -1 not in depths[:-1] else source
 

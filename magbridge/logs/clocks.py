@@ -241,7 +241,7 @@ def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bo
         letters = [part[0].lower() for part in order.groups()]
         fit = [pattern for pattern in fit if re.findall("%([ymd])", pattern.lower())[:3] == letters] or fit
     if not fit:
-        return TimeFormat("iso")  # each cell will be refused with its row
+        return TimeFormat("iso")  # later, an error names the row of each cell
     if len(fit) > 1:
         which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit)
         first = "day or month" if len({pattern.lower().find("%y") for pattern in fit}) == 1 else "day or year"
@@ -332,7 +332,7 @@ def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray
     if zone is not None and stamps.dt.tz is None:
         stamps = stamps.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
     counts = stamps.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy("datetime64[us]")
-    whole = counts.astype("datetime64[s]")  # separately, so that no digit is lost
+    whole = counts.astype("datetime64[s]")  # converted separately, so that no digit is lost
     times = whole.astype(np.int64) + ((counts - whole).astype(np.int64) * 1e-6 + seconds)
     return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)
 

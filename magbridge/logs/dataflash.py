@@ -194,7 +194,7 @@ def _decoded(data: Bytes, kind: _Kind, starts: IndexArray, wanted: Collection[st
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
         if letter not in LETTERS or offset + layout.itemsize > kind.length:
-            break  # how long a field of an unknown letter is, and so where the next begins, is not known
+            break  # a field of an unknown letter has no known length, so the next has no known start
         if name in wanted and layout.kind in "iuf":
             numbers = _gather(data, starts, layout, offset).astype(np.float64)
             fields[name] = numbers / OWN_SCALE.get(letter, 1.0)

@@ -147,7 +147,7 @@ def header_of(
     decimal = declared.decimal or _decimal(rows)
     if decimal == "," and not declared.decimal:
         guesses.append("decimal commas")
-    # MagArrow: sentences with commas of their own, at the end of some rows
+    # MagArrow appends sentences that contain commas to some rows
     open_ended = NMEA_HEADING in headings
     headings = headings[: headings.index(NMEA_HEADING)] if open_ended else headings
     maker, declared = declared_by_maker(headings, declared)
@@ -211,7 +211,7 @@ def _separator(body: Sequence[str]) -> str:
         if most > 1 and (often > 1 or len(body) == 1):
             headed = _count(body[0], separator) == most
             share = often / len(body) + 0.5 * (separator != BLANKS and headed)
-            # a comma may be a decimal's: the headings must have as many fields as the rows
+            # a comma may be the decimal sign: the headings must have as many fields as the rows
             if not headed and share < 0.5:
                 share *= 0.1
             if share > best_score + 0.05:

@@ -315,7 +315,7 @@ def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str
 def _numberings(number: int) -> list[Callable[[str], str]]:
     """Return functions that turn the name of an axis of the first sensor into one of sensor `number`."""
     return [
-        # b1x, imu0magx: the last 0 or 1 counts
+        # b1x, imu0magx: the last 0 or 1 is the number of the sensor
         lambda word: re.sub(r"([01])(\D*)$", lambda m: f"{int(m[1]) + number - 1}{m[2]}", word),
         lambda word: f"{word[:-1]}{number}{word[-1]}",
         lambda word: f"{word}{number}",

@@ -54,9 +54,9 @@ def merge(
 ) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
-    The first piece of each log gives its start and its columns. A log is in memory from its start until the
-    merged rows reach the start of the next log. Empty logs are left out. If sensors' own logs are combined
-    with a vehicle's, all logs are in memory. `named`, `clock_offset_s`: as for :func:`combine`.
+    The first piece of each log gives its start and its columns. A log is in memory while the merged rows are
+    between its start and its end. Empty logs are left out. If sensors' own logs are combined with a
+    vehicle's, all logs are in memory. `named`, `clock_offset_s`: as for :func:`combine`.
     """
     firsts: list[xr.Dataset] = []
     opened: list[Callable[[], Iterator[xr.Dataset]]] = []
@@ -69,14 +69,14 @@ def merge(
         firsts.append(first.isel(time=slice(0, 1)).copy(deep=True))
         declared.append(k < len(named) and named[k])
         room -= first.nbytes
-        # where memory does not suffice, the log is opened again
+        # if the memory for first pieces is full, the log is opened again later
         opened.append(partial(chain, [first], pieces) if room > 0 else partial(source, rows))
     if _sensor_logs(firsts, declared)[0]:
         logs = [join([*pieces()]) for pieces in opened]
         yield from sliced(join(combine(logs, declared, clock_offset_s)), rows)
         return
     refuse_offset(clock_offset_s)
-    whole = join(firsts)  # also checks that they agree on units and on what heading means
+    whole = join(firsts)  # also checks units and references
     columns = {str(name): dict(whole[name].attrs) for name in whole.data_vars}
     # a file's attributes are those of the first piece, and must name all sources
     meaning = {key: whole.attrs[key] for key in ("source", "heading_reference") if key in whole.attrs}

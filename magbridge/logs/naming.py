@@ -64,9 +64,9 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
 def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[str]) -> Layout:
     """Return the layout with a name for each column; '' for a column that is not read."""
     headings = layout.headings
-    # a name that stands twice, with different units: the second keeps them in its name
+    # of two equal names with different units, the second keeps its unit in the name
     names = [name if name not in names[:k] else headings[k] for k, name in enumerate(names)]
-    # a foreign 'Quality' is not our set of flags
+    # a column 'Quality' of another program does not hold magbridge's flags
     lower = [name if name in COLUMNS or name.lower() == "quality" else name.lower() for name in names]
     names = [
         low if low in COLUMNS and lower.count(low) == 1 else name

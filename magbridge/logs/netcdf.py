@@ -114,12 +114,12 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
     start, scale = _epoch(path, clock)
     columns, left_out = _columns(path, file, dimension, clock)
     units = {one.name: str(getattr(one.variable, "units", "1")) for one in columns}
-    # UDUNITS, and so a file of ours, has degree for an angle
+    # UDUNITS, and so a file of this writer, calls the unit of an angle degree
     units = {name: "deg" if unit == "degree" else unit for name, unit in units.items()}
     meanings = {one.name: str(getattr(one.variable, "long_name", "")) for one in columns}
     try:
         attrs = {key: value for key, value in file.__dict__.items() if key not in GENERATED}
-    except AttributeError as error:  # netCDF4's, of a damaged attribute
+    except AttributeError as error:  # netCDF4 raises it for a damaged attribute
         raise FormatError(path, f"its attributes cannot be read: {error}") from None
     attrs = {key: value.item() if isinstance(value, np.generic) else value for key, value in attrs.items()}
     heading = next((one.variable for one in columns if one.name == "heading"), None)
@@ -346,7 +346,7 @@ def floats(variable: Any, rows: slice | tuple[slice, ...] = WHOLE_AXIS) -> Float
 def _as_stored(declared: Any, kind: np.dtype[Any]) -> list[Any]:
     """Return the numbers of an attribute in a variable's type, without numbers that the type cannot hold."""
     try:
-        numbers = np.atleast_1d(np.asarray(declared)).astype(np.float64)  # also from text
+        numbers = np.atleast_1d(np.asarray(declared)).astype(np.float64)  # also converts text
     except ValueError:
         return []
     with np.errstate(all="ignore"):
@@ -392,7 +392,7 @@ class FileWriter:
             {
                 key: value
                 for key, value in dataset.attrs.items()
-                if isinstance(value, (str, int, float)) and "/" not in key  # which netCDF forbids
+                if isinstance(value, (str, int, float)) and "/" not in key  # netCDF forbids slashes
             }
             | {
                 "title": "magnetometer deployment",
@@ -430,7 +430,7 @@ class FileWriter:
             if flags:
                 attrs.pop("units", None)
             elif attrs.get("units") == "deg":
-                attrs["units"] = "degree"  # UDUNITS knows no deg
+                attrs["units"] = "degree"  # UDUNITS does not define deg
             variable.setncatts(attrs)
             variable.setncatts({"column": name})
             self._variables[name] = variable

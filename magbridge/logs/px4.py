@@ -44,7 +44,7 @@ Topics = dict[str, dict[int, Table]]
 Parameters = Mapping[str, float]
 
 PX4_FIELDS = field_maps("px4")
-# heights are above the sea; that of the local position is above the start, and the last choice
+# heights above the sea are preferred: the local position, above the start, comes last
 PX4_FIELDS["vehicle_gps_position"] = PX4_FIELDS["sensor_gps"]
 PX4_FIELDS["vehicle_local_position"] = PX4_FIELDS.pop("vehicle_local_position")
 GAUSS_AXES = tuple(f"magnetometer_ga[{k}]" for k in range(3))

@@ -79,7 +79,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     except ROSBAG_ERRORS as error:
         raise FormatError(path, f"expected a ROS bag: {error}") from None
     except (OSError, EOFError, KeyError, IndexError, ValueError, AssertionError) as error:
-        # what rosbags raises where the file, not a message, is damaged
+        # rosbags raises these if the file, not a message, is damaged
         reason = str(error) or type(error).__name__
         raise FormatError(path, f"expected a ROS bag; it is damaged: {reason}") from None
     fields = [stream for stream in streams if stream.kind is MESSAGE_KINDS[MAGNETIC_FIELD]]
@@ -264,7 +264,7 @@ def _angles(v: Values) -> Columns:
     if not known.any() or (np.abs(w) == 1.0).all():  # a constant identity is not an attitude
         return
     x, y, z, w = (np.where(known, one, np.nan) for one in (x, y, z, w))
-    # of the rotation from FLU to ENU; FRD has the opposite y and z, NED swaps x and y and has the opposite z
+    # elements of the rotation from FLU to ENU; FRD reverses y and z, NED swaps x and y and reverses z
     down_x, down_y, down_z = -2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     east_x, north_x = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
     yield "roll", "deg", np.degrees(np.arctan2(down_y, down_z))
@@ -334,7 +334,7 @@ MESSAGE_KINDS = {
         MessageKind(
             "sensor_msgs/JointState",
             lambda m: dict(zip(m.name, map(float, m.position), strict=False)),
-            # rad, or m of a joint that slides: the message does not say
+            # rad, or m for a sliding joint: the message does not state the unit
             lambda _, __, v: ((_name(name), "1", values) for name, values in v.items()),
         ),
         MessageKind("sensor_msgs/Temperature", lambda m: {"temperature": float(m.temperature)}, _temperature),

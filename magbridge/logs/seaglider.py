@@ -209,7 +209,7 @@ def _add_log(known: Dive, path: Path) -> None:
         elif found := GPS_LINE.match(line):
             when = datetime.strptime(found[1] + found[2], "%d%m%y%H%M%S").replace(tzinfo=UTC).timestamp()
             fixes.append((when, *degrees([found[3], found[4]])))
-        elif len(values) in (1, 2):  # a canonical log also has the default
+        elif len(values) in (1, 2):  # a canonical log also states the default
             known.settings[name] = _number(values[0])
     known.manoeuvres = dict(zip(names, np.array(manoeuvres, float).reshape(-1, len(names)).T, strict=True))
     for name in {"st_secs", "end_secs"} & known.manoeuvres.keys():

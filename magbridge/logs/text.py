@@ -341,7 +341,7 @@ def _attributes(path: Path) -> dict[str, str | float]:
 
 
 def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:
-    if name == "quality":  # a row that was not corrected is never taken for a good one
+    if name == "quality":  # no flags: the row was not corrected
         return ["uncalibrated" if isnan(v) else Quality(int(v)).names() for v in values.tolist()]
     return ["" if isnan(v) else repr(v) for v in values.tolist()]
 
