@@ -1,10 +1,10 @@
-"""The other end of every line: a simulated world, and emulated devices with real protocols.
+"""Simulation of deployments, and emulation of the bridge's devices with their real protocols.
 
 A :mod:`.scenario` describes the simulation. In its :mod:`.world` a vehicle (:mod:`.platform`) with an
-:mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`, or the way of a real log; the
-:mod:`.twin` is all of them together, and its log a :mod:`.dataset`. :mod:`.inject` hides effects.
-:mod:`.fluxgate` emulates the sensors' protocols, and :mod:`.replay` plays deployments to the bridge.
-:mod:`.demo` does the main job.
+:mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`, or along the track of a real log. The
+:mod:`.twin` combines them and measures a deployment, which is a :mod:`.dataset`. :mod:`.inject` adds hidden
+effects. :mod:`.fluxgate` emulates the sensors' protocols, and :mod:`.replay` sends deployments to the bridge.
+:mod:`.demo` runs all steps from simulation to correction.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Scenario", "Twin", "load", "segments", "simulate", "simulate_like"]
 
-# loaded when first asked for: an emulated device needs neither scipy nor xarray
+# loaded on first use, because an emulated device needs neither scipy nor xarray
 _HOMES = {
     "Scenario": "sitl.scenario",
     "Twin": "sitl.twin",

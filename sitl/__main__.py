@@ -1,4 +1,4 @@
-"""``python -m sitl``: the same as ``magbridge replay``."""
+"""Run ``python -m sitl``, which does the same as ``magbridge replay``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulated deployment as a Dataset: names, units, the mission's parts; and as a calibration's input."""
+"""Build the Dataset of a simulated deployment, split it into segments, and correct it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ OWN = {
     "truth_latitude": Column("deg", "true latitude"),
     "truth_longitude": Column("deg", "true longitude"),
 }
-"""Columns that a simulation adds to those of any deployment."""
+"""Columns that only a simulated deployment has."""
 
 
 def dataset(track: Track, time: FloatArray, columns: Mapping[str, FloatArray], source: str) -> xr.Dataset:
-    """Return `columns`, sampled at `time` (n,), s after the track's start, as a deployment."""
+    """Return a deployment of `columns` (n,), sampled at `time` (n,), s after the track's start."""
     known = dict(COLUMNS | OWN)
     for name in track.parameters:
         unit = MOUNTINGS[name].unit if name in MOUNTINGS else "1"
@@ -45,7 +45,7 @@ def dataset(track: Track, time: FloatArray, columns: Mapping[str, FloatArray], s
 
 
 def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the parts of a simulated deployment's mission by name."""
+    """Return the segments of a simulated deployment by name."""
     return {
         name: deployment.sel(time=slice(first, np.nextafter(last, first)))
         for name, first, last in json.loads(deployment.attrs["segments"])
@@ -53,7 +53,7 @@ def segments(deployment: xr.Dataset) -> dict[str, xr.Dataset]:
 
 
 def at_rest(deployment: xr.Dataset, masses: Iterable[str]) -> xr.Dataset:
-    """Leave out the samples near which a mass is moving."""
+    """Return the samples of a deployment at which none of the `masses` (names) is moving."""
     still = np.ones(deployment.sizes["time"], bool)
     for name in masses:
         moved = np.abs(np.diff(deployment[name])) > 1e-9
@@ -63,7 +63,7 @@ def at_rest(deployment: xr.Dataset, masses: Iterable[str]) -> xr.Dataset:
 
 
 def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> FloatArray:
-    """Return columns side by side, (n, k)."""
+    """Return the named columns as an array (n, k)."""
     out = np.empty((deployment.sizes["time"], len(names)))
     for k, name in enumerate(names):
         out[:, k] = deployment[name]
@@ -71,11 +71,11 @@ def side_by_side(deployment: xr.Dataset, names: Sequence[str]) -> FloatArray:
 
 
 def channels(deployment: xr.Dataset) -> FloatArray:
-    """Return the three channels as read, (n, 3), nT."""
+    """Return the uncorrected readings of the three channels (n, 3), nT."""
     return side_by_side(deployment, CHANNELS)
 
 
 def corrected(deployment: xr.Dataset, calibration: Calibration) -> CorrectedArrays:
-    """Correct a deployment's channels as they stand, row by row; the arrays are (n, ...)."""
+    """Correct a deployment's channels row by row, without alignment in time; the arrays are (n, ...)."""
     positions = side_by_side(deployment, calibration.channels)
     return correct(calibration, channels(deployment), positions, deployment["time"].to_numpy())

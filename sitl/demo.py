@@ -1,4 +1,4 @@
-"""The main job on a simulated glider: simulate, fit, replay through the bridge, listen, compare."""
+"""Demonstrate the package on a simulated glider: simulate, fit, replay through the bridge, compare."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ PARAMETERS = ("battpos", "ballast")
 
 
 def demo(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> dict[str, Any]:
-    """Run the demonstration; leave the deployment, the calibration, the log and a picture in `folder`.
+    """Run the demonstration; write deployment, calibration, log and plot to `folder`.
 
     Returns
     -------
     dict
-        Errors over the survey in nT, counts of samples, names of the files made.
+        Errors over the survey (nT), numbers of samples, and names of the written files.
     """
     folder.mkdir(parents=True, exist_ok=True)
     begun = time.monotonic()
@@ -81,9 +81,9 @@ def demo(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> 
 
 
 def _align(field: dict[str, FloatArray], survey: xr.Dataset) -> xr.Dataset:
-    """Return the received values, on the times at which it was measured, with the truth at those times.
+    """Return the received field with the true total field, interpolated at its times.
 
-    ``flagged`` is true where a flag concerns the total field, which needs no boresight.
+    ``flagged`` is True where any flag but NO_BORESIGHT is set, which does not concern the total field.
     """
     times = survey["time"].to_numpy()
     truth = np.interp(field["time"], times, survey["truth_total_field"].to_numpy())
@@ -109,7 +109,7 @@ def _compare(survey: xr.Dataset, nominal: Fit, received: xr.Dataset) -> dict[str
 
 
 def summary(result: dict[str, Any]) -> str:
-    """Return the demonstration's result for people to read."""
+    """Return the demonstration's result as text."""
     rows = [
         ("raw, as the fluxgate reads it", result["raw_rms_nT"]),
         ("one ellipsoid for all positions (nominal)", result["nominal_rms_nT"]),

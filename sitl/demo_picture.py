@@ -1,4 +1,4 @@
-"""The demonstration's picture: the fluxgate's readings, what the bridge publishes, and the true field."""
+"""Plot the demonstration: the fluxgate's readings, the published field, and the true field."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#1111
 
 
 def draw(survey: xr.Dataset, nominal: FloatArray, samples: xr.Dataset, path: Path) -> None:
-    """Draw the survey: masses, raw and true field, corrected and true field, errors.
+    """Plot the survey to the file `path`: masses, raw field, corrected field, true field and errors.
 
-    `nominal` (n,) is the total field (nT) of the survey's samples as one ellipsoid corrects it; `samples` are
-    the values received over the link.
+    `nominal` (n,) is the survey's total field (nT) as the nominal calibration, one ellipsoid, corrects it.
+    `samples` are the values received over the link.
     """
     hours = _hours(survey["time"], survey)
     received = _hours(samples["time"], survey)

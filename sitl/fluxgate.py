@@ -1,8 +1,9 @@
-"""Emulated instruments: the inverse of each driver, in the instrument's own bytes.
+"""Emulate magnetometers: each encoder sends readings in the protocol that one of the drivers reads.
 
-An encoder quantises and saturates as the instrument does, counts its readings, and answers what the driver
-sends, so that a program behind a pty cannot distinguish it from the real one. Other packages add theirs by
-an entry point in the group ``magbridge.encoders``: the driver's name, and a class like :class:`Encoder`.
+An encoder quantises and saturates like the instrument, counts its readings, and answers the driver's
+commands, so that a program behind a pty cannot distinguish it from the real instrument. Other packages add
+encoders by an entry point in the group ``magbridge.encoders``: the driver's name, and a class like
+:class:`Encoder`.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ __all__ = ["ENCODERS", "Encoder", "Rm3100Registers", "open_encoder"]
 
 
 class Encoder(ABC):
-    """An instrument, switched on, with the options of the driver that reads it.
+    """Emulated instrument that is switched on; `options` are those of the driver that reads it.
 
-    `rate` is that of the readings, Hz, for an instrument that gives a reading's number in place of its time.
-    It is `streaming` while it sends readings; some wait for a command. `power_cycle` is how many times it was
-    switched on.
+    `rate` is the rate of the readings (Hz), for instruments that send a reading's number and not its time.
+    `streaming` is True while the instrument sends readings; some instruments wait for a command.
+    `power_cycle` is the number of times that it was switched on.
     """
 
     Options: ClassVar[Any]
@@ -49,39 +50,38 @@ class Encoder(ABC):
         self.power_on()
 
     def power_on(self) -> None:
-        """Switch off and on again: add a power cycle, and count readings from 0."""
+        """Power-cycle the instrument: add a power cycle, and count readings from 0."""
         self.power_cycle += 1
         self.sequence = 0
 
     @abstractmethod
     def encode(self, reading: Reading) -> bytes:
-        """Return the bytes sent for one reading; none while it is not streaming.
+        """Return the bytes that the instrument sends for one reading; none while it is not streaming.
 
-        It uses the reading's field (nT, finite), `device_time` (s on its own clock, which begins at
-        power-on), `channel_delay`, `temperature` and `supply`, where the instrument sends them; counters
-        are its own.
+        The bytes contain the reading's field (nT, finite), and its `device_time` (s since power-on),
+        `channel_delay`, `temperature` and `supply` if the instrument sends these. Counters are the encoder's.
         """
 
-    def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most do not listen
-        """Receive bytes that were sent to the instrument; return its answers."""
+    def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most instruments ignore commands
+        """Pass bytes to the instrument; return its answers."""
         return b""
 
 
 def clip(value: float, limit: float) -> float:
-    """Return `value`, at most `limit` either side of zero."""
+    """Return `value` clipped to the range from -`limit` to `limit`."""
     return max(-limit, min(value, limit))
 
 
-# ---- a line protocol, as the configuration describes it ----------------------------------------------------
+# ---- line protocol, as the configuration describes it ------------------------------------------------------
 
 
 class AsciiEncoder(Encoder):
-    """Sends a line with every reading."""
+    """Emulated instrument that sends each reading as a line of text."""
 
     Options = ascii_wire.AsciiOptions
 
     def encode(self, reading: Reading) -> bytes:
-        """Return one line; the end of another before the first: a listener cannot tell half a line."""
+        """Return one line; before the first line, end any incomplete line that was sent earlier."""
         options = self.options
         end = b"\r\n" if options.terminator == "\n" else b"\r"
         before = b"" if self.sequence else end
@@ -118,7 +118,7 @@ WRAP = 1 << 16
 
 
 class DigitizerEncoder(Encoder):
-    """Three channels, one converter."""
+    """Emulated digitizer of three channels with one converter."""
 
     Options = DigitizerOptions
 
@@ -147,26 +147,26 @@ class DigitizerEncoder(Encoder):
         return cobs_encode(message + crc32(message).to_bytes(4, "little")) + b"\0"
 
 
-# ---- the HMR2300: as delivered it sends ASCII, and only when asked -----------------------------------------
+# ---- HMR2300: as delivered, it sends ASCII, and only on command --------------------------------------------
 
 
 STOP = b"\x1b"
 
 
 class Hmr2300Encoder(Encoder):
-    """Three magnetoresistive channels, commands, two outputs."""
+    """Emulated HMR2300: three magnetoresistive channels, commands, ASCII or binary output."""
 
     Options = hmr2300.Hmr2300Options
 
     def power_on(self) -> None:
-        """Wait for commands."""
+        """Power-cycle the instrument, which then waits for commands."""
         super().power_on()
         self.streaming = self.binary = self._enabled = False
         self._latest = (0, 0, 0)
         self._lines = Framer(b"\r", 64)
 
     def encode(self, reading: Reading) -> bytes:
-        """Return one frame or line, where it streams."""
+        """Return one frame or line, or nothing if the instrument is not streaming."""
         x, y, z = (round(clip(value / hmr2300.NT_PER_COUNT, hmr2300.MAX_COUNTS)) for value in reading.field)
         self._latest = x, y, z
         return self._sample() if self.streaming else b""
@@ -177,7 +177,7 @@ class Hmr2300Encoder(Encoder):
         return ("  ".join(map(_comma, self._latest)) + "  \r").encode()
 
     def feed(self, data: bytes) -> bytes:
-        """Obey commands and answer them."""
+        """Execute commands; return the instrument's answers."""
         if STOP in data:
             self.streaming = False
             data = data.replace(STOP, b"")
@@ -195,7 +195,7 @@ class Hmr2300Encoder(Encoder):
         return self._set(command)
 
     def _set(self, command: str) -> bytes:
-        """Obey a command that is accepted only after a write enable."""
+        """Execute a command that needs a preceding write enable; return the answer."""
         enabled, self._enabled = self._enabled, command == "WE"
         if command in ("A", "B") and enabled:
             self.binary = command == "B"
@@ -207,15 +207,15 @@ class Hmr2300Encoder(Encoder):
 
 
 def _comma(count: int) -> str:
-    """Write a count as the instrument does: sign, two digits, comma, three digits, leading zeros blank."""
+    """Format a count like the instrument: sign, two digits, comma, three digits, leading zeros blank."""
     return ("-" if count < 0 else " ") + f"{abs(count):,}".rjust(6)
 
 
-# ---- the RM3100: its registers behind the bus interface, and the lines of its readings ---------------------
+# ---- RM3100: its registers behind the bus interface, and the lines of its readings -------------------------
 
 
 class Rm3100Encoder(Encoder):
-    """An RM3100 with the program that polls it."""
+    """Emulated RM3100 with the program that polls it and prints lines."""
 
     Options = rm3100.Rm3100Options
 
@@ -225,14 +225,14 @@ class Rm3100Encoder(Encoder):
 
 
 def results(reading: Reading, cycle_count: int) -> bytes:
-    """Return the nine bytes of the result registers for a reading's field."""
+    """Return the nine bytes of the RM3100's result registers for a reading's field."""
     step = rm3100.nt_per_count(cycle_count)
     counts = (round(clip(value / step, rm3100.MAX_COUNT)) for value in reading.field)
     return b"".join(count.to_bytes(3, "big", signed=True) for count in counts)
 
 
 class Rm3100Registers:
-    """The part's register map, which answers as the part does in a `field` (nT) at its coils.
+    """Emulated register map of an RM3100 in a `field` (nT) at its coils.
 
     If it `is_frozen`, no measurement completes until the registers are written again. If it `has_failed`, the
     bus does not answer; if it `is_absent`, an SPI bus reads zeros. `broken_axes` (bits 4 to 6) are the coils
@@ -249,7 +249,7 @@ class Rm3100Registers:
         self._ready = False
 
     def read(self, register: int, count: int) -> bytes:
-        """Return `count` bytes from `register` on."""
+        """Return the `count` bytes that start at `register`."""
         self._fail()
         if self.is_absent:
             return bytes(count)
@@ -263,7 +263,7 @@ class Rm3100Registers:
         return bytes(self._registers[register : register + count])
 
     def write(self, register: int, data: bytes) -> None:
-        """Write bytes from `register` on, and do as the part does."""
+        """Write bytes that start at `register`, and perform the action that they trigger."""
         self._fail()
         self._registers[register : register + len(data)] = data
         if register == rm3100.POLL:
@@ -275,29 +275,29 @@ class Rm3100Registers:
             self.configured += 1
 
     def close(self) -> None:
-        """Release the bus."""
+        """Do nothing: there is no bus to release."""
 
     def _fail(self) -> None:
         if self.has_failed:
             raise OSError(121, "Remote I/O error")
 
 
-# ---- a TIO device of either generation, its samples 32-bit floats as those of the VMR ----------------------
+# ---- TIO device of either generation, with samples of 32-bit floats like the VMR's -------------------------
 
 
 FLOAT32 = 0x42
 STREAM = {1: 0, 2: 1}
-"""The stream that holds the field, in each generation."""
+"""Generation of the protocol: number of the stream that has the field."""
 
 
 class TwinleafEncoder(Encoder):
-    """A TIO device; set `generation` before its first reading to have the older one."""
+    """Emulated TIO device; set `generation` to 1 before the first reading for the older protocol."""
 
     Options = tio.TwinleafOptions
     generation = 2
 
     def power_on(self) -> None:
-        """Begin a new session; describe it before its first reading."""
+        """Begin a new session, which the device describes before its first reading."""
         super().power_on()
         options = self.options
         self._rate = Fraction(self.rate).limit_denominator(1000)
@@ -308,7 +308,7 @@ class TwinleafEncoder(Encoder):
         self._described = False
 
     def encode(self, reading: Reading) -> bytes:
-        """Return one packet of one sample, its number the time times the rate."""
+        """Return one packet of one sample; the sample's number is its time multiplied by the rate."""
         number = round(reading.device_time * self._rate)
         limit = self.options.range
         values = [clip(value, limit) / NT_PER_UNIT[self._unit] for value in reading.field]
@@ -327,7 +327,7 @@ class TwinleafEncoder(Encoder):
         return tio.END + heartbeat + self._describe() + packet
 
     def feed(self, data: bytes) -> bytes:
-        """Answer requests."""
+        """Execute requests; return the device's replies."""
         answers = b""
         for frame in self._frames.split(data):
             packet = tio.unslip(frame)
@@ -376,7 +376,7 @@ class TwinleafEncoder(Encoder):
         )
 
     def _records(self) -> list[tuple[int, bytes]]:
-        """Return the records of generation 2, each with its type."""
+        """Return the metadata records of generation 2, each with its type."""
         session, stream = self.power_cycle, STREAM[2]
         size, active = 4 * len(self._columns), 3
         records = [
@@ -414,7 +414,7 @@ ENCODERS: dict[str, type[Encoder]] = {
     "rm3100": Rm3100Encoder,
     "twinleaf": TwinleafEncoder,
 }
-"""Driver's name: the emulated instrument."""
+"""Emulated instrument of each driver, by the driver's name."""
 
 
 def open_encoder(
@@ -422,13 +422,13 @@ def open_encoder(
 ) -> Encoder:
     """Return the emulated instrument that the driver called `name` reads.
 
-    Arguments are those of :func:`magbridge.sensors.open_driver`; `rate` is that of the readings, Hz, for an
-    instrument that gives a reading's number in place of its time.
+    The other arguments are those of :func:`magbridge.sensors.open_driver`; `rate` is the rate of the readings
+    (Hz), for instruments that send a reading's number and not its time.
 
     Raises
     ------
     ConfigError
-        No such instrument, or a wrong option.
+        There is no such instrument, or an option is wrong.
     """
     others = {} if name in ENCODERS else plugins("magbridge.encoders")
     if name not in ENCODERS and name not in others:

@@ -1,11 +1,11 @@
-"""Hide an effect in a simulated deployment, with finer physics than anyone would fit to it.
+"""Add a hidden effect to a simulated deployment, with a finer model than the detector's.
 
-It shares nothing with the detector: heat soaks through a slab where the detector has two lags in series,
-steel has a Preisach distribution where it has one play operator, currents flow in wires with a shape, filters
-and converters are the instrument's own, the ionosphere has a spectrum. Each effect is one function of the
-:class:`Scene`, a size, and a random generator that draws its direction, place and time. An effect is
-proportional to its size as far as physics allows. Properties of the vehicle or its instrument are drawn from
-the seed of :class:`HiddenEffect` alone, so they are the same on every deployment.
+The effects share no model with the detector. Heat diffuses through a slab, but the detector has two lags in
+series. Steel has a Preisach distribution, but the detector has one play operator. Currents flow in wires of a
+given shape, filters and converters belong to the instrument, and the ionosphere has a spectrum. Each effect
+is a function of the :class:`Scene`, a size, and a random generator for its direction, place and time. An
+effect is proportional to its size as far as physics allows. Properties of the vehicle or its instrument
+depend only on the seed of :class:`HiddenEffect`, so they are the same in every deployment.
 """
 
 from __future__ import annotations
@@ -34,40 +34,40 @@ Generator = np.random.Generator
 
 @dataclass
 class Scene:
-    """What an effect may change, on the simulation's fine grid of n points; m rows are logged."""
+    """Quantities that an effect may change: n points of the simulation's fine grid, m logged rows."""
 
     track: Track
     when: Array
-    """(m,), s after the start, of the rows."""
+    """Times of the logged rows (m,), s after the start."""
     field: Array
-    """(n, 3), nT at the sensor, body axes."""
+    """Field at the sensor (n, 3), nT, body axes."""
     earth: Array
-    """(n, 3), nT north-east-down, added to the Earth's field but not to the reference."""
+    """Change of the Earth's field (n, 3), nT, north-east-down, that the reference does not contain."""
     water: Array
-    """(n,), degC."""
+    """Water temperature (n,), degC."""
     instrument: Instrument
     reference: Array
-    """(m,), nT by which the reference is too small."""
+    """Amount by which the reference field is too small (m,), nT."""
     late: float = 0.0
-    """s by which the telemetry's timestamps are behind."""
+    """Delay of the telemetry's values against their timestamps, s."""
     logged: dict[str, tuple[Array, str]] = attribute(default_factory=dict)
-    """(n,) each: Further telemetry."""
+    """Further telemetry by name: values (n,) and unit."""
     bend: list[Callable[[Array], Array]] = attribute(default_factory=list)
-    """Functions applied to the channels (m, 3) after the analogue chain."""
+    """Functions that change the digitised channels (m, 3), nT."""
     truth: dict[str, float] = attribute(default_factory=dict)
-    """Numbers that a perfect diagnosis would print, by the name it would print them under."""
+    """Parameters that a perfect diagnosis would report, by the names in the report."""
 
     @property
     def t(self) -> Array:
-        """(n,) s after the start."""
+        """Time of each point (n,), s after the start."""
         return self.track.elapsed
 
     def add(self, shape: Array, vector: Array) -> None:
-        """Add ``shape(t) vector``, (n,) times (3,) nT in body axes, to the field at the sensor."""
+        """Add `shape` (n,) times `vector` (3,), nT in body axes, to the field at the sensor."""
         self.field = self.field + shape[:, None] * vector
 
     def record_truth(self, vector: Array) -> None:
-        """Note as the truth what the channels read of a `vector` (3,) in body axes."""
+        """Record as true parameters the channels' readings of a `vector` (3,) in body axes."""
         self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
 
 
@@ -75,7 +75,7 @@ Effect = Callable[[Scene, float, Generator], None]
 
 
 class HiddenEffect(msgspec.Struct, frozen=True):
-    """One hidden effect: its name, as in :data:`EFFECTS`, size, seed."""
+    """Hidden effect: its name in :data:`EFFECTS`, its size in the effect's unit, and its seed."""
 
     name: str
     size: float
@@ -83,13 +83,16 @@ class HiddenEffect(msgspec.Struct, frozen=True):
 
 
 def direction(rng: Generator) -> Array:
-    """Draw a unit vector (3,)."""
+    """Draw a random unit vector (3,)."""
     d = rng.normal(size=3)
     return np.asarray(d / np.linalg.norm(d))
 
 
 def relays(x: Array, centres: Array, widths: Array) -> Array:
-    """Return the mean state (n,) of relays along a history x (n,) less that without hysteresis (Preisach)."""
+    """Return the mean state (n,) of Preisach relays along x (n,), minus the state without hysteresis.
+
+    `centres` and `widths` are the relays' thresholds, in the unit of x.
+    """
     total = np.zeros(len(x))
     for c, w in zip(centres, widths, strict=True):
         up, down = x >= c + w / 2, x <= c - w / 2
@@ -99,7 +102,7 @@ def relays(x: Array, centres: Array, widths: Array) -> Array:
 
 
 def soaked(surface: Array, step: float, lag: float) -> Array:
-    """Return the temperature (n,) in the middle of a slab whose faces follow `surface` (n,), every `step` s.
+    """Return the temperature (n,) in the middle of a slab whose faces have `surface` (n,), every `step` s.
 
     `lag` is the slowest mode's time constant, s (Carslaw & Jaeger 1959, sec. 3.4).
     """
@@ -110,7 +113,7 @@ def soaked(surface: Array, step: float, lag: float) -> Array:
 
 
 def furnish(scene: Scene, rng: Generator) -> None:
-    """Log what any vehicle logs, related to an effect or not: motor currents, a fin, temperatures."""
+    """Add telemetry that vehicles usually log: motor currents, a fin's angle, temperatures."""
     n, t, step = len(scene.t), scene.t, scene.track.step
     moving = np.abs(np.gradient(scene.track.parameters["ballast"], step)) > 1.0
     duty = (autoregressive(rng, (n,), 1.0, 400.0 / step) > 0.8) & ~moving
@@ -134,18 +137,18 @@ def furnish(scene: Scene, rng: Generator) -> None:
 
 
 CALIBRATED_AT = 4.5
-"""Instrument's temperature during the calibration, to about half a degree, degC."""
+"""Mean temperature of the instrument during the calibration, degC."""
 SWING = {"battpos": 0.6, "ballast": 200.0}
-"""How far a survey moves the masses either way, in their units."""
+"""Amplitude of the masses' motion in a survey, in their units."""
 FIN = np.radians(12.0)
-"""A usual deflection of the fin."""
+"""Usual deflection of the fin, rad."""
 
 
 # ---- the instrument: heat, shocks, age; its converter, filter, clock and range ----------------------
 
 
 def _warmer(scene: Scene, rng: Generator) -> Array:
-    """Return by how much the core is warmer than during the calibration, degC."""
+    """Return the core's temperature (n,) minus that during the calibration, degC."""
     core = soaked(scene.logged["sensor_temperature"][0], scene.track.step, float(rng.uniform(300, 4000)))
     return core - CALIBRATED_AT - 0.5 * rng.normal()
 
@@ -158,7 +161,7 @@ def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
-    """Let the gains follow the temperature of the coils' copper; the size is 5e4 times that in 1/degC."""
+    """Change the gains with the temperature of the coils; the size is in nT/degC at 50,000 nT."""
     gains = 1.0 + size / 5e4 * np.abs(rng.normal(1.0, 0.4, 3)) * _warmer(scene, rng)[:, None]
     scene.field = scene.field * gains
 
@@ -194,7 +197,7 @@ def anti_alias(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG0
 
 
 def late_stamps(scene: Scene, size: float, rng: Generator) -> None:
-    """Set the telemetry's clock back or forward; the size is in s."""
+    """Delay or advance the telemetry against its timestamps; the size is the delay in s."""
     scene.late = size * float(rng.choice([-1.0, 1.0]))
     scene.truth["delay"] = scene.late
 
@@ -223,7 +226,7 @@ def rail(scene: Scene, size: float, rng: Generator) -> None:  # noqa: ARG001  (t
 
 
 def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
-    """Flip bits of a dozen samples, which are then wrong by `size` nT, or two or four times that."""
+    """Add outliers of 1, 2 or 4 times the size to a dozen readings, like flipped bits; the size is in nT."""
 
     def bend(H: Array) -> Array:
         rows = rng.choice(len(H) // 4, 12, replace=False) * 4
@@ -240,7 +243,7 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
-    """Add the four harmonics of Sq and the ocean's tide, mostly along the field; the size is in nT."""
+    """Add four harmonics of the Sq variation and the ocean's tide; the size is in nT."""
     hours = scene.t / 3600.0
     total = sum(
         amplitude * np.cos(2 * np.pi * hours / period + rng.uniform(0, 2 * np.pi))
@@ -250,7 +253,7 @@ def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def bad_map(scene: Scene, size: float, rng: Generator) -> None:
-    """Leave bodies out of the map, which make bumps of about a kilometre; the size is in nT."""
+    """Omit three wide anomalies from the map; the size is the 1-sigma of their amplitudes in nT."""
     seen = scene.track.pose_at(scene.when)
     north, east = scene.track.local(seen["latitude"], seen["longitude"])
     width = 0.35 * max(np.ptp(north), np.ptp(east))
@@ -281,7 +284,7 @@ def hum(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def wires(scene: Scene, size: float, rng: Generator) -> None:
-    """Add the field of a motor's supply loop at 30 cm, by Biot and Savart; the size multiplies it."""
+    """Add the field of a motor's supply loop at 30 cm (Biot-Savart); the size is in nT/A."""
     name = str(rng.choice(["amps_a", "amps_b"]))
     centre, u = 0.3 * direction(rng), direction(rng)
     v = np.cross(u, direction(rng))
@@ -298,7 +301,7 @@ def wires(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
-    """Add a magnet on a lever that an actuator moves and turns; the size is in nT at 12 deg."""
+    """Add the field of a magnet on a fin's lever; the size is in nT at a deflection of 12 deg."""
     arm, m = np.array([0.08, 0.0, 0.0]), direction(rng)
     place = np.array([-0.5, 0.1, 0.1]) + 0.1 * rng.normal(size=3)
 
@@ -312,7 +315,7 @@ def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def neighbours(scene: Scene, size: float, rng: Generator) -> None:
-    """Add the field of two masses that magnetise each other, too curved for a cubic; the size is in nT."""
+    """Add the field of two masses that magnetise each other, which no cubic fits; the size is in nT."""
     x, y = (scene.track.parameters[name] / SWING[name] for name in ("battpos", "ballast"))
     curved = (35 * x**4 - 30 * x**2 + 3) / 8 + rng.normal(0, 0.5) * x**3 * y
     scene.add(np.tanh(0.5 * curved), size * direction(rng))
@@ -321,15 +324,15 @@ def neighbours(scene: Scene, size: float, rng: Generator) -> None:
 def preisach(scene: Scene, size: float, rng: Generator) -> None:
     """Add the hysteresis of steel along the battery's path, by relays of many widths; the size is in nT."""
     x = scene.track.parameters["battpos"] / SWING["battpos"]
-    # relays() leaves out what depends on the position alone: a calibration has that already
+    # relays() subtracts the part that depends only on the position: a calibration has this part already
     memory = relays(x, rng.normal(0, 0.35, 80), rng.lognormal(np.log(0.5), 0.4, 80))
     scene.add(memory, size * direction(rng))
 
 
 def ring(scene: Scene, size: float, rng: Generator) -> None:
-    """Add the field of a conducting ring with inductance; the size in s multiplies the field's rate.
+    """Add the field of a conducting ring with inductance; the size (s) multiplies the field's rate.
 
-    It lies where its own field at the sensor is perpendicular to its axis n. The field of a dipole along n,
+    The ring is where its field at the sensor is perpendicular to its axis n. The field of a dipole along n,
     in the direction p, is ``3 p (p . n) - n``: at the magic angle, ``(p . n)^2 = 1/3``, it has no part
     along n.
     """
@@ -377,7 +380,7 @@ EFFECTS: dict[str, Effect] = {
     "interference_tone": hum,
     "outliers": bit_flips,
 }
-"""Cause, by its public name -> the effect that is hidden."""
+"""Function that adds the effect of each cause, by the cause's public name."""
 
 
 # ---- a deployment with effects -----------------------------------------------------------------------------
@@ -388,11 +391,10 @@ FINER = 5
 
 
 def _interpolate(scene: Scene) -> tuple[Array, Array, float]:
-    """Return field, water temperature and step on a finer grid.
+    """Return field (nT), water temperature (degC) and step (s) on a finer grid.
 
-    The Earth's part of the field turns with the vehicle and is interpolated by a spline, because a delayed
-    channel would see the error of a straight line. The rest is interpolated linearly: masses start and stop
-    abruptly.
+    A spline interpolates the Earth's part of the field, because linear interpolation would cause errors in
+    delayed channels. The interpolation of the rest is linear, because masses start and stop abruptly.
     """
     track, t = scene.track, scene.t
     turn = rotation(track.roll, track.pitch, track.heading)
@@ -404,7 +406,7 @@ def _interpolate(scene: Scene) -> tuple[Array, Array, float]:
 
 
 def _samples(scene: Scene, rng: np.random.Generator) -> Samples:
-    """Return what the scene's instrument gives, the effects on the channels after it included."""
+    """Return the samples of the scene's instrument, with the effects on the digitised channels."""
     track = scene.track
     if scene.earth.any():
         turn = rotation(track.roll, track.pitch, track.heading)
@@ -426,13 +428,11 @@ def disturb(
     seed: int = 0,
     effects: Mapping[str, Effect] = EFFECTS,
 ) -> xr.Dataset:
-    """Measure along `track` with `hidden` effects, by their names in `effects`.
+    """Return the deployment measured along `track` with `hidden` effects, by their names in `effects`.
 
-    Without any, the furnished deployment alone is returned. The triples are taken at `time` (m,), s after the
-    track's start, up to a few seconds before its end. `seed` is that of the telemetry that has nothing to do
-    with the effects. The deployment has more telemetry than that of :meth:`~sitl.twin.Twin.measure`;
-    ``attrs["truth"]`` (JSON) holds what a perfect diagnosis would print of a single effect, where physics has
-    such numbers.
+    `time` (m,) are the times of the samples, s after the track's start, up to a few seconds before its end.
+    `seed` determines the telemetry that :func:`furnish` adds to that of :meth:`~sitl.twin.Twin.measure`.
+    ``attrs["truth"]`` (JSON) holds the parameters that a perfect diagnosis would report for a single effect.
     """
     ambient = twin.ambient(track)
     scene = Scene(
@@ -448,7 +448,7 @@ def disturb(
     for one in hidden:
         effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
     out = twin.log(track, time, ambient.earth, _samples(scene, twin.instrument_rng()))
-    if "reference_field" in out:  # `reference` is by how much the true field exceeds it
+    if "reference_field" in out:  # scene.reference is the amount by which it is too small
         known = out["reference_field"]
         out["reference_field"] = "time", known.to_numpy() - scene.reference, known.attrs
     seen = np.clip(time - scene.late, 0.0, None)

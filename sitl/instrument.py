@@ -1,4 +1,4 @@
-"""The instrument chain of the paper's section 3: fluxgate, RC filter, one 24-bit converter for all three."""
+"""Simulate the instrument of the paper's section 3: fluxgate, RC filters, one multiplexed converter."""
 
 from __future__ import annotations
 
@@ -20,47 +20,47 @@ Vector = tuple[float, float, float]
 
 
 class Instrument(Table, frozen=True):
-    """``[instrument]``: a three-axis fluxgate and its digitiser."""
+    """Table ``[instrument]``: a three-axis fluxgate and its digitiser."""
 
     rate: Positive = 0.25
     """Rate of the readings, Hz."""
     scale: Vector = (1.0, 1.0, 1.0)
     offset: Vector = (0.0, 0.0, 0.0)
-    """`scale`, `offset`: Gain of each axis, and nT."""
+    """`scale`, `offset`: Gain and offset (nT) of each axis."""
     orthogonality: Vector = (0.0, 0.0, 0.0)
-    """deg by which the angles xy, xz, yz differ from 90."""
+    """Differences of the angles xy, xz and yz from 90 deg, deg."""
     mounting: Vector = (0.0, 0.0, 0.0)
-    """deg roll, pitch, heading of the sensor in the body."""
+    """Roll, pitch and heading of the sensor relative to the body, deg."""
     turn_on_sigma: NotNegative = 0.0
-    """nT an axis; the offset changes at every power-on."""
+    """1-sigma of the offset's change at every power-on, nT on each axis."""
     power_on: tuple[float, ...] = ()
-    """s after the start at which the instrument is powered on again."""
+    """Times at which the instrument is power-cycled, s after the start."""
     offset_per_degree: Vector = (0.0, 0.0, 0.0)
     scale_per_degree: Vector = (0.0, 0.0, 0.0)
-    """`offset_per_degree`, `scale_per_degree`: nT/degC and 1/degC, about `reference_temperature`."""
+    """`offset_per_degree`, `scale_per_degree`: Temperature coefficients, nT/degC and 1/degC."""
     reference_temperature: float = 2.0
-    """degC at which offset and scale are as given."""
+    """Temperature at which the temperature coefficients have no effect, degC."""
     start_temperature: float | None = None
-    """degC of the fluxgate at the start; None: the temperature of the water."""
+    """Temperature of the fluxgate at the start, degC; None for the temperature of the water."""
     thermal_lag: NotNegative = 3600.0
     """Time constant with which the fluxgate's temperature follows the water's, s."""
     corner: NotNegative = 0.33
-    """Hz of the RC anti-alias filter; 0 leaves it out."""
+    """Corner frequency of the RC anti-alias filter, Hz; 0 for no filter."""
     channel_delay: Vector = (0.0, 0.0, 0.0)
-    """s after the triple's time at which the converter reaches each channel."""
+    """Time from the triple's time until the converter samples each channel, s."""
     bits: Annotated[int, Meta(ge=2, le=32)] = 24
     full_scale: Positive = 100_000.0
-    """`bits`, `full_scale`: float: Converter: bits, and nT either side of zero."""
+    """`bits`, `full_scale`: Resolution of the converter, bits, and its range to either side of zero, nT."""
     noise_sigma: NotNegative = 1.0
     noise_memory: NotNegative = 0.0
-    """`noise_sigma`, `noise_memory`: nT of a channel's noise, and samples over which its correlation falls by
-    e (0: white)."""
+    """`noise_sigma`, `noise_memory`: 1-sigma of a channel's noise (nT), and its correlation time in samples
+    (0: white noise)."""
 
     def matrix(self) -> FloatArray:
         """Return the matrix (3, 3) from the field in body axes to the channels, without noise and offset.
 
-        Rows are the sensing axes in sensor axes: x is the reference, y lies in the x-y plane. The rotation
-        from body to sensor follows the 3-2-1 order.
+        Its rows are the sensing axes: in sensor axes, x is the reference and y lies in the x-y plane. The
+        rotation from body to sensor has the order 3-2-1.
         """
         xy, xz, yz = np.radians(self.orthogonality)
         axes = np.array(
@@ -75,11 +75,11 @@ class Instrument(Table, frozen=True):
     def measure(
         self, field: FloatArray, water: FloatArray, step: float, time: FloatArray, rng: np.random.Generator
     ) -> Samples:
-        """Measure a `field` (n, 3), nT in body axes at the sensor, given every `step` s.
+        """Return the instrument's samples of a `field` (n, 3), nT in body axes, given every `step` s.
 
-        `water` (n,), degC, is around the instrument; triples are taken at `time` (m,), s after the first
-        point, inside the grid with channel delays included. `rng` is that of the offsets at power-on and of
-        the noise.
+        `water` (n,) is the water temperature, degC. The samples are triples at `time` (m,), s after the first
+        point; with the channel delays, they must lie within the grid. `rng` generates the offsets at power-on
+        and the noise.
         """
         temperature = self.temperature(water, step)
         warm = (temperature - self.reference_temperature)[:, None]
@@ -109,7 +109,7 @@ class Instrument(Table, frozen=True):
         return first_order(water, step, self.thermal_lag, self.start_temperature)
 
     def digitise(self, field: FloatArray) -> FloatArray:
-        """Return `field` (n, 3), nT, as the converter gives it: rounded to its step, clipped at its ends."""
+        """Return `field` (n, 3), nT, rounded to the converter's step and clipped to its range."""
         half = 2 ** (self.bits - 1)
         step = self.full_scale / half
         return np.asarray(np.clip(np.rint(field / step), -half, half - 1) * step)
@@ -117,20 +117,20 @@ class Instrument(Table, frozen=True):
 
 @dataclass(frozen=True)
 class Samples:
-    """What an :class:`Instrument` gave."""
+    """Samples of an :class:`Instrument`, at m times."""
 
     channels: FloatArray
-    """(m, 3), nT."""
+    """Readings (m, 3), nT."""
     times: FloatArray
-    """(m, 3), s after the grid's first point, when each channel was sampled."""
+    """Time at which each channel was sampled (m, 3), s after the grid's first point."""
     temperature: FloatArray
-    """(m,), degC at the fluxgate."""
+    """Temperature of the fluxgate (m,), degC."""
     power_cycle: FloatArray
-    """(m,): How many times it was powered on again."""
+    """Number of power cycles before each sample (m,)."""
 
 
 def rotation(roll: float | FloatArray, pitch: float | FloatArray, heading: float | FloatArray) -> Rotation:
-    """Return the rotations that take body vectors to the world's axes, angles (n,) in deg, order 3-2-1.
+    """Return the rotations from body axes to north-east-down axes; angles (n,) in deg, order 3-2-1.
 
     ``rotation(...).apply(field_ned, inverse=True)`` is the field in body axes.
     """

@@ -1,4 +1,4 @@
-"""The demonstration's glider as it flies: its bridge on a pty and a socket, in real time, for the page.
+"""Run the demonstration's glider in real time, with its bridge on a pty and a socket, for the monitor page.
 
 ::
 
@@ -42,23 +42,23 @@ from sitl.twin import Twin, simulate
 __all__ = ["MAP", "flying"]
 
 MAP = "grid.nc"
-"""The anomaly map of the glider's world, in its folder."""
+"""File name of the anomaly map of the glider's world."""
 
 PARAMETERS = ("battpos", "ballast")
 RATE = 1.0
-"""Hz of the fluxgate: the deployment's one sample in four seconds is dull to watch."""
+"""Rate of the fluxgate, Hz; the scenario's 0.25 Hz is too slow to watch."""
 LEAD = 8.0
-"""s until the first sample: the bridge starts meanwhile."""
+"""Time until the first sample, s, in which the bridge starts."""
 ENDING = 10.0
-"""s that the bridge has to end."""
+"""Longest time for the bridge to end, s."""
 
 
 @contextmanager
 def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> Iterator[str]:
-    """Fly the glider of a seed while the context lasts; give the link at which a ground station receives it.
+    """Run the simulated glider while the context lasts; yield the URL for a ground station's link.
 
-    `folder` is for the deployment, its calibration, its world's map, the bridge's configuration and its log.
-    `notify` is called with a line about each step.
+    The function writes the deployment, calibration, anomaly map, bridge configuration and log to `folder`.
+    It calls `notify` with a line about each step.
     """
     notify("simulating a glider and fitting its calibration to the spirals")
     survey = _prepare(folder, seed)
@@ -92,7 +92,7 @@ def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -
 
 
 def _prepare(folder: Path, seed: int) -> xr.Dataset:
-    """Simulate, fit, and return the survey."""
+    """Simulate a deployment, fit and save its calibration, and return the survey."""
     scenario = load("demo")
     instrument = msgspec.structs.replace(scenario.instrument, rate=RATE)
     scenario = msgspec.structs.replace(scenario, instrument=instrument)
@@ -106,7 +106,7 @@ def _prepare(folder: Path, seed: int) -> xr.Dataset:
 
 
 def _state_at(survey: xr.Dataset, begin: float) -> xr.Dataset:
-    """Return the survey with its times moved to `begin`, s since 1970."""
+    """Return the survey with its times shifted to begin at `begin`, s since 1970."""
     shift = begin - float(survey["time"][0])
     moved = {
         name: survey[name] + shift for name in map(str, survey.data_vars) if name.startswith("mag_time_")
@@ -115,7 +115,7 @@ def _state_at(survey: xr.Dataset, begin: float) -> xr.Dataset:
 
 
 def _play(survey: xr.Dataset, config: Path, master: int, router: _Router, stop: Stop) -> None:
-    """Send what the two devices send, each byte at its time."""
+    """Send the bytes of the emulated fluxgate and autopilot at their times, until `stop` is set."""
     for event in emulate(survey, load_config(config)):
         if stop.wait(max(0.0, event.time_us * 1e-6 - time.time())):
             return
@@ -137,7 +137,7 @@ def _end(bridge: subprocess.Popen[bytes]) -> None:
 
 
 class _Router:
-    """Passes datagrams between the bridge and the ground station, and the autopilot's to both."""
+    """Router of UDP datagrams between bridge and ground station; both receive the autopilot's."""
 
     def __init__(self, opened: ExitStack) -> None:
         self._sockets = [
@@ -150,7 +150,7 @@ class _Router:
         self.bridge_port, self.station_port = (one.getsockname()[1] for one in self._sockets)
 
     def run(self, stop: Stop) -> None:
-        """Forward received bytes, until stopped."""
+        """Forward received datagrams until `stop` is set."""
         while not stop.is_set():
             ready, _, _ = select.select(self._sockets, [], [], 0.2)
             for one in ready:
@@ -160,7 +160,7 @@ class _Router:
                     self._send(1 - side, data)
 
     def from_autopilot(self, data: bytes) -> None:
-        """Send to both."""
+        """Send the autopilot's bytes to the bridge and to the ground station."""
         for side in (0, 1):
             self._send(side, data)
 

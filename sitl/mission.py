@@ -1,4 +1,4 @@
-"""What a deployment consists of: calibration spirals, a criss-cross survey, or a planner's list of legs."""
+"""Define the parts of a mission: calibration spirals, a criss-cross survey, or a list of legs."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ TABLE_1: tuple[tuple[int, float, float, float], ...] = (
     (9, -30.0, 0.527, 0.472),
     (10, 30.0, -0.401, -0.348),
 )
-"""The paper's Table 1: run, pitch (deg), battery position (in) in trial 1 and in trial 2.
+"""Table 1 of the paper: run, pitch (deg), battery position (in) in trial 1 and in trial 2.
 
-The ballast stands at -200 cm³ in a dive and at 200 cm³ in a climb.
+The ballast is at -200 cm³ in a dive and at 200 cm³ in a climb.
 """
 
 
 class Limit(Table, frozen=True):
-    """``[limits.NAME]``: what the vehicle allows a moving mass: its ends (units) and speed (units/s)."""
+    """Table ``[limits.NAME]``: lowest and highest position (units) and speed (units/s) of a moving mass."""
 
     low: float
     high: float
@@ -46,27 +46,27 @@ LIMITS = {name: Limit(low=m.low, high=m.high, rate=m.rate, unit=m.unit) for name
 
 
 class Leg(Table, frozen=True):
-    """One descent, ascent or level stretch with every commanded value held."""
+    """Descent, ascent or level stretch with constant commands."""
 
     duration: Positive
-    """s."""
+    """Duration of the leg, s."""
     pitch: Annotated[float, Meta(ge=-80, le=80)]
     roll: Annotated[float, Meta(ge=-80, le=80)] = 0.0
-    """`pitch`, `roll`: deg."""
+    """`pitch`, `roll`: Commanded angles, deg."""
     turn: float = 0.0
     """Turn rate, deg/s, clockwise seen from above."""
     heading: float | None = None
-    """deg at its start; None keeps the heading at which the last leg ended."""
+    """Heading at the start of the leg, deg; None keeps the heading at which the last leg ended."""
     parameters: dict[str, float] = msgspec.field(default_factory=dict)
-    """Positions of the moving masses; one that is not named stays where it is."""
+    """Commanded positions of the moving masses; a mass that is not named does not move."""
     segment: str = "mission"
-    """Consecutive legs of one name are one segment of the deployment."""
+    """Name of the segment; consecutive legs of one name are one segment of the deployment."""
 
 
 class Run(Table, frozen=True):
-    """One calibration run, as a planner asks for it: deg, and positions of the moving masses.
+    """Calibration run of a planner: pitch and roll (deg), and positions of the moving masses.
 
-    Without a `roll` the spiral banks as the vehicle's spirals do.
+    If `roll` is None, the roll is drawn from :attr:`Spirals.roll`.
     """
 
     pitch: Annotated[float, Meta(ge=-80, le=80)]
@@ -75,22 +75,22 @@ class Run(Table, frozen=True):
 
 
 class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
-    """Calibration runs: spirals, clockwise, each a descent or an ascent with every mass at rest."""
+    """Calibration runs: clockwise spirals, each a descent or an ascent with all masses at rest."""
 
     trial: Literal[1, 2] = 1
-    """1 or 2, which of the columns of :data:`TABLE_1` is flown."""
+    """Trial (1 or 2) whose column of :data:`TABLE_1` gives the battery positions."""
     runs: tuple[Run, ...] = ()
-    """Flown instead of the table."""
+    """Runs to use in place of :data:`TABLE_1`."""
     duration: Positive = 900.0
-    """s of one descent or ascent; the paper's pair took about 30 minutes."""
+    """Duration of one descent or ascent, s; the paper's pair took about 30 minutes."""
     turns: float = 4.0
-    """Full turns in a descent or ascent."""
+    """Number of full turns in a descent or ascent."""
     roll: tuple[float, NotNegative] = (6.0, 1.0)
-    """Mean and spread of the bank, deg."""
+    """Mean and standard deviation of the roll, deg."""
     segment: str = "calibration"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
-        """Return a leg for each run; masses that a run does not name are drawn for each."""
+        """Return a leg for each run; draw unnamed positions of masses other than battery and ballast."""
         legs = []
         for run in self.runs or _table_1(self.trial):
             bank = float(rng.normal(*self.roll))
@@ -107,27 +107,27 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
 
 
 class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
-    """The survey: straight dives and climbs, zigzagging out along an axis and back again."""
+    """Survey of straight dives and climbs that zigzag out along an axis and back."""
 
     hours: Positive = 6.0
-    """Its length."""
+    """Duration of the survey, h."""
     pitch: tuple[float, NotNegative] = (26.0, 1.0)
     roll: tuple[float, NotNegative] = (0.0, 2.0)
-    """`pitch`, `roll`: deg, mean and spread from leg to leg; the pitch changes sign between dives and climbs.
-    """
+    """`pitch`, `roll`: Mean and standard deviation over the legs, deg; the pitch changes sign between dives
+    and climbs."""
     axis: float = 150.0
     zigzag: float = 45.0
-    """`axis`, `zigzag`: deg, the way out, and how far legs run to either side of it."""
+    """`axis`, `zigzag`: Heading of the way out, and deviation of the legs to either side, deg."""
     yos_per_leg: Annotated[int, Meta(ge=1)] = 3
-    """Dives and climbs between two changes of heading."""
+    """Number of pairs of dive and climb between two changes of heading."""
     duration: Positive = 900.0
-    """s of one descent or ascent."""
+    """Duration of one descent or ascent, s."""
     battery_spread: NotNegative = 0.02
-    """Spread of the battery's position about Table 1's at this pitch, in."""
+    """Standard deviation of the battery's position about its position in Table 1 at the same pitch, in."""
     segment: str = "survey"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
-        """Return dives and climbs in turn, as many as fit the hours."""
+        """Return alternate dives and climbs, as many as fit into the hours."""
         count = 2 * max(1, round(self.hours * 1800 / self.duration))
         made = []
         for k in range(count):
@@ -155,12 +155,12 @@ class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
 
 
 class Legs(Table, frozen=True, tag_field="kind", tag="legs"):
-    """Legs as they are listed: what a planner asked for."""
+    """Explicit list of legs, for example from a planner."""
 
     runs: tuple[Leg, ...]
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:  # noqa: ARG002  the others draw
-        """Return the list."""
+        """Return the listed legs; nothing is drawn."""
         return [*self.runs]
 
 
@@ -186,7 +186,7 @@ def other_channels(rng: np.random.Generator, limits: Mapping[str, Limit]) -> dic
 
 
 def _battery(pitch: float) -> float:
-    """Return where the battery stands at `pitch`: both trials' mean, linear between the table's pitches."""
+    """Return the battery's position (in) at `pitch` (deg): Table 1's mean over both trials, interpolated."""
     rows = sorted((p, (a + b) / 2) for _, p, a, b in TABLE_1)
     pitches, places = zip(*rows, strict=True)
     return float(np.interp(pitch, pitches, places))

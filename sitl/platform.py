@@ -1,4 +1,4 @@
-"""The vehicle's own magnetism: fixed iron, and moving masses, each a dipole."""
+"""Simulate the vehicle's magnetism: fixed iron, and moving masses, which are dipoles."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 class Mounting(NamedTuple):
-    """Where a kind of mass usually sits, and how it moves."""
+    """Usual place of a kind of mass in the vehicle, and its motion."""
 
     at: Vector
     travel: Vector
-    """`at`, `travel`: m from the sensor in body axes when the parameter is 0, and m per unit of the
-    parameter."""
+    """`at`, `travel`: Position relative to the sensor at parameter 0 (m, body axes), and displacement per
+    unit of the parameter (m)."""
     low: float
     high: float
     rate: float
-    """`low`, `high`, `rate`: The vehicle's limits, units and units/s."""
+    """`low`, `high`, `rate`: Limits of the parameter (units), and its speed (units/s)."""
     unit: str
 
 
@@ -48,26 +48,26 @@ MOUNTINGS: dict[str, Mounting] = {
 
 
 HARD_IRON, SOFT_IRON = 1500.0, 0.01
-"""1-sigma on each axis of a drawn vehicle's fixed iron: nT, and nT per nT."""
+"""1-sigma on each axis of a random vehicle's hard iron (nT) and soft iron (nT per nT)."""
 MOMENT = 3.0
-"""A m², 1-sigma an axis of a drawn mass."""
+"""1-sigma on each axis of a random mass's permanent moment, A m²."""
 VOLUME, VOLUME_SPREAD = (2e-3, 1e-3, 1e-3), 0.3
-"""m³, apparent susceptibility times volume along each axis, and the spread of its logarithm."""
+"""Median of apparent susceptibility times volume along each axis (m³), and the 1-sigma of its logarithm."""
 PLACE_SPREAD = (0.06, 0.03, 0.03)
-"""1-sigma of where a drawn mass stands about :data:`MOUNTINGS`, m."""
+"""1-sigma of a random mass's position about :data:`MOUNTINGS`, m."""
 
 
 class Mass(Table, frozen=True):
-    """``[vehicle.mass.NAME]``: a mass that the parameter NAME moves."""
+    """Table ``[vehicle.mass.NAME]``: a mass that the parameter NAME moves."""
 
     at: Vector
     travel: Vector
-    """`at`, `travel`: m from the sensor in body axes when the parameter is 0, and m per unit of the
-    parameter."""
+    """`at`, `travel`: Position relative to the sensor at parameter 0 (m, body axes), and displacement per
+    unit of the parameter (m)."""
     moment: Vector
-    """A m², the permanent magnetisation."""
+    """Permanent magnetic moment, A m²."""
     volume: Vector = (0.0, 0.0, 0.0)
-    """m³, apparent susceptibility times volume along each axis: the induced moment is ``volume * B / µ0``."""
+    """Apparent susceptibility times volume along each axis, m³: the induced moment is ``volume * B / µ0``."""
 
     def field(self, ambient: FloatArray, position: FloatArray) -> FloatArray:
         r"""Return the mass's field at the sensor (n, 3), nT in body axes.
@@ -76,8 +76,8 @@ class Mass(Table, frozen=True):
 
         Notes
         -----
-        :math:`\mathbf m = \mathbf m_0 + \chi V \mathbf B / \mu_0`, in the field that would be there without
-        the mass; with µ0/4π = 100 nT m/A, :math:`B[nT] / \mu_0 = B[nT] / (400 \pi)`.
+        :math:`\mathbf m = \mathbf m_0 + \chi V \mathbf B / \mu_0`, with B the field without the mass.
+        With µ0/4π = 100 nT m/A, :math:`B[nT] / \mu_0 = B[nT] / (400 \pi)`.
         """
         r = -(np.asarray(self.at) + position[:, None] * np.asarray(self.travel))
         m = np.asarray(self.moment) + np.asarray(self.volume) * ambient / (4 * np.pi * MU_0_OVER_4_PI)
@@ -85,14 +85,14 @@ class Mass(Table, frozen=True):
 
 
 class Vehicle(Table, frozen=True):
-    """``[vehicle]``: a vehicle whose magnetism is known."""
+    """Table ``[vehicle]``: a vehicle of given magnetism."""
 
     hard_iron: Vector = (0.0, 0.0, 0.0)
-    """Field of all parts that do not move, nT."""
+    """Permanent field of all parts that do not move, nT, body axes."""
     soft_iron: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """Field that fixed iron adds per unit of the Earth's field, body axes."""
     mass: dict[str, Mass] = msgspec.field(default_factory=dict)
-    """By the name of the parameter that moves it."""
+    """Moving masses, by the name of the parameter that moves each."""
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -107,8 +107,8 @@ class Vehicle(Table, frozen=True):
     ) -> FloatArray:
         """Return the field at the sensor, (n, 3) nT in body axes.
 
-        `ambient` (n, 3), nT, is the Earth's field in body axes; `channels` (n,) each has the position of
-        every mass. Iron does not depend on the time.
+        `ambient` (n, 3), nT, is the Earth's field in body axes; `channels` has the positions (n,) of every
+        mass. Iron does not depend on the time.
         """
         fixed = ambient + np.asarray(self.hard_iron) + ambient @ np.asarray(self.soft_iron).T
         moving = (mass.field(ambient, channels[name]) for name, mass in self.mass.items())
@@ -117,30 +117,30 @@ class Vehicle(Table, frozen=True):
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A vehicle described by a calibration: the calibration's forward model in place of iron."""
+    """Vehicle whose magnetism is the forward model of a calibration."""
 
     calibration: Calibration
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of the channels that :meth:`field` needs: masses, and the channels of the effects."""
+        """Names of the channels that :meth:`field` needs: mass positions, and the channels of the effects."""
         return self.calibration.channels
 
     def field(self, ambient: FloatArray, channels: Mapping[str, FloatArray], time: FloatArray) -> FloatArray:
-        """Return the field at the sensor (n, 3) as :meth:`Vehicle.field`; `time` (n,) is s since 1970."""
+        """Return the field at the sensor like :meth:`Vehicle.field`; `time` (n,) is s since 1970."""
         sampled = np.reshape([channels[name] for name in self.channels], (-1, len(time))).T
         return forward(self.calibration, ambient, sampled, time)
 
 
 def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "ballast")) -> Vehicle:
-    """Draw a vehicle with these moving masses (keys of :data:`MOUNTINGS`).
+    """Draw a random vehicle with these moving masses (keys of :data:`MOUNTINGS`).
 
-    The sizes are those of a small glider. Fixed iron: 1,500 nT and 1 % an axis. A mass: 3 A m² an axis left
-    by handling (ten kilograms of alkaline cells hold two or three kilograms of steel, 3e-4 m³, at some
-    10 kA/m), and an apparent susceptibility times volume of 2 litres along its length, half that across
-    (cans with a demagnetising factor near 0.1). It stands within centimetres of where its kind usually
-    stands. A nominal calibration of such a vehicle over the spirals of the paper's Table 1 leaves about
-    150 nT, as the paper's did.
+    The magnitudes are typical of a small glider. Fixed iron has 1,500 nT and 1 % on each axis. A mass has a
+    permanent moment of 3 A m² on each axis: ten kilograms of alkaline cells contain two or three kilograms of
+    steel, 3e-4 m³, at some 10 kA/m. Its apparent susceptibility times volume is 2 litres along its length and
+    half as much across (cans with a demagnetising factor near 0.1). Its position is within centimetres of the
+    usual one. A nominal calibration of such a vehicle over the spirals of the paper's Table 1 has an error of
+    about 150 nT, like the paper's.
     """
     iron = rng.normal(0, SOFT_IRON, (3, 3))
     return Vehicle(

@@ -1,4 +1,4 @@
-"""A scenario: one TOML file that describes world, vehicle, instrument and mission."""
+"""Read a scenario: a TOML file that describes world, vehicle, instrument and mission."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from sitl.world import Geology, Water
 __all__ = ["SCENARIOS", "Hidden", "Place", "Scenario", "Telemetry", "load"]
 
 SCENARIOS = Path(__file__).parent / "scenarios"
-"""The scenarios that come with the package."""
+"""Folder of the scenarios that come with the package."""
 
 
 class Place(Table, frozen=True):
-    """``[world]``: where, with the crustal field and the water.
+    """Table ``[world]``: first position (deg), geology and water.
 
-    A scenario that is driven by a log takes the place from the log.
+    If a log drives the scenario, the position is the log's.
     """
 
     latitude: Annotated[float, Meta(ge=-90, le=90)] = 0.0
@@ -38,65 +38,63 @@ class Place(Table, frozen=True):
 
 
 class Telemetry(Table, frozen=True):
-    """``[telemetry]``: errors of the vehicle's own attitude and position, and the reference."""
+    """Table ``[telemetry]``: errors of the logged attitude and position, and the reference field."""
 
     roll_pitch_sigma: NotNegative = 0.1
     heading_sigma: NotNegative = 1.0
-    """`roll_pitch_sigma`, `heading_sigma`: deg, white."""
+    """`roll_pitch_sigma`, `heading_sigma`: Standard deviations of white noise, deg."""
     drift: NotNegative = 0.0
-    """m/s an axis, standard deviation of a steady current that the logged position lacks."""
+    """Standard deviation on each axis of a constant drift velocity of the logged position, m/s."""
     reference: Literal["none", "true", "map"] = "none"
-    """What ``reference_field`` holds: ``none`` leaves it out, ``true`` is the true total field, ``map`` is
-    the IGRF with the anomaly of the map that an aeromagnetic survey would have made."""
+    """Content of ``reference_field``: ``none`` omits the column, ``true`` gives the true total field, ``map``
+    gives the IGRF plus the anomaly of a simulated aeromagnetic map."""
     map_altitude: NotNegative = 90.0
-    """m of that survey."""
+    """Altitude of the aeromagnetic survey, m."""
 
 
 class Hidden(Table, frozen=True):
-    """``[[hidden]]``: something happens that the calibration does not know."""
+    """Table ``[[hidden]]``: an effect that the calibration does not model."""
 
     effect: str
-    """Of :data:`sitl.inject.EFFECTS`."""
+    """Name of the effect, a key of :data:`sitl.inject.EFFECTS`."""
     size: NotNegative
-    """In the effect's own unit: see its function."""
+    """Size in the unit that the effect's function states."""
     segment: str = "survey"
-    """The part of the mission that it shows in."""
+    """Segment of the mission that has the effect."""
 
 
 class Scenario(Table, frozen=True):
-    """A whole scenario file."""
+    """Contents of a scenario file."""
 
     name: str
     start: Annotated[datetime, Meta(tz=True)] = datetime(2013, 12, 11, 12, tzinfo=UTC)
-    """With its offset from UTC (TOML: ``2013-12-11T12:00:00Z``)."""
+    """Start time with its offset from UTC (TOML: ``2013-12-11T12:00:00Z``)."""
     masses: tuple[str, ...] = ("battpos", "ballast")
-    """Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn from the
-    seed."""
+    """Moving masses (keys of :data:`sitl.platform.MOUNTINGS`) of a random vehicle."""
     vehicle: Vehicle | None = None
-    """A vehicle whose magnetism is given; nothing is drawn then."""
+    """Vehicle of given magnetism; None for a random vehicle."""
     calibration: str | None = None
-    """A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument, in place of a
-    vehicle."""
+    """Path of a ``cal.json`` (relative to the scenario's file) that takes the place of a vehicle."""
     limits: dict[str, Limit] = msgspec.field(default_factory=dict)
-    """The vehicle's limits where they differ from those of its kind of mass."""
+    """Limits of masses that differ from :data:`sitl.mission.LIMITS`."""
     world: Place = Place()
     motion: Motion = Motion()
     instrument: Instrument = Instrument()
     telemetry: Telemetry = Telemetry()
-    """`world`, `motion`, `instrument`, `telemetry`: The tables of these names."""
+    """`world`, `motion`, `instrument`, `telemetry`: Contents of the tables of these names."""
     hidden: tuple[Hidden, ...] = ()
-    """What happens besides."""
+    """Hidden effects to add to the deployment."""
     mission: tuple[Part, ...] = ()
-    """Spirals, surveys and legs, one after the other; empty where a log is to drive the scenario."""
+    """Spirals, surveys and legs in their order; empty if a log drives the scenario."""
 
     @property
     def all_limits(self) -> dict[str, Limit]:
-        """Limits of every mass the vehicle has, battery and ballast always among them."""
+        """Limits of the vehicle's masses by name, always including battery and ballast."""
         names = dict.fromkeys(("battpos", "ballast", *self.masses))
         return {name: LIMITS[name] for name in names} | self.limits
 
     def replace(self, **changes: Any) -> Scenario:
-        """Return the scenario with other values; of a table, a dict of those that change."""
+        """Return a copy with changed values; a dict changes only the named entries of a table."""
         for name, change in changes.items():
             table = getattr(self, name)
             if isinstance(table, Table) and isinstance(change, dict):
@@ -105,7 +103,7 @@ class Scenario(Table, frozen=True):
 
 
 def load(path: str | Path) -> Scenario:
-    """Read and check a scenario file; a bare name is one that comes with the package.
+    """Read and check a scenario file; a name without suffix means a scenario of the package.
 
     Raises
     ------

@@ -13,7 +13,7 @@ __all__ = ["autoregressive", "correlated", "first_order", "first_order_at"]
 def first_order(
     u: FloatArray, step: float, time_constant: float, start: FloatArray | float | None = None
 ) -> FloatArray:
-    r"""Return the output of a first-order lag for an input u (n,) or (n, k), every `step` s, of its shape.
+    r"""Return the output of a first-order lag, of the shape of its input u (n,) or (n, k), every `step` s.
 
     The output begins at `start` (k,), or at ``u[0]``. A time constant of 0 s passes the input through.
 
@@ -40,10 +40,10 @@ def first_order(
 def first_order_at(
     u: FloatArray, y: FloatArray, step: float, time_constant: float, time: FloatArray
 ) -> FloatArray:
-    r"""Return a first-order lag's output (m,) between the points of its grid.
+    r"""Return a first-order lag's output (m,) at any times between the points of its grid.
 
-    Input u and output y (n,) are those of :func:`first_order`; `time` (m,) is s after the first point, inside
-    the grid.
+    Input u and output y (n,) on the grid are from :func:`first_order`. `time` (m,) is s after the first
+    point, within the grid.
 
     Notes
     -----
@@ -62,16 +62,16 @@ def first_order_at(
 def autoregressive(
     rng: np.random.Generator, shape: tuple[int, ...], sigma: float, memory: float
 ) -> FloatArray:
-    """Return stationary noise of a shape; its correlation falls by e in `memory` points of the first axis.
+    """Return stationary AR(1) noise (n, ...) with a correlation length of `memory` points of the first axis.
 
-    `sigma` is the standard deviation of the noise itself, not of its innovations; a memory of 0
-    is white noise.
+    `sigma` is the standard deviation of the noise itself, not of its innovations. A `memory` of 0 gives white
+    noise.
     """
     white = rng.normal(0.0, sigma, shape)
     return correlated(white, np.exp(-1.0 / memory)) if memory else white
 
 
 def correlated(white: FloatArray, phi: float) -> FloatArray:
-    """Make stationary white noise (n, ...) autoregressive: neighbours correlate by `phi`, the size stays."""
+    """Convert white noise (n, ...) to AR(1) noise of the same variance and lag-1 correlation `phi`."""
     driven = np.concatenate([white[:1], np.sqrt(1 - phi**2) * white[1:]])
     return np.asarray(lfilter([1.0], [1.0, -phi], driven, axis=0), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""How the vehicle flies: legs of constant commands, followed with a real vehicle's lag and wander."""
+"""Compute the vehicle's track: it follows legs of constant commands with lag and wander."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ __all__ = ["Motion", "Track", "fly"]
 
 
 class Motion(Table, frozen=True):
-    """``[motion]``: how the vehicle follows its commands."""
+    """Table ``[motion]``: how the vehicle follows its commands."""
 
     speed: Positive = 0.35
-    """m/s through the water."""
+    """Speed through the water, m/s."""
     angle_of_attack: float = 3.0
-    """deg by which the path is steeper than the pitch."""
+    """Angle by which the path is steeper than the pitch, deg."""
     settle: NotNegative = 15.0
-    """s of the first-order approach to a commanded attitude."""
+    """Time constant of the first-order approach to a commanded attitude, s."""
     wander: tuple[float, float, float] = (0.3, 0.6, 5.0)
-    """Standard deviation of roll, pitch and heading about the command, deg; as a Slocum's log shows them."""
+    """Standard deviations of roll, pitch and heading about the command, deg, as in a Slocum glider's log."""
     wander_memory: Positive = 20.0
-    """s over which the wander's correlation falls."""
+    """Correlation time of the wander, s."""
     current: tuple[float, float] = (0.0, 0.0)
-    """m/s north, east of the water."""
+    """Velocity of the water, north and east, m/s."""
     max_depth: Positive = 200.0
     """Depth at which the vehicle stays until it climbs, m."""
 
 
 STEADY = Motion()
-"""How a small glider follows its commands."""
+"""Motion of a small glider."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """What the vehicle really did, on a uniform grid."""
+    """True track of the vehicle, on a uniform grid of n times."""
 
     start: float
     step: float
-    """`start`, `step`: s since 1970, and s between points."""
+    """`start`, `step`: Time of the first point (s since 1970), and interval between points (s)."""
     latitude: FloatArray
     longitude: FloatArray
     depth: FloatArray
@@ -56,17 +56,16 @@ class Track:
     roll: FloatArray
     pitch: FloatArray
     heading: FloatArray
-    """`roll`, `pitch`, `heading`, (n,), deg; the heading runs on past 360 (so that it can be interpolated).
-    """
+    """`roll`, `pitch`, `heading`, (n,), deg; the heading is unwrapped beyond 360 for interpolation."""
     parameters: dict[str, FloatArray]
     """(n,) each: Positions of the moving masses, and other logged channels on which the vehicle's magnetism
     depends."""
     run: FloatArray | None = None
-    """(n,): Number of the leg, from 1."""
+    """Number of the leg at each point (n,), from 1."""
     segments: tuple[tuple[str, float, float], ...] = ()
-    """(name, first, last) each, s after the start."""
+    """Name, first time and last time of each segment, s after the start."""
     water: FloatArray | None = None
-    """(n,), degC around the vehicle, where it was measured."""
+    """Measured water temperature (n,), degC; None if the world's model is to give it."""
 
     @property
     def elapsed(self) -> FloatArray:
@@ -74,14 +73,14 @@ class Track:
         return np.asarray(self.step * np.arange(len(self.depth)))
 
     def pose_at(self, time: FloatArray) -> dict[str, FloatArray]:
-        """Return every quantity by name at `time` (m,), s after the start, linear between the points."""
+        """Return pose and parameters by name at `time` (m,), s after the start, interpolated linearly."""
         names = ("latitude", "longitude", "depth", "roll", "pitch", "heading")
         columns = {name: getattr(self, name) for name in names} | self.parameters
         elapsed = self.elapsed
         return {name: np.interp(time, elapsed, column) for name, column in columns.items()}
 
     def local(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return places (m,), deg, as metres north and east of where the track begins."""
+        """Convert positions (m,), deg, to metres north and east of the track's first point."""
         return separation(float(self.latitude[0]), float(self.longitude[0]), latitude, longitude)
 
 
@@ -95,20 +94,20 @@ def fly(
 ) -> Track:
     """Fly `legs` one after the other, from a `start` (s since 1970, latitude and longitude in deg).
 
-    The track has a point every `step` s; `rng` is that of the wander. `limits` has every moving mass; one
+    The track has a point every `step` s; `rng` generates the wander. `limits` has every moving mass; a mass
     that no leg moves stays in the middle of its travel.
 
     Raises
     ------
     OutOfRange
-        A leg wants a mass beyond the vehicle's limits, or one that has none.
+        A leg commands a mass beyond its limits, or a mass without limits.
     """
     ends = np.cumsum([leg.duration for leg in legs])
     t = np.arange(0.0, ends[-1], step)
     leg_of = np.searchsorted(ends, t, side="right")
     memory = motion.wander_memory / step
-    # a vehicle has inertia: the wander is smoothed. A lag of time constant T leaves 1 / (1 + T / tau) of the
-    # variance of noise with memory tau, 3/4 for T = tau / 3, and its offset is given back
+    # a vehicle has inertia, so smooth the wander. A lag of time constant T reduces the variance of noise with
+    # correlation time tau by 1 / (1 + T / tau), 3/4 for T = tau / 3; the factor 4 / 3 restores the variance
     wander = first_order(autoregressive(rng, (len(t), 3), 1.0, memory), step, motion.wander_memory / 3)
     wander *= np.sqrt(4 / 3) * np.asarray(motion.wander)
 
@@ -119,7 +118,7 @@ def fly(
     pitch = settled(np.array([leg.pitch for leg in legs])[leg_of]) + wander[:, 1]
     heading = settled(_headings(legs, ends, t, leg_of)) + wander[:, 2]
 
-    # the wings' lift, and the angle of attack with it, changes sides between dive and climb
+    # the angle of attack changes its sign between dive and climb
     path = np.radians(pitch + motion.angle_of_attack * np.tanh(pitch / 5))
     sink = -motion.speed * np.sin(path) * step
     ahead = motion.speed * np.cos(path)
@@ -143,14 +142,14 @@ def fly(
 
 
 def _depth(sink: FloatArray, deepest: float) -> FloatArray:
-    """Return the depth (n,), m: not above the surface, and not below the greatest depth."""
+    """Return the depth (n,), m, from the `sink` (m) of each step, between the surface and `deepest`."""
     return np.array(
         [*accumulate(sink.tolist(), lambda depth, by: min(max(depth + by, 0.0), deepest), initial=0.0)][1:]
     )
 
 
 def _headings(legs: Sequence[Leg], ends: FloatArray, t: FloatArray, leg_of: IndexArray) -> FloatArray:
-    """Return the commanded heading, unwrapped: each leg turns the shorter way to its own start."""
+    """Return the commanded heading (n,), deg, unwrapped; between legs it turns the shorter way."""
     first, last = [], legs[0].heading or 0.0
     for leg in legs:
         start = last if leg.heading is None else last + (leg.heading - last + 180) % 360 - 180
@@ -169,7 +168,7 @@ def _mass_motion(
     leg_of: IndexArray,
     limits: Mapping[str, Limit],
 ) -> FloatArray:
-    """Return a mass's position (n,): at each leg's start it sets out for its target, as fast as it can."""
+    """Return a mass's position (n,); from each leg's start it moves at full speed to its target."""
     if name not in limits:
         raise OutOfRange("moving mass", name, f"the vehicle has {', '.join(limits)}")
     limit = limits[name]

@@ -1,4 +1,4 @@
-"""The forward model: a scenario and a seed make a deployment.
+"""Simulate deployments from a scenario and a seed.
 
 >>> from sitl.scenario import load
 >>> deployment = simulate(load("demo"), seed=1)
@@ -34,27 +34,27 @@ from sitl.world import World
 __all__ = ["FINE_STEP", "TEMPERATURE", "Ambient", "Twin", "placed_at", "simulate", "simulate_like"]
 
 FINE_STEP = 0.5
-"""s between the simulation's points: a spiral's arc departs from its chords by 0.1 nT."""
+"""Interval between the simulation's points, s: in a spiral, linear interpolation is exact to 0.1 nT."""
 TEMPERATURE = "sensor_temperature"
-"""Column of the fluxgate's temperature, which is simulated, whatever the log that drives a twin says."""
+"""Column of the fluxgate's temperature, which is always simulated, even if a log drives the twin."""
 FIELD_STEP = 4.0
-"""s between evaluations of the Earth's field, which varies by less than 0.01 nT about a line meanwhile."""
+"""Interval of the Earth's field evaluations, s: linear interpolation is exact to 0.01 nT."""
 
 
 class Ambient(NamedTuple):
-    """What an instrument is exposed to, on a track's grid of n points."""
+    """Field and temperature at an instrument, on a track's grid of n points."""
 
     earth: FloatArray
-    """(n, 3), nT north-east-down, of the Earth alone."""
+    """Earth's field (n, 3), nT, north-east-down."""
     field: FloatArray
-    """(n, 3), nT at the sensor, body axes, the vehicle's included."""
+    """Field at the sensor (n, 3), nT, body axes, including the vehicle's."""
     water: FloatArray
-    """(n,), degC."""
+    """Water temperature (n,), degC."""
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A world and a vehicle, drawn from a seed, that a scenario can be run in."""
+    """World and vehicle of a scenario, with all that the scenario leaves open drawn from a seed."""
 
     scenario: Scenario
     seed: int
@@ -63,9 +63,9 @@ class Twin:
 
     @classmethod
     def draw(cls, scenario: Scenario, seed: int) -> Twin:
-        """Draw what the scenario leaves open.
+        """Return a twin of the scenario; draw from the seed what the scenario leaves open.
 
-        World, vehicle, mission, instrument and telemetry each have a stream of their own, so that a change to
+        World, vehicle, mission, instrument and telemetry have separate random streams, so that a change of
         one does not change the others.
         """
         place = scenario.world
@@ -84,12 +84,12 @@ class Twin:
         return cls(scenario, seed, world, vehicle)
 
     def fly(self) -> Track:
-        """Fly the scenario's mission.
+        """Return the track of the scenario's mission.
 
         Raises
         ------
         WrongUse
-            It has none.
+            The scenario has no mission.
         """
         rng = _stream(self.seed, 2)
         limits = self.scenario.all_limits
@@ -103,9 +103,10 @@ class Twin:
         return fly(legs, start, step, rng, self.scenario.motion, limits)
 
     def measure(self, track: Track, time: FloatArray) -> xr.Dataset:
-        """Measure along a track at `time` (n,), s after its start; channel delays end inside it.
+        """Return the deployment measured along a track at `time` (n,), s after the track's start.
 
-        The deployment has the contract's columns and ``truth_*``.
+        The deployment has the standard columns and ``truth_*``. With the channel delays, `time` must lie
+        within the track.
         """
         ambient = self.ambient(track)
         samples = self.scenario.instrument.measure(
@@ -114,7 +115,7 @@ class Twin:
         return self.log(track, time, ambient.earth, samples)
 
     def ambient(self, track: Track) -> Ambient:
-        """Return what the instrument is exposed to along a track."""
+        """Return field and temperature at the instrument along a track."""
         earth = self._earth_field(track)
         attitude = rotation(track.roll, track.pitch, track.heading)
         water = self.world.water.temperature(track.depth) if track.water is None else track.water
@@ -128,9 +129,9 @@ class Twin:
         return _stream(self.seed, 3)
 
     def log(self, track: Track, time: FloatArray, earth: FloatArray, samples: Samples) -> xr.Dataset:
-        """Return the deployment of an instrument's samples at `time` (m,), as :meth:`measure` does.
+        """Return the deployment of an instrument's samples at `time` (m,), s after the track's start.
 
-        `earth` (n, 3) is that of :class:`Ambient`.
+        `earth` (n, 3) is :attr:`Ambient.earth`.
         """
         true = track.pose_at(time)
         field_ned = np.column_stack([np.interp(time, track.elapsed, b) for b in earth.T])
@@ -163,11 +164,11 @@ class Twin:
             self.scenario.start.timestamp(),
             altitude,
             extent=0.75 * geology.extent,
-            spacing=(geology.top + altitude) / 3,  # an anomaly is about as wide as its source is deep
+            spacing=(geology.top + altitude) / 3,  # the width of an anomaly is about the depth of its source
         )
 
     def _earth_field(self, track: Track) -> FloatArray:
-        """Return the Earth's field (n, 3), nT NED, on the track's grid, linear between sparser points."""
+        """Return the Earth's field (n, 3), nT NED, on the track's grid, interpolated from fewer points."""
         stride = max(1, int(FIELD_STEP / track.step))
         points = np.unique(np.append(np.arange(0, len(track.depth), stride), len(track.depth) - 1))
         when = track.start + track.step * points
@@ -176,7 +177,7 @@ class Twin:
         return np.column_stack([np.interp(grid, points, component) for component in field.T])
 
     def _channels(self, track: Track, water: FloatArray) -> dict[str, FloatArray]:
-        """Return the channels on which the vehicle depends, the fluxgate's temperature among them."""
+        """Return the channels (n,) on which the vehicle's field depends, by name."""
         known = track.pose_at(track.elapsed)
         known[TEMPERATURE] = self.scenario.instrument.temperature(water, track.step)
         for name in self.vehicle.channels:
@@ -187,7 +188,7 @@ class Twin:
         return {name: known[name] for name in self.vehicle.channels}
 
     def _telemetry(self, true: dict[str, FloatArray], time: FloatArray) -> dict[str, FloatArray]:
-        """Return the telemetry: attitude and position with their errors, all else as it is."""
+        """Return the telemetry: attitude and position with simulated errors, other quantities unchanged."""
         settings, rng = self.scenario.telemetry, _stream(self.seed, 4)
         seen = dict(true)
         for name in ("roll", "pitch"):
@@ -223,7 +224,10 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
 
 
 def _with_hidden(twin: Twin, track: Track, moment: FloatArray) -> xr.Dataset:
-    """Measure twice, and take each effect's segment from where it is: the noise is the same in both."""
+    """Return the deployment of a track at the times `moment` (m,), s, with each effect in its segment only.
+
+    Simulations with and without an effect have the same noise, so their segments fit together.
+    """
     from sitl.inject import HiddenEffect, disturb  # noqa: PLC0415 - the effects simulate with twins
 
     out = disturb(twin, (), track, moment, twin.seed)
@@ -249,24 +253,25 @@ def _stream(seed: int, hidden: int) -> np.random.Generator:
 
 
 POINTS = 8
-"""Points of the simulation between two rows of a slow log."""
+"""Number of the simulation's points between two rows of a slow log."""
 
 
 def simulate_like(log: xr.Dataset, scenario: Scenario, seed: int = 0) -> xr.Dataset:
     """Simulate what the scenario's vehicle and instrument would have measured in a logged deployment.
 
-    The `log` has attitude, position, depth and the position of every moving mass of the scenario. A lacking
-    value is interpolated in time; before the first and after the last one it is held. The scenario's mission,
-    place and start are not used. `seed` is that of what the scenario leaves open, and of the noise.
+    The `log` has attitude, position, depth and the position of every moving mass of the scenario. A missing
+    value is interpolated in time; before the first and after the last value, that value is held. The
+    scenario's mission, place and start are not used. The `seed` determines what the scenario leaves open, and
+    the noise.
 
-    The result has the log's rows and columns, with ``mag_*``, ``sensor_temperature``, ``power_cycle``,
-    ``truth_*`` and, as the scenario asks, ``reference_field`` simulated; the log's attitude and position are
+    The result has the log's rows and columns. ``mag_*``, ``sensor_temperature``, ``power_cycle``, ``truth_*``
+    and, if the scenario has one, ``reference_field`` are simulated, with the log's attitude and position as
     the truth.
 
     Raises
     ------
     FormatError
-        The log lacks a column that the forward model needs, or one holds nothing.
+        The log lacks a column that the forward model needs, or such a column has no value.
     """
     twin = Twin.draw(placed_at(log, scenario), seed)
     measured = twin.measure(*read_track(log, scenario, twin.vehicle.channels))
@@ -291,7 +296,7 @@ def placed_at(log: xr.Dataset, scenario: Scenario) -> Scenario:
 
 
 def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> tuple[Track, FloatArray]:
-    """Return a log's track with these `channels` on a uniform grid, and the times in s from its start."""
+    """Return a log's track with these `channels` on a uniform grid, and its times, s after the start."""
     log = with_true_heading(log)
     time = log["time"].to_numpy().astype(np.float64)
     if len(time) < 2:
@@ -322,7 +327,7 @@ def read_track(log: xr.Dataset, scenario: Scenario, channels: Sequence[str]) -> 
 
 
 def _column(log: xr.Dataset, name: str) -> FloatArray:
-    """Return a column (n,), NaN where it lacks a value; angles without their jumps by 360 deg."""
+    """Return a column (n,), with NaN for missing values; heading and longitude are unwrapped (deg)."""
     if name not in log:
         there = ", ".join(map(str, log))
         raise FormatError(_source(log), f"the forward model needs it; there are {there}", column=name)

@@ -1,4 +1,4 @@
-"""The simulated world: main field, magnetised bodies below the sea floor, water with a temperature."""
+"""Simulate the world: main field, magnetised bodies below the sea floor, and water temperature."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from magbridge.toml import Table
 __all__ = ["MU_0_OVER_4_PI", "Geology", "Rock", "Water", "World", "dipole_field"]
 
 MU_0_OVER_4_PI = 100.0
-"""nT m / A: µ0/4π = 1e-7 T m/A."""
+"""Constant µ0/4π, nT m/A (1e-7 T m/A)."""
 
 
 def dipole_field(r: FloatArray, m: FloatArray) -> FloatArray:
-    r"""Return the field (..., 3), nT, of point dipoles m (..., 3), A m², at r (..., 3), m from them.
+    r"""Return the field (..., 3), nT, of point dipoles m (..., 3), A m², at r (..., 3), m from the dipoles.
 
     Notes
     -----
@@ -34,22 +34,22 @@ def dipole_field(r: FloatArray, m: FloatArray) -> FloatArray:
 
 
 class Geology(Table, frozen=True):
-    """``[world.geology]``: how rough the crustal field is."""
+    """Table ``[world.geology]``: the magnetised bodies that cause the crustal field."""
 
     sources: int = 600
-    """How many magnetised bodies; 0 leaves the Earth's main field alone."""
+    """Number of magnetised bodies; 0 for the main field without a crustal field."""
     extent: float = 12_000.0
-    """Half the side of the square that holds them, about the first position, m."""
+    """Half the side of the square that contains the bodies, about the first position, m."""
     top: float = 350.0
     bottom: float = 3_000.0
-    """`top`, `bottom`: m below the surface, where the bodies lie: as many in each octave of depth. The
-    vehicle stays above."""
+    """`top`, `bottom`: least and greatest depth of the bodies below the surface, m, with equally many bodies
+    in each octave of depth. The vehicle stays above the bodies."""
     rms: float = 100.0
-    """nT of the total-field anomaly at the surface."""
+    """RMS of the total-field anomaly at the surface, nT."""
 
 
 class Water(Table, frozen=True):
-    """``[world.water]``: the temperature (degC) above and below a thermocline (m)."""
+    """Table ``[world.water]``: temperature (degC) above and below a thermocline (depth, thickness: m)."""
 
     surface: float = 1.6
     deep: float = 2.4
@@ -57,26 +57,26 @@ class Water(Table, frozen=True):
     thickness: float = 15.0
 
     def temperature(self, depth: FloatArray) -> FloatArray:
-        """Return degC (n,) at `depth` (n,), m."""
+        """Return the water temperature (n,), degC, at `depth` (n,), m."""
         share = 0.5 * (1 + np.tanh((depth - self.thermocline) / self.thickness))
         return np.asarray(self.surface + (self.deep - self.surface) * share)
 
 
 @dataclass(frozen=True)
 class Rock:
-    """Point dipoles below the sea floor: harmonic everywhere above them."""
+    """Point dipoles below the sea floor, whose field is harmonic everywhere above them."""
 
     position: FloatArray
-    """(m, 3), m north, east, down of the world's origin."""
+    """Positions (m, 3), m north, east and down of the world's origin."""
     moment: FloatArray
-    """(m, 3): A m², the same axes."""
+    """Magnetic moments (m, 3), A m², north, east and down."""
 
     @classmethod
     def draw(cls, geology: Geology, main_field: FloatArray, rng: np.random.Generator) -> Rock:
-        """Draw bodies that give the anomaly `geology` asks for in a `main_field` (3,) nT.
+        """Draw random bodies that cause the anomaly `geology` specifies in a `main_field` (3,), nT, NED.
 
-        A body's moment grows as the cube of its depth, so that each depth contributes equally; half of it is
-        induced, along the main field, and half remanence in any direction, of either sign.
+        A body's moment grows with the cube of its depth, so that all depths contribute equally. It is the sum
+        of an induced part along the main field and of remanence in a random direction, with a random sign.
         """
         n = geology.sources
         depth = geology.top * (geology.bottom / geology.top) ** rng.random(n)
@@ -93,9 +93,9 @@ class Rock:
         return cls(position, rock.moment * geology.rms / np.std(anomaly))
 
     def field(self, ned: FloatArray, block: int = 4096) -> FloatArray:
-        """Return the bodies' field (n, 3), nT, at local points (n, 3), m.
+        """Return the bodies' field (n, 3), nT NED, at local points `ned` (n, 3), m.
 
-        :func:`dipole_field` summed over the bodies, with the sums as matrix products.
+        The field is the sum of :func:`dipole_field` over the bodies, computed by matrix products.
         """
         s, m = self.position, self.moment
         s2, ms = np.sum(s * s, axis=1), np.sum(m * s, axis=1)
@@ -111,10 +111,10 @@ class Rock:
 
 @dataclass(frozen=True)
 class World:
-    """The magnetic field at any place and time."""
+    """Model of the Earth's field at any place and time, and of the water."""
 
     origin: tuple[float, float]
-    """Latitude and longitude (deg) of the local axes."""
+    """Latitude and longitude (deg) of the origin of the local axes."""
     rock: Rock
     water: Water
 
@@ -127,24 +127,24 @@ class World:
         water: Water,
         rng: np.random.Generator,
     ) -> World:
-        """Draw magnetised bodies about `origin`; `time` (s since 1970) is that of the magnetising field."""
+        """Draw bodies about `origin` (deg), magnetised by the main field at `time` (s since 1970)."""
         latitude, longitude, depth, when = np.array([[origin[0]], [origin[1]], [0.0], [time]])
         return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
 
     def field(
         self, time: FloatArray, latitude: FloatArray, longitude: FloatArray, depth: FloatArray
     ) -> FloatArray:
-        """Return the field (n, 3) in nT, north-east-down, at times (s since 1970), places (deg, deg, m)."""
+        """Return the Earth's field (n, 3), nT NED, at times (s since 1970) and positions (deg, deg, m)."""
         north, east = separation(*self.origin, latitude, longitude)
         return igrf(longitude, latitude, depth, time) + self.rock.field(np.column_stack([north, east, depth]))
 
     def anomaly_map(
         self, time: float, altitude: float = 90.0, extent: float = 8_000.0, spacing: float = 150.0
     ) -> AnomalyGrid:
-        """Return the map of an aeromagnetic survey at an `altitude`, m, at a `time`, s since 1970.
+        """Return the anomaly map of an aeromagnetic survey at an `altitude` (m) and `time` (s since 1970).
 
-        It shows the bodies of this world from higher up, without the fine structure that a vehicle under
-        water meets. `extent` is half the side of the square, m, `spacing` the distance between nodes, m.
+        At this altitude the map lacks the fine structure of the field under water. `extent` is half the side
+        of the mapped square (m), `spacing` the distance between nodes (m).
         """
         side = np.arange(-extent, extent + spacing / 2, spacing)
         latitude, longitude = offset(*self.origin, side, side)

@@ -1,7 +1,8 @@
-"""Replay: a log, or a simulated deployment, played to the unmodified bridge.
+"""Replay a log, or a simulated deployment, through the unmodified bridge.
 
-:mod:`.run` plays files and puts the result into words. :mod:`.setup` makes the bridge's configuration where
-none is given. :mod:`.emulation` makes of a deployment what its two devices would have sent; :mod:`.own_log`
-takes that from the bridge's own log. The :mod:`.stage` has a pty, a socket and the bridge's process
-(:mod:`.bridge`), which keeps the log's time by a timetable. :mod:`.listener` receives its messages.
+:mod:`.run` replays files and reports the result. :mod:`.setup` creates a configuration of the bridge if none
+is given. :mod:`.emulation` computes the bytes that fluxgate and autopilot would have sent in a deployment;
+:mod:`.own_log` reads these bytes from a bridge's own log. The :mod:`.stage` connects a pty and a socket to
+the bridge's process (:mod:`.bridge`), whose clock follows the log. :mod:`.listener` receives the bridge's
+messages.
 """

@@ -1,6 +1,6 @@
-"""The process in which the bridge runs during a replay: its real ports, and the timetable's clock.
+"""Run the bridge in a process of its own during a replay, with real ports and the timetable's clock.
 
-Run by :class:`sitl.replay.stage.Stage`; not a command of its own.
+:class:`sitl.replay.stage.Stage` starts this module; it is not a command for users.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from magbridge.records import Channel
 from sitl.replay.stage import read_entries
 
 EVENTS_PER_BATCH = 8192
-"""Bytes to the autopilot that may wait to be sent together."""
+"""Number of bytes to the autopilot that are collected before they are sent."""
 
 
 class ScriptedEdge:
-    """Reads real ports in the order, and at the times, given by a timetable."""
+    """Source of events that reads real ports in the order and with the times of a timetable."""
 
     def __init__(self, ports: dict[int, Port], timetable: int) -> None:
         self._ports = ports
@@ -40,12 +40,12 @@ class ScriptedEdge:
         self._unsent = bytearray()
 
     def start(self) -> StartEvent:
-        """Return the start that the timetable begins with."""
+        """Return the start event, with which the timetable begins."""
         *_, data = next(self._entries)
         return msgspec.json.decode(data, type=StartEvent)
 
     def events(self, _deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield the events of the timetable; the bytes come through the ports."""
+        """Yield the events of the timetable, with the bytes read from the ports."""
         for time_us, channel, sensor_id, size, data in self._entries:
             if channel is not Channel.STATE:
                 number = port_number(sensor_id) if channel is Channel.SENSOR else Channel.LINK
@@ -58,7 +58,7 @@ class ScriptedEdge:
         return os.read(self._timetable, 65536)
 
     def _read(self, number: int, size: int) -> bytes:
-        """Return exactly `size` bytes of a port, waiting for them."""
+        """Wait for exactly `size` bytes of the port `number`, and return them."""
         unread = self._unread[number]
         while len(unread) < size:
             port = self._ports[number]
@@ -69,7 +69,7 @@ class ScriptedEdge:
         return data
 
     def send(self, number: int, data: bytes) -> None:
-        """Send to the autopilot. Commands to a sensor are dropped: the logged one has already had them."""
+        """Send bytes to the autopilot; drop commands to a sensor, because the replay has its answers."""
         if number != Channel.LINK:
             return
         self._unsent += data
@@ -77,7 +77,7 @@ class ScriptedEdge:
             self.flush()
 
     def credit(self, frames: list[bytes]) -> None:
-        """Do nothing: there is one peer."""
+        """Do nothing: a replay has only one peer."""
 
     def flush(self) -> None:
         """Send all bytes that are waiting."""
@@ -86,7 +86,7 @@ class ScriptedEdge:
 
 
 def main() -> int:
-    """Play the bridge on the ports given."""
+    """Run the bridge on the ports of the command line; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("config", type=Path)
     parser.add_argument("--sensor", required=True, nargs="+")
@@ -102,7 +102,7 @@ def main() -> int:
         for one, device in zip(config.sensors, chosen.sensor, strict=True):
             ports[port_number(one.id or 0)] = SerialPort(device, one.baudrate)
         ports[Channel.LINK] = open_link(chosen.link, 0)
-        for port in ports.values():  # the link last: the stage begins to send when it connects
+        for port in ports.values():  # open the link last: the stage begins to send when the link connects
             port.open()
         edge = ScriptedEdge(ports, chosen.timetable)
         pipeline = set_up(config, edge.start())

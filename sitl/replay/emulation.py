@@ -1,7 +1,7 @@
-"""What two devices would have sent in a deployment: the events that a replay of it plays.
+"""Compute the events of a replay: the bytes that fluxgate and autopilot would have sent in a deployment.
 
-The emulated fluxgate takes its readings at the deployment's times and sends each when its last channel is
-sampled; the emulated autopilot sends each row's telemetry just before.
+The emulated fluxgate measures at the deployment's times, and sends each reading when its last channel is
+sampled. The emulated autopilot sends each row's telemetry just before the reading.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ __all__ = ["Autopilot", "emulate", "start_us", "with_motion"]
 
 HEARTBEAT_US = 1_000_000
 FIX_3D, GPS_ACCURACY = 3, 10_000
-"""GPS_FIX_TYPE and mm of its receiver."""
+"""GPS_FIX_TYPE and accuracy (mm) of the emulated GPS receiver."""
 
 LARGEST = 2e6
-"""m, deg, m/s: the largest value that fits every position or motion field, 32 bits of mm included."""
+"""Largest value (m, deg or m/s) that fits every position or motion field, even 32 bits of mm."""
 
 
 class Autopilot:
-    """Turns rows of a deployment into MAVLink frames, as the bridge's configuration expects them.
+    """Emulated autopilot that encodes a deployment's rows as the MAVLink messages the bridge expects.
 
-    The vehicle booted at `boot_us`, µs since 1970 UTC.
+    Its time since boot counts from `boot_us`, µs since 1970 UTC.
     """
 
     def __init__(self, config: Config, boot_us: int) -> None:
@@ -50,7 +50,7 @@ class Autopilot:
         self._next_heartbeat_us = boot_us
 
     def heartbeats(self, until_us: int) -> list[tuple[int, bytes]]:
-        """Return the heartbeats due up to `until_us`, with their times."""
+        """Return the heartbeats due up to `until_us`, each with its time (µs since 1970 UTC)."""
         due = []
         while self._next_heartbeat_us <= until_us:
             frame = self._codec.pack(
@@ -65,7 +65,7 @@ class Autopilot:
         return due
 
     def row(self, time_us: int, row: Mapping[str, float]) -> list[bytes]:
-        """Return the frames for one row: columns by their contract names, NaN where missing."""
+        """Return the frames for one `row`: values by column name, NaN if missing."""
         boot_ms = (time_us - self._boot_us) // 1000
         frames = [
             self._parameter(telemetry, row[name], boot_ms)
@@ -98,7 +98,7 @@ class Autopilot:
         return frames
 
     def _parameter(self, telemetry: Telemetry, value: float, boot_ms: int) -> bytes:
-        """Return the message from which the bridge will read `value`: the inverse of its mapping."""
+        """Return the message from which the bridge's telemetry mapping will read `value`."""
         name, index = split_index(telemetry.field)
         field = spec(telemetry.message).fields[name]
         number: Any = (value - telemetry.offset) / telemetry.scale
@@ -118,7 +118,7 @@ class Autopilot:
 
 
 def _finite(row: Mapping[str, float], *names: str) -> tuple[float, ...]:
-    """Return the row's values under these names; nothing if one is missing or too large for a message."""
+    """Return the row's values of these names; () if a value is missing or too large for a message."""
     values = tuple(row.get(name, nan) for name in names)
     return values if all(abs(value) < LARGEST for value in values) else ()
 
@@ -127,22 +127,22 @@ def _finite(row: Mapping[str, float], *names: str) -> tuple[float, ...]:
 
 
 LEAD_US = 2_000_000
-"""µs before the first row at which the bridge starts."""
+"""Time from the bridge's start to the first row, µs."""
 TELEMETRY_LEAD_US = 1_000
-"""µs by which a row's telemetry comes before its reading."""
+"""Time from a row's telemetry to its reading, µs."""
 LINE_DELAY_US = 2_000
-"""µs from a reading's last sample to its last byte."""
+"""Time from a reading's last sample to its last byte, µs."""
 
 
 def start_us(deployment: xr.Dataset) -> int:
-    """Return when the bridge starts, in µs since 1970 UTC: a little before the first row."""
+    """Return the time at which the bridge starts, µs since 1970 UTC, shortly before the first row."""
     return _stamp(float(deployment["time"][0])) - LEAD_US
 
 
 def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
     """Yield the events of a deployment with ``mag_x mag_y mag_z``, in order of time.
 
-    The bridge's configuration states which instrument is emulated, and which messages carry the telemetry.
+    The bridge's configuration determines the emulated instrument and the messages of the telemetry.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
 
 
 def _rows(deployment: xr.Dataset) -> Iterator[tuple[int, dict[str, float]]]:
-    """Yield each row as a dict, with its time in µs."""
+    """Yield the time (µs since 1970 UTC) and the values by name of each row."""
     names = ["time", *(str(name) for name in deployment.data_vars)]
     columns = [deployment[name].to_numpy().astype(float).tolist() for name in names]
     for values in zip(*columns, strict=True):
@@ -186,7 +186,7 @@ def _rows(deployment: xr.Dataset) -> Iterator[tuple[int, dict[str, float]]]:
 
 
 def _reading(fluxgate: Encoder, device_time: float, row: dict[str, float], time_us: int) -> tuple[bytes, int]:
-    """Return the bytes of a row's reading, and the µs until its last channel is sampled."""
+    """Return the bytes of a row's reading, and the time (µs) until its last channel is sampled."""
     x, y, z = row["mag_x"], row["mag_y"], row["mag_z"]
     if not isfinite(x + y + z):
         return b"", 0
@@ -213,9 +213,9 @@ def _rate(times: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
 def with_motion(deployment: xr.Dataset) -> xr.Dataset:
     """Return the deployment with the columns that the autopilot sends to a navigator.
 
-    These are ``gps_latitude gps_longitude`` (deg), the log's or its first position, and ``local_north
-    local_east`` (m) of a track or a velocity. From a speed or a glide the bridge dead-reckons itself. The
-    motions :data:`~magbridge.navigate.batch.MOTIONS` are tried in that order.
+    These are ``gps_latitude gps_longitude`` (deg), from the log or its first position, and ``local_north
+    local_east`` (m), from a logged track or velocity. If the log has only a speed or a glide, the bridge
+    computes the motion. The first of :data:`~magbridge.navigate.batch.MOTIONS` that the log has is used.
 
     Raises
     ------

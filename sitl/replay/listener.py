@@ -1,4 +1,4 @@
-"""A ground station that listens: decodes the bridge's stream as it comes."""
+"""Decode the bridge's messages like a ground station."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ COLUMNS = {
     "field_z": "z",
     "quality": "flags",
 }
-"""Values kept of every MAG_FIELD of the main sensor, by the message's names."""
+"""Field of MAG_FIELD that each column of :meth:`Listener.field` contains."""
 SENSOR_ID = FIELD.fields["sensor_id"]
 
 
 class Listener:
-    """Counts messages, and keeps the corrected field and the `texts`, STATUSTEXTs in order.
+    """Receiver that counts messages, and stores the corrected field and the STATUSTEXTs in `texts`.
 
-    `navigation` counts the position updates by the filter's state.
+    `navigation` counts the MAG_NAVIGATION messages by their state.
     """
 
     def __init__(self) -> None:
@@ -42,11 +42,11 @@ class Listener:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages by name."""
+        """Number of received messages, by message name."""
         return {spec(number).name: count for number, count in self._counts.items()}
 
     def receive(self, data: bytes) -> None:
-        """Receive bytes in any pieces."""
+        """Decode received bytes; a message may be split between calls."""
         for message in self._codec.parse(data):
             self._counts[message.id] += 1
             if message.id == FIELD.id and not SENSOR_ID.get(message.payload):
@@ -57,13 +57,13 @@ class Listener:
                 self.navigation[MAG_NAVIGATION_STATE(message["state"]).name.lower()] += 1
 
     def field(self) -> dict[str, FloatArray]:
-        """Return the corrected field, (n,) each: ``time`` (s since 1970 UTC), the rest in nT, ``quality``."""
+        """Return the main sensor's field (n,) by column: ``time`` (s since 1970 UTC), nT, and ``quality``."""
         table = np.array(self._values).reshape(-1, len(COLUMNS))
         columns = dict(zip(COLUMNS, table.T, strict=True))
         return {**columns, "time": columns["time"] * 1e-6}
 
     def flags(self) -> dict[str, int]:
-        """Return how many samples carried each flag, by its public name."""
+        """Return the number of samples with each flag, by the flag's public name."""
         quality = self.field()["quality"].astype(int)
         counts = {flag.names(): int((quality & flag != 0).sum()) for flag in Quality}
         return {name: count for name, count in counts.items() if count}

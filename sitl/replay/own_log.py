@@ -1,4 +1,4 @@
-"""A bridge's own log: the events to replay, and what the bridge must publish again, bit for bit."""
+"""Read a bridge's own log: the events to replay, and the bytes that the bridge must publish again."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ BEGIN, PARAMETER, STREAM, COLUMN = (
     spec(name).id for name in ("MAG_BRIDGE_START", "PARAM_VALUE", "MAG_SIGNING_STREAM", "MAG_COLUMN")
 )
 NOT_EVENTS = (BEGIN, PARAMETER, STREAM, COLUMN, spec("MAG_RAW").id)
-"""State records that a bridge writes for readers of the log, and that a replay does not need."""
+"""Ids of the state records that a bridge writes only for readers of the log, not for a replay."""
 
 
 def is_own_log(path: Path) -> bool:
-    """Return whether a file is the beginning of a bridge's own log."""
+    """Return True if a file is the beginning of a bridge's own log."""
     if path.suffix.lower() != ".tlog":
         return False
     with path.open("rb") as file:
@@ -29,7 +29,7 @@ def is_own_log(path: Path) -> bool:
 
 
 def runs(paths: Sequence[Path]) -> list[list[Path]]:
-    """Group files, in order, by the run that they belong to: each begins with the start of a bridge."""
+    """Group files, in order, by run of a bridge: a run begins with a file in which the bridge starts."""
     grouped: list[list[Path]] = []
     for path in paths:
         if is_own_log(path) or not grouped:
@@ -39,13 +39,13 @@ def runs(paths: Sequence[Path]) -> list[list[Path]]:
 
 
 class Recorded:
-    """The log of one run of a bridge, in one file or in the several that it was rotated into.
+    """Log of one run of a bridge, in one file or in several rotated files.
 
-    `start` is what the run started from, `config_digest` the digest of its configuration. `late` is the time,
-    s, of the run before the log begins; above 0 if the log was restarted after a loss. The bridge's state at
-    that time is not in the log, so the replay starts without it, at a multiple of the time synchronisation's
-    interval: its requests to the autopilot are then those that the log answers. `published` are the bytes
-    that it published, as far as :meth:`events` has been read.
+    `start` is the run's start event, `config_digest` the digest of its configuration. `late` is the time from
+    the run's start to the log's beginning, s; it exceeds 0 if the log was restarted after a loss. The log
+    lacks the bridge's state at that time, so the replay starts without the state. It starts at a multiple of
+    the time synchronisation's interval, so that its requests to the autopilot match the logged answers.
+    `published` are the bytes that the bridge published, as far as :meth:`events` has been read.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class Recorded:
         for record in records:
             one = record.message
             if record.channel == Channel.STATE and one.id == COLUMN:
-                continue  # repeated in every file, for readers
+                continue  # MAG_COLUMN is repeated in every file, for readers
             if record.channel == Channel.STATE and one.id == STREAM:
                 ahead = bool(one["ahead"])
                 streams.append((one["link"], one["system"], one["sender"], ahead, one["stamp"]))
@@ -90,7 +90,7 @@ class Recorded:
                 self.damages += reader.damages
 
     def events(self) -> Iterator[Event]:
-        """Yield the inputs; the outputs are added to `published`."""
+        """Yield the bridge's inputs; add its outputs to `published`."""
         frame_log = FrameLogReader()
         time_us = self.start.time_us
         inputs = (record for record in self._records() if not self._went_out(record) and _is_event(record))
@@ -121,11 +121,11 @@ def _event_key(record: TlogRecord) -> tuple[int, int, int]:
 
 
 def _is_event(record: TlogRecord) -> bool:
-    """Return whether a record is an input; other records may lie between two pieces that came together."""
+    """Return True if a record is an input; other records may separate two pieces of one input."""
     return record.channel != Channel.STATE or record.message.id not in NOT_EVENTS
 
 
 def _sensor_bytes(records: Iterable[TlogRecord]) -> bytes:
-    """Return the bytes that came at one time; the log may hold them in several records."""
+    """Return the sensor bytes of one time, which the log may have split into several records."""
     messages = (record.message for record in records)
     return b"".join(message["data"][: message["length"]] for message in messages)

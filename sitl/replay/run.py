@@ -1,4 +1,4 @@
-"""Replay a log through the real bridge: real bytes through a pty, real MAVLink through a socket."""
+"""Replay a log through the real bridge: sensor bytes through a pty, MAVLink through a socket."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ def replay(
     log: Path | None = None,
     options: Options = DEFAULTS,
 ) -> Result:
-    """Replay `files` through the bridge; return the results, as the command prints them.
+    """Replay `files` through the bridge; return the results for :func:`summary`.
 
-    A bridge's own log (all its files, in order) is published again bit for bit; of any other logs, two
-    emulated devices send magnetometer and telemetry. Without a `config`, a nominal calibration is fitted on
-    all but the last file. `speed` is in times real time, `log` the folder for the bridge's log of the replay,
-    `options` how to read other logs.
+    From a bridge's own log (all its files, in order), the bridge must publish the same bytes again. For other
+    logs, two emulated devices send magnetometer data and telemetry. Without a `config`, a nominal calibration
+    is fitted to all but the last file. `speed` is the ratio to real time, `log` the folder for the bridge's
+    log of the replay, `options` are for reading other logs.
 
     Raises
     ------
     DataError
-        A log without the three channels, or of one row.
+        A log lacks one of the three channels, or has only one row.
     WrongUse
-        A bridge's own log without its configuration, with `options`, or together with other logs.
+        A bridge's own log comes without its configuration, with `options`, or with other logs.
     """
     if config is not None:
         load(config)  # a faulty configuration is reported before anything begins
@@ -99,7 +99,10 @@ def _republished(files: Sequence[Path], config: Path, speed: float, log: Path | 
 
 
 def agreement(published: bytearray, recorded: Recorded) -> Result:
-    """Return how many samples agree if the log begins late; of a whole log the bytes are compared."""
+    """Compare the total field sample by sample, if the log begins after the start of its run.
+
+    For a complete log, return only that it begins at 0 s, because its bytes are compared.
+    """
     if not recorded.late:
         return {"late_s": 0.0}
     ours, theirs = (_received(stream) for stream in (published, recorded.published))
@@ -123,7 +126,7 @@ def _received(stream: bytearray) -> dict[str, FloatArray]:
 
 
 def _first_difference(first: bytearray, second: bytearray) -> int | None:
-    """Return the first byte at which two streams differ; None where they do not."""
+    """Return the index of the first byte at which two streams differ; None if they are equal."""
     if first == second:
         return None
     size = min(len(first), len(second))
@@ -136,7 +139,7 @@ def _first_difference(first: bytearray, second: bytearray) -> int | None:
 def _play(
     deployment: xr.Dataset, config: Path, parts: Sequence[Part], speed: float, log: Path | None
 ) -> Result:
-    """Replay a deployment that two emulated devices send, and compare the field with the reference."""
+    """Replay a deployment by emulated devices, and compare the corrected field with the reference."""
     if deployment.sizes["time"] < 2:
         raise DataError(f"{deployment.attrs['source']}: one row: at least 2 needed")
     listener = Listener()
@@ -171,7 +174,7 @@ def _play(
 def _compared(
     part: Part, times: FloatArray, raw: FloatArray, corrected: FloatArray, sigma: FloatArray
 ) -> Result:
-    """Return the errors (n,) nT against the reference, raw and corrected, over one part of a replay."""
+    """Return the statistics of one part from the raw and corrected errors and sigmas (n,), nT."""
     rows = rows_of(part, times)
     error = corrected[rows]
     known = np.isfinite(error)
@@ -187,13 +190,13 @@ def _compared(
 
 
 def _nearest(times: FloatArray, wanted: FloatArray) -> IndexArray:
-    """Return the index of the row (in order of time) nearest to each wanted time."""
+    """Return the index of the row whose time (ascending) is nearest to each wanted time."""
     after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
     return after - (wanted - times[after - 1] < times[after % len(times)] - wanted)
 
 
 def _reference(deployment: xr.Dataset) -> FloatArray:
-    """Return the true total field in nT; NaN where it is not known."""
+    """Return the reference total field (n,), nT; NaN if unknown."""
     try:
         return reference_field(deployment)
     except DataError:
@@ -201,7 +204,7 @@ def _reference(deployment: xr.Dataset) -> FloatArray:
 
 
 def _rms(values: FloatArray) -> float | None:
-    """Return the root mean square of the finite values; None where there are none."""
+    """Return the root mean square of the finite values; None if no value is finite."""
     values = values[np.isfinite(values)]
     with np.errstate(over="ignore"):  # an absurd value is infinitely wrong
         return float(np.sqrt(np.mean(values**2))) if len(values) else None
@@ -211,11 +214,11 @@ def _rms(values: FloatArray) -> float | None:
 
 
 UNKNOWN = 50_000.0
-"""Sigma of the total field from which on nothing is known, nT."""
+"""Value above which a number counts as unknown in the summary, nT."""
 
 
 def summary(result: Result) -> str:
-    """Return a replay's result for people to read."""
+    """Return a replay's result as text."""
     if "runs" in result:
         return "\n".join(_own_log(run) for run in result["runs"])
     first = (

@@ -1,7 +1,7 @@
-"""Set up a replay from nothing but a log: a configuration, and a calibration fitted to part of it.
+"""Set up a replay from a log alone: write a configuration, and fit a calibration to part of the log.
 
-The last of several files (or the last third of a single one) is left out of the fit: only its error is out of
-sample.
+The fit omits the last of several files, or the last third of a single file. Only the error of this part is
+out of sample.
 """
 
 from __future__ import annotations
@@ -26,45 +26,45 @@ from sitl.scenario import load
 from sitl.twin import simulate_like
 
 FULL_SCALE = 100_000.0
-"""nT that the emulated fluxgate can read."""
+"""Range of the emulated fluxgate to either side of zero, nT."""
 SENSITIVITY = 5e-5
-"""V/nT of the emulated fluxgate."""
+"""Sensitivity of the emulated fluxgate, V/nT."""
 TIMEOUT = 10.0
-"""s without a reading, after which the sensor counts as silent; at least three times the log's interval."""
+"""Shortest time without a reading after which the bridge reports a silent sensor, s."""
 SETTLE_TIME = 4.0
-"""s after a movement: eight time constants of the paper's anti-alias filter."""
+"""Settling time after a mass has moved, s: eight time constants of the paper's anti-alias filter."""
 
 
 class Part(NamedTuple):
-    """A part of the deployment: a file, or a third of the only one."""
+    """Part of the deployment: a file, or a third of a single file."""
 
     name: str
     begin: float
     end: float
-    """`begin`, `end`: s since 1970 UTC."""
+    """`begin`, `end`: Times of the first and the last sample, s since 1970 UTC."""
 
 
 class ReplaySetup(NamedTuple):
-    """A deployment ready to be replayed."""
+    """Deployment with all that its replay needs."""
 
     config: Path
-    """A ``bridge.toml``."""
+    """Path of the written ``bridge.toml``."""
     deployment: xr.Dataset
     parts: list[Part]
-    """The last one was not used by the calibration."""
+    """Parts in order of time; the calibration does not use the last one."""
     calibration: str
-    """How the calibration was made, or why there is none."""
+    """Origin of the calibration, or the reason why there is none."""
     simulated: bool
-    """The log has no magnetometer: its field is simulated, its telemetry real."""
+    """True if the log has no magnetometer, so that its field is simulated from its telemetry."""
 
 
 def prepare(files: Sequence[Path], folder: Path, options: Options) -> ReplaySetup:
-    """Read logs, fit a nominal calibration on all but the last, and write the bridge's files to `folder`.
+    """Read logs, fit a nominal calibration to all but the last part, and write both to `folder`.
 
     Raises
     ------
     FormatError
-        A file cannot be read, or holds neither a magnetic field nor the columns to simulate one.
+        A file cannot be read, or the logs have neither a magnetic field nor the columns to simulate one.
     """
     deployment = read(files, options=options)
     simulated = not set(CHANNELS) <= set(deployment)
@@ -81,7 +81,7 @@ def prepare(files: Sequence[Path], folder: Path, options: Options) -> ReplaySetu
 
 
 def _parts(files: Sequence[Path], deployment: xr.Dataset, options: Options) -> list[Part]:
-    """Return the time spans of the files (those of one stem are one part), or the thirds of one file."""
+    """Return the time spans of the files, or thirds of a single one; files of one stem are one part."""
     time = deployment["time"].to_numpy()
     stems = list(dict.fromkeys(file.stem for file in files))
     if len(stems) == 1:
@@ -92,7 +92,7 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset, options: Options) -> l
     few = deployment.sizes["time"] / len(stems) / 10
     for stem in stems:
         own = read([file for file in files if file.stem == stem], options=options)["time"].to_numpy()
-        if spans and len(own) < few:  # a few rows at the surface are not a part of their own
+        if spans and len(own) < few:  # a few rows at the surface join the previous part
             spans[-1] = spans[-1]._replace(end=float(own[-1]))
         else:
             spans.append(Part(stem, float(own[0]), float(own[-1])))
@@ -100,12 +100,12 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset, options: Options) -> l
 
 
 def rows_of(part: Part, time: FloatArray) -> BoolArray:
-    """Return which times (n,), s since 1970, belong to a part."""
+    """Return a mask (n,) of the times (s since 1970) that belong to a part."""
     return (time >= part.begin) & (time <= part.end)
 
 
 def _calibrate(deployment: xr.Dataset, parts: Sequence[Part], path: Path) -> str:
-    """Fit the nominal calibration on all but the last part; return how, or why there is none."""
+    """Fit and save a nominal calibration to all but the last part; return its origin, or the error."""
     held_out = rows_of(parts[-1], deployment["time"].to_numpy())
     try:
         found = fit(observations(deployment.isel(time=~held_out), ()), "nominal")
@@ -154,7 +154,7 @@ def bridge_toml(
 
 
 def telemetry_of(deployment: xr.Dataset) -> list[str]:
-    """Return the columns that are telemetry: not the contract's own, and nameable in a ``bridge.toml``."""
+    """Return the names of the non-standard columns whose names a ``bridge.toml`` allows."""
     names = (str(name) for name in deployment.data_vars)
     return [
         name
@@ -166,7 +166,7 @@ def telemetry_of(deployment: xr.Dataset) -> list[str]:
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
-    """Return a short name of its own for each."""
+    """Return a unique short name, for a NAMED_VALUE_FLOAT, for each of `names`."""
     short: dict[str, str] = {}
     for name in names:
         short[name] = short_name(name, short.values())

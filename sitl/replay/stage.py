@@ -1,11 +1,11 @@
-"""The stage of a replay: a pty and a socket, and the two devices that use them.
+"""Connect a replay's emulated devices to the bridge by real ptys and a real socket.
 
-An emulated fluxgate sends its real protocol into a pty, an emulated autopilot sends MAVLink on a real
-socket. Between them stands the bridge, unmodified, in a process of its own.
+An emulated fluxgate sends its real protocol to a pty, an emulated autopilot sends MAVLink to a socket. The
+unmodified bridge runs in a process of its own and reads both.
 
-A pty keeps no time, so the times of the bytes go separately, through a pipe, as the timetable: one entry per
-event, which channel, how many bytes, at what time. The bridge under replay reads its ports in that order and
-takes those times for its clock; everything behind its ports is the same code as at sea.
+A pty does not transmit the times of the bytes. A pipe therefore transmits a timetable, with an entry for each
+event: time, channel and number of bytes. The bridge under replay reads its ports in this order, and its clock
+follows these times. All code behind the ports is the same as at sea.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from magbridge.records import Channel
 __all__ = ["Stage", "read_entries"]
 
 Entry = struct.Struct("<QIB")
-"""Stamp (µs, channel in the low two bits), number of bytes, sensor id; a ``STATE`` entry is followed by its
-bytes."""
+"""Layout of an entry: time (µs, with the channel in the low two bits), number of bytes, sensor id. The bytes
+of a ``STATE`` event follow its entry."""
 BATCH = 2048
-"""Bytes sent at once when nothing has to wait: below what a pty holds."""
+"""Number of bytes that are sent at once, if there is no wait: less than the buffer of a pty."""
 CONNECT_TIMEOUT = 30.0
-"""s for the bridge to start and connect."""
+"""Longest time for the bridge to start and connect, s."""
 PATIENCE = 1.0
-"""s that a failed bridge has to print its reason and end."""
+"""Longest time for a failed bridge to print its error and end, s."""
 
 
 class Stage:
-    """Sets the stage, plays events to a bridge, and hands on what the bridge publishes.
+    """Bridge process with its ports, to which a replay sends events.
 
-    Of the bridge's own ``bridge.toml``, only the sensor port and the link are replaced by the stage's. The
-    `listener` takes the bytes that the bridge sends to the autopilot, as they come, on a thread of its own.
-    The bridge writes its own log of the replay to the folder `log`.
+    The bridge runs with the ``bridge.toml`` of `config`, but with the sensor ports and the link of the stage.
+    A separate thread passes the bytes that the bridge sends to the autopilot to `listener`. The bridge writes
+    its log of the replay to the folder `log`.
     """
 
     def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
@@ -91,10 +91,10 @@ class Stage:
             self._opened = opened.pop_all()
 
     def _wait(self, fd: int, event: int, timeout: float | None = None) -> bool:
-        """Return whether `event` comes within `timeout` s; raises why the bridge has ended, if it has."""
+        """Return True if `event` comes within `timeout` s; raise an error if the bridge has ended."""
         waiting = select.poll()
         waiting.register(fd, event)
-        waiting.register(self._times, 0)  # it breaks when the bridge, its only reader, ends
+        waiting.register(self._times, 0)  # the pipe breaks when the bridge, its only reader, ends
         ready = [one for one, _ in waiting.poll(timeout and timeout * 1e3)]
         if ready and fd not in ready:
             raise self._failure()
@@ -108,7 +108,7 @@ class Stage:
             return  # the bridge ended early; :meth:`play` reports why
 
     def _failure(self, otherwise: str = "") -> MagbridgeError:
-        """End the bridge; return why it failed: the error for its exit code, with its last line on stderr."""
+        """End the bridge; return the error for its exit code, with its last line on stderr as message."""
         try:
             _, texts = self._bridge.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:
@@ -120,14 +120,14 @@ class Stage:
         return PortError("replay", words or otherwise or f"the bridge ended with {self._bridge.returncode}")
 
     def play(self, start: StartEvent, events: Iterable[Event], speed: float = float("inf")) -> None:
-        """Play events in order, `speed` times faster than they happened, until the bridge has dealt with all.
+        """Send events in order, `speed` times faster than they happened, until the bridge has handled all.
 
         Raises
         ------
         WrongUse
-            The bridge refused its configuration.
+            The bridge rejected its configuration.
         PortError
-            It ended early; the message is its last line of output.
+            The bridge ended early; the message is its last line of output.
         """
         try:
             self._send(start, events, speed)
@@ -160,9 +160,9 @@ class Stage:
         self._flush()
 
     def _flush(self) -> None:
-        """Write the due bytes: the timetable first, by which the bridge reads more than a pty holds.
+        """Write the due bytes, the timetable first, so that the bridge empties the ptys meanwhile.
 
-        The sensors' bytes come last, so that the bridge never waits for the link's while a pty is full.
+        The sensors' bytes come last, so that the bridge never waits for link bytes while a pty is full.
         """
         times, link = self._times_due, self._link_due
         try:
@@ -176,7 +176,7 @@ class Stage:
             raise self._failure() from error
 
     def _write_sensors(self) -> None:
-        """Write what the ptys take now: the bridge reads them in the order of the timetable."""
+        """Write as many bytes as the ptys accept now; the bridge reads them in the timetable's order."""
         waiting = select.poll()
         waiting.register(self._times, 0)  # it breaks when the bridge, its only reader, ends
         masters = {self._masters[one]: due for one, due in self._sensors_due.items() if due}
@@ -190,9 +190,9 @@ class Stage:
 
 
 def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int, int, bytes]]:
-    """Yield the entries: time in µs, channel, sensor id, number of bytes, and bytes of a ``STATE`` entry.
+    """Yield each entry: time (µs), channel, sensor id, number of bytes, and the bytes of a ``STATE`` entry.
 
-    `read` returns the next bytes of the timetable, and none at its end.
+    `read` returns the next bytes of the timetable, and ``b""`` at its end.
     """
     buffer = bytearray()
     channels = tuple(Channel)
@@ -216,10 +216,9 @@ def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int,
 
 
 def pace(events: Iterable[Event], speed: float) -> Iterator[tuple[float, Event]]:
-    """Yield how long to wait before each event, in s (negative: it is late), and the event.
+    """Yield the time to wait before each event (s; negative if the event is late), and the event.
 
-    The events, in order of time, are played `speed` times faster than they happened; ``inf`` waits for
-    nothing.
+    The events, in order of time, are sent `speed` times faster than they happened; ``inf`` means no waiting.
     """
     begun = time.monotonic()
     first_us: int | None = None
