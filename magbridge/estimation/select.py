@@ -21,7 +21,7 @@ from magbridge.estimation.priors import PriorFamily
 __all__ = ["BLOCK_LOG_EVIDENCE_PRICE", "select_blocks"]
 
 BLOCK_LOG_EVIDENCE_PRICE = 6.0
-"""Log evidence that an optional block must gain: odds of 400:1. The best of many lags gains 3 by chance."""
+"""Log evidence that an optional block must gain: odds of 400:1. The best of some lags gains 3 by chance."""
 
 
 def select_blocks(
@@ -32,7 +32,7 @@ def select_blocks(
     sigma: float,
     price: float = BLOCK_LOG_EVIDENCE_PRICE,
 ) -> tuple[ParameterBlock, ...]:
-    """Return the blocks without the optional blocks that the log does not need, and with one lag at most.
+    """Return the blocks without optional ones that the log does not need, with one temperature lag at most.
 
     `quadratic`: information about the unknowns of `family`, then of all blocks. `family`: prior of the
     coefficients. `groups`: all blocks of the fit. `eta` (h,), `sigma`: hyperparameters and noise (nT) at

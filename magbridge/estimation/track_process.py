@@ -47,7 +47,7 @@ class Course:
         self._north = self._east = 0.0
 
     def move(self, north: float, east: float) -> float:
-        """Add a displacement, m; return the change of course, rad, if a new course is complete, else 0."""
+        """Add a displacement, m; return the change of course, rad, per completed course length, else 0."""
         if not isfinite(north + east):
             return 0.0
         self._north += north

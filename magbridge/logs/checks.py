@@ -61,7 +61,7 @@ LOOKAHEAD_ROWS = 64
 def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf) -> None:
     """Check that `time` (n,), s, is finite and increases, also from `previous`, the last time before it.
 
-    FormatError: names the first row that does not fit, counted from 1.
+    FormatError: it does not; the message names the first wrong row, counted from 1.
     """
     wrong = _wrong(time, previous)
     if len(wrong):
@@ -259,7 +259,7 @@ class Faults:
         self._known[column] += known
 
     def lost(self, **counts: int) -> None:
-        """Add counts to the losses, named as the counters of a deployment."""
+        """Add `counts` to the losses; their names are the counters of a deployment."""
         self._counts.update(counts)
 
     def since_last(self) -> tuple[Counter[str], list[str]]:

@@ -32,7 +32,7 @@ DATES = (
     *("%Y%m%d", "%d%m%y", "%y%m%d", "%m%d%y"),
 )
 WHOLE_MOMENTS = ("%a %b %d %H:%M:%S %Y", "%Y%m%d%H%M%S", "%Y %m %d %H %M %S", "%Y %j %H %M %S")
-"""Patterns of date and time together; the last are columns of numbers, joined."""
+"""Patterns of date and time together; the last two are for columns of numbers, joined by blanks."""
 SECONDS_SUFFIX = " s"
 YEAR_1900 = -2_208_988_800.0
 """Start of 1900, s since 1970: date of a time of day without a date, and earliest date of a log."""
@@ -77,7 +77,7 @@ UNIX_TIME_RANGE_S = 3e8, 4.2e9
 """Range in which a count is recognised as Unix time by its size, s since 1970: 1979 to 2103."""
 YEAR_1980 = 315_532_800.0
 MIN_CLOCK_STEP = 10.0
-"""Median step of whole numbers from which they are probably not seconds since a boot, but a finer unit."""
+"""Median step from which whole numbers probably count a finer unit than seconds since a boot."""
 DATE_ORDER = re.compile(r"\b(yyyy|yy|mm|dd)\W?(mm|dd)\W?(yyyy|yy|dd)\b", re.IGNORECASE)
 """Part of a heading that states the order of day, month and year."""
 MIN_RUN_ROWS = 3

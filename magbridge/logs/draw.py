@@ -18,9 +18,9 @@ LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_fie
 
 
 def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
-    """Draw a log that ``magbridge correct`` wrote as PNG, PDF or SVG.
+    """Draw a log from ``magbridge correct`` and save the chart as PNG, PDF or SVG.
 
-    The panels show the total field and, if known, the anomaly with their 2-sigma bands, and the 1-sigma.
+    The panels show total field and, if known, anomaly with 2-sigma bands, and the total field's 1-sigma.
 
     WriteError: the file cannot be written.
     """

@@ -1,4 +1,4 @@
-"""The table of formats: the module of each format, and how a file is recognised.
+"""Table of formats: the module of each format, and the recognition of its files.
 
 The first bytes of a file determine its format. The suffix counts only if they are inconclusive (CSV, or a log
 that begins with damage). Text files may be compressed by gzip, bzip2 or xz. Another package adds a format

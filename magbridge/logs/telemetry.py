@@ -52,7 +52,7 @@ __all__ = ["FileWriter", "chunks"]
 Payloads = NDArray[np.uint8]
 """(n, size): Payloads of messages of one kind, padded with zeros to full size."""
 MAVLINK_FIELDS = field_maps("mavlink")
-"""Message -> its fields; values that the dialect declares as invalid are missing as well."""
+"""Message -> its fields, without the invalid values of the dialect, which :class:`MessageField` adds."""
 SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": []}
 """Messages that can make the rows, the best first -> fields of the message that fill columns."""
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))

@@ -285,7 +285,7 @@ def _json_cells(names: Sequence[str], line: str) -> list[object]:
 
 
 class FileWriter:
-    """Writer of successive deployments with the columns of the first; `metadata` is for a separate file."""
+    """Writer of successive deployments with the columns of the first; `metadata` is its metadata file."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
