@@ -1,8 +1,8 @@
-"""What the studies share: running cases in parallel, keeping their rows, and the tables of the results.
+"""Common part of the studies: run cases in parallel, store their rows, and print the tables of the results.
 
-A study is a function that runs one case and returns its rows, the columns that distinguish the lines of its
-table, and a summary for each further column. ``--out FILE.parquet`` keeps the rows; cases that the file has
-are not run again.
+A study consists of a function that runs one case and returns its rows, the columns that distinguish the lines
+of the table, and a statistic for each further column. ``--out FILE.parquet`` stores the rows; cases in the
+file are not run again.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from scipy.stats import binomtest
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
 REPORT_EVERY = 10
-"""Cases between two lines of progress without a terminal."""
+"""Number of cases between two lines of progress if stderr is not a terminal."""
 
 
 def command_line(doc: str | None) -> argparse.ArgumentParser:
-    """Return a parser whose help begins with a tool's docstring, as it stands there."""
+    """Return a parser whose help begins with a tool's docstring, with its line breaks kept."""
     return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def add_engine(parser: argparse.ArgumentParser) -> None:
-    """Add the option that states how many processes a study uses."""
+    """Add the option ``--workers``, the number of processes of a study."""
     parser.add_argument("--workers", type=int, default=2, help="processes")
 
 
 def table(title: str, *headings: str, left: Collection[str] = ("",)) -> Table:
-    """Return an empty table, its numbers to the right."""
+    """Return an empty table whose columns are right-aligned, except for those with a heading in `left`."""
     made = Table(title=title, title_justify="left")
     for heading in headings:
         made.add_column(heading, justify="left" if heading in left else "right")
@@ -52,7 +52,7 @@ def table(title: str, *headings: str, left: Collection[str] = ("",)) -> Table:
 def as_done(
     function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace
 ) -> Iterator[tuple[Any, Future[Any]]]:
-    """Run a function on cases, each the tuple of its arguments; yield case and future as each finishes."""
+    """Run a function on cases (tuples of arguments) in parallel; yield case and future as each finishes."""
     is_terminal = sys.stderr.isatty()
     with ProcessPoolExecutor(options.workers) as pool:
         futures = {pool.submit(function, *case): case for case in cases}
@@ -68,7 +68,7 @@ def as_done(
 
 
 def in_order(function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace) -> list[Any]:
-    """Run a function on cases, each the tuple of its arguments; return the results in that order."""
+    """Run a function on cases (tuples of arguments) in parallel; return the results in this order."""
     with ProcessPoolExecutor(options.workers) as pool:
         futures = [pool.submit(function, *case) for case in cases]
         return [future.result() for future in futures]
@@ -76,7 +76,7 @@ def in_order(function: Callable[..., Any], cases: Sequence[Any], options: argpar
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a study's table: a statistic of one or several columns of its rows.
+    """Column of a study's table: a statistic of one or several columns of the rows.
 
     The statistic takes the finite values, (n,) or (n, columns), and returns a number, which `form` formats.
     """
@@ -86,7 +86,7 @@ class Column:
     form: str = ".2f"
 
     def cell(self, rows: pd.DataFrame) -> str:
-        """Return the statistic of the rows, as text; empty where no row has a value."""
+        """Return the formatted statistic of the rows; an empty text if no row has a value."""
         names = [self.source] if isinstance(self.source, str) else list(self.source)
         if not set(names) <= set(rows):
             return ""
@@ -97,7 +97,7 @@ class Column:
 
 
 def fraction(good: Sequence[bool] | np.ndarray) -> str:
-    """Return the percentage of the true values with its 95 % interval (Clopper and Pearson 1934) | count."""
+    """Return the percentage of true values, its 95 % interval (Clopper and Pearson 1934), and the count."""
     n, k = len(good), int(np.sum(good))
     if not n:
         return "not run | 0"
@@ -106,21 +106,21 @@ def fraction(good: Sequence[bool] | np.ndarray) -> str:
 
 
 def percentile(per_cent: float) -> Statistic:
-    """Return the statistic that is a percentile."""
+    """Return the function that computes a percentile of values (n,)."""
     return lambda values: float(np.percentile(values, per_cent))
 
 
 def fraction_within(low: float, high: float) -> Statistic:
-    """Return the statistic that is the fraction of the values between two limits."""
+    """Return the function that computes the fraction of values (n,) between two limits."""
     return lambda values: float(np.mean((values > low) & (values < high)))
 
 
 @dataclass(frozen=True)
 class Study:
-    """A study: how a case is run, and the table of its rows.
+    """Function that runs a case of a study, and the columns of the study's table.
 
-    `run` takes the parts of a case and returns its rows, each a dictionary. A row whose ``failed`` is not
-    empty is counted and left out of the statistics. `by` are the columns of the rows that distinguish the
+    `run` takes the elements of a case and returns its rows, each a dictionary. Rows with a text in ``failed``
+    are counted, but are not part of the statistics. `by` are the columns of the rows that distinguish the
     lines of the table; `columns` are further columns of the table by heading.
     """
 
@@ -129,7 +129,7 @@ class Study:
     columns: Mapping[str, Column]
 
     def rows(self, cases: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> pd.DataFrame:
-        """Return the rows of all cases; those in ``--out`` are taken from there."""
+        """Return the rows of all cases; run only the cases that the file ``--out`` lacks."""
         path: Path | None = options.out
         kept = pd.read_parquet(path) if path is not None and path.exists() else pd.DataFrame({"case": []})
         names = [repr(case) for case in cases]
@@ -144,7 +144,7 @@ class Study:
         return rows.sort_values("case", key=lambda case: case.map(order), kind="stable", ignore_index=True)
 
     def table(self, title: str, rows: pd.DataFrame) -> Table:
-        """Return the table of rows."""
+        """Return the table of the rows, with a line for each combination of the columns `by`."""
         headings = (*self.by, "rows", *self.columns, "failed")
         made = table(title, *headings, left=(self.by[0], self.by[-1]))
         for key, group in rows.groupby(list(self.by), sort=False):
@@ -160,7 +160,7 @@ class Study:
 
 
 def study_options(doc: str | None) -> argparse.ArgumentParser:
-    """Return a command line with the options that every study has."""
+    """Return an argument parser with the options that every study has."""
     parser = command_line(doc)
     parser.add_argument("--out", type=Path, help="Parquet file of the rows; its cases are not run again")
     add_engine(parser)

@@ -1,4 +1,4 @@
-"""The simulated worlds of the studies: random gliders with runs and a survey, and the paper's trials.
+"""Simulated worlds of the studies: random gliders with runs and a survey, and the paper's trials.
 
 The noise floor of a survey is the error of a calibration that knows the vehicle (:func:`oracle`);
 :class:`BestFit` and :class:`SurveyBound` are Cramér-Rao bounds for the vehicle's true model.
@@ -36,18 +36,18 @@ from sitl.scenario import Scenario
 
 MASSES = ("battpos", "ballast")
 NOISES = {"1 nT white": (1.0, 0.0), "5 nT AR(1)": (5.0, 10.0)}
-"""Standard deviation of a channel (nT), and samples over which its correlation falls by e."""
+"""Standard deviation of a channel's noise (nT), and its correlation time (1/e), in samples."""
 MAX_COVARIANCE_SAMPLES = 2_700
-"""Samples of a covariance of a survey bound."""
+"""Maximum number of samples in the covariance matrix of a survey bound."""
 PLANE_WAVES = 1500
-"""Plane waves that make a Gaussian crustal field."""
+"""Number of plane waves in a Gaussian crustal field."""
 
 
 # ---- random gliders that fly the paper's runs --------------------------------------------------------------
 
 
 class Glider(NamedTuple):
-    """A simulated vehicle with its calibration runs and its survey, without samples of masses in motion."""
+    """Simulated vehicle, its calibration runs and its survey, without samples of moving masses."""
 
     vehicle: Vehicle
     runs: xr.Dataset
@@ -59,14 +59,14 @@ class Glider(NamedTuple):
         return rms(oracle(self.vehicle, self.survey) - true_field(self.survey))
 
     def score(self, calibration: Calibration) -> dict[str, float]:
-        """Return the survey's error over the noise floor, and the deviation of its normalised error."""
+        """Return the survey's RMS error over the noise floor, and the deviation of its normalised error."""
         after = corrected(self.survey, calibration)
         error = after.total - true_field(self.survey)
         return {"ratio": rms(error) / self.floor, "sigma": float(np.std(error / after.sigma))}
 
 
 def glider(scenario: Scenario, seed: int, masses: Sequence[str] = MASSES) -> Glider:
-    """Simulate a random glider."""
+    """Return a simulated random glider with its runs and its survey."""
     vehicle = Twin.draw(scenario, seed).vehicle
     assert isinstance(vehicle, Vehicle)
     parts = {name: at_rest(part, tuple(masses)) for name, part in segments(simulate(scenario, seed)).items()}
@@ -82,7 +82,7 @@ def true_field(part: xr.Dataset) -> FloatArray:
 
 
 class GaussianRock:
-    """A crustal field that is a Gaussian random field in the plane, along the main field, at every depth."""
+    """Gaussian random crustal field in the horizontal plane, along the main field, equal at every depth."""
 
     def __init__(self, size: float, length: float, direction: FloatArray, rng: np.random.Generator) -> None:
         self.k = rng.normal(0, 1 / length, (PLANE_WAVES, 2))
@@ -90,7 +90,7 @@ class GaussianRock:
         self.size, self.direction = size * np.sqrt(2 / PLANE_WAVES), direction
 
     def anomaly(self, place: FloatArray) -> FloatArray:
-        """Return nT (n,) at places (n, 2), m north and east of the world's origin."""
+        """Return the anomaly (n,), nT, at places (n, 2), m north and east of the world's origin."""
         out = np.empty(len(place))
         for start in range(0, len(place), 4096):
             part = slice(start, start + 4096)
@@ -98,14 +98,14 @@ class GaussianRock:
         return out
 
     def field(self, ned: FloatArray) -> FloatArray:
-        """Return nT (n, 3), north-east-down, as the simulated world's crust does."""
+        """Return the crustal field (n, 3), nT north-east-down, at places (n, 3), m."""
         return self.anomaly(ned[:, :2])[:, None] * self.direction
 
 
 def fly_survey(
     hours: float, size: float, length: float, noise: str, seed: int
 ) -> tuple[Twin, dict[str, xr.Dataset]]:
-    """Return a glider in its world, its calibration runs, and its surveys on two days."""
+    """Return a simulated glider in its world, its calibration runs, and its surveys on two days."""
     sigma, memory = NOISES[noise]
     same = {"hours": hours, "pitch": (25.0, 2.5), "roll": (1.0, 2.0), "battery_spread": 0.1}
     parts = [Spirals(), CrissCross(**same), CrissCross(**same, segment="another day")]  # type: ignore[arg-type]
@@ -124,7 +124,7 @@ def fly_survey(
 
 
 def drifted(log: xr.Dataset, by: float) -> xr.Dataset:
-    """Return a log whose positions are slowly off by `by` m north and east, as dead-reckoned ones."""
+    """Return a log whose positions drift by up to about `by` m, as dead-reckoned positions do."""
     t = (log["time"] - log["time"][0]) / float(log["time"][-1] - log["time"][0])
     per_latitude, per_longitude = metres_per_degree(float(log["latitude"].mean()))
     north, east = by * np.sin(2.2 * np.pi * t + 0.3), by * (np.cos(1.7 * np.pi * t) - 1.0)
@@ -140,7 +140,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "cubic": {},
     "auto": {},
 }
-"""The paper's two methods, with its constraints, and the default."""
+"""Options of the fit by method: the paper's two methods with its constraints, and the default."""
 TRIALS = ("trial 1", "trial 2")
 PAPER = {
     ("trial 1", "nominal"): (153, 207),
@@ -148,17 +148,17 @@ PAPER = {
     ("trial 1", "cubic"): (29, 124),
     ("trial 2", "cubic"): (17, 69),
 }
-"""nT RMS on the calibration runs and on the survey (section 4 and Table 2)."""
+"""The paper's errors on the calibration runs and on the survey, nT RMS (section 4 and Table 2)."""
 
 
 @dataclass(frozen=True)
 class Trials:
-    """A simulated deployment of the paper, and each method's result on it.
+    """Simulated deployment of the paper, and the results of each method.
 
     `parts` are trial 1, survey and trial 2; `corrected` (n,), nT, is by part, trial of the coefficients and
     method. By trial and method, `failed` is the reason of a failure, and `scales` the smallest and the
-    largest scale of A on its runs: a fit can lower its residual by shrinking them. `anomaly` is the map used
-    as reference of the fit.
+    largest scale of A on its runs: a fit with small scales has a small residual. `anomaly` is the map that is
+    the reference of the fit.
     """
 
     parts: dict[str, xr.Dataset]
@@ -168,7 +168,7 @@ class Trials:
     anomaly: AnomalyGrid
 
     def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> FloatArray:
-        """Return the error of `method` with the coefficients of `trial`, (n,) nT; NaN where it failed."""
+        """Return the error (n,), nT, of `method` with the coefficients of `trial`; NaN if the fit failed."""
         known = self.parts[part][against].to_numpy()
         found: FloatArray = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
         return np.asarray(found - known)
@@ -179,10 +179,10 @@ class Trials:
 
 
 def measure_trials(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Dataset]:
-    """Fly trial 1, survey and trial 2; return each on one time base, without the samples of masses in motion.
+    """Simulate trial 1, survey and trial 2; return each on one time base, without samples of moving masses.
 
-    With `at_depth` the reference is the map continued down to the glider, as ``--grid`` does it; else the
-    scenario's: the map at the altitude of its survey, as in the paper.
+    With `at_depth` the reference is the map continued down to the glider, as with ``--grid``; otherwise it is
+    the map at its survey altitude, as in the scenario and in the paper.
     """
     track = twin.fly()
     instrument = twin.scenario.instrument
@@ -216,7 +216,7 @@ def fly_trials(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: 
 
 
 def _on_row_times(deployment: xr.Dataset) -> xr.Dataset:
-    """Interpolate the channels linearly to the time of their row, as the paper does."""
+    """Return the log with its channels interpolated linearly to the time of the row, as in the paper."""
     time = deployment["time"].to_numpy()
     moved = {n: ("time", np.interp(time, deployment[f"mag_time_{n[-1]}"], deployment[n])) for n in CHANNELS}
     return deployment.assign(moved).drop_vars(CHANNEL_TIMES)
@@ -228,8 +228,8 @@ def _on_row_times(deployment: xr.Dataset) -> xr.Dataset:
 def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
     """Return the total field (n,), nT, corrected by a calibration that knows the vehicle exactly.
 
-    Its error is the noise floor: the channels' noise in the magnitude. The instrument must have no errors
-    of its own but noise.
+    The error of this field is the noise floor: the channels' noise in the magnitude. The instrument must have
+    no errors except noise.
     """
     D, T = _response(vehicle, deployment)
     raw = channels(deployment)
@@ -237,7 +237,7 @@ def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
 
 
 class BestFit:
-    r"""A fit that reaches the Cramér-Rao bound: the least error that the calibration data allow.
+    r"""Fit that reaches the Cramér-Rao bound, the least error that the calibration data allow.
 
     `vehicle` is the truth: dipoles with a permanent moment, a three-axis induced moment and a position each.
     The prior is the distribution that such vehicles are drawn from, or `widths` (k,): 1-sigma of soft iron
@@ -270,7 +270,7 @@ class BestFit:
     ) -> None:
         self._vehicle, self._calibration, self._survey = vehicle, calibration, survey
         self._phi = np.exp(-1 / memory) if memory else 0.0
-        # θ in units of its prior: the information is then well scaled
+        # θ in units of its prior's 1-sigma, so that the information is well scaled
         scale = _widths(vehicle, at_sigma) if widths is None else widths
         g, self._learned_floor = _sensitivity(vehicle, calibration, sigma)
         self._g = self._whitened(g) * scale
@@ -280,7 +280,7 @@ class BestFit:
         self.bound = np.sqrt(np.einsum("ni,ij,nj->n", self._h, self._covariance, self._h) + self.floor**2)
 
     def error(self, rng: np.random.Generator) -> FloatArray:
-        r"""Return the survey's error (n,), nT, on these very data; the bound is its size on average.
+        r"""Return the survey's error (n,), nT, with the simulated noise; `bound` is its expected 1-sigma.
 
         Notes
         -----
@@ -297,7 +297,7 @@ class BestFit:
         return np.asarray(after - self._h @ off)
 
     def _whitened(self, values: FloatArray) -> FloatArray:
-        """Whiten columns (m, j), nT, on the calibration's samples; each run begins independently."""
+        """Return whitened columns (m, j), from nT, on the calibration's samples; runs are independent."""
         values = values / self._learned_floor[:, None]
         follows = (np.diff(self._calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
         innovations = (values - self._phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - self._phi**2)
@@ -305,7 +305,7 @@ class BestFit:
 
 
 class SurveyBound:
-    """The least errors after a survey alone: of the field on another one, and of the map.
+    """Least errors after a calibration from a survey only: of the field on another survey, and of the map.
 
     Vehicle and crustal field are estimated from a `survey` of n samples at `place` (n, 2), m. `crust` are
     amplitude (nT) and length (m) of a Gaussian field with a Gaussian covariance, which are known; `noise` is
@@ -345,20 +345,20 @@ class SurveyBound:
         self._K = floor * floor.T * R + self._alike(self._place, self._place) + MAIN_FIELD_SIGMA_NT**2
 
     def of_field(self, other: xr.Dataset) -> float:
-        """Return the least error about its mean of another survey, over the noise floor."""
+        """Return the least RMS error without bias on another survey, over the noise floor."""
         h, floor = _sensitivity(self._vehicle, other, self._sigma)
         G, H = self._G, (h - h.mean(axis=0)) * self._scale
         P = np.linalg.inv(G.T @ np.linalg.solve(self._K, G) + np.eye(len(self._scale)))
         return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (floor**2).sum()))
 
     def data_covariance(self, *, vehicle_known: bool) -> FloatArray:
-        """Return the covariance (n, n), nT², of the magnitudes: crustal field, bias, noise, vehicle."""
+        """Return the covariance (n, n), nT², of the magnitudes by crustal field, bias, noise and vehicle."""
         return np.asarray(self._K if vehicle_known else self._K + self._G @ self._G.T)
 
     def of_map(self, at: FloatArray, apart_from: int, *, vehicle_known: bool) -> FloatArray:
-        """Return the least error (m,), nT, of the map at places (m, 2), m.
+        """Return the least 1-sigma error (m,), nT, of the map at places (m, 2), m.
 
-        It excludes the mean error at the first `apart_from` of them.
+        The error is relative to the mean error at the first `apart_from` places.
         """
         K = self.data_covariance(vehicle_known=vehicle_known)
         C = self._alike(at, self._place)
@@ -373,7 +373,7 @@ class SurveyBound:
 
 
 def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:
-    """Return the prior's width of each parameter, (k,), in the order of :func:`_neighbours`."""
+    """Return the prior 1-sigma of each parameter, (k,), in the order of :func:`_neighbours`."""
     widths = [*[SOFT_IRON] * 9, *[HARD_IRON] * 3]
     for mass in vehicle.mass.values():
         widths += [*[MOMENT] * 3, *(VOLUME_SPREAD * volume for volume in mass.volume), *[at_sigma] * 3]
@@ -381,7 +381,7 @@ def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:
 
 
 def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return the derivative of the corrected magnitude by each parameter (n, k), and its noise (n,), nT."""
+    """Return the derivatives (n, k) of the corrected magnitude by each parameter, and its noise (n,), nT."""
     ambient = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
     positions = {name: deployment[name].to_numpy() for name in vehicle.channels}
     D, _ = _response(vehicle, deployment)
@@ -395,7 +395,7 @@ def _sensitivity(vehicle: Vehicle, deployment: xr.Dataset, sigma: float) -> tupl
 
 
 def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[FloatArray, FloatArray]:
-    """Return D (n, 3, 3) and T (n, 3): the reading is affine in the ambient field."""
+    """Return D (n, 3, 3) and T (n, 3), nT: the reading is ``D B + T`` for the ambient field B."""
     positions = {name: deployment[name].to_numpy() for name in vehicle.channels}
     n, unit = deployment.sizes["time"], 1e4
     T = vehicle.field(np.zeros((n, 3)), positions)
@@ -406,7 +406,7 @@ def _response(vehicle: Vehicle, deployment: xr.Dataset) -> tuple[FloatArray, Flo
 
 
 def _neighbours(vehicle: Vehicle) -> Iterator[tuple[Vehicle, Vehicle, float]]:
-    """Yield the vehicle with one number a step up, a step down, and the step; in the prior's order."""
+    """Yield the vehicle with one parameter a step up and a step down, and the step, in the prior's order."""
 
     def vary(struct: Any, name: str, step: float) -> Iterator[tuple[Any, Any, float]]:
         value = np.asarray(getattr(struct, name), dtype=np.float64)

@@ -1,11 +1,11 @@
-"""Measure how well a survey calibrates itself, and how good its map is, over random simulated gliders.
+"""Measure the accuracy of a calibration from a survey only, and of its map, over random simulated gliders.
 
-Each glider has dipoles of its own and flies a criss-cross over a crustal field that is a random Gaussian
-field of a given amplitude and length, the same at every depth; no calibration runs, no map, the reference is
-the IGRF alone. The calibration is tested on another day's survey of the same kind; the map along the track
-and between tracks, up to one length away. Printed are the corrected field's error about its mean over the
-noise floor, the normalised error with and without the reference bias, and the map's error over that of an
-oracle (true calibration, the field's amplitude and length known). A bound knows all but the vehicle.
+Each glider has random dipoles and surveys a Gaussian random crustal field of a given amplitude and length,
+equal at every depth, on crossing tracks. It has no calibration runs and no map; the reference is the IGRF.
+The calibration is tested on another day's survey, and the map along the track and up to one length from
+it. The table has the corrected field's error without bias over the noise floor, the normalised error with and
+without the reference bias, and the map's error over an oracle's, which knows the true calibration and the
+field's amplitude and length. The bound is for an estimator that knows all except the vehicle.
 
     python tools/survey.py --gliders 10 --hours 6 12 --out survey.parquet
 """
@@ -40,19 +40,19 @@ from sitl import Twin
 from sitl.platform import Vehicle
 
 POSITION_SIGMA_M = 100.0
-"""Drift of the positions that a fit is given, where positions drift."""
+"""1-sigma of the position drift that the fit gets as an option if positions drift, m."""
 PLACES = 600
-"""Places of the map along the track, and as many up to one length from it."""
+"""Number of test places of the map along the track, and between the tracks."""
 TRACK_DISTANCE_LENGTHS = 0.4
-"""Standard deviation of the distance from the track, north and east, in lengths of the field."""
+"""Standard deviation of a place's distance from the track, north and east, in lengths of the field."""
 MAX_PEER_SAMPLES, PEER_BLOCK_SAMPLES = 2_500, 50
-"""Samples that equivalent sources are given, and samples of a stretch that is held out to choose them."""
+"""Maximum number of samples for equivalent sources, and samples of a held-out stretch that selects them."""
 PEER_DEPTHS, PEER_DAMPINGS = (0.5, 1.0, 2.0), (1e-3, 1e-1, 1.0, 10.0)
-"""Depths of the sources in lengths of the field, and dampings of their fit."""
+"""Depths of the sources in lengths of the field, and dampings of their fit, from which to select."""
 
 
 def run(hours: float, size: float, length: float, noise: str, drift: float, seed: int) -> list[Row]:
-    """Fly, calibrate from the survey alone and from ten runs with the true field, and score."""
+    """Simulate a glider, calibrate it from its survey, and from ten runs with the true field; return rows."""
     twin, parts = fly_survey(hours, size, length, noise, seed)
     row: Row = {"hours": hours, "crust nT": size, "m": length, "noise": noise, "drift m": drift, "seed": seed}
     row["failed"] = ""
@@ -82,13 +82,13 @@ def run(hours: float, size: float, length: float, noise: str, drift: float, seed
         "with_bias": rms(error / sigma),
         "bias": float(error.mean()) / float(bias.mean()),
     }
-    if not drift:  # the map is drawn along the track as it was logged
+    if not drift:  # the map's places follow the logged track
         row |= score_map(twin, survey(from_vector(log, found)), size, length, best)
     return [row]
 
 
 def errors(calibration: Calibration, part: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the corrected field's error, its sigma, and the part of it that is a reference bias, (n,) nT."""
+    """Return the corrected field's error, its sigma, and the sigma of the reference bias in it, (n,) nT."""
     seen = observations(part, MASSES)
     channels = seen.channels(calibration)
     got = correct(calibration, seen.field, channels, seen.time)
@@ -97,9 +97,9 @@ def errors(calibration: Calibration, part: xr.Dataset) -> tuple[FloatArray, Floa
 
 
 def score_map(twin: Twin, done: Result, size: float, length: float, best: SurveyBound) -> Row:
-    """Compare a survey's map with the true field, an oracle's map and harmonica's equivalent sources.
+    """Return the errors of a survey's map, next to an oracle's map and harmonica's equivalent sources.
 
-    The reference bias, which no survey determines, is each map's mean error along the track.
+    The score excludes each map's mean error along the track: the reference bias, which no survey determines.
     """
     crust, shift = twin.world.rock, np.array(separation(*twin.world.origin, *done.samples.origin))
     assert isinstance(crust, GaussianRock)
@@ -128,7 +128,7 @@ def _about_track_mean(error: FloatArray) -> FloatArray:
 def _oracle_map(
     twin: Twin, done: Result, places: FloatArray, size: float, length: float, crust: FloatArray
 ) -> FloatArray:
-    """Return the map of an oracle that knows the calibration and the field's amplitude and length, nT."""
+    """Return an oracle's map at places, nT; it knows the calibration and the field's amplitude and length."""
     place, noise = done.samples.place, twin.scenario.instrument.noise_sigma
     field = GaussianField(nodes_for(place, 1.5 * length, 4), 1.5 * length, 4)
     B = field.basis(place)
@@ -138,7 +138,7 @@ def _oracle_map(
 
 
 def _equivalent_sources(done: Result, places: FloatArray, length: float) -> FloatArray:
-    """Return harmonica's map, nT, with the depth and damping that predict held-out stretches best."""
+    """Return harmonica's map at places, nT, with the depth and damping that predict held-out data best."""
     thin = slice(None, None, max(len(done.samples.value) // MAX_PEER_SAMPLES, 1))
     place, value = done.samples.place[thin], done.samples.value[thin]
     held = np.arange(len(value)) // PEER_BLOCK_SAMPLES % 5 == 0

@@ -1,4 +1,4 @@
-"""Simulated voyages over magnetic maps, and their navigation. ``tools/navigation.py`` tabulates them."""
+"""Simulate tracks over magnetic maps and navigate them; ``tools/navigation.py`` prints the tables."""
 
 from __future__ import annotations
 
@@ -39,29 +39,29 @@ from sitl.dataset import at_rest
 from sitl.signals import autoregressive
 
 START = 1_386_201_600.0
-"""2013-12-05, s since 1970 UTC."""
+"""Start of a track (2013-12-05), s since 1970 UTC."""
 PLACE = (49.5, -57.9)
 """Latitude and longitude of Bonne Bay, deg."""
 HOUR = 3600.0
 SPEEDS = (0.35, 0.25, 0.5)
-"""m/s, from run to run."""
+"""Speeds of successive runs, m/s."""
 LEFT = {"auto": 0.5, "nominal": 125.0}
-"""Slow error that a calibration leaves in addition to 1 nT of white noise, nT (tools/accuracy.py)."""
+"""1-sigma of the slow error after a calibration, nT, next to 1 nT of white noise (tools/accuracy.py)."""
 GLIDER = NavigationOptions(
     current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0
 )
-"""A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
+"""Options for a glider, which moves 14 m in 40 s: less than 2 % of any correlation length here."""
 OUTSIDE = float(chi2.ppf(0.9999, 2))
-"""Squared distance beyond which the filter is wrong."""
+"""Squared Mahalanobis distance of the 99.99 % ellipse, beyond which the filter is wrong."""
 
 
 @dataclass(frozen=True)
 class Map:
-    """A synthetic anomaly: its scatter nT, correlation length m, and spectrum."""
+    """Synthetic anomaly map: RMS (nT), correlation length (m) and spectrum."""
 
     rms: float
     length: float
-    rough: bool = False  # waves down to a quarter of the length, as k^-3, instead of a Gaussian
+    rough: bool = False  # k^-3 spectrum down to a quarter of the length, instead of a Gaussian
 
     def __str__(self) -> str:
         return f"{self.rms:g} nT, {self.length:g} m{', rough' if self.rough else ''}"
@@ -69,11 +69,11 @@ class Map:
 
 @cache
 def synthetic(kind: Map, seed: int, extent: float = 16_000.0) -> AnomalyGrid:
-    """Return a random map: the sum of 600 plane waves."""
+    """Return a random map: the sum of 600 plane waves, `extent` m to each side."""
     rng = np.random.default_rng(seed)
     size = 600
     k = rng.normal(size=(size, 2))
-    if kind.rough:  # wavenumbers between 1/2 and 4 over the length, fewer the finer
+    if kind.rough:  # wavenumbers of 1/2 to 4 over the length, with fewer short waves
         k *= (0.5 * 8.0 ** (rng.uniform(size=size) ** 2) / np.linalg.norm(k, axis=1))[:, None]
     k, phase = k / kind.length, rng.uniform(0.0, 2.0 * np.pi, size)
     y = np.arange(-extent, extent + 1.0, kind.length / (16 if kind.rough else 8))
@@ -95,9 +95,9 @@ def track_over(
     every: float = 4.0,
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> xr.Dataset:
-    """Return a deployment of a vehicle that goes 45 minutes at a time at random headings.
+    """Return the measurements of a vehicle that changes to a random heading every 45 minutes.
 
-    All errors are drawn from the options' own model; a sample has 1 nT of white noise in addition.
+    All errors are drawn from the error model of the options; a sample also has 1 nT of white noise.
     """
     rng = np.random.default_rng(seed)
     n = int(hours * HOUR / every)
@@ -123,8 +123,8 @@ def adrift(
     """Return the measurements of a vehicle in water with a current, over a map with errors.
 
     `velocity` (n, 2), m/s, is the motion through the water up to each sample, every `every` s. `errors` (n,),
-    nT, are those of the corrected total field, `sigma` (n,), nT, what the calibration claims. A `jump` (hour,
-    metres north and east) displaces the vehicle at once, unnoticed by its dead reckoning.
+    nT, are the errors of the corrected total field, `sigma` (n,), nT, their claimed sigma. A `jump` (hour,
+    metres north and east) displaces the vehicle at once, without a change of its dead reckoning.
     """
     o, n = options, len(velocity)
     time = START + every * np.arange(1, n + 1)
@@ -156,7 +156,7 @@ def adrift(
 
 @dataclass(frozen=True)
 class Run:
-    """The result of one track; arrays over the records."""
+    """Result of the navigation of one track; the arrays have one value for each record."""
 
     hours: FloatArray
     error: FloatArray  # m
@@ -170,14 +170,14 @@ class Run:
 
     @property
     def second_half(self) -> BoolArray:
-        """Records of the second half."""
+        """Mask (n,) of the records in the second half."""
         return np.asarray(self.hours > 0.5 * self.hours[-1])
 
     def score(self) -> dict[str, float]:
-        """Return the run in numbers: errors in m over the second half, NEES over its degrees of freedom.
+        """Return the scores of a run: errors over the second half, m; NEES over its degrees of freedom.
 
-        A run is *lost* if the truth lay outside for half an hour on end. An alarm is *false* if the truth was
-        never outside for more than 6 minutes. *waited* is the time until the position was first valid, h.
+        A run is *lost* if the truth was outside the ellipse for half an hour without a break. An alarm is
+        *false* if the truth was never outside for more than 6 minutes. *waited*: time until valid, h.
         """
         half = self.second_half
         lost = bool((self.state == NavigationState.LOST).any())
@@ -193,27 +193,27 @@ class Run:
 
     @property
     def outside(self) -> BoolArray:
-        """Records outside the filter's ellipse and over a quarter correlation length away."""
+        """Mask (n,) of the records with the truth outside the ellipse and a quarter length away."""
         return (self.nees > OUTSIDE) & (self.error > 0.25 * self.length)
 
     def silence(self) -> tuple[float, float]:
-        """Return the longest spells (h) in which a wrong position counted as valid, and of being wrong."""
+        """Return the longest times (h) in which a wrong position counted as valid, and existed."""
         return longest(self.outside & self.valid, self.hours), longest(self.outside, self.hours)
 
     def standing(self) -> tuple[float, float]:
-        """Return the shares of the time in which a right position counted as valid, and a wrong one."""
+        """Return the fractions of the time in which a right and a wrong position counted as valid."""
         return float(np.mean(self.valid & ~self.outside)), float(np.mean(self.valid & self.outside))
 
 
 def longest(flags: BoolArray, hours: FloatArray) -> float:
-    """Return the longest time, in hours, that the flags were set without a break."""
+    """Return the longest time (h) in which the flags (n,) were set without a break."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     spans = [hours[min(b, hours.size) - 1] - hours[a] for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return float(max(spans, default=0.0))
 
 
 def sail(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Run:
-    """Run the navigator over a track."""
+    """Run the navigator over a track and return its errors."""
     navigator = Navigator(grid, options)
     every = float(ds["time"][1] - ds["time"][0])
     navigator.fix(round(1e6 * (float(ds["time"][0]) - every)), *PLACE)
@@ -258,7 +258,7 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Run:
 
 
 def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Iterator[tuple[Block, float]]:
-    """Yield the measurements that the navigator makes of a track, and the metres travelled until each."""
+    """Yield the measurements that the navigator forms from a track, and the distance travelled so far, m."""
     where = DeadReckoning()
     where.place(*PLACE)
     collector = Collector(options, block_length(grid))
@@ -272,7 +272,7 @@ def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Ite
 
 
 def telemetry(ds: xr.Dataset) -> Iterator[tuple[float, dict[str, float], float, float]]:
-    """Yield the time of each sample, the motion up to it, the total field and its sigma."""
+    """Yield time, motion up to the sample, total field and its sigma of each sample of a track."""
     motion = {name: ds[name].to_numpy().tolist() for name in ("velocity_north", "velocity_east", "depth")}
     columns = [ds[name].to_numpy().tolist() for name in ("time", "total_field", "total_field_sigma")]
     for t, field, sigma, *moved in zip(*columns, *motion.values(), strict=True):
@@ -294,8 +294,8 @@ def drawn_track(
 ) -> tuple[xr.Dataset, AnomalyGrid, NavigationOptions]:
     """Return a glider's track, its map and its options, as :func:`sail` takes them.
 
-    `start` is the 1-sigma of the first position in correlation lengths of the map; the track is flown `over`
-    another field if one is given.
+    `start` is the 1-sigma of the first position in correlation lengths of the map. The true field is `over`
+    if given, else the map.
     """
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, start_sigma=start * grid.correlation_length, **changes)
@@ -304,7 +304,7 @@ def drawn_track(
 
 
 def carried(kind: Map, seed: int) -> tuple[float, float]:
-    """Displace a tracking vehicle by 1.5 correlation lengths at 2 h; return as :meth:`Run.silence`."""
+    """Displace a vehicle by 1.5 correlation lengths at 2 h and navigate; return :meth:`Run.silence`."""
     length = 1.5 * synthetic(kind, seed % 10).correlation_length
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     away = (2.0, float(length * np.cos(angle)), float(length * np.sin(angle)))
@@ -312,15 +312,15 @@ def carried(kind: Map, seed: int) -> tuple[float, float]:
 
 
 def misled(kind: Map, seed: int) -> tuple[float, float]:
-    """Claim a tenth of the true 1-sigma of the start, one length; return as :meth:`Run.silence`."""
+    """Navigate with a tenth of the true 1-sigma of the start (one length); return :meth:`Run.silence`."""
     ds, grid, options = drawn_track(kind, seed, 1.0, first=7000)
     return sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)).silence()
 
 
 def dived(seed: int) -> Iterator[dict[str, float]]:
-    """Fly the demo's spirals and survey over its own world, in the true field; without and with depth.
+    """Navigate the demo's deployment in the true field, with the map as it is and continued to the depth.
 
-    Yield RMS error (m), NEES over its two degrees of freedom, and the share of the time it is valid.
+    Yield the score of :func:`track_score` for each of the two maps.
     """
     scenario = load("demo")
     grid, log = Twin.draw(scenario, seed).anomaly_map(), simulate(scenario, seed)
@@ -331,7 +331,7 @@ def dived(seed: int) -> Iterator[dict[str, float]]:
 
 
 def track_score(track: xr.Dataset) -> dict[str, float]:
-    """Return RMS error (m), NEES over its two degrees of freedom, and the share of the time it is valid."""
+    """Return RMS error (m), NEES over its two degrees of freedom, and the valid fraction of the time."""
     north, east = track["error_north"].to_numpy(), track["error_east"].to_numpy()
     nn, ne, ee = (track[f"covariance_{axes}"].to_numpy() for axes in ("nn", "ne", "ee"))
     nees = (ee * north**2 - 2.0 * ne * north * east + nn * east**2) / (nn * ee - ne**2)
@@ -340,7 +340,7 @@ def track_score(track: xr.Dataset) -> dict[str, float]:
 
 
 def calibrated(kinds: tuple[Map, ...], seed: int) -> list[dict[str, object]]:
-    """Return how a glider navigates on each map with each calibration, all else the same.
+    """Return the scores of a glider's navigation on each map with each calibration, otherwise equal.
 
     *error* is the RMS error (nT) of the corrected field on the survey, *claimed* the median claimed sigma.
     """
@@ -371,14 +371,14 @@ def calibrated(kinds: tuple[Map, ...], seed: int) -> list[dict[str, object]]:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A vehicle that flies a survey that crosses itself, its errors drawn from the options."""
+    """Vehicle that performs a survey with crossing tracks, with errors drawn from its options."""
 
     options: NavigationOptions
     hours: float
     speed: float  # m/s
     every: float  # s between samples
-    leg: tuple[float, float]  # s, shortest and longest leg
-    star: bool  # every leg turns by 125 to 150 degrees; else they zigzag out along an axis, and back
+    leg: tuple[float, float]  # s, minimum and maximum duration of a leg
+    star: bool  # turns of 125 to 150 deg between legs; else a zigzag along an axis and back
     extent: float  # half the side of the map, m
 
 
@@ -393,7 +393,7 @@ SURVEYOR = Vehicle(
     star=False,
     extent=10_000.0,
 )
-"""A current of 2 cm/s remains when its mean is known from the last surfacings."""
+"""Glider of a survey; a current of 2 cm/s remains if its mean is known from the latest surfacings."""
 AIRCRAFT = Vehicle(
     NavigationOptions(
         start_sigma=10.0, current_sigma=0.5, current_time=3600.0, drift=0.1,
@@ -406,11 +406,11 @@ AIRCRAFT = Vehicle(
     star=True,
     extent=30_000.0,
 )  # fmt: skip
-"""100 minutes with an inertial platform that drifts by a nautical mile an hour."""
+"""Aircraft on a survey of 100 minutes, whose inertial platform drifts by a nautical mile an hour."""
 
 
 def located(vehicle: Vehicle, kind: Map, seed: int) -> dict[str, float]:
-    """Fly a survey and localise it; return RMS in m over the whole track, and processor seconds."""
+    """Simulate a survey and localise it without a map; return RMS errors (m) and processor time (s)."""
     flown = survey(vehicle, kind, seed)
     begun = clock.process_time()
     track = localise(flown, vehicle.options, start=PLACE)
@@ -425,7 +425,7 @@ def located(vehicle: Vehicle, kind: Map, seed: int) -> dict[str, float]:
 
 
 def survey(vehicle: Vehicle, kind: Map, seed: int) -> xr.Dataset:
-    """Return a survey's measurements by a vehicle of unknown drift, with its true track."""
+    """Return the measurements of a survey by a vehicle of unknown drift, with its true track."""
     rng, o = np.random.default_rng([seed, 44]), vehicle.options
     velocity = _velocity(vehicle, rng)
     n = len(velocity)
@@ -435,7 +435,7 @@ def survey(vehicle: Vehicle, kind: Map, seed: int) -> xr.Dataset:
 
 
 def _velocity(vehicle: Vehicle, rng: np.random.Generator) -> FloatArray:
-    """Return velocities (n, 2), m/s north and east, of legs of a random shape."""
+    """Return velocities (n, 2), m/s north and east, on random legs of the vehicle's pattern."""
     n = int(vehicle.hours * HOUR / vehicle.every)
     leg = np.arange(n) // int(rng.uniform(*vehicle.leg) / vehicle.every)
     first = rng.uniform(0.0, 360.0)
@@ -452,7 +452,7 @@ def _velocity(vehicle: Vehicle, rng: np.random.Generator) -> FloatArray:
 
 
 def magnav_flight(folder: Path) -> tuple[AnomalyGrid, xr.Dataset]:
-    """Return the map of MagNav.jl's simple example, and its flight: field, inertial and true track."""
+    """Return map and flight of MagNav.jl's simple example: field, inertial track and true track."""
     log = np.genfromtxt(folder / "xyz.csv", delimiter=",", names=True)
     time = 1.5e9 + log["tt"]
     columns = {

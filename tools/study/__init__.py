@@ -1,1 +1,1 @@
-"""The parts of ``tools/blind.py``: deployments, cases, the ideal detector, and the table."""
+"""Parts of the blind study ``tools/blind.py``: deployments, cases, ideal detector and table."""

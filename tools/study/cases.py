@@ -1,4 +1,4 @@
-"""The cases: the hidden effects of each part of the study, and the result of a case's diagnosis."""
+"""Cases of the blind study: the hidden effects of each part, and the result of a case's diagnosis."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from study.ideal import ideal
 Row = dict[str, Any]
 NAMES = tuple(EFFECTS)
 KNOWN = tuple(CAUSES)
-"""Causes with a function of their own in the table; outliers are found by the noise model."""
+"""Causes in the table of causes; outliers are not among them, because the noise model finds them."""
 LADDER = (4.0, 3.0, 5.0, 2.0, 6.0)
 LOUD = (25.0, 100.0, 15.0, 50.0)
 LASTING = (
@@ -45,23 +45,23 @@ LASTING = (
     "hysteresis", "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity",
     "pressure_offset", "reference_bias",
 )  # fmt: skip
-"""Causes that last to another deployment; the others are tied to a moment, a place or the range
-of one log."""
+"""Causes that persist in another deployment; the others depend on a moment, a place or the range of one
+log."""
 NAMELESS = ("unknown", "seen", "foreign")
-"""Parts in which the hidden effect is not among the causes of the table."""
+"""Parts of the study in which the hidden effect is not a cause of the table."""
 PREDICTED = ("named", "ladder")
-"""Parts for which the ideal detector is computed."""
+"""Parts of the study for which the ideal detector is computed."""
 STRANGE = ("jettison", "duet", "winch", "mooring")
-"""Foreign effects that were made after the detector was frozen."""
+"""Foreign effects that were added after the last change of the detector."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase",
 )  # fmt: skip
-"""Foreign effects that were made before the detector was last improved."""
+"""Foreign effects that existed before the last improvement of the detector."""
 GOLDEN = 0.6180339887498949
 
 
 class Part(NamedTuple):
-    """A part of the study: its share of the cases, and its k-th case."""
+    """Part of the study: its fraction of the cases, and a function that returns its k-th case."""
 
     share: float
     entry: Callable[[int], Row]
@@ -105,7 +105,7 @@ def _gain(k: int) -> Row:
 
 
 def _charted(k: int) -> Row:
-    """Return a case like the paper's log: the reference is a map; a third of the cases hide nothing."""
+    """Return the k-th case like the paper's log: the reference is a map; a third of the cases hide none."""
     names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
     return {
         "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
@@ -114,7 +114,7 @@ def _charted(k: int) -> Row:
 
 
 def _flicker(k: int) -> Row:
-    """Return a case in flicker noise; its signal-to-noise refers to white noise of the same RMS."""
+    """Return the k-th case in flicker noise; its signal-to-noise refers to white noise of the same RMS."""
     names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
     return {"names": names, "wanted": 25.0 * bool(names), "noise": FLICKER}
 
@@ -135,22 +135,22 @@ PARTS: dict[str, Part] = {
 
 
 def losses(k: int) -> str:
-    """Return how the k-th case of a part loses samples: every third does, in one of four ways.
+    """Return the kind of lost samples in the k-th case of a part: one of four in every third case, else "".
 
-    Multiples of the golden section are not in step with the cycles of causes, noises and sizes.
+    Multiples of the golden section avoid a coincidence with the cycles of causes, noises and sizes.
     """
     place = int(3 * len(LOSSES) * (GOLDEN * k % 1.0))
     return LOSSES[place] if place < len(LOSSES) else ""
 
 
 def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
-    """Return the study's entries, the parts evenly mixed; a longer study contains the shorter one.
+    """Return the entries of the study, with evenly mixed parts; a longer study contains the shorter study.
 
-    Another `seed` hides the same causes at the same signal-to-noise in other vehicles; all else is drawn
-    again.
+    Another `seed` hides the same causes at the same signal-to-noise ratios in other vehicles, with other
+    random numbers.
     """
     made = []
-    # the last two share their hundred thousand: a seed has no more numbers
+    # the last two parts share a range of 100,000 numbers, because a seed has only ten ranges
     for place, (name, part) in zip((*range(10), 9.5), PARTS.items(), strict=True):
         count = round(cases * part.share) if name in parts else 0
         made += [
@@ -166,7 +166,7 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
 
 
 def case(entry: Row) -> Row:
-    """Hide the effects of an entry, diagnose the log, and return the result with the ideal detector's."""
+    """Hide the effects of an entry, diagnose the log, and return the row with the ideal results."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
     deployment = deployment_of(number, noise, entry.get("reference", "true"))
@@ -197,7 +197,7 @@ def case(entry: Row) -> Row:
 
 
 def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
-    """Return (value - truth) / sigma of each parameter of known truth, if named; positive if too large."""
+    """Return (value - truth) / sigma of each parameter of the named cause; positive for too large values."""
     truth = json.loads(whole.attrs["truth"])
     own = [f["parameters"] for f in found["findings"] if names == (f["cause"],)]
     if len(own) != 1:
@@ -212,9 +212,9 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
 def harm(
     hidden: tuple[HiddenEffect, ...], background: Background, ds: xr.Dataset, result: Diagnosis
 ) -> dict[str, float]:
-    """Return mean square errors (nT²) against the true field, as calibrated and extended.
+    """Return mean square errors (nT²) of the calibration ("before") and the extended calibration ("after").
 
-    They are computed on this log, and on one of another day (keys with " elsewhere").
+    The errors refer to the true field, on this log and on a log of another day (keys with " elsewhere").
     """
     calibration, number = background.deployment.calibration, background.number + 1
     other = rebuilt(background.deployment, DAY).measure(hidden, number)
@@ -229,7 +229,7 @@ def harm(
 
 
 def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> BoolArray:
-    """Return the samples of a log whose masses stand within the range that those of `ds` covered."""
+    """Return the samples (n,) of a log whose masses are within the ranges of the log `ds`."""
     inside = np.ones(other.sizes["time"], bool)
     for parameter in calibration.parameters:
         known = ds[parameter.name]

@@ -1,4 +1,4 @@
-"""Vehicles with their calibrations, their deployments, and effects of a requested size hidden in them."""
+"""Simulate vehicles, their calibrations and deployments, and effects of a requested size hidden in a log."""
 
 from __future__ import annotations
 
@@ -31,45 +31,45 @@ from sitl.world import Water, World
 
 Rows = IndexArray
 MEMORY = 0.8
-"""Correlation of neighbouring samples in autoregressive noise."""
+"""Correlation of consecutive samples in autoregressive noise."""
 SLOWER = 0.95
-"""Correlation of neighbouring samples in the autoregressive third (by power) of mixed noise."""
+"""Correlation of consecutive samples in the autoregressive third (by power) of mixed noise."""
 NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
-"""White; autoregressive; white plus slower autoregressive; heavy-tailed; of varying level; 1.5 times as large
-as in the calibration; white over a stronger crustal field."""
+"""Kinds of noise: white; autoregressive; white plus slower autoregressive; heavy-tailed; of varying level;
+1.5 times the calibration's; white over a stronger crustal field."""
 FLICKER, CORNER = "flicker", 0.1
-"""Noise of 1 nT RMS with a 1/f spectrum below a corner, and that corner over the sampling frequency."""
+"""Noise of 1 nT RMS with a 1/f spectrum below a corner; the corner over the sampling frequency."""
 GLIDER = "glider"
-"""The noise of the paper's twin: eight times as large, and correlated."""
+"""Noise of the paper's glider: eight times as large, and autocorrelated."""
 LOSSES = ("single", "bursts", "hole", "surfacing")
-"""Lost samples: one in twenty; about two minutes, twelve times; a sixth of the log at once; 44 s of every
-dive."""
+"""Kinds of lost samples: one in twenty; about two minutes, twelve times; a sixth of the log at once; 44 s of
+every dive."""
 HOURS = 6.0
-"""Length of a deployment; the tests' are shorter."""
+"""Length of a deployment, h; the tests use a shorter one."""
 VEHICLES = 23
-"""Number of vehicles of one seed. It is prime: parts step through their causes and sizes in cycles, and so
-each of these meets every vehicle."""
+"""Number of vehicles of one seed. The number is prime, so that each part's cycles of causes and sizes meet
+every vehicle."""
 SEEDS = 1_000_000
-"""Most case numbers of one seed."""
+"""Maximum number of case numbers of one seed."""
 INERTIA = 3.0
-"""s, time constant of each of two lags with which the attitude follows what :mod:`sitl.trajectory` draws."""
+"""Time constant of each of two lags by which the attitude follows the track of :mod:`sitl.trajectory`, s."""
 TURN_ON = 20.0
-"""nT (1-sigma) per axis by which the paper's offset changes at every power-on."""
+"""Change of the paper's offset at every power-on, nT (1-sigma) per axis."""
 DAY = timedelta(days=1)
 CHARTS = ("map at its depth", "map")
-"""Maps that serve as reference: aeromagnetic, continued down to the glider, or taken as it was flown."""
+"""Maps that serve as reference: aeromagnetic, continued down to the glider, or at flight level."""
 
 
 @dataclass(frozen=True)
 class Remembered(World):
-    """A world that caches the field along a track: all cases of a vehicle fly the same one."""
+    """Simulated world that caches the field along a track, because all cases of a vehicle share a track."""
 
     known: dict[bytes, FloatArray] = attribute(default_factory=dict)
 
     def field(
         self, time: FloatArray, latitude: FloatArray, longitude: FloatArray, depth: FloatArray
     ) -> FloatArray:
-        """See :meth:`~sitl.world.World.field`."""
+        """Return the field of :meth:`~sitl.world.World.field`, (n, 3) nT, from the cache if possible."""
         way = np.stack([time, latitude, longitude, depth]).tobytes()
         if way not in self.known:
             self.known[way] = super().field(time, latitude, longitude, depth)
@@ -77,11 +77,11 @@ class Remembered(World):
 
 
 class Deployment(NamedTuple):
-    """A vehicle with its calibration, and a deployment's track with the times of its rows.
+    """Deployment of a vehicle: its calibration, track and times of the rows.
 
-    `prior` (K, K) is the prior covariance of the calibration's coefficients in a diagnosis: its own, and the
-    drift that no instrument is free of. `learned` is the calibration's own log, where the diagnosis is given
-    it, and `chart` the map that is the reference of both logs.
+    `prior` (K, K) is the prior covariance of the calibration's coefficients in a diagnosis: the calibration's
+    covariance and the instrument's drift. `learned` is the calibration's log if the diagnosis gets this
+    log, and `chart` is the map that is the reference of both logs.
     """
 
     twin: Twin
@@ -93,17 +93,17 @@ class Deployment(NamedTuple):
     chart: AnomalyGrid | None = None
 
     def measure(self, hidden: tuple[HiddenEffect, ...], number: int) -> xr.Dataset:
-        """Return the log with effects, before its noise and its losses."""
+        """Return the log with hidden effects, without noise and lost samples."""
         ds = disturb(self.twin, hidden, self.track, self.when, number, EFFECTS | FOREIGN)
         return ds if self.chart is None else charted(ds, self.chart)
 
 
 @lru_cache(maxsize=VEHICLES)
 def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Deployment:
-    """Draw a vehicle, calibrate it on a log of its own, fly its survey; `rms` (nT) is the crustal field.
+    """Draw a vehicle, calibrate it on its own log and simulate its survey; `rms` (nT) is the crustal field.
 
-    Where the reference is a map, one of :data:`CHARTS`, it is a glider like the paper's: its noise is larger,
-    and its offset has changed between calibration and survey.
+    If the reference is a map, one of :data:`CHARTS`, the vehicle is a glider like the paper's: its noise is
+    larger, and its offset has changed between calibration and survey.
     """
     swap = msgspec.structs.replace
     base = load("demo")
@@ -116,7 +116,7 @@ def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Deployment
     world = swap(base.world, water=water, geology=swap(base.world.geology, rms=rms))
     base = swap(base, instrument=instrument, world=world, motion=swap(base.motion, settle=40.0))
     trial = swap(base, mission=(Spirals(),))
-    # not a multiple of the sampling interval, 4 s: else every mass would start to move just at a sample
+    # the duration is not a multiple of the 4 s between samples, so masses start to move between samples
     survey = CrissCross(hours=HOURS, roll=(0.0, 4.0), pitch=(24.0, 3.0), battery_spread=0.12, duration=701.5)
     twin = Twin.draw(swap(base, instrument=swap(instrument, noise_sigma=0.0), mission=(survey,)), seed)
     if reference == "true":
@@ -130,16 +130,16 @@ def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Deployment
 
 
 def drawn(twin: Twin, reference: str) -> AnomalyGrid:
-    """Return the map of a twin's waters, one of :data:`CHARTS`."""
+    """Return the anomaly map of a simulated world: one of :data:`CHARTS`."""
     chart = twin.anomaly_map()
     if reference == "map at its depth":
         return chart
-    # the same without its altitude, so that it is not continued downward
+    # without an altitude, the map is not continued downward
     return AnomalyGrid(chart.longitude, chart.latitude, chart.anomaly, name=chart.name)
 
 
 def charted(ds: xr.Dataset, chart: AnomalyGrid) -> xr.Dataset:
-    """Return a log with a map as reference; the error that its reference had before is kept on top."""
+    """Return a log with a map as reference; the error of its former reference is added."""
     known = reference_field(ds.drop_vars("reference_field"), chart)
     return ds.assign(reference_field=ds["reference_field"] - ds["truth_total_field"] + known)
 
@@ -158,7 +158,7 @@ def rebuilt(deployment: Deployment, later: timedelta = timedelta()) -> Deploymen
 def _flown(twin: Twin, calibration: Calibration) -> Deployment:
     twin = replace(twin, world=Remembered(twin.world.origin, twin.world.rock, twin.world.water))
     track = twin.fly()
-    # a hull has inertia: without it the attitude has no rate of change, and a delay of a millisecond would
+    # the hull's inertia: without it the attitude would change in steps, and a delay of a millisecond would
     # look like noise
     roll, pitch, heading = (
         first_order(first_order(angle, track.step, INERTIA), track.step, INERTIA)
@@ -170,14 +170,14 @@ def _flown(twin: Twin, calibration: Calibration) -> Deployment:
 
 
 def deployment_of(number: int, noise: str, reference: str = "true") -> Deployment:
-    """Return the deployment of a case."""
+    """Return the deployment of a case by its number, noise and reference."""
     seed, place = divmod(number, SEEDS)
     rms = {"map": 300.0, GLIDER: 120.0}.get(noise, 60.0)
     return vehicle(VEHICLES * seed + place % VEHICLES, rms, reference)
 
 
 def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-    """Return the residual (n,), and its derivatives by the calibration's coefficients (n, K)."""
+    """Return the residual (n,), nT, and its derivatives by the calibration's coefficients (n, K)."""
     H = np.column_stack([ds[f"mag_{axis}"] for axis in "xyz"])
     p = np.column_stack([ds[name] for name in calibration.channels])
     phi = regressors(calibration, H, p, ds["time"].to_numpy()).T
@@ -192,7 +192,7 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[FloatArray, Float
 
 
 def project(X: FloatArray, A: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Project the calibration (columns A, prior `covariance`) out of columns X.
+    """Return columns X (n, m) with the calibration (columns A, prior `covariance`) projected out.
 
     The inner product of the result with X is the Fisher information with the calibration free. By Woodbury's
     identity the prior covariance need not be inverted.
@@ -202,9 +202,9 @@ def project(X: FloatArray, A: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def size_of(name: str, d: FloatArray, A: FloatArray, covariance: FloatArray) -> float:
-    """Return the signal-to-noise of a signature d: its norm with the calibration projected out.
+    """Return the signal-to-noise ratio of a signature d (n,): its norm with the calibration projected out.
 
-    For outliers, each at an unknown moment of its own, it is that of the largest.
+    For outliers, which are independent, the ratio is that of the largest outlier.
     """
     left = project(d[:, None], A, covariance)[:, 0]
     if name == "outliers":
@@ -213,7 +213,7 @@ def size_of(name: str, d: FloatArray, A: FloatArray, covariance: FloatArray) -> 
 
 
 class Injected(NamedTuple):
-    """A hidden effect of the wanted size, its whitened signature in the residual, and the log with it."""
+    """Hidden effect, its whitened signature in the residual, and the log with the effect."""
 
     hidden: HiddenEffect
     signature: FloatArray
@@ -221,7 +221,7 @@ class Injected(NamedTuple):
 
 
 class Background(NamedTuple):
-    """What does not depend on the effect: a log's rows, its residual without one, the calibration's columns.
+    """Data of a case without a hidden effect: rows of the log, its residual, and the calibration's columns.
 
     The columns (of `rows` only) are whitened; the residual (of all rows) is not.
     """
@@ -235,18 +235,18 @@ class Background(NamedTuple):
 
     @classmethod
     def of(cls, deployment: Deployment, number: int, noise: str, losses: str = "") -> Background:
-        """Set up; `number` seeds the unneeded telemetry, and which samples are lost."""
+        """Return the background of a case; `number` seeds the irrelevant telemetry and the lost samples."""
         clean = deployment.measure((), number)
         rows = kept_rows(losses, len(deployment.when), number)
         e, J = compare(clean, deployment.calibration)
         return cls(deployment, number, noise, rows, e, whiten(J[rows], noise, rows))
 
     def measure(self, *hidden: HiddenEffect) -> xr.Dataset:
-        """Return the log with effects, before its noise and its losses."""
+        """Return the log with hidden effects, without noise and lost samples."""
         return self.deployment.measure(hidden, self.number)
 
     def show(self, hidden: HiddenEffect) -> Injected:
-        """Return an effect's signature and log here."""
+        """Return an effect with its signature and the log in which it is hidden."""
         ds = self.measure(hidden)
         d = compare(ds, self.deployment.calibration)[0] - self.residual
         return Injected(hidden, whiten(d[self.rows], self.noise, self.rows), ds)
@@ -256,7 +256,7 @@ class Background(NamedTuple):
         return add_noise(ds, self.noise, self.number).isel(time=self.rows)
 
     def hide(self, name: str, wanted: float, seed: int) -> Injected:
-        """Find the size at which the effect has the signal-to-noise that is wanted."""
+        """Return the effect with the size at which its signal-to-noise ratio is `wanted`."""
         size = 1.0
         for _ in range(6):
             made = self.show(HiddenEffect(name, size, seed))
@@ -271,12 +271,12 @@ class Background(NamedTuple):
 
 
 def statistics(noise: str) -> tuple[float, float]:
-    """Return correlation of neighbouring samples and 1-sigma (nT) with which theory whitens this noise."""
+    """Return the correlation of consecutive samples and the 1-sigma (nT) with which noise is whitened."""
     return (MEMORY if noise in ("ar", GLIDER) else 0.0), {"half": 1.5, GLIDER: 8.0}.get(noise, 1.0)
 
 
 def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
-    """Add noise of its `kind` to each channel, of unit variance unless the kind says otherwise."""
+    """Return the log with noise of a `kind` on each channel, 1 nT unless the kind has another amplitude."""
     rng = np.random.default_rng([seed, 99])
     n = ds.sizes["time"]
     noise = rng.standard_normal((n, 3))
@@ -299,7 +299,7 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
 
 
 def kept_rows(losses: str, n: int, seed: int) -> Rows:
-    """Return the rows of a log that are kept; all of its n rows where `losses` is empty."""
+    """Return the indices of the rows of a log that are not lost; all n rows if `losses` is empty."""
     rng = np.random.default_rng([seed, 98])
     there = np.ones(n, bool)
     if losses == "single":
@@ -319,7 +319,7 @@ def kept_rows(losses: str, n: int, seed: int) -> Rows:
 def whiten(x: FloatArray, noise: str, rows: Rows) -> FloatArray:
     """Return the innovations of a signal x at `rows`, in units of their 1-sigma under the true noise.
 
-    Over a step of k rows an AR(1) is one of ``rho^k``. The first row has no past and is left out.
+    Over a step of k rows, an AR(1) process has the correlation ``rho^k``. The result omits the first row.
     """
     memory, sigma = statistics(noise)
     rho = (memory ** np.diff(rows)).reshape(-1, *[1] * (x.ndim - 1))

@@ -1,16 +1,16 @@
-r"""The best that a detector can do that knows the noise and the true shape of the hidden effect.
+r"""Compute the performance of an ideal detector that knows the noise and the shape of the hidden effect.
 
 Notes
 -----
 Let d be the hidden signature and X the columns of all hypotheses, whitened, with the calibration projected
-out. The scores of all columns are then ``N(X^T d, X^T X)``, whatever the data are. So the ideal detector's
-results are drawn from that distribution, and no deployment is simulated. It compares the truth (a single
-column d, with as many degrees of freedom k as the cause has in the table) with every other cause of the
-table, by the evidence that the real detector uses. Its set of names holds all causes within 20:1 of the best.
+out. The scores of all columns then have the distribution ``N(X^T d, X^T X)``. The ideal detector's results
+are drawn from this distribution, without a simulated deployment. It compares the truth (a single column d,
+with as many degrees of freedom k as the cause has in the table) with every other cause of the table, by the
+evidence that the real detector uses. Its set of names holds all causes within 20:1 of the best.
 
-An effect is *found* if one of the table's tests, or that of the truth, passes: ``chi2_k`` beyond its quantile
-at 1 % divided among all causes and their independent hypotheses. The signal-to-noise of half detection, and
-that of 95 %, follow from the draws with d scaled to other sizes.
+An effect is *found* if a test of the table or the test of the truth is significant: ``chi2_k`` exceeds its
+quantile at 1 %, divided among all causes and their independent hypotheses. The signal-to-noise ratios of
+50 % and 95 % detection follow from the draws with d scaled to other sizes.
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ from study.deployment import Background, Injected, compare, project, whiten
 
 DRAWS = 400
 SIZES = np.linspace(1.0, 12.0, 45)
-"""Signal-to-noise ratios at which the chance of detection is computed."""
+"""Signal-to-noise ratios at which the probability of detection is computed."""
 EQUIVALENT = {"clock_offset": "filter_lag"}
-"""Causes that count as one: in a uniform field a late field and an early clock leave the same trace."""
+"""Causes that count as one: in a uniform field, filter lag and clock offset have the same signature."""
 
 
 def cause_names(causes: Iterable[str]) -> set[str]:
-    """Return the names of causes; equivalent ones have one name."""
+    """Return the set of cause names, with one name for equivalent causes."""
     return {EQUIVALENT.get(cause, cause) for cause in causes}
 
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """One of a cause's hypotheses.
+    """Hypothesis of a cause: a span of columns of the table.
 
     Attributes
     ----------
     cause : str
     channel : str or None
     own : slice
-        Places of its columns.
+        Indices of the hypothesis' columns.
     price : float
-        Log of the number of hypotheses that it stands for.
+        Natural log of the number of hypotheses that this one represents.
     positive : bool
-        Its coefficients cannot be negative.
+        True if the coefficients cannot be negative.
     spectra : (l, k) array or None
-        Where its coefficients have one common size (:mod:`magbridge.diagnose.joint`): l
+        If the coefficients have one common size (:mod:`magbridge.diagnose.joint`): l
         alternatives for their prior variances.
     more : float
-        Of a true shape: how many further coefficients its cause has, which fit nothing but noise.
+        For the true shape: number of further coefficients of its cause, which fit only noise.
     """
 
     cause: str
@@ -75,30 +75,30 @@ class Span:
 
     @property
     def tail(self) -> float:
-        """Share of a chi-square's tail that counts in a test: half where a size cannot be negative."""
+        """Fraction of a chi-square's tail that counts in a test: half if a size cannot be negative."""
         return 0.5 if self.positive or self.spectra is not None else 1.0
 
 
 class Draws(NamedTuple):
-    """Fisher information S of all columns, the truth's last, and draws of their scores' noise (m, DRAWS)."""
+    """Fisher information S (m, m) of all columns, the truth's last, and noise of their scores (m, DRAWS)."""
 
     S: FloatArray
     noise: FloatArray
 
     @classmethod
     def of(cls, S: FloatArray) -> Draws:
-        """Draw the noise of scores whose covariance is S."""
+        """Return random draws of the noise of scores with the covariance S."""
         values, vectors = np.linalg.eigh(0.5 * (S + S.T))
         drawn = np.random.default_rng(20131212).standard_normal((len(S), DRAWS))
         return cls(S, vectors @ (drawn * np.sqrt(np.maximum(values, 0.0))[:, None]))
 
     @property
     def wanted(self) -> float:
-        """Signal-to-noise of the truth."""
+        """Signal-to-noise ratio of the truth."""
         return float(np.sqrt(self.S[-1, -1]))
 
     def ratio(self, span: Span, scale: float | FloatArray = 1.0) -> tuple[FloatArray, float]:
-        """Return likelihood ratios of a hypothesis, the truth times `scale`, and its degrees of freedom."""
+        """Return likelihood ratios of a hypothesis for the truth times `scale`, and degrees of freedom."""
         statistic = Statistic(self.S[span.own, span.own], span.spectra)
         given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
         scores = np.moveaxis(self.noise[span.own] + scale[..., None] * given[:, None], -2, 0)
@@ -110,7 +110,7 @@ class Draws(NamedTuple):
         return value, float(statistic.freedom + span.more)
 
     def conditional_on(self, span: Span) -> Draws:
-        """Return the draws with one hypothesis projected out."""
+        """Return the draws with the columns of one hypothesis projected out."""
         taken = self.S[:, span.own] @ root_of(self.S, span)
         own = root_of(self.S, span).T @ self.noise[span.own]
         return Draws(self.S - taken @ taken.T, self.noise - taken @ own)
@@ -124,24 +124,24 @@ def explained(S: FloatArray, span: Span) -> float:
 
 
 def evidence(span: Span, ratio: FloatArray, freedom: float) -> FloatArray:
-    """Log evidence of likelihood ratios; coefficients of one common size are already integrated out."""
+    """Return the log evidence of likelihood ratios; ratios of a common size are already integrated."""
     if span.spectra is not None:
         return np.asarray(0.5 * ratio - np.log(len(span.spectra)))
-    # of a known sign: the share of the posterior that has it, over half of the prior
+    # for a known sign: the posterior probability of this sign over its prior probability, one half
     return log_bayes(ratio, freedom) + (one_sided(ratio) if span.positive else 0.0)
 
 
 def root_of(S: FloatArray, span: Span) -> FloatArray:
-    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' coefficients, where the data see them."""
+    """Return R (k, f) with ``R R^T`` the covariance of a hypothesis' coefficients that the data determine."""
     own = S[span.own, span.own]
-    if span.spectra is not None:  # with their prior, at the likeliest size given the truth
+    if span.spectra is not None:  # add the prior at the likeliest size given the truth
         own = own + np.diag(1.0 / Statistic(own, span.spectra).best(S[span.own, -1]).variance)
     statistic = Statistic(own)
     return np.asarray(statistic.vectors / np.sqrt(statistic.values))
 
 
 def numbers(S: FloatArray, span: Span) -> float:
-    """Return the number of coefficients that the data determine and not the prior."""
+    """Return the effective number of coefficients that the data determine, not the prior."""
     root = root_of(S, span)
     return float(np.trace(root.T @ S[span.own, span.own] @ root))
 
@@ -149,7 +149,7 @@ def numbers(S: FloatArray, span: Span) -> float:
 def by_cause(
     evidences: Mapping[Span, FloatArray], name: str = "", truth: FloatArray | None = None
 ) -> dict[str, FloatArray]:
-    """Return the log evidence of each cause, averaged over its grid, for its best channel, truth included."""
+    """Return each cause's log evidence: mean over its grid, maximum over its channels, with the truth."""
     groups: dict[tuple[str, str | None], list[tuple[FloatArray, float]]] = {}
     for span, evidence in evidences.items():
         groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))
@@ -166,26 +166,26 @@ def by_cause(
 def ideal(
     hidden: Injected, background: Background, ds: xr.Dataset, look_elsewhere: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Return the chances of an ideal detector.
+    """Return the probabilities of the outcomes of an ideal detector.
 
     Parameters
     ----------
     hidden : Injected
-        The hidden effect.
+        Hidden effect of the case.
     background : Background
-        The log that it is hidden in.
+        Background of the log with the effect.
     ds : Dataset
-        The deployment that is diagnosed.
+        Deployment that is diagnosed.
     look_elsewhere : mapping
         Cause -> number of its independent hypotheses.
 
     Returns
     -------
     dict
-        ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean
-        size; ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50
-        and 95 % are found; ``here``: p-value with the noise of this log, if the truth had the sizes
-        :data:`SIZES`; ``left``: cause -> signal-to-noise that its best hypotheses leave.
+        Probabilities: ``alone``, only the truth is named; ``inside``, the set of names has the truth;
+        ``first``, each cause is named first. ``size``: mean size of the set. ``half``, ``sure``:
+        signal-to-noise ratio of 50 and 95 % detection. ``here``: p-value in this log's noise for each of
+        :data:`SIZES`. ``left``: signal-to-noise ratio that each cause's best hypotheses leave.
     """
     name = EQUIVALENT.get(hidden.hidden.name, hidden.hidden.name)
     spans, S, noise = information(hidden, background, ds)
@@ -212,10 +212,7 @@ def ideal(
 def information(
     hidden: Injected, background: Background, ds: xr.Dataset
 ) -> tuple[list[Span], FloatArray, FloatArray]:
-    """Return spans, Fisher information (m, m) of all columns, and scores (m, 1) of the log's own noise.
-
-    The hidden signature is the last column.
-    """
+    """Return hypotheses, Fisher information (m, m) of all columns, and scores (m, 1) of the log's noise."""
     noise, rows, calibration = background.noise, background.rows, background.deployment.calibration
     problem = pose(load_survey([ds], calibration), calibration)
     candidates = [c for cause in CAUSES.values() for c in cause.candidates(problem)]
@@ -238,17 +235,17 @@ def information(
 
 
 def own_span(S: FloatArray, spans: Sequence[Span], name: str) -> Span | None:
-    """Return the hypothesis of the true cause with the largest evidence; None if the log cannot test it."""
+    """Return the true cause's hypothesis of largest evidence; None if the log has no such hypothesis."""
 
     def worth(span: Span) -> float:
         freedom = numbers(S, span)
-        return float(log_bayes(explained(S, span) + freedom, freedom))  # at its mean likelihood ratio
+        return float(log_bayes(explained(S, span) + freedom, freedom))  # at the mean likelihood ratio
 
     return max((span for span in spans if span.cause == name), key=worth, default=None)
 
 
 def true_span(S: FloatArray, own: Span | None, name: str) -> Span:
-    """Return the true shape, the last column, with as many coefficients as its cause's `own` hypothesis."""
+    """Return the true shape (last column) as a hypothesis, with as many coefficients as `own`."""
     shape = slice(len(S) - 1, len(S))
     if own is None:
         return Span(name, None, shape)
@@ -256,7 +253,7 @@ def true_span(S: FloatArray, own: Span | None, name: str) -> Span:
 
 
 def left_by_causes(draws: Draws, spans: Sequence[Span]) -> dict[str, float]:
-    """Return the signal-to-noise that the best two hypotheses of each cause leave of the truth."""
+    """Return the truth's signal-to-noise ratio with the best two hypotheses of each cause projected out."""
     causes: dict[str, list[Span]] = {}
     for span in spans:
         causes.setdefault(span.cause, []).append(span)
@@ -270,7 +267,7 @@ def left_by_causes(draws: Draws, spans: Sequence[Span]) -> dict[str, float]:
 
 
 def p_values(draws: Draws, spans: Sequence[Span], look_elsewhere: Mapping[str, float]) -> FloatArray:
-    """Return the smallest p-value of all tests for each of :data:`SIZES` and each draw."""
+    """Return the smallest p-value of all tests for each of :data:`SIZES` and each draw, (sizes, DRAWS)."""
     scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)
@@ -281,6 +278,6 @@ def p_values(draws: Draws, spans: Sequence[Span], look_elsewhere: Mapping[str, f
 
 
 def found_at(p: FloatArray) -> dict[str, float]:
-    """Return the signal-to-noise ratios at which 50 % and 95 % are found."""
+    """Return the signal-to-noise ratios with 50 % and 95 % probability of detection."""
     chance = np.maximum.accumulate(np.mean(p < FALSE_ALARM_RATE, axis=1))
     return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}

@@ -1,6 +1,6 @@
-"""The table of the blind study, each figure with that of an ideal detector, and its two plots.
+"""Make the table of the blind study, with the results of an ideal detector, and its two plots.
 
-Intervals are of 95 %. ``theory`` in a row holds what :func:`study.ideal.ideal` predicts for that case.
+Intervals are of 95 %. ``theory`` in a row holds the results of :func:`study.ideal.ideal` for this case.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from study.ideal import EQUIVALENT, SIZES, cause_names
 
 Row = dict[str, Any]
 Line = tuple[str, str, str]
-"""Figure, value of an ideal detector, measured value | number of cases."""
+"""Line of the table: figure, value of an ideal detector, measured value with number of cases."""
 MIN_CHANCE = 0.95
-"""Chance of the ideal detector to name the truth alone, from which on a case is held to it."""
+"""Minimum probability of the ideal detector to name only the truth, for a case that must be named."""
 MAX_IDEAL_P_VALUE = 0.1
-"""Largest p-value of the ideal detector for which the sensitivities are compared: p-values end at one."""
+"""Maximum p-value of the ideal detector for a comparison of sensitivities, as p-values are bounded by 1."""
 NEITHER = "no name"
 
 
@@ -34,7 +34,7 @@ NEITHER = "no name"
 
 
 def hidden(row: Row) -> set[str]:
-    """Return the hidden causes."""
+    """Return the names of the hidden causes."""
     return cause_names(row["names"])
 
 
@@ -49,47 +49,47 @@ def asserted(row: Row) -> set[str]:
 
 
 def sets(row: Row) -> set[str]:
-    """Return the named causes, their alternatives, and those that an unexplained residual keeps."""
+    """Return the named causes, their alternatives, and the alternatives of an unexplained residual."""
     kept = (row["unexplained"] or {}).get("alternatives", ())
     alternatives = [cause_names(entry[3]) for entry in row["found"]]
     return asserted(row).union(*alternatives, cause_names(a["cause"] for a in kept))
 
 
 def is_right_alone(row: Row) -> bool:
-    """Return True if exactly the truth is named, without alternatives."""
+    """Return True if the diagnosis names exactly the hidden causes, without alternatives."""
     return asserted(row) == sets(row) == hidden(row)
 
 
 def holds(row: Row) -> bool:
-    """Return True if the truth is in the set of names."""
+    """Return True if the named causes and their alternatives include the hidden causes."""
     return hidden(row) <= sets(row)
 
 
 def has_second(row: Row) -> bool:
-    """Return True if more causes are named than are hidden."""
+    """Return True if the diagnosis names more causes than are hidden."""
     return len(asserted(row) - changed(row)) > max(len(hidden(row)), 1)
 
 
 def is_false_alarm(row: Row) -> bool:
-    """Return True if a log without a hidden effect has more than its world's own change."""
+    """Return True if the diagnosis of a log finds more than the world's own change (no effect is hidden)."""
     return found(row) and not (asserted(row) and asserted(row) <= changed(row))
 
 
 def changed(row: Row) -> set[str]:
-    """Return the name of what the world itself changes.
+    """Return the names of effects that are part of the simulated world.
 
-    The offset of a vehicle whose reference is a map is another one since its calibration, by `TURN_ON`.
+    If the reference is a map, the vehicle's offset has changed by `TURN_ON` since its calibration.
     """
     return {"offset_step"} if row["part"] == "charted" else set()
 
 
 def is_nameable(row: Row) -> bool:
-    """Return True if an ideal detector names the truth alone."""
+    """Return True if an ideal detector would name only the truth."""
     return all(theory["alone"] >= MIN_CHANCE for theory in row["theory"])
 
 
 def is_worse(row: Row) -> bool:
-    """Return True if an extension does harm, on its own log or on another day's."""
+    """Return True if the extended calibration is worse, on its own log or on another day's."""
     error = row["gain"]
     return any(error["after" + log] > 1.02 * error["before" + log] for log in ("", " elsewhere"))
 
@@ -98,17 +98,17 @@ def is_worse(row: Row) -> bool:
 
 
 def share(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:
-    """Return the percentage of the rows that are good, with its interval and the count."""
+    """Return the percentage of rows for which `good` holds, with its interval and the count."""
     return fraction([good(row) for row in rows])
 
 
 def scores(rows: Sequence[Row]) -> FloatArray:
-    """Return (value - truth) / sigma of all parameters of known truth."""
+    """Return (value - truth) / sigma (n,) of all parameters with a known truth."""
     return np.array([z for row in rows for z in row["scores"]])
 
 
 def chance(rows: Sequence[Row], key: str) -> str:
-    """Return the mean chance of the ideal detector, as text."""
+    """Return the ideal detector's mean probability to find the rows' effects at a signal-to-noise ratio."""
     values = [theory[key] for row in rows for theory in row["theory"]]
     return f"{100 * np.mean(values):.0f} %" if values else "-"
 
@@ -124,10 +124,10 @@ def detection_curve(rows: Sequence[Row], size: FloatArray | float) -> FloatArray
 
 
 def needed_size(rows: Sequence[Row]) -> tuple[float, float, float] | None:
-    """Return the signal-to-noise that the detector needs over the ideal one's, with a 68 % interval.
+    """Return the signal-to-noise ratio that the detector needs over the ideal's, with a 68 % interval.
 
-    Both have the same noise, which cancels. So one log that is compared in this way has the information of
-    dozens that are only counted as found or not.
+    Both detectors have the same noise, which cancels. So one comparison has the information of dozens of logs
+    that are only counted as found or not.
     """
     known = [row for row in rows if row["theory"]]
     known = [r for r in known if np.interp(r["wanted"], SIZES, r["theory"][0]["here"]) < MAX_IDEAL_P_VALUE]
@@ -139,7 +139,7 @@ def needed_size(rows: Sequence[Row]) -> tuple[float, float, float] | None:
 
 
 def equal_size(row: Row) -> float:
-    """Return the signal-to-noise at which the ideal detector has the diagnosis' p-value in the same noise."""
+    """Return the signal-to-noise ratio at which the ideal detector has the diagnosis' p-value."""
     surprise = -np.log(np.minimum.accumulate(row["theory"][0]["here"]))
     return float(np.interp(-np.log(row["p_value"]), surprise, SIZES))
 
@@ -148,7 +148,7 @@ def equal_size(row: Row) -> float:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return the lines of the table, in Markdown."""
+    """Return the lines of the table in Markdown."""
     part = {name: [r for r in rows if r["part"] == name] for name in {r["part"] for r in rows}}
     figures = [
         *_nulls(part.get("null", [])),
@@ -219,7 +219,7 @@ def _others(part: dict[str, list[Row]]) -> list[Line]:
 
 
 def confusion(rows: Sequence[Row]) -> tuple[FloatArray, FloatArray]:
-    """Return predicted and measured shares: hidden by row, named first by column, the last without a name."""
+    """Return predicted and measured fractions (hidden cause, first name); the last column means no name."""
     columns = [*KNOWN, NEITHER]
     predicted, measured = np.full((2, len(KNOWN), len(columns)), np.nan)
     for i, name in enumerate(KNOWN):
@@ -236,7 +236,7 @@ def confusion(rows: Sequence[Row]) -> tuple[FloatArray, FloatArray]:
 
 
 def plot_confusion(rows: Sequence[Row], path: Path) -> None:
-    """Draw both matrices of :func:`confusion`."""
+    """Plot both matrices of :func:`confusion` to a file."""
     named = [r for r in rows if r["part"] == "named" and r["theory"]]
     figure = Figure(figsize=(17, 8.7), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
@@ -257,7 +257,7 @@ def plot_confusion(rows: Sequence[Row], path: Path) -> None:
 
 
 def plot_detection(rows: Sequence[Row], path: Path) -> None:
-    """Draw the share found against signal-to-noise, and the signal-to-noise that each cause needs."""
+    """Plot the fraction found against signal-to-noise ratio, and the ratio that each cause needs."""
     single = [r for r in rows if r["part"] in ("named", "ladder", "loud", "gain")]
     figure = Figure(figsize=(13, 5.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -281,7 +281,7 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
 
 
 def _plot_needed_sizes(axis: Axes, rows: Sequence[Row]) -> None:
-    """Draw the signal-to-noise that each cause needs over the ideal detector's, with its 68 % interval."""
+    """Plot the signal-to-noise ratio that each cause needs over the ideal detector's, with 68 % intervals."""
     factors = {name: needed_size([r for r in rows if list(r["names"]) == [name]]) for name in KNOWN}
     excess = {name: 100.0 * (np.array(each) - 1.0) for name, each in factors.items() if each}
     for place, (middle, low, high) in enumerate(excess.values()):
