@@ -1,8 +1,8 @@
-"""Instruments: each driver a parser that never touches a port, all of them in one table.
+"""Drivers of the instruments: parsers of received bytes, which never open a port.
 
-Other packages add their own by an entry point in the group ``magbridge.sensors`` whose name is the driver's
-and whose object is a class like :class:`Driver`; one that inherits from it needs no more than ``Options``,
-``feed`` and the two counters. ``examples/driver`` is such a package.
+Other packages add drivers by entry points in the group ``magbridge.sensors``. The name of the entry point is
+the driver's name, its object a class like :class:`Driver`. A class that inherits from :class:`Driver` needs
+only ``Options``, ``feed`` and the two counters. ``examples/driver`` is an example of a package with a driver.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ DRIVERS: dict[str, tuple[str, str]] = {
     "rm3100": ("magbridge.sensors.rm3100", "Rm3100"),
     "twinleaf": ("magbridge.sensors.twinleaf", "Twinleaf"),
 }
-"""Name: module and class; a module is imported when its driver is opened."""
+"""Name of each built-in driver -> its module and class; the module is imported when the driver is opened."""
 
 
 class Driver(Protocol):
-    """What every driver offers.
+    """Interface of all drivers.
 
-    Whole chunk or byte by byte, :meth:`feed` gives the same readings and the same counts; whatever the bytes
-    are, they end up in a reading, in a message that is not a reading, in a counter, or, up to a bound, in the
-    remainder that waits for more.
+    :meth:`feed` gives the same readings and counts however the bytes are split into chunks. Every byte
+    belongs to a reading or another message, is counted as skipped, or waits in a limited buffer for the rest
+    of its frame.
 
     Attributes
     ----------
     Options : type
-        A msgspec struct: the keys that ``[sensor.options]`` may have.
+        A msgspec struct with the keys that ``[sensor.options]`` may have.
     range_nt : float
-        nT, at which a channel saturates; infinite where unknown.
+        Field at which a channel saturates, nT; infinite if unknown.
     nt_per_count : float
-        nT per count of ``Reading.counts``; 0 where the instrument sends no counts.
+        Field of one count of ``Reading.counts``, nT; 0 if the instrument sends no counts.
     sequence_modulo : int
-        Where ``Reading.sequence`` wraps; 0: never, or there is none.
+        Value at which ``Reading.sequence`` wraps to 0; 0 if it never wraps or does not exist.
     time_modulo : float
-        s, at which ``Reading.device_time`` wraps; 0 where it does not.
+        Time at which ``Reading.device_time`` wraps to 0, s; 0 if it never wraps.
     period : float
-        s, nominal, between the readings of an instrument without a clock; 0 where unknown or irrelevant.
+        Nominal time between the readings of an instrument without a clock, s; 0 if unknown or irrelevant.
     is_scalar : bool
-        The instrument measures the total field F only: its readings are (F, 0, 0).
+        True if the instrument measures only the total field F; its readings are (F, 0, 0).
     """
 
     Options: ClassVar[Any]
@@ -68,18 +68,19 @@ class Driver(Protocol):
 
     @property
     def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid frame (delimiters are not counted)."""
+        """Number of bytes that belonged to no valid frame (delimiters are not counted)."""
         ...
 
     @property
     def frames_bad(self) -> int:
-        """Frames with a wrong length, checksum or content."""
+        """Number of frames with a wrong length, checksum or content."""
         ...
 
     def start(self) -> tuple[bytes, ...]:
-        """Begin a line that has just been opened, perhaps in the middle of a frame.
+        """Reset the parser for a line that was just opened; return the commands that start the instrument.
 
-        Return the commands to send to the instrument, at intervals of at least 0.1 s; maybe none.
+        The first bytes may be in the middle of a frame. The caller sends the commands, if any, at intervals
+        of at least 0.1 s.
         """
         return ()
 
@@ -89,21 +90,21 @@ class Driver(Protocol):
 
 
 class Bus(Protocol):
-    """Registers on a bus; each method raises OSError where the part does not answer."""
+    """Registers of a part on a bus; each method raises OSError if the part does not respond."""
 
     def read(self, register: int, count: int) -> bytes:
-        """Return `count` bytes from `register` on."""
+        """Return the bytes of `count` registers from `register` on."""
         ...
 
     def write(self, register: int, data: bytes) -> None:
-        """Write bytes from `register` on."""
+        """Write `data` to the registers from `register` on."""
         ...
 
 
 MEMBERS = (
     "range_nt", "nt_per_count", "sequence_modulo", "time_modulo", "period", "bytes_skipped", "frames_bad",
 )  # fmt: skip
-"""What an open driver must have besides its methods."""
+"""Attributes that an open driver must have in addition to its methods."""
 
 
 def open_driver(
@@ -114,18 +115,18 @@ def open_driver(
     Parameters
     ----------
     name : str
-        From :data:`DRIVERS`, or an entry point of the group ``magbridge.sensors``.
+        Name in :data:`DRIVERS`, or of an entry point of the group ``magbridge.sensors``.
     options : mapping
-        As they stand in ``[sensor.options]``.
+        Values of ``[sensor.options]``.
     source : path
-        The file they stand in, for the error.
+        Path of the configuration, for the error.
     key : str
         Dotted key of the sensor's table, for the error.
 
     Raises
     ------
     ConfigError
-        No such driver, or one that lacks a member; an option that is unknown, missing, of the wrong type or
+        The driver does not exist or lacks a member, or an option is unknown, missing, of the wrong type or
         out of range.
     """
     driver: type[Driver] = driver_class(name, source, key)
@@ -136,18 +137,18 @@ def open_driver(
 
 
 def is_scalar(driver: Driver) -> bool:
-    """Return True if the instrument measures the total field F only; a driver need not say."""
+    """Return True if the instrument measures only the total field; False if the driver does not state it."""
     return getattr(driver, "is_scalar", False)
 
 
 def _check(name: str, driver: object, members: tuple[str, ...], source: str | Path, key: str) -> None:
-    """Raise :class:`ConfigError` where a driver, its class or an instance, lacks some of `members`."""
+    """Raise :class:`ConfigError` if a driver (a class or an instance) lacks an attribute of `members`."""
     if lacking := [member for member in members if not hasattr(driver, member)]:
         raise ConfigError(source, f"{key}.driver", f"driver {name!r} lacks {', '.join(lacking)}")
 
 
 def driver_class(name: str, source: str | Path, key: str = "sensor") -> Any:
-    """Return the class of the driver called `name`; ConfigError, naming `source`: there is none."""
+    """Return the class of the driver called `name`; ConfigError: the driver does not exist."""
     if name in DRIVERS:
         module, attribute = DRIVERS[name]
         return getattr(import_module(module), attribute)

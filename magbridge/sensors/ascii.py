@@ -1,13 +1,13 @@
-"""``ascii``: any line of text that holds three channels or a total field, described in the configuration.
+"""Driver ``ascii``: lines of text with three channels or a total field, described in the configuration.
 
-An APS 1540 in its autosend mode (gauss and degrees, separated by blanks)::
+Options for an APS 1540 in its autosend mode (gauss and degrees, separated by blanks)::
 
     [sensor.options]
     columns = ["x", "y", "z", "temperature"]
     unit = "G"
     range = 65000.0
 
-An FGsensors FGA logger (comma separated, ms since power-on in 32 bits, more columns than we need)::
+For an FGsensors FGA logger (comma separated, ms since power-on in 32 bits, with further columns)::
 
     [sensor.options]
     separator = ","
@@ -15,7 +15,7 @@ An FGsensors FGA logger (comma separated, ms since power-on in 32 bits, more col
     time_unit = "ms"
     time_modulo = 4294967.296
 
-A sentence like NMEA's, ``$PMAG,1234.500,12345.6,-234.5,43210.9*5A``::
+For a sentence similar to NMEA, ``$PMAG,1234.500,12345.6,-234.5,43210.9*5A``::
 
     [sensor.options]
     prefix = "$PMAG,"
@@ -23,7 +23,7 @@ A sentence like NMEA's, ``$PMAG,1234.500,12345.6,-234.5,43210.9*5A``::
     columns = ["time", "x", "y", "z"]
     checksum = "nmea"
 
-The JSON lines of runMag (HamSCI), with counts at a cycle count of 200::
+For the JSON lines of runMag (HamSCI), with counts at a cycle count of 200::
 
     [sensor.options]
     columns = ["x", "y", "z", "temperature"]
@@ -31,7 +31,7 @@ The JSON lines of runMag (HamSCI), with counts at a cycle count of 200::
     unit = "counts"
     scale = 13.333
 
-A scalar instrument: Marine Magnetics Explorer and SeaSPY2, whose lines begin with
+For scalar instruments such as Marine Magnetics Explorer and SeaSPY2, whose lines begin with
 ``*26.150/12:34:56.7 F:050123.456 S:142 D:+001.2m``::
 
     [sensor.options]
@@ -60,14 +60,14 @@ __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions", "strip_checksum"]
 MAX_LINE_BYTES = 512
 """Longest line, in bytes."""
 MAX_ASCII_COUNT = 2**31
-"""A count that no converter reaches and no message can hold."""
+"""Limit of the counts in a message; no converter reaches it."""
 SCALAR_STEP_NT = 1e-4
-"""nT per count in which the total field of a scalar instrument is logged."""
+"""Field of one count in which the total field of a scalar instrument is logged, nT."""
 MAX_DEVICE_COUNT = 2**63
-"""Larger than any count that an instrument can hold."""
+"""Limit of sequence and power-cycle numbers; no instrument reaches it."""
 ENCODING = "latin-1"
 NAMED_VALUE_PATTERN = re.compile(rb'(\w+)"?\s*:\s*"?([-+.\w]+)')
-"""A key with its number, both with or without quotation marks."""
+"""Pattern of a key with its number, both with or without quotation marks."""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -78,9 +78,9 @@ CHECKSUMS: dict[str, tuple[int, Callable[[bytes], int]]] = {
     "sum": (2, lambda text: sum(text) & 0xFF),
     "crc32": (8, crc32),
 }
-"""Name: number of hexadecimal digits after the ``*``, and the checksum of all bytes before it.
+"""Name of each checksum -> number of hexadecimal digits after ``*``, and function of the bytes before ``*``.
 
-``nmea`` leaves out the first byte, the ``$``.
+``nmea`` omits the first byte, the ``$``.
 """
 
 
@@ -92,7 +92,7 @@ def _finite(text: bytes) -> float:
 
 
 def _measured(text: bytes) -> float:
-    number = float(text)  # NaN passes: some instruments send it for an unknown value
+    number = float(text)  # NaN is accepted, because some instruments send NaN for an unknown value
     if abs(number) > MAX_MEASURED_NT:
         raise ValueError
     return number
@@ -112,7 +112,7 @@ COLUMN_READERS: dict[str, Callable[[bytes], float]] = {
     "sequence": _count,
     "power_cycle": _count,
 }
-"""Function that reads each column other than x, y and z."""
+"""Name of each column except the field's -> function that reads its text."""
 
 
 class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -121,34 +121,34 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     columns: list[str] = msgspec.field(default_factory=lambda: ["x", "y", "z"])
     """Meaning of each column: ``x y z``, or ``total_field`` of a scalar instrument (one of both is required);
     ``time temperature supply sequence power_cycle``; ``-`` for a column to ignore; ``*`` at the end for any
-    number of further ones."""
+    number of further columns to ignore."""
     keys: list[str] = msgspec.field(default_factory=list)
     """For lines of JSON, or of text such as ``x:"14"``: the key of each column, in the order of columns."""
     separator: str = ""
-    """Between columns; empty for any number of blanks or tabs."""
+    """Text between columns; empty for any number of blanks or tabs."""
     prefix: str = ""
-    """The text that every line begins with."""
+    """Text with which every line begins."""
     terminator: Literal["\n", "\r"] = "\n"
-    """The last byte of a line; a carriage return before it is dropped."""
+    """Last byte of a line; a carriage return before it is removed."""
     unit: Literal["nT", "uT", "mT", "T", "pT", "fT", "G", "mG", "uG", "counts"] = "nT"
     """Unit of the columns x, y and z, or total_field."""
     scale: float = 1.0
     """Factor on the channels, with its sign; for counts: nT per count."""
     range: Positive | None = None
-    """nT at which a channel saturates."""
+    """Field at which a channel saturates, nT."""
     checksum: Literal["nmea", "xor", "sum", "crc32"] | None = None
-    """In hexadecimal after a ``*`` at the end of the line; ``nmea`` leaves out the first byte, the ``$``."""
+    """Checksum in hexadecimal after a ``*`` at the end of the line; ``nmea`` omits the first byte, ``$``."""
     time_unit: Literal["s", "ms", "us"] = "s"
     """Unit of the column ``time``."""
     time_modulo: NotNegative = 0.0
     """Time at which the device's clock wraps, s; 0: never."""
     sequence_modulo: Annotated[int, Meta(ge=0)] = 0
-    """Where the column ``sequence`` wraps; 0: never."""
+    """Value at which the column ``sequence`` wraps to 0; 0: never."""
     rate: NotNegative = 0.0
-    """Lines per second of a device without a clock, to remove the jitter of their arrival; 0: it sends when
-    it likes, and each line is dated by its arrival."""
+    """Lines per second of a device without a clock, to remove the jitter of their arrival; 0: the rate is not
+    constant, and each line has the time of its arrival."""
     start: list[str] = msgspec.field(default_factory=list)
-    """Commands to send once the port is open."""
+    """Commands to send whenever the port is opened."""
 
     def __post_init__(self) -> None:
         for key in ("scale", "range", "time_modulo", "rate"):
@@ -170,7 +170,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class Ascii(FramedDriver):
-    """Parser of a line protocol."""
+    """Parser of lines of text as :class:`AsciiOptions` describe them."""
 
     Options: ClassVar = AsciiOptions
 
@@ -199,7 +199,7 @@ class Ascii(FramedDriver):
         self.period = 1.0 / options.rate if options.rate else 0.0
 
     def start(self) -> tuple[bytes, ...]:
-        """Discard half a line, and skip the next one if it might be incomplete.
+        """Discard an incomplete line, and the next line if nothing would show that it is incomplete.
 
         Return the configured commands.
         """
@@ -207,18 +207,18 @@ class Ascii(FramedDriver):
         return tuple(command.encode(ENCODING) for command in self._options.start)
 
     def is_bad(self, frame: bytes) -> bool:
-        """Return False for an empty line."""
+        """Return True for an invalid line, except a lone carriage return."""
         return frame != b"\r"
 
     def _cells(self, text: bytes) -> list[bytes]:
-        """Return the cells of a line, in the order of the columns."""
+        """Return the texts of the columns in a line, in the order of the options."""
         if not self._keys:
             return text.split(self._separator)
         found = dict(NAMED_VALUE_PATTERN.findall(text))
         return [found[key] for key in self._keys if key in found]
 
     def read_frame(self, frame: bytes) -> Reading:
-        """Return the reading in a line; raise ValueError where the line does not hold one."""
+        """Return the reading in a line; raise ValueError if the line does not contain a valid reading."""
         line = frame.rstrip(b"\r")
         if self._options.checksum:
             line = strip_checksum(line, self._options.checksum)
@@ -228,7 +228,7 @@ class Ascii(FramedDriver):
         if len(cells) != self._width and not (self._more and len(cells) > self._width):
             raise ValueError
         if b"_" in line and any(b"_" in cells[index] for index in self._used):
-            raise ValueError  # Python's numbers may hold underscores
+            raise ValueError  # float() and int() would accept underscores in a number
         x, y, z = [*(float(cells[index]) for index in self._field), 0.0, 0.0][:3]
         scale = self._scale
         field = (x * scale, y * scale, z * scale)
@@ -250,7 +250,10 @@ class Ascii(FramedDriver):
         )
 
     def _counts_of(self, x: float, y: float, z: float, total: float) -> tuple[int, int, int] | None:
-        """Return the counts of a reading; those of a total field (nT) keep more digits than a float32."""
+        """Return the counts of a reading, or None without counts.
+
+        A total field (nT) is converted to counts of `SCALAR_STEP_NT`, which are more precise than a float32.
+        """
         if self._counts:
             return int(x), int(y), int(z)
         if self.is_scalar and abs(total) < MAX_ASCII_COUNT * SCALAR_STEP_NT:
@@ -259,7 +262,7 @@ class Ascii(FramedDriver):
 
 
 def strip_checksum(line: bytes, checksum: str) -> bytes:
-    """Return the part of `line` before its checksum; raise ValueError where the checksum is wrong."""
+    """Return the part of `line` before its ``*`` and checksum; raise ValueError if the checksum is wrong."""
     digits, function = CHECKSUMS[checksum]
     text, star, stated = line[: -digits - 1], line[-digits - 1 : -digits], line[-digits:]
     if star != b"*" or int(stated, 16) != function(text):

@@ -1,13 +1,13 @@
-"""When a reading was taken, on the host's clock.
+"""Estimate of the times of readings on the host's clock, from device times and times of arrival.
 
-A byte arrives after it was sent, never before: ``arrival = device time + offset + drift + delay``,
-``delay >= 0``. Serial converters and schedulers make the delay anything from nothing to many ms, but now and
-then it is short. So the relation between the two clocks is the straight line that the points (device time,
-arrival - device time) lie above: each block of readings gives its lowest point, and a line is fitted to the
-lowest points of the last blocks. The shortest delay, a constant, remains as an error of the times.
+A byte arrives after it was sent: ``arrival = device time + offset + drift + delay``, ``delay >= 0``. Serial
+converters and schedulers cause delays of up to many ms, but some readings have a short delay. So the relation
+between the two clocks is a straight line below all points (device time, arrival - device time). Each block of
+readings gives its lowest point, and a line is fitted to the lowest points of the last blocks. The shortest
+delay, a constant, remains as an error of the times.
 
-An instrument without a clock is its own clock when it sends at a steady rate: reading n was taken at
-``n * period``, and the line's slope is the error of its nominal period.
+For an instrument without a clock but with a steady rate, the device time of reading n is ``n * period``. The
+slope of the line is then the error of the nominal period.
 """
 
 from __future__ import annotations
@@ -24,26 +24,30 @@ from magbridge.sensors import Driver
 __all__ = ["DeviceClock", "Stamp"]
 
 FIRST_BLOCK_READINGS: Final = 8
-"""Readings in the first blocks."""
+"""Number of readings in the first blocks."""
 LINE_POINTS: Final = 16
-"""Lowest points that the line is fitted to."""
+"""Number of lowest points to which the line is fitted."""
 SPAN: Final = 4.0
-"""s: blocks grow to this duration, and every point must be late for this long before the line is given up,
-since a busy computer may delay all points for a second."""
+"""Duration to which blocks grow, s, and time for which all points must be late before the line is restarted.
+A busy computer may delay all points for a second."""
 TOLERANCE: Final = 20_000.0
-"""µs by which an arrival may contradict the line."""
+"""Difference from the line that an arrival may have, µs."""
 INITIAL_DELAY_US: Final = 5_000.0
-"""Mean delay before anything is known, µs."""
+"""Mean delay before the first reading, µs."""
 STALL: Final = 100_000.0
-"""Largest delay that enters the mean delay, µs; longer ones say nothing about the usual delay."""
+"""Limit to which longer delays are reduced in the mean delay, µs, because they are not typical."""
 WANDER: Final = 0.05
-"""Fraction of the prior sigma below which the slope's sigma never falls: rates change with temperature."""
+"""Smallest sigma of the slope as a fraction of its prior sigma, because rates change with temperature."""
 BOUND: Final = 5.0
-"""Largest slope, in prior sigmas."""
+"""Largest magnitude of the slope, in prior sigmas."""
 
 
 class Floor:
-    """The straight line below the points (x, y): x in s, y in µs.
+    """Estimate of the straight line below the points (x, y), with x in s and y in µs.
+
+    `slope`: slope of the line, µs/s.
+    `delay`: running mean of the points' height above the line, µs.
+    `lowest`: lowest point (x, y) of the last complete block, or of the present one.
 
     Notes
     -----
@@ -52,8 +56,8 @@ class Floor:
         b   = b_0 + sum (x_k - X) (y_k - Y - b_0 (x_k - X)) / S,   S = sum (x_k - X)^2 + (s / s_b)^2
         s_b = s / sqrt(S)                                          afterwards
 
-    which is least squares with a Gaussian prior of width `s_b` on the slope; s, the scatter of the lowest
-    points, is the mean delay over the number of readings in a block, as it is for exponential delays.
+    which is least squares with a Gaussian prior on the slope. The scatter s of the lowest points is the mean
+    delay divided by the number of readings in a block, as for exponentially distributed delays.
     """
 
     def __init__(self, slope_sigma: float) -> None:
@@ -63,7 +67,7 @@ class Floor:
         self.restart(0.0, 0.0)
 
     def restart(self, x: float, y: float) -> None:
-        """Begin a new line at a point; the slope so far becomes the mean of its prior."""
+        """Start a new line at the point (`x`, `y`), with the present slope as the prior mean of its slope."""
         self._prior = self.slope
         self._sigma = self._prior_sigma
         self._points: list[tuple[float, float]] = []
@@ -75,24 +79,23 @@ class Floor:
         self._late_from = inf
 
     def value_at(self, x: float) -> float:
-        """Return the line at `x`, in µs."""
+        """Return the height of the line at `x`, µs."""
         return self._y + self.slope * (x - self._x) + self._drop
 
     @property
     def scatter(self) -> float:
-        """1-sigma scatter of the blocks' lowest points, in µs."""
+        """Standard deviation of the lowest points of blocks, µs."""
         return self.delay / self._size + 1.0
 
     def tolerance(self, x: float) -> float:
-        """Return by how much a point at `x` may reasonably contradict the line, in µs."""
+        """Return the difference from the line (µs) that a point at `x` may have."""
         return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
 
     def add(self, x: float, y: float, above: float, limit: float) -> float:
-        """Take a point that lies `above` the line (µs); return by how much the line has risen, else 0.
+        """Add the point (`x`, `y`), `above` µs above the line; fit the line after each complete block.
 
-        That is the height of a block's lowest point above the line, once all blocks for `SPAN` lay more than
-        `limit` above it. Such blocks are left out of the fit; `lowest` is the lowest point of the last one
-        until a point is added.
+        If the lowest points of all blocks were more than `limit` (µs) above the line for `SPAN`, return the
+        height of the last one. Otherwise return 0. Blocks above `limit` do not enter the fit.
         """
         if not self._count:
             self._began, self._least = x, inf
@@ -116,7 +119,7 @@ class Floor:
         return 0.0
 
     def _thin(self, duration: float) -> None:
-        """Shorten the list: join short blocks in pairs; once they last `SPAN`, drop the oldest instead."""
+        """Join blocks in pairs if the last lasted less than `SPAN` (`duration`, s); else drop the oldest."""
         if duration >= SPAN:
             del self._points[0]
             return
@@ -127,7 +130,7 @@ class Floor:
     def _fit(self) -> None:
         points = self._points
         x = y = sxx = sxy = 0.0
-        for x_k, y_k in points:  # in loops: sum() adds differently in Python 3.12 than before, and compiled
+        for x_k, y_k in points:  # not by sum(), whose rounding differs between Python versions and compilers
             x += x_k
             y += y_k
         x, y = x / len(points), y / len(points)
@@ -143,40 +146,40 @@ class Floor:
 
 SIGMA_CLOCK: Final = 1e3
 SIGMA_PERIOD: Final = 1e4
-"""µs/s (ppm): how wrong a clock's rate, or a nominal period, is before anything is known."""
+"""Prior standard deviations of a clock's rate and of a nominal period, µs/s (ppm)."""
 RESTART: Final = 1e6
-"""µs: an instrument's time that went back has wrapped if, unwrapped, it fits the host's to within this; else
+"""Difference from the host's time, µs, up to which a device time that went back counts as wrapped. Beyond it,
 the instrument was restarted."""
 HALF: Final = 0.6
-"""Fraction of a period: a reading later than this shows that one before it is missing."""
+"""Delay of a reading, as a fraction of the period, beyond which an earlier reading is missing."""
 BASELINE: Final = 1 << 16
-"""Readings after which the interval between readings is measured again, to count missing readings."""
+"""Number of readings after which the mean interval between readings is computed again."""
 MIN_INTERVAL_READINGS: Final = 16
-"""Readings from which on an interval is better than the one before."""
+"""Smallest number of readings for a new mean interval to replace the previous one."""
 KEEP_PHASE: Final = 3
-"""Missing readings in a row above which the line is restarted: the instrument may have stopped."""
+"""Most missing readings in a row without a restart of the line; beyond, the instrument may have stopped."""
 
 
 class Stamp(msgspec.Struct, frozen=True, gc=False):
-    """When a reading was taken."""
+    """Time at which a reading was taken."""
 
     time_us: int
-    """µs since 1970 UTC, a multiple of 4, increasing unless `stepped`."""
+    """Time, µs since 1970 UTC, a multiple of 4, increasing unless `stepped`."""
     restarted: bool = False
-    """The instrument's own clock restarted: it was powered on again."""
+    """True if the instrument's clock restarted, because the instrument was powered on again."""
     stepped: bool = False
-    """One of the two clocks was set; the relation between them is estimated again."""
+    """True if one of the two clocks was set, so that the relation between them is estimated again."""
     missing: int = 0
-    """Readings that are missing before this one."""
+    """Number of readings missing immediately before this reading."""
 
 
 class DeviceClock:
-    """Host times of an instrument's readings.
+    """Estimator of the times of an instrument's readings on the host's clock.
 
-    `time_modulo`: s, at which the instrument's time wraps; 0: never.
-    `sequence_modulo`: where its count of readings wraps; 0: never.
-    `period`: s between the readings of an instrument without a clock; 0: not steady, and a reading is dated
-        by its arrival.
+    `time_modulo`: time at which the instrument's clock wraps to 0, s; 0 if it never wraps.
+    `sequence_modulo`: value at which the instrument's count of readings wraps to 0; 0 if it never wraps.
+    `period`: time between the readings of an instrument without a clock, s; 0 if not steady, so that each
+        reading gets the time of its arrival.
     """
 
     def __init__(self, *, time_modulo: float = 0.0, sequence_modulo: int = 0, period: float = 0.0) -> None:
@@ -194,22 +197,22 @@ class DeviceClock:
 
     @classmethod
     def for_driver(cls, driver: Driver) -> DeviceClock:
-        """Return the clock that a driver's readings need."""
+        """Return a clock with the settings of a driver."""
         return cls(
             time_modulo=driver.time_modulo, sequence_modulo=driver.sequence_modulo, period=driver.period
         )
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster the host's clock runs than the instrument's, in µs/s."""
+        """Rate of the host's clock minus the instrument's, µs/s."""
         return self._floor.slope
 
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
-        """Return when each reading of a chunk was taken, the chunk having arrived at `arrival_us` (µs).
+        """Return the times of the readings of one chunk, which arrived at `arrival_us` (µs).
 
-        The last reading was delayed the least. The others were already waiting, so their delay says nothing
-        about the line. What piled up while the host stood still may come in several chunks, of which only the
-        last ends with a fresh reading.
+        Only the last reading updates the line, because the earlier readings waited for the last one. Readings
+        that queued up during a stall of the host may come in several chunks; only the last chunk then ends
+        with a reading without delay.
         """
         last = len(readings) - 1
         if not last:
@@ -221,7 +224,7 @@ class DeviceClock:
                 waited = readings[last].device_time - reading.device_time
                 if isnan(waited):
                     waited = (last - index) * self._period
-                elif not 0.0 <= waited < 60.0:  # a restart or a wrap between them
+                elif not 0.0 <= waited < 60.0:  # a restart or a wrap between the two readings
                     waited = 0.0
             arrived_us = arrival_us - int(waited * 1e6)
             stamps.append(self.update(reading.device_time, arrived_us, reading.sequence, index == last))
@@ -230,13 +233,13 @@ class DeviceClock:
     def update(
         self, device_time: float, arrival_us: int, sequence: int | None = None, informative: bool = True
     ) -> Stamp:
-        """Return when a reading was taken.
+        """Return the time at which a reading was taken.
 
-        `device_time`: s on the instrument's clock; NaN where it has none.
-        `arrival_us`: µs on the host's clock.
-        `sequence`: the instrument's count of readings.
-        `informative`: whether the relation between the clocks is learned from this reading; False for one
-            that only waited for a later one.
+        `device_time`: time of the reading on the instrument's clock, s; NaN without a clock.
+        `arrival_us`: time of arrival on the host's clock, µs.
+        `sequence`: the instrument's count of readings; None without a count.
+        `informative`: True if the reading updates the relation between the clocks; False for a reading that
+            waited for a later one.
         """
         if not abs(device_time) < MAX_DEVICE_TIME_S:
             device_time = nan
@@ -248,7 +251,7 @@ class DeviceClock:
             self._begin(device_time, arrival_us)
             time_us = float(arrival_us)
         elif timed:
-            if sequence is None and self._period:  # a nominal rate but no number
+            if sequence is None and self._period:  # a nominal rate but no sequence number
                 missing = max(round((device_time - self._device_time) / self._period) - 1, 0)
             time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, informative)
         elif self._period:
@@ -264,11 +267,11 @@ class DeviceClock:
         return Stamp(out_us, restarted, stepped, 0 if restarted else missing)
 
     def _missing(self, sequence: int | None, arrival_us: int) -> int:
-        """Return the number of missing readings before this one, by its sequence number.
+        """Return the number of readings missing before the one with number `sequence`.
 
-        The number may have wrapped many times since the last reading, so turns are added until the count fits
-        the time that has passed, at the interval at which the readings came so far. That is right as long as
-        the readings in this time, times the relative error of the interval, are fewer than half a turn.
+        The number may have wrapped several times since the last reading. So multiples of its modulo are added
+        until the count fits the elapsed time divided by the mean interval of the readings. The result is
+        correct if the error of this quotient is less than half the modulo.
         """
         last, self._sequence = self._sequence, sequence
         if sequence is None or last is None:
@@ -291,7 +294,7 @@ class DeviceClock:
         return max(hole, 0)
 
     def _begin(self, device_time: float, arrival_us: int) -> None:
-        """Restart the estimate of the relation between the clocks from this reading."""
+        """Restart the estimate of the relation between the clocks from a reading."""
         self._origin_us = arrival_us
         self._zero, self._turned, self._count = device_time, 0.0, 0
         self._floor.restart(0.0, 0.0)
@@ -299,7 +302,7 @@ class DeviceClock:
     def _by_time(
         self, device_time: float, arrival_us: int, origin_us: int, informative: bool
     ) -> tuple[float, bool, bool]:
-        """Return the host time (µs), and True if the instrument restarted or a clock was set."""
+        """Return the host time (µs) of a device time, and two flags: the clock restarted, a clock was set."""
         step = device_time - self._device_time
         if self._time_modulo:
             turns = round(((arrival_us - self._arrival_us) * 1e-6 - step) / self._time_modulo)
@@ -324,7 +327,10 @@ class DeviceClock:
     def _by_count(
         self, arrival_us: int, origin_us: int, missing: int, informative: bool
     ) -> tuple[float, bool, int]:
-        """Return the host time (µs), whether it stepped back, and how many more readings are missing."""
+        """Return the host time (µs) by the count of readings, and True if it stepped back.
+
+        Also return the number of missing readings in addition to `missing`, the number by sequence numbers.
+        """
         floor, period_us = self._floor, 1e6 * self._period
         self._count += 1 + missing
         x = self._count * self._period

@@ -1,4 +1,4 @@
-"""Code that several drivers share: frames between delimiters or of one size, COBS, the end of a range."""
+"""Code that several drivers share: framing by delimiter or size, COBS, checksums, saturation."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ CRC32_RESIDUE = 0x2144DF1C
 
 
 class Framer:
-    """Cuts a byte stream at a delimiter; a frame longer than `limit` bytes is skipped, not kept.
+    """Splitter of a byte stream into frames between delimiters; longer frames than `limit` are skipped.
 
     `delimiter`: one byte.
-    `limit`: longest frame, without its delimiter.
-    `skipped`: bytes of frames that were too long; the driver adds those of frames that it rejects.
+    `limit`: length of the longest frame without its delimiter, bytes.
+    `skipped`: number of skipped bytes; the driver adds the bytes of frames that it rejects.
     """
 
     __slots__ = ("_delimiter", "_limit", "_overlong", "_rest", "skipped")
@@ -37,16 +37,16 @@ class Framer:
         self.skipped = 0
 
     def begin(self, *, inside_frame: bool) -> None:
-        """Restart: bytes that wait for their delimiter are skipped.
+        """Skip the bytes of an incomplete frame, and start again with the next byte.
 
-        `inside_frame`: the next byte may be in the middle of a frame: all up to the first delimiter is
-            skipped.
+        `inside_frame`: True if the next byte may be in the middle of a frame; then all bytes up to the first
+            delimiter are skipped.
         """
         self.skipped += len(self._rest)
         self._rest, self._overlong = b"", inside_frame
 
     def split(self, data: bytes) -> list[bytes]:
-        """Process bytes; return the frames that they complete, empty ones left out."""
+        """Process received bytes; return the frames that they complete, without empty frames."""
         pieces = (self._rest + data).split(self._delimiter)
         rest = pieces.pop()
         if pieces and self._overlong:
@@ -68,16 +68,16 @@ class Framer:
 
 
 class FramedDriver:
-    """A driver whose readings are frames between delimiters; it has to define :meth:`read_frame`.
+    """Base of drivers whose readings are frames between delimiters; a subclass defines :meth:`read_frame`.
 
-    The attributes are those of :class:`magbridge.sensors.Driver`.
+    :class:`magbridge.sensors.Driver` documents the attributes.
 
     Parameters
     ----------
     delimiter : bytes
         One byte.
     limit : int
-        Longest frame, without its delimiter.
+        Length of the longest frame without its delimiter, bytes.
     """
 
     range_nt: float = inf
@@ -93,16 +93,16 @@ class FramedDriver:
 
     @property
     def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid frame."""
+        """Number of bytes that belonged to no valid frame."""
         return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
-        """Discard half a frame; return no commands."""
+        """Discard an incomplete frame; return no commands."""
         self._framer.begin(inside_frame=False)
         return ()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Parse bytes in any chunks; return the readings that they complete."""
+        """Process received bytes; return the readings that they complete."""
         readings = []
         for frame in self._framer.split(data):
             try:
@@ -116,28 +116,29 @@ class FramedDriver:
         return readings
 
     def read_frame(self, frame: bytes) -> Reading | None:
-        """Return the reading in a frame, None if it is a message without one; ValueError: it is invalid."""
+        """Return the reading in a frame, or None if it has none; ValueError: the frame is invalid."""
         raise NotImplementedError
 
     def is_bad(self, frame: bytes) -> bool:  # noqa: ARG002 - some drivers look at it
-        """Return True if an invalid frame counts as bad: not so the reply to a command."""
+        """Return True if an invalid frame counts in `frames_bad`; False for the reply to a command."""
         return True
 
 
 class FixedFramer:
-    """Cuts a byte stream into frames of one size whose last byte is a delimiter that may be data as well.
+    """Splitter of a byte stream into frames of one size, whose last byte is a delimiter.
 
-    `layout`: numbers of a frame, without its delimiter.
-    `delimiter`: last byte.
-    `text`: bytes of replies to commands: a first frame of these only is skipped.
-    `skipped`, `broken`: bytes that belonged to no frame, and how often the alignment was lost.
+    Data bytes may have the delimiter's value.
+
+    `layout`: layout of a frame's numbers, without its delimiter.
+    `delimiter`: value of the last byte of a frame.
+    `text`: bytes that occur in replies to commands; a first frame of only these bytes is skipped.
+    `skipped`, `broken`: number of bytes that belonged to no frame, and of losses of the alignment.
 
     Notes
     -----
-    In a steady field a data byte may have the delimiter's value at the same place for long. So a place is
-    taken for the end of a frame if `CONFIRM` frames in a row end there, and of several such places the one
-    where the numbers change least from frame to frame: elsewhere low bytes, which are noise, are taken for
-    high bytes.
+    In a steady field a data byte may have the delimiter's value in many frames. So a place counts as the end
+    of frames if `CONFIRM` frames in a row end there. If several places qualify, the splitter takes the place
+    where the numbers change least from frame to frame. At a wrong place, noisy low bytes act as high bytes.
     """
 
     CONFIRM = 4
@@ -149,12 +150,12 @@ class FixedFramer:
         self.skipped = self.broken = 0
 
     def begin(self) -> None:
-        """Restart: bytes that wait are skipped."""
+        """Skip the bytes of an incomplete frame, and search for the alignment again."""
         self.skipped += len(self._rest)
         self._rest, self._aligned = b"", False
 
     def split(self, data: bytes) -> list[tuple[int, ...]]:
-        """Process bytes; return the numbers of the frames that they complete."""
+        """Process received bytes; return the numbers of each frame that they complete."""
         buffer, size = self._rest + data, self._size
         frames: list[tuple[int, ...]] = []
         position = 0
@@ -173,14 +174,14 @@ class FixedFramer:
         return frames
 
     def _align(self, buffer: bytes, position: int) -> tuple[int, bool]:
-        """Return the number of bytes from `position` to the first frame, and whether there is one."""
+        """Return the number of bytes from `position` to the first frame, and True if a frame was found."""
         size = self._size
         best, least, found = size, 0, False
         for offset in range(size):
             starts = range(position + offset, position + offset + size * self.CONFIRM, size)
             if all(buffer[start + size - 1] == self._delimiter for start in starts):
                 frames = [self._layout.unpack_from(buffer, start) for start in starts]
-                # without the first frame: it may be text, and its step to the second large
+                # without the first frame, which may be text with a large step to the second frame
                 variation = sum(sum(map(abs, map(sub, new, old))) for old, new in pairwise(frames[1:]))
                 if not found or variation < least:
                     best, least, found = offset, variation, True
@@ -190,13 +191,13 @@ class FixedFramer:
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Return `data`, at most 253 bytes, without zeros and one byte longer (delimiter not included).
+    """Return `data`, at most 253 bytes, encoded without zero bytes; the result is one byte longer.
 
     Notes
     -----
-    Consistent Overhead Byte Stuffing (Cheshire & Baker 1999): a leading byte says how far it is to the first
-    zero, each zero is replaced by the distance to the next one, the last by the distance to the end. Up to
-    this length the code 255 ("no zero follows") is never needed.
+    Consistent Overhead Byte Stuffing (Cheshire & Baker 1999): a leading byte states the distance to the first
+    zero, each zero is replaced by the distance to the next zero, the last by the distance to the end. Up to
+    253 bytes, the code 255 ("no zero follows") is never needed. The delimiter is not included.
     """
     stuffed = bytearray(b"\0" + data + b"\0")
     at = 0
@@ -207,8 +208,8 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(frame: bytes) -> bytes:
-    """Return the data of a frame of :func:`cobs_encode`; empty where it is not one."""
-    pieces: list[bytes] = []  # between the zeros
+    """Return the data that :func:`cobs_encode` encoded as `frame`; empty if the frame is not valid."""
+    pieces: list[bytes] = []  # data between the zeros
     at, end = 0, len(frame)
     while at < end:
         step = frame[at]
@@ -220,13 +221,13 @@ def cobs_decode(frame: bytes) -> bytes:
 
 
 def nmea_checksum(text: bytes) -> int:
-    """Return the exclusive or of all bytes but the first, the ``$``."""
+    """Return the NMEA checksum of `text`: the exclusive or of all bytes except the first, the ``$``."""
     return reduce(xor, text[1:], 0)
 
 
 def saturated(x: float, y: float, z: float, limit: float) -> bool:
-    """Return True if a channel is at the end of its range, or beyond: ``|channel| >= limit``, in one unit.
+    """Return True if a channel saturates: ``|channel| >= limit``, all in one unit.
 
-    The channels are numbers: a driver has counted a reading with a NaN as bad before it asks.
+    No channel may be NaN; drivers count readings with a NaN as bad before.
     """
     return not (-limit < x < limit and -limit < y < limit and -limit < z < limit)

@@ -1,11 +1,14 @@
-"""``hmr2300``: Honeywell's smart digital magnetometer, its binary and its ASCII output.
+"""Driver ``hmr2300``: binary and ASCII output of Honeywell's smart digital magnetometer.
 
-Facts from Honeywell's data sheet (900139): ±2 gauss as ±30,000 counts, so 15,000 counts/gauss; binary,
-7 bytes, three 16-bit two's complement numbers, high byte first, and a carriage return; ASCII, 28
-characters, three times sign, two digits, comma, three digits (leading zeros and their comma are blanks),
-two blanks between, and a carriage return. Neither output has a checksum, a counter or a clock. Commands
-begin with ``*dd`` (``dd`` the device's number, 99 all) and end with a carriage return; a change needs
-``*ddWE`` before it.
+Facts from Honeywell's data sheet (900139):
+
+* ±2 gauss are ±30,000 counts, so 15,000 counts/gauss.
+* A binary frame has 7 bytes: three 16-bit two's complement numbers, high byte first, and a carriage return.
+* An ASCII line has 28 characters: three numbers with two blanks between them, and a carriage return. A number
+  has a sign, two digits, a comma and three digits; leading zeros and their comma are blanks.
+* Neither output has a checksum, a counter or a clock.
+* A command begins with ``*dd`` (``dd`` is the device's number, 99 addresses all) and ends with a carriage
+  return. A command that changes a setting needs ``*ddWE`` before it.
 """
 
 from __future__ import annotations
@@ -36,15 +39,16 @@ class Hmr2300Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """``[sensor.options]`` of the HMR2300."""
 
     output: Literal["binary", "ascii"] = "binary"
-    """Set at start-up. At 9600 bit/s ASCII reaches 30 readings/s, binary 100; at 19,200 50 and 154."""
+    """Output format, set at start-up. At 9600 bit/s ASCII reaches 30 readings/s, binary 100; at 19,200 bit/s
+    50 and 154."""
     rate: Literal[10, 20, 25, 30, 40, 50, 60, 100, 123, 154] = 20
-    """Readings per second; only the device's own rates."""
+    """Readings per second, one of the device's rates."""
     device: Annotated[int, Meta(ge=0, le=99)] = 99
     """Number of the device on an RS-485 line; 99 addresses all."""
 
 
 class Hmr2300(FramedDriver):
-    """Parser of the HMR2300's two outputs."""
+    """Parser of the HMR2300's binary or ASCII output, as the options select."""
 
     Options: ClassVar = Hmr2300Options
     range_nt = MAX_COUNTS * NT_PER_COUNT
@@ -58,11 +62,11 @@ class Hmr2300(FramedDriver):
 
     @property
     def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid frame."""
+        """Number of bytes that belonged to no valid frame."""
         return self._framer.skipped + self._binary.skipped
 
     def start(self) -> tuple[bytes, ...]:
-        """Forget half a frame; return the commands: stop, set output and rate, send continuously."""
+        """Discard an incomplete frame; return the commands: stop, set output and rate, send continuously."""
         super().start()
         self._binary.begin()
         address = f"*{self._options.device:02d}"
@@ -80,7 +84,7 @@ class Hmr2300(FramedDriver):
         return readings
 
     def read_frame(self, frame: bytes) -> Reading:
-        """Return the reading in a line."""
+        """Return the reading in a line; ValueError: the line does not contain a reading."""
         match = ANSWER_LINE.fullmatch(frame)
         if match is None:
             raise ValueError
@@ -88,7 +92,7 @@ class Hmr2300(FramedDriver):
         return _reading(x, y, z)
 
     def is_bad(self, frame: bytes) -> bool:
-        """Return False for a word: it is the reply to a command."""
+        """Return True for an invalid line, unless it begins with a letter, as the reply to a command does."""
         return not frame[:1].isalpha()
 
 

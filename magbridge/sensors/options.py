@@ -1,4 +1,4 @@
-"""The options of a driver, read from its own struct: for help, and for a commented configuration."""
+"""Descriptions of a driver's options, for the help and for a commented configuration."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ __all__ = ["Option", "attributes_of", "driver_names", "options_of"]
 
 
 class Option(NamedTuple):
-    """A key of ``[sensor.options]``."""
+    """Description of one key of ``[sensor.options]``."""
 
     name: str
     kind: str
-    """Its type, in words."""
+    """Type of the value, as text."""
     default: Any
-    """``msgspec.NODEFAULT`` where it is required."""
+    """Default value; ``msgspec.NODEFAULT`` if the key is required."""
     meaning: str
 
     @property
     def required(self) -> bool:
-        """Whether a configuration must set it."""
+        """True if a configuration must set the key."""
         return self.default is msgspec.NODEFAULT
 
 
 def driver_names() -> list[str]:
-    """Return the names of all drivers, also those that packages add."""
+    """Return the names of all drivers, including drivers of other packages, sorted."""
     return sorted({*DRIVERS, *plugins("magbridge.sensors")})
 
 
 def options_of(driver: str) -> list[Option]:
-    """Return the options of a driver, in its own order; those without a default first.
+    """Return the options of a driver in the order of its struct, with required options first.
 
-    ConfigError: no such driver.
+    ConfigError: the driver does not exist.
     """
     return sorted(attributes_of(driver_class(driver, "options").Options), key=lambda one: not one.required)
 
 
 def attributes_of(struct: Any) -> list[Option]:
-    """Return the fields of a msgspec struct with what its source says below each."""
+    """Return the fields of a msgspec struct, with the docstring below each field as its meaning."""
     kinds, meanings = get_type_hints(struct), _meanings(struct)
     return [
         Option(one.name, _words(kinds[one.name]), _default(one), meanings.get(one.name, ""))
@@ -57,7 +57,7 @@ def attributes_of(struct: Any) -> list[Option]:
 
 
 def _words(kind: Any) -> str:
-    """Return a type as a reader of a configuration knows it."""
+    """Return a Python type as text for a reader of a configuration."""
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(repr, get_args(kind)))}"
     if get_origin(kind) in (Union, UnionType):
@@ -74,7 +74,10 @@ def _default(field: Any) -> Any:
 
 
 def _meanings(struct: Any) -> dict[str, str]:
-    """Return field -> the string below it; one that begins with several names is of all of them."""
+    """Return the docstring below each field of a struct, by the field's name.
+
+    A docstring that begins with several field names is the meaning of all these fields.
+    """
     try:
         (defined,) = ast.parse(dedent(inspect.getsource(struct))).body
     except OSError:  # a package without its source

@@ -1,9 +1,14 @@
-"""``rm3100``: PNI's magneto-inductive magnetometer on I2C or SPI.
+"""Driver ``rm3100``: PNI's magneto-inductive magnetometer on I2C or SPI.
 
-Facts from PNI's user manual (r07): cycle counts in 0x04 to 0x09, X first, high byte first; the gain in counts
-per microtesla is ``0.3671 cycle_count + 1.5``; results from 0x24, three times 24 bits, high byte first; the
-data are ready where bit 7 of 0x34 is set; 0x36 always reads 0x22. The part has no command for a reset: the
-bridge stops it and writes all registers again. The bus port polls; its lines of text go to the log.
+Facts from PNI's user manual (r07):
+
+* Registers 0x04 to 0x09 hold the cycle counts, X first, high byte first.
+* The gain is ``0.3671 cycle_count + 1.5`` counts per microtesla.
+* The results are in the registers from 0x24 on, three times 24 bits, high byte first.
+* Data are ready if bit 7 of 0x34 is set. Register 0x36 always reads 0x22.
+* The part has no reset command. So the bridge stops the part and writes all registers again.
+
+The bus port polls the registers and converts the results to lines of text, which the log contains.
 """
 
 from __future__ import annotations
@@ -25,20 +30,20 @@ REVISION = 0x22
 ALL_AXES, CONTINUOUS, SELF_TEST = 0x70, 0x71, 0x8F
 FASTEST_TMRC, FASTEST_HZ, SELF_TEST_S, MAX_COUNT = 0x92, 600.0, 0.5, 0x7FFFFF
 CYCLES_PER_SECOND = 29_400
-"""Cycles of all three axes a second: 147 Hz at a cycle count of 200."""
+"""Cycles of all three axes per second; a cycle count of 200 allows 147 readings/s."""
 
 
 class Rm3100Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[sensor.options]`` of the RM3100."""
 
     cycle_count: Annotated[int, Meta(ge=30, le=400)] = 200
-    """Cycles of each axis: more of them give a finer step (13.3 nT at 200) and a lower highest rate."""
+    """Cycles of each axis; more cycles give a finer step (13.3 nT at 200) and a lower highest rate."""
     rate: Annotated[float, Meta(ge=0.1, le=600)] = 37.0
-    """Readings per second; the part has 600 Hz divided by powers of two, and the nearest is used."""
+    """Readings per second; the part has 600 Hz divided by powers of two, and the nearest rate is used."""
     mode: Literal["continuous", "single"] = "continuous"
-    """``single``: the bridge starts each measurement, so that the part rests in between."""
+    """With ``single``, the bridge starts each measurement, so that the part uses less power."""
     self_test: bool = True
-    """Test the three coils whenever the port is opened."""
+    """True to test the three coils whenever the part is configured."""
 
     def __post_init__(self) -> None:
         if self.rate > (fastest := CYCLES_PER_SECOND / self.cycle_count):
@@ -46,7 +51,7 @@ class Rm3100Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class Rm3100(FramedDriver):
-    """Reads the registers, and parses the lines in which the readings are logged."""
+    """Reader of the RM3100's registers, and parser of the lines in which its readings are logged."""
 
     Options: ClassVar = Rm3100Options
 
@@ -59,7 +64,7 @@ class Rm3100(FramedDriver):
         self.range_nt = MAX_COUNT * self.nt_per_count
 
     def configure(self, bus: Bus) -> None:
-        """Stop the part, write all registers, test it and start it; OSError: no RM3100, or a broken one."""
+        """Stop, configure, test and start the part; OSError: it is not an RM3100, or the self-test fails."""
         _is_ready(bus)
         bus.write(CMM, b"\0")
         bus.write(CYCLE_COUNTS, self._options.cycle_count.to_bytes(2, "big") * 3)
@@ -70,7 +75,7 @@ class Rm3100(FramedDriver):
         bus.write(*((POLL, bytes([ALL_AXES])) if is_single else (CMM, bytes([CONTINUOUS]))))
 
     def poll(self, bus: Bus, time: float) -> bytes:
-        """Return the line of the reading that is ready at `time` (s, any steady clock); empty if none is."""
+        """Return the line of a completed measurement at `time` (s, steady clock); empty if not ready."""
         if not _is_ready(bus):
             return b""
         line = encode_line(bus.read(RESULTS, 9), time)
@@ -79,7 +84,7 @@ class Rm3100(FramedDriver):
         return line
 
     def read_frame(self, frame: bytes) -> Reading:
-        """Return the reading in a line; ValueError: it does not hold one."""
+        """Return the reading in a line; ValueError: the line does not contain a valid reading."""
         prefix, time_text, digits = strip_checksum(frame, "nmea").split(b",")
         data, time = bytes.fromhex(digits.decode("ascii")), float(time_text)
         if prefix != b"$RM3100" or len(data) != 9 or not abs(time) < MAX_DEVICE_TIME_S:
@@ -90,12 +95,12 @@ class Rm3100(FramedDriver):
 
 
 def nt_per_count(cycle_count: int) -> float:
-    """Return nT per count at a cycle count."""
+    """Return the field of one count (nT) for a cycle count."""
     return 1e3 / (0.3671 * cycle_count + 1.5)
 
 
 def encode_line(results: bytes, time: float) -> bytes:
-    """Return the line of nine bytes of results, read at `time` (s)."""
+    """Return the line of text for nine bytes of result registers, read at `time` (s)."""
     text = b"$RM3100,%.6f,%s" % (time, results.hex().encode())
     return b"%s*%02X\n" % (text, nmea_checksum(text))
 
@@ -115,7 +120,7 @@ def _test(bus: Bus) -> None:
 
 
 def _is_ready(bus: Bus) -> bool:
-    """Return True if a measurement is complete; OSError: a bus without the part reads zeros or ones."""
+    """Return True if a measurement is complete; OSError: no RM3100 responds (0x36 does not read 0x22)."""
     status = bus.read(STATUS, 3)
     if len(status) != 3 or status[2] != REVISION:
         raise OSError(f"no RM3100 answers: expected {REVISION:#x} in register 0x36, got 0x{status[2:].hex()}")

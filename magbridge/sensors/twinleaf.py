@@ -1,16 +1,17 @@
-"""``twinleaf``: vector magnetometers that send Twinleaf I/O (TIO), of either generation.
+"""Driver ``twinleaf``: vector magnetometers that send either generation of Twinleaf I/O (TIO).
 
-As the public drivers read them: ``libtio`` (protocol overview), ``tio-python`` (devices before 2025) and
-``twinleaf-rust`` (since). On a serial line a packet and its CRC-32 stand between SLIP delimiters (RFC 1055)::
+Sources of the format are the public drivers ``libtio`` (protocol overview), ``tio-python`` (devices before
+2025) and ``twinleaf-rust`` (since 2025). On a serial line, SLIP delimiters (RFC 1055) separate packets, each
+with a CRC-32::
 
     packet = type u8, routing length in the low 4 bits u8, payload length u16, payload, routing
 
 All numbers are little-endian. Both generations describe a stream before its samples can be read:
 
-* generation 1: TIMEBASE, SOURCE and STREAM packets; samples of stream 0 begin with a 32-bit number;
-* generation 2: METADATA packets with records (device, stream, segment, column); samples of streams 1 to 127
-  begin with a 24-bit number and the segment they belong to. A record begins with the length of its fixed
-  part, which later firmware may extend; strings follow.
+* Generation 1 sends TIMEBASE, SOURCE and STREAM packets. Samples of stream 0 begin with a 32-bit number.
+* Generation 2 sends METADATA packets with records (device, stream, segment, column). Samples of streams 1 to
+  127 begin with a 24-bit sample number and the number of their segment. A record begins with the length of
+  its fixed part, which later firmware may extend; strings follow.
 """
 
 from __future__ import annotations
@@ -32,60 +33,62 @@ __all__ = ["Twinleaf", "TwinleafOptions", "pack", "slip", "unslip"]
 
 END = b"\xc0"
 MAX_FRAME_BYTES = 2 * (512 + 4)
-"""Longest SLIP frame, every byte escaped."""
+"""Length of the longest SLIP frame, with every byte escaped."""
 MAX_ROUTING = 8
 
 RPC_REQUEST, RPC_REPLY, RPC_ERROR, HEARTBEAT, TIMEBASE, SOURCE, STREAM, METADATA = 2, 3, 4, 5, 6, 7, 8, 11
 STREAM_TYPE = 128
-"""Samples of stream n have the type 128 + n."""
+"""Packet type of stream 0; samples of stream n have the type 128 + n."""
 DEVICE_RECORD, STREAM_RECORD, SEGMENT_RECORD, COLUMN_RECORD = 1, 2, 3, 4
 
 TYPE_FORMATS = {
     0x10: "B", 0x11: "b", 0x20: "H", 0x21: "h", 0x40: "I", 0x41: "i", 0x42: "f",
     0x80: "Q", 0x81: "q", 0x82: "d",
 }  # fmt: skip
-"""Data type: format character. The high nibble of a type is its size in bytes (24 bits have no character)."""
+"""Data type -> format character of :mod:`struct`. The high nibble of a type is its size in bytes; the 24-bit
+types have no format character."""
 
 TIO_HEADER = Struct("<BBH")
 RPC_HEADER = Struct("<HH")
 TIMEBASE_HEADER = Struct("<HBBQIIIf")
-"""Number, source, epoch, start, numerator and denominator of the period in µs, flags, stability."""
+"""Layout: number, source, epoch, start, numerator and denominator of the period in µs, flags, stability."""
 SOURCE_HEADER = Struct("<HHIIiHHB")
-"""Number, timebase, period, offset, format, flags, channels, type; then name, columns, title,
-unit by tabs."""
+"""Layout: number, timebase, period, offset, format, flags, channels, type. The texts name, columns, title and
+unit follow, separated by tabs."""
 STREAM_HEADER = Struct("<HHIIQHH")
-"""Number, timebase, period in its ticks, offset, sample number, components, flags."""
+"""Layout: number, timebase, period in ticks of the timebase, offset, sample number, components, flags."""
 COMPONENT = Struct("<HHII")
-"""Source, flags, period, offset."""
+"""Layout: source, flags, period, offset."""
 DEVICE_HEADER = Struct("<BBIBBB")
-"""Length, length of the name, session, lengths of two strings, streams."""
+"""Layout: length, length of the name, session, lengths of two strings, number of streams."""
 STREAM_RECORD_HEADER = Struct("<BBBBHHB")
-"""Length, stream, columns, segments, bytes of a sample, samples kept, length of the name."""
+"""Layout: length, stream, columns, segments, bytes of a sample, buffered samples, length of the name."""
 SEGMENT_HEADER = Struct("<BBBBBBIIIIfB")
-"""Length, stream, segment, flags, epoch, length of a string, session, start, rate, decimation, filter (2)."""
+"""Layout: length, stream, segment, flags, epoch, length of a string, session, start, rate, decimation, and
+two numbers of the filter."""
 COLUMN_HEADER = Struct("<BBBBBBB")
-"""Length, stream, index, type, lengths of name, unit and description."""
+"""Layout: length, stream, index, type, lengths of name, unit and description."""
 SEND_ALL_REQUEST, METADATA_REQUEST = 1, 2
-"""Numbers of our two requests."""
+"""Numbers of the driver's two requests for descriptors."""
 WRAP_1, WRAP_2 = 1 << 32, 1 << 24
-"""Where the sample numbers of the two generations wrap."""
+"""Values at which the sample numbers of the two generations wrap to 0."""
 MAX_DESCRIPTORS = 256
-"""Descriptors of each kind that are kept at most."""
+"""Most descriptors of each kind that are stored."""
 
 
 class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[sensor.options]`` of a TIO device."""
 
     columns: tuple[str, str, str] = ("vector.x", "vector.y", "vector.z")
-    """The three channels, as the device calls them."""
+    """The device's names of the three channels."""
     temperature: str = ""
-    """The column with the temperature in degC, if there is one."""
+    """The device's name of the column with the temperature in degC; empty for none."""
     unit: str | None = None
-    """Unit of the channels, instead of the one that the device states."""
+    """Unit of the channels, in place of the unit that the device states."""
     route: Annotated[str, Meta(pattern=r"^/?(\d+(/\d+)*/?)?$")] = "/"
-    """Which device of a tree, as in ``/0/2``."""
+    """Port numbers from the root to the device in a tree of devices, such as ``/0/2``."""
     range: Annotated[float, Meta(gt=0)] = 100_000.0
-    """nT at which a channel saturates."""
+    """Field at which a channel saturates, nT."""
 
     def __post_init__(self) -> None:
         if self.unit is not None and self.unit not in NT_PER_UNIT:
@@ -95,12 +98,12 @@ class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
             raise ValueError(f"route: expected at most {MAX_ROUTING} numbers up to 255")
 
     def hops(self) -> list[int]:
-        """Return the port numbers on the way from the root to the device."""
+        """Return the port numbers from the root of the device tree to the device."""
         return [int(hop) for hop in self.route.split("/") if hop]
 
 
 class StreamColumn(NamedTuple):
-    """One number of a sample; `type` from :data:`TYPE_FORMATS`."""
+    """Description of one number of a sample; `type` is a key of :data:`TYPE_FORMATS`."""
 
     name: str
     unit: str
@@ -108,33 +111,34 @@ class StreamColumn(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Samples without a break: sample n of it is sample ``first + n``, taken at ``start + n * period``."""
+    """Uninterrupted part of a stream, whose sample n is number ``first + n``, at ``start + n * period``."""
 
     start: int
-    """s on the device's clock."""
+    """Time of the first sample on the device's clock, s."""
     first: int
+    """Number of the first sample in the stream."""
     period: float
-    """s"""
+    """Time between two samples, s."""
 
 
 class SampleLayout(NamedTuple):
-    """How a sample is read."""
+    """Layout of the samples of one stream."""
 
     fields: list[tuple[int, Struct]]
-    """Place and format of the three channels, and of the temperature if there is one."""
+    """Offset and format of the three channels, and of the temperature if it is configured."""
     needed: int
-    """Bytes up to the end of the last of these fields."""
+    """Number of bytes up to the end of the last of `fields`."""
     sizes: list[int]
-    """Lengths at which a sample may end, after any part; the last is that of a whole sample."""
+    """Lengths at which a sample may end, after each part, bytes; the last is that of a whole sample."""
     scale: float
-    """nT per unit of the channels."""
+    """Conversion factor from the channels' unit to nT."""
 
 
 class Twinleaf(FramedDriver):
-    """Parser of a TIO device, of either generation.
+    """Parser of the packets of a TIO device of either generation.
 
-    ``Reading.power_cycle`` is the session number of the device, which differs after every power-on.
-    ``Reading.sequence`` counts the samples, through all segments.
+    ``Reading.power_cycle`` is the session number of the device, which changes at every power-on.
+    ``Reading.sequence`` counts the samples of all segments.
     """
 
     Options: ClassVar = TwinleafOptions
@@ -146,10 +150,10 @@ class Twinleaf(FramedDriver):
         self._routing = bytes(reversed(options.hops()))
         self.range_nt = options.range
         self._session: int | None = None
-        # generation 1: timebase -> s, source -> columns, stream -> sources, timebase, period in its ticks
+        # generation 1: timebase -> s, source -> columns, stream -> sources, timebase, period in ticks
         self._timebases: dict[int, float] = {}
         self._sources: dict[int, tuple[StreamColumn, ...]] = {}
-        # generation 2: a part of a stream is a column; segments by stream and number
+        # generation 2: each part of a stream is one column; segments by stream and number
         self._streams: dict[int, tuple[tuple[int, ...], int, int]] = {}
         self._columns: dict[tuple[int, int], StreamColumn] = {}
         self._segments: dict[tuple[int, int], Segment] = {}
@@ -157,7 +161,7 @@ class Twinleaf(FramedDriver):
         self._last = 0, 0, 0  # segment, sample number and wraps of the last packet
 
     def start(self) -> tuple[bytes, ...]:
-        """Return a heartbeat, and the two generations' requests for descriptors."""
+        """Return one command: a heartbeat, and each generation's request for descriptors."""
         packets = [pack(HEARTBEAT, b"", self._routing)]
         for number, method in ((SEND_ALL_REQUEST, b"data.send_all"), (METADATA_REQUEST, b"dev.metadata")):
             call = RPC_HEADER.pack(number, 0x8000 | len(method)) + method
@@ -180,7 +184,7 @@ class Twinleaf(FramedDriver):
         return readings
 
     def _open(self, frame: bytes) -> tuple[int, bytes]:
-        """Return type and payload of a packet, the type 0 where it is another device's.
+        """Return type and payload of the packet in a frame; type 0 for a packet of another device.
 
         ValueError: the packet is damaged.
         """
@@ -194,7 +198,7 @@ class Twinleaf(FramedDriver):
         return (kind if packet[end:-4] == self._routing else 0), packet[4:end]
 
     def _describe(self, kind: int, payload: bytes) -> None:
-        """Read a packet that is not samples."""
+        """Process a packet without samples, such as a heartbeat or a descriptor."""
         if kind == METADATA:
             self._record(payload[0], payload[2:])
         elif kind == RPC_REPLY and int.from_bytes(payload[:2], "little") == METADATA_REQUEST:
@@ -218,7 +222,7 @@ class Twinleaf(FramedDriver):
             self._remember(self._streams, number, (parts, timebase, period))
 
     def _record(self, kind: int, record: bytes) -> None:
-        """Read a record of generation 2."""
+        """Process a metadata record of generation 2."""
         if kind == DEVICE_RECORD:
             self._session = int.from_bytes(record[2:6], "little")
         elif kind == STREAM_RECORD:
@@ -243,7 +247,7 @@ class Twinleaf(FramedDriver):
             self._layouts.clear()
 
     def _samples(self, number: int, payload: bytes) -> list[Reading]:
-        """Return the readings in a packet of samples of the stream `number`."""
+        """Return the readings in a sample packet of the stream `number`; ValueError: a wrong length."""
         if len(payload) < 4:
             raise ValueError
         if number not in self._layouts and (parts := self._parts(number)) is not None:
@@ -285,7 +289,10 @@ class Twinleaf(FramedDriver):
         return readings
 
     def _segment(self, number: int, segment: int) -> Segment | None:
-        """Return a segment of a stream; the whole stream is one in generation 1. None if not described."""
+        """Return a segment of the stream `number`; None if the device has not described it yet.
+
+        In generation 1 (stream 0), the whole stream is one segment.
+        """
         if number:
             return self._segments.get((number, segment))
         _, timebase, period = self._streams.get(0, ((), -1, 0))
@@ -294,7 +301,7 @@ class Twinleaf(FramedDriver):
         return Segment(0, 0, self._timebases[timebase] * period)
 
     def _unwrap(self, segment: int, number: int, wrap: int) -> int:
-        """Return the sample number with its wraps within the segment undone."""
+        """Return the sample number within `segment` after unwrapping: `number` plus a multiple of `wrap`."""
         last_segment, last, turns = self._last
         if segment != last_segment:
             turns = 0
@@ -304,7 +311,7 @@ class Twinleaf(FramedDriver):
         return number + turns * wrap
 
     def _parts(self, number: int) -> list[tuple[StreamColumn, ...]] | None:
-        """Return the parts of a stream's samples, each with its columns; None where not all are known yet."""
+        """Return the columns of each part of a stream's samples; None if a part is not described yet."""
         parts = []
         for part in self._streams.get(number, ((), 0, 1))[0]:
             column = self._columns.get((number, part))
@@ -313,7 +320,7 @@ class Twinleaf(FramedDriver):
         return parts if parts and all(parts) else None
 
     def _layout(self, parts: list[tuple[StreamColumn, ...]]) -> SampleLayout | None:
-        """Return the layout of samples of these parts; None if they lack our channels."""
+        """Return the layout of samples with the given parts; None if they lack a configured channel."""
         columns = [column for part in parts for column in part]
         names = [column.name for column in columns]
         if not set(self._options.columns) <= set(names):
@@ -331,23 +338,27 @@ class Twinleaf(FramedDriver):
 
 
 def unslip(frame: bytes) -> bytes:
-    """Return the packet in a SLIP frame, its CRC-32 still behind it."""
+    """Return the packet in a SLIP frame, followed by its CRC-32."""
     return frame.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
 
 
 def slip(packet: bytes) -> bytes:
-    """Return a packet as it stands on the line, with its CRC-32 and delimiter."""
+    """Return the SLIP frame of a packet, with its CRC-32 and delimiter."""
     packet += crc32(packet).to_bytes(4, "little")
     return packet.replace(b"\xdb", b"\xdb\xdd").replace(b"\xc0", b"\xdb\xdc") + END
 
 
 def pack(kind: int, payload: bytes, routing: bytes = b"") -> bytes:
-    """Return a packet of the type `kind`; `routing` names the device, last hop first."""
+    """Return a packet of the type `kind`; `routing` has the port numbers to the device, last hop first."""
     return TIO_HEADER.pack(kind, len(routing), len(payload)) + payload + routing
 
 
 def _columns(text: bytes, channels: int, code: int) -> tuple[StreamColumn, ...]:
-    """Return the columns of a source, named ``source.column``: name, columns, title and unit by tabs."""
+    """Return the columns of a source, with names of the form ``source.column``.
+
+    `text`: name, columns, title and unit of the source, separated by tabs.
+    `channels`, `code`: number of columns, and their data type.
+    """
     texts = [*text.decode("utf-8", "replace").split("\t"), "", "", ""]
     name, unit, names = texts[0], texts[3], texts[1].split(",")
     if channels == 1 or len(names) != channels:
