@@ -1,1 +1,1 @@
-"""The bridge: a pipeline without input or output, and the threads and ports that feed it."""
+"""Bridge between sensors and a MAVLink link: a pipeline without input or output, its threads and ports."""

@@ -1,4 +1,4 @@
-"""Find the faults of a ``bridge.toml``: in the file, or by the messages that arrive on its ports."""
+"""Checks of a ``bridge.toml``, by its contents and by the messages that arrive on its ports."""
 
 from __future__ import annotations
 
@@ -39,23 +39,20 @@ __all__ = ["LISTEN_TIME_S", "ConfigFault", "LiveCheck", "access", "findings"]
 
 CALIBRATION_KEYS = ("calibration.file", "learning.prior")
 MIN_FREE_BYTES = 100e6
-"""Bytes that a log's disk should have."""
+"""Free space that the disk of the log should have, bytes."""
 
 
 class ConfigFault(NamedTuple):
-    """A fault of a configuration."""
+    """Fault of a configuration."""
 
     fatal: bool
-    """The bridge would not start; otherwise it would start and wait, or run worse."""
+    """True if the bridge would not start; False if it would wait, or run with less function."""
     text: str
     """One line with the file, the key, and the expected value."""
 
 
 def findings(path: Path) -> list[ConfigFault]:
-    """Return all faults of a configuration; only the files that it names are opened.
-
-    `path`: the ``bridge.toml``.
-    """
+    """Return all faults of the ``bridge.toml`` at `path`; open the files that it names, but no ports."""
     try:
         table = load_toml(path)
     except ConfigError as error:
@@ -77,7 +74,7 @@ def findings(path: Path) -> list[ConfigFault]:
 
 
 def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[ConfigError]:
-    """Yield the faults of a table; each faulty key is removed so that the next one is found."""
+    """Yield the errors of `attempt`; remove the faulty key from `table` before each further attempt."""
     while True:
         try:
             attempt()
@@ -97,7 +94,7 @@ def _remove_key(table: dict[str, Any], key: str) -> bool:
 
 
 def _contents(config: Config) -> Iterator[ConfigFault]:
-    """Yield the faults of single values."""
+    """Yield the faults of a configuration that was parsed: of its files, ports, messages and parameters."""
     path = config.path
     yield from _files(config)
     calibration = None
@@ -137,7 +134,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
 
 
 def _files(config: Config) -> Iterator[ConfigFault]:
-    """Yield each missing file that the configuration names."""
+    """Yield a fault for each file that the configuration names and that does not exist."""
     for key, name in config.files.items():
         if name is not None and not (file := config.resolve(name)).exists():
             yield ConfigFault(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
@@ -154,7 +151,10 @@ def _driver(config: Config, sensor: Sensor) -> Iterator[ConfigFault]:
 
 
 def _other_sensors(config: Config, main: Calibration | None) -> Iterator[ConfigFault]:
-    """Yield the faults of the sensors after the first: their calibrations, and what these need."""
+    """Yield the faults of the calibrations of all sensors after the first.
+
+    `main`: calibration of the first sensor, or None.
+    """
     try:
         drivers, calibrations = open_drivers(config), other_calibrations(config)
     except MagbridgeError as error:
@@ -182,7 +182,7 @@ def _tried(attempt: Callable[[], object]) -> Iterator[ConfigFault]:
 
 
 def _device(config: Config, key: str, name: str) -> Iterator[ConfigFault]:
-    """Yield why a serial device could not be opened now."""
+    """Yield the reasons why the serial device `name` of a `key` cannot be opened now, as faults."""
     if "://" in name or not name.startswith("/"):
         return
     there = sorted(glob.glob(name))  # noqa: PTH207 - it may be absolute, which pathlib does not glob
@@ -196,7 +196,7 @@ def _device(config: Config, key: str, name: str) -> Iterator[ConfigFault]:
 
 
 def access(device: str) -> str:
-    """Return why this user may not open a device, and the remedy; empty if the user may."""
+    """Return why this user may not open a device, and the remedy; empty if the user may open it."""
     if os.access(device, os.R_OK | os.W_OK):
         return ""
     group = _group(device)
@@ -216,7 +216,10 @@ def _group(device: str) -> str:
 
 
 def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFault]:
-    """Yield each parameter that the calibration needs and the link would not provide."""
+    """Yield a fault for each parameter that the calibration needs and the link would not provide.
+
+    Also yield the warnings of the calibration, and a calibration of another type of sensor.
+    """
     if not calibration.sensor.may_be(config.sensor.driver):
         text = (
             f"{config.path}: sensor.driver: the calibration is of {calibration.sensor.name!r}: every sample "
@@ -259,11 +262,11 @@ def _log(config: Config) -> Iterator[ConfigFault]:
 
 
 LISTEN_TIME_S = 20.0
-"""s for which the ports are read."""
+"""Default time for which the ports are read, s."""
 RATE_INTERVALS = 4
-"""Intervals of that time over which rates are measured: after the first one, rates are requested."""
+"""Number of equal intervals of a check over which rates are measured; requests follow the first interval."""
 SENT: Final = frozenset(spec(name).id for name in ("HEARTBEAT", "TIMESYNC", "COMMAND_LONG"))
-"""Messages that the check sends: routers forward only to a sender of heartbeats."""
+"""Ids of the messages that the check sends; a router forwards messages only to senders of heartbeats."""
 SYSTEM_TIME: Final = spec("SYSTEM_TIME").id
 ARDUPILOT_GROUPS: Final = {
     "ATTITUDE": "EXTRA1", "VFR_HUD": "EXTRA2", "EKF_STATUS_REPORT": "EXTRA3", "BATTERY_STATUS": "EXTRA3",
@@ -271,11 +274,11 @@ ARDUPILOT_GROUPS: Final = {
     "GPS_RAW_INT": "EXT_STAT", "GLOBAL_POSITION_INT": "POSITION", "LOCAL_POSITION_NED": "POSITION",
     "SERVO_OUTPUT_RAW": "RC_CHAN", "RAW_IMU": "RAW_SENS", "SCALED_PRESSURE": "RAW_SENS",
 }  # fmt: skip
-"""Groups by which ArduPilot sets rates (``ArduPlane/GCS_MAVLink_Plane.cpp``, ``STREAM_*_msgs``)."""
+"""Message -> ArduPilot's group of stream rates (``ArduPlane/GCS_MAVLink_Plane.cpp``, ``STREAM_*_msgs``)."""
 MAX_CLOCK_DIFFERENCE_S = 2.0
-"""s between the host's clock and SYSTEM_TIME above which the difference is reported."""
+"""Difference of the host's clock from SYSTEM_TIME above which the check reports it, s."""
 YEAR_2001_US = 10**15
-"""Lowest SYSTEM_TIME that is a date, µs; before, the autopilot does not know the time."""
+"""Smallest SYSTEM_TIME that is a valid date, µs since 1970 UTC."""
 NO_READING = {
     MAG_PORT_STATE.LOST: "the port is not open; the bridge would wait for it",
     MAG_PORT_STATE.SILENT: "check power, cable, sensor.baudrate and sensor.options",
@@ -284,28 +287,28 @@ NO_READING = {
 
 
 class Arrived(NamedTuple):
-    """A message that arrived, or that the bridge needs."""
+    """Message that arrived during a check, or that the bridge needs."""
 
     name: str
     sender: str
-    """System and component, ``1:1``."""
+    """System and component of the sender, such as ``1:1``."""
     rate_hz: float
-    """Rate in the last quarter of the check, after the requests; of a rarer message, over all of it."""
+    """Rate in the last quarter of the check, Hz; over the whole check if none arrived in this quarter."""
     needed_hz: float
-    """Rate that the bridge needs; 0 if it needs none."""
+    """Rate that the bridge needs, Hz; 0 if it does not need the message."""
 
 
 class LiveCheck:
-    """Open the ports of a configuration for some seconds and count the messages.
+    """Check that opens the ports of a configuration for some seconds and counts the messages.
 
-    The bridge's own pipeline reads the bytes, so that the sensor is started and messages are requested as by
-    ``run``. No sample and no fix is sent, and no log is written.
+    The bridge's own pipeline reads the bytes. So the sensors are started and messages are requested as by
+    ``run``. The check sends no sample and no fix, and writes no log.
 
-    `config`: a configuration with which the bridge would start.
-    `duration_s`: s for which the ports are read.
-    `arrived`: messages by sender, the needed ones first.
-    `readings_hz`: rate of each sensor's readings, by the sensor's name.
-    `faults`: one warning for each thing that is missing, with its remedy.
+    `config`: a configuration without fatal faults.
+    `duration_s`: time for which the ports are read, s.
+    `arrived`: messages that arrived or are needed, the needed messages first.
+    `readings_hz`: rate of each sensor's readings, Hz, by the sensor's name.
+    `faults`: one warning, with its remedy, for each missing message, reading or value.
     """
 
     def __init__(self, config: Config, duration_s: float) -> None:
@@ -324,7 +327,7 @@ class LiveCheck:
         self._edge: LiveEdge | None = None
 
     def listen(self) -> None:
-        """Read the ports, then fill the attributes."""
+        """Read the ports for the duration of the check, then set the attributes with its results."""
         config, link = self._config, self._link
         keeper, clock = Keeper(config), HostClock()
         key = load_key(config.resolve(link.signing_key)) if link.signing_key else None
@@ -350,7 +353,7 @@ class LiveCheck:
         self._compare(pipeline)
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield the events of the ports; count the messages in those of the link."""
+        """Yield the events of the ports; count the messages in the events of the link."""
         assert self._edge is not None
         for event in self._edge.events(deadline):
             if event.channel is Channel.LINK:
@@ -358,7 +361,7 @@ class LiveCheck:
             yield event
 
     def send(self, number: int, data: bytes) -> None:
-        """Send to a sensor; send only the messages of :data:`SENT` to the link."""
+        """Send `data` to the port `number` (MAG_PORT_NAME); to the link, send only the messages in `SENT`."""
         assert self._edge is not None
         if number == Channel.LINK:
             data = b"".join(frame for frame in cut(data) if int.from_bytes(frame[7:10], "little") in SENT)
@@ -366,12 +369,12 @@ class LiveCheck:
             self._edge.send(number, data)
 
     def credit(self, frames: list[bytes]) -> None:
-        """Report to the link which frames are signed with the key."""
+        """Pass the frames that were signed with the key to the link, so that it replies to their senders."""
         assert self._edge is not None
         self._edge.credit(frames)
 
     def _receive(self, event: Event) -> None:
-        """Count the messages and the values of telemetry in an event of the link."""
+        """Count the messages and the telemetry values in an event of the link."""
         late = event.time_us - self._begin_us >= self._duration_us * (RATE_INTERVALS - 1) // RATE_INTERVALS
         for message in self._ear.parse(event.data, final=self._link.shared):
             if not message.known:
@@ -383,7 +386,7 @@ class LiveCheck:
                 self._read(message, event.time_us)
 
     def _read(self, message: Message, time_us: int) -> None:
-        """Read the date and the values of telemetry in a message of the vehicle."""
+        """Use a message of the vehicle: compare SYSTEM_TIME with the host's clock, count telemetry values."""
         if message.id == SYSTEM_TIME and message["time_unix_usec"] > YEAR_2001_US:
             self._clock_difference_s = (time_us - message["time_unix_usec"]) * 1e-6
         for name, value, _ in self._telemetry.values(message, time_us, VehicleClock()):
@@ -392,14 +395,14 @@ class LiveCheck:
                 counts[name] += 1
 
     def _rate(self, key: tuple[int, int, int]) -> float:
-        """Return the rate of a message in Hz."""
+        """Return :attr:`Arrived.rate_hz` of a message, given by system, component and message id."""
         late_s = self._duration_us * 1e-6 / RATE_INTERVALS
         if late := self._late_counts[key]:
             return late / late_s
         return self._counts[key] / (late_s * RATE_INTERVALS)
 
     def _compare(self, pipeline: Pipeline) -> None:
-        """List the messages that arrived, and report the missing ones."""
+        """List the messages that arrived, and add a fault for each missing message or value."""
         streams, system = pipeline.component.streams, self._link.system
         needed = {(system, *stream): streams.rate_of(stream) for stream in streams.needed}
         for key in sorted(needed.keys() | self._counts.keys(), key=lambda key: (key not in needed, key)):
@@ -441,7 +444,7 @@ class LiveCheck:
                 self._warn(stream.sensor.key, text)
 
     def _no_autopilot(self) -> str:
-        """Return the faults of a link without a heartbeat of the autopilot."""
+        """Return the text of the fault that no heartbeat of the autopilot arrived, with the remedy."""
         text = f"no HEARTBEAT of {self._link.system}:{self._link.autopilot}"
         senders = sorted({f"{system}:{component}" for system, component, _ in self._counts})
         if not senders:
@@ -449,7 +452,7 @@ class LiveCheck:
         return f"{text}, but messages of {', '.join(senders)}: check link.system and link.autopilot"
 
     def _no_value(self, name: str) -> str:
-        """Return why a parameter has no value, and the remedy."""
+        """Return why the telemetry parameter `name` has no value, and the remedy."""
         wanted = self._config.telemetry[name]
         if self._unknown_values[name]:
             return f"{wanted.message}.{wanted.field} is marked as not known by its sender"
@@ -466,7 +469,10 @@ class LiveCheck:
 
 
 def _too_rare(arrived: Arrived, denied: str, *, is_autopilot: bool) -> str:
-    """Return the fault of a message that arrives too rarely, with the remedy."""
+    """Return the text of the fault that a message arrives too rarely, with the remedy.
+
+    `denied`: text of a rejected request of the message, or empty.
+    """
     arrives = f"arrives at {arrived.rate_hz:.2g} Hz" if arrived.rate_hz else "does not arrive"
     why = f" ({denied})" if denied else ""
     remedy = f"request it of PX4 by `mavlink stream -s {arrived.name} -r {arrived.needed_hz:g}`"

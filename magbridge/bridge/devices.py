@@ -1,4 +1,4 @@
-"""Ports that are devices of this computer: serial lines, and parts on an I2C or SPI bus."""
+"""Ports to devices of this computer: serial lines, and parts on an I2C or SPI bus."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from magbridge.sensors.rm3100 import Rm3100
 __all__ = ["BusPort", "SerialPort", "may_be_device", "sensor_port", "serial_line"]
 
 MAX_READ_BYTES = 4095
-"""Bytes that one read of a terminal device returns at most, however many are waiting."""
+"""Most bytes that one read of a terminal device returns, however many are waiting."""
 BACKLOG_WAIT_S = 0.02
-"""s within which the next piece of a backlog can be read, even on a busy computer."""
+"""Time within which the next piece of a backlog is readable, even on a busy computer, s."""
 
 LEAD = 0.05
-"""s of the line's time that are handed to the system at once."""
+"""Time on the line of the bytes that are written to the system at once, s."""
 LINE_BUFFER_BYTES = 20_000
-"""Bytes that a line which does not say how much waits in it holds when it is full: a pseudo-terminal does."""
+"""Bytes in the full buffer of a line that does not report its fill level, such as a pseudo-terminal."""
 
 
 class SerialPort(PacedPort):
-    """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
+    """Port on a serial line, given by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
 
     def __init__(self, name: str, baudrate: int) -> None:
         super().__init__(name, round(baudrate / 10 * LEAD))
@@ -52,7 +52,7 @@ class SerialPort(PacedPort):
         self._pump: Pump | None = None
 
     def open(self) -> None:
-        """Open the first device that the name or pattern finds; raises :class:`PortError`."""
+        """Open the first device of the name or pattern; raise :class:`PortError` if none can be opened."""
         reason: object = "no such device"
         for name in self._names():
             try:
@@ -76,29 +76,29 @@ class SerialPort(PacedPort):
         raise PortError(self.name, str(reason))
 
     def move_on(self) -> None:
-        """Close the device if the pattern finds others; the next one is opened then."""
+        """Close the device if the pattern matches further devices, so that the next one is opened."""
         if len(self._names()) > 1:
             self._passed = self._last
             self.close()
 
     def _names(self) -> list[str]:
-        """Return the devices that there are, beginning with the one after that which was passed over."""
+        """Return the devices that match the name, beginning after the device that :meth:`move_on` left."""
         if not glob.has_magic(self.name):
             return [self.name]
         found = glob.glob(self.name)  # noqa: PTH207 - it may be absolute, which pathlib does not glob
         return sorted(found, key=lambda name: (name <= self._passed, name))
 
     def read(self) -> bytes:
-        """Return the received bytes; an end of file or an error on the line is a lost port.
+        """Return the received bytes; raise :class:`PortError` at an end of file or an error on the line.
 
-        A backlog is returned as a whole: for an instrument without a clock, only the last reading's time of
-        arrival says when it was sent.
+        A backlog is returned as a whole, because the time of arrival of its last reading dates all of them if
+        the instrument has no clock.
         """
         data = super().read()
         return data if len(data) < MAX_READ_BYTES else data + self._backlog()
 
     def _backlog(self) -> bytes:
-        """Return the bytes after a first piece; the next :meth:`read` finds an end of file or error."""
+        """Return the bytes that wait after a first piece; the next :meth:`read` reports an error."""
         data = b""
         with suppress(OSError):
             while len(data) < READ_BYTES and select.select([self._fd], [], [], BACKLOG_WAIT_S)[0]:
@@ -109,14 +109,14 @@ class SerialPort(PacedPort):
         return data
 
     def blocked(self) -> list[int]:
-        """Return the descriptor, except that of a paced line, which is always writable."""
+        """Return the descriptor; none for a line paced by its baud rate, which is always writable."""
         return super().blocked() if self._idle_at == -inf else []
 
     def _room(self) -> bool:
-        """Return True if less than 256 bytes wait in the system, for only then is a line writable.
+        """Return True if the system reports the line as writable, with less than 256 bytes waiting.
 
-        A pseudo-terminal does not say what waits in it and is writable until it is full. Once it was, it gets
-        no more than its baud rate carries.
+        A pseudo-terminal does not report waiting bytes and is writable until it is full. Once it was full, it
+        gets no more bytes than its baud rate transmits.
         """
         if self._pump is not None:
             return True
@@ -124,7 +124,7 @@ class SerialPort(PacedPort):
         if self._idle_at > now + LEAD:
             return False
         room = bool(select.select([], [self._fd], [], 0)[1])
-        with suppress(OSError):  # just unplugged: writing will tell
+        with suppress(OSError):  # the device was just unplugged: the next write fails
             if not room and getattr(self._serial, "out_waiting", -1) == 0:
                 self._idle_at = now + LINE_BUFFER_BYTES * 10 / self.baudrate
         return room
@@ -156,9 +156,9 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
 
     `name`: a device, a pattern or a pyserial URL.
     `baudrate`: bits per second.
-    `source`, `key`: the file and the key that `name` comes from, for the error.
-    ConfigError: no device's name, a URL of a kind that pyserial does not know, or one of a socket without
-        HOST:PORT.
+    `source`, `key`: file and key that contain `name`, for the error.
+    ConfigError: the name cannot be a device's, pyserial does not know the kind of URL, or the URL of a socket
+        lacks HOST:PORT.
     """
     kind, url, _ = name.partition("://")
     known = kind.isalnum() and find_spec(f"serial.urlhandler.protocol_{kind.lower()}")
@@ -176,15 +176,15 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
 
 
 def may_be_device(name: str) -> bool:
-    """Return True if a serial device has this name or could get it later."""
+    """Return True if a serial device has this name, or if a device could get this name later."""
     path = Path(name)
     if path.exists():
         return not (path.is_file() or path.is_dir())
-    return "/" in name or os.name == "nt"  # where they are called COM3
+    return "/" in name or os.name == "nt"  # names on Windows, such as COM3, have no slash
 
 
 def _reason(error: Exception) -> str:
-    """Return why a port did not open, short enough for a STATUSTEXT: pyserial's own words repeat its name."""
+    """Return why a port did not open, without the port's name, so that the text fits a STATUSTEXT."""
     beneath = error.__context__ if isinstance(error.__context__, OSError) else error
     if isinstance(beneath, OSError) and beneath.errno == errno.EAGAIN:
         return "in use by another program"
@@ -192,16 +192,17 @@ def _reason(error: Exception) -> str:
 
 
 def _wait_for_bytes(line: Any) -> bytes:
-    """Return the bytes of a pyserial port, or none after its timeout."""
+    """Return the received bytes of a pyserial port; empty if none arrived within its timeout."""
     data: bytes = line.read(max(1, line.in_waiting))
     return data
 
 
 class Pump:
-    """A thread that moves what `read` returns into a pipe, for a port without a descriptor of its own.
+    """Thread that writes received bytes to a pipe, for a port without a file descriptor.
 
-    `fd`: the pipe's end to read from. It is at its end of file when `read` has raised OSError, whose reason
-    `failed` then receives.
+    `read`: returns received bytes, or raises OSError when the port is lost.
+    `failed`: function that is called with the reason of an OSError of `read`.
+    `fd`: descriptor of the pipe's reading end, which reports an end of file after an OSError of `read`.
     """
 
     def __init__(self, read: Callable[[], bytes], failed: Callable[[str], object] = str) -> None:
@@ -217,13 +218,13 @@ class Pump:
             while self._running:
                 if data := self._read():
                     os.write(self._in, data)
-        except OSError as error:  # pyserial's errors are such, too
+        except OSError as error:  # includes pyserial's SerialException
             self._failed(error.strerror or str(error))
         finally:
             os.close(self._in)
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread and close the pipe."""
         self._running = False
         self._thread.join()
         os.close(self.fd)
@@ -232,11 +233,12 @@ class Pump:
 BUS_ADDRESS = re.compile(r"i2c:(\d+):(0x[0-9a-fA-F]{1,2}|\d{1,3})|spi:(\d+)\.(\d+)")
 SPI_HZ = 1_000_000
 MAX_ERRORS = 5
-"""Errors of the bus in a row after which the port is lost, and opened again."""
+"""Number of bus errors in a row after which the port counts as lost and is opened again."""
 MIN_SILENCE_S, SILENT_PERIODS = 0.5, 8
-"""A part that completes no measurement for that long is configured again."""
+"""Time (s) and number of measurement periods without a reading after which the part is configured again. The
+longer of the two counts."""
 FROZEN_READINGS = 200
-"""Equal readings in a row after which the part is configured again: noise changes the last bits."""
+"""Most equal readings in a row before the part is configured again; noise normally changes the last bits."""
 
 
 class I2cBus:
@@ -260,7 +262,7 @@ class I2cBus:
 
 
 class SpiBus:
-    """Registers of a part on an SPI bus; bit 7 of the address reads."""
+    """Registers of a part on an SPI bus; bit 7 of the register address selects reading."""
 
     def __init__(self, number: int, select: int) -> None:
         self._bus: Any = import_module("spidev").SpiDev()
@@ -281,7 +283,7 @@ class SpiBus:
 
 
 def open_bus(name: str) -> Any:
-    """Return the bus of ``i2c:BUS:ADDRESS`` or ``spi:BUS.DEVICE``; OSError: it cannot be opened."""
+    """Return the opened bus of ``i2c:BUS:ADDRESS`` or ``spi:BUS.DEVICE``; OSError: it cannot be opened."""
     match = BUS_ADDRESS.fullmatch(name)
     assert match is not None
     if match[1]:
@@ -290,9 +292,9 @@ def open_bus(name: str) -> Any:
 
 
 class BusPort(Port):
-    """Poll a part on a bus; return the readings as lines.
+    """Port that polls a part on a bus and returns its readings as lines of text.
 
-    `name`: as :func:`open_bus` takes it.
+    `name`: ``i2c:BUS:ADDRESS`` or ``spi:BUS.DEVICE``.
     `driver`: configures the part and reads its registers.
     """
 
@@ -307,7 +309,7 @@ class BusPort(Port):
         self._heard, self._last = 0.0, b""
 
     def open(self) -> None:
-        """Open the bus, configure the part and start to poll it; raises :class:`PortError`."""
+        """Open the bus, configure the part and start to poll it; raise :class:`PortError` if this fails."""
         bus = None
         try:
             bus = open_bus(self.name)
@@ -322,11 +324,11 @@ class BusPort(Port):
         self._fd = self._pump.fd
 
     def move_on(self) -> None:
-        """Close the port; opening it configures a silent part again."""
+        """Close the port, so that opening it again configures a silent part."""
         self.close()
 
     def _send(self, data: bytes, address: Any) -> None:
-        """Drop the bytes: the part accepts no commands from the pipeline."""
+        """Drop `data`, because the part accepts no commands from the pipeline."""
 
     def close(self) -> None:
         """Stop polling and close the bus."""
@@ -336,11 +338,14 @@ class BusPort(Port):
             bus.close()
 
     def _give_up(self, reason: str) -> None:
-        """Record why the bus failed."""
+        """Set `reason`, for which the bus failed, as the reason of the port's loss."""
         self._ended = reason
 
     def _poll(self, bus: Bus) -> bytes:
-        """Return the next reading, or none; raise OSError if the bus fails `MAX_ERRORS` times in a row."""
+        """Wait a short time, then return the line of a new reading, or nothing if none is complete.
+
+        Configure a silent or frozen part again. Raise OSError if the bus fails `MAX_ERRORS` times in a row.
+        """
         time.sleep(self._pause_s)
         now = time.monotonic()
         try:
@@ -364,7 +369,7 @@ class BusPort(Port):
 def sensor_port(sensor: Sensor, path: Path) -> SerialPort | BusPort:
     """Return the (unopened) port of a sensor in the configuration `path`: a serial line, or a part on a bus.
 
-    ConfigError: a name that is neither, a driver that does not read a bus, or a library that is not
+    ConfigError: the port's name is neither, the driver cannot read a bus, or the bus library is not
         installed.
     """
     source, key = str(path), sensor.key

@@ -1,7 +1,7 @@
-"""Events, all inputs of the bridge: how they arise from ports and clock, and how the log records them.
+"""Events, which are all inputs of the bridge, their creation from ports and clock, and their log records.
 
-One thread reads, corrects and sends. Each port has a thread of its own that opens it when it is down, so that
-an open that takes long (a host name that does not resolve) never holds up another port.
+One thread reads, corrects and sends. Each port has a further thread that opens the port when it is down. So a
+slow attempt to open one port (a host name that does not resolve) never delays another port.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ __all__ = [
 
 
 class StartEvent(msgspec.Struct, frozen=True):
-    """State of a run in addition to its configuration, its calibration and its events."""
+    """State at the start of a run that a replay needs besides configuration, calibration and events."""
 
     time_us: int
-    """µs since 1970 UTC, a multiple of 4."""
+    """Start of the run, µs since 1970 UTC, a multiple of 4."""
     parameters: dict[str, float] = {}
-    """Values that a ground station set in earlier runs."""
+    """Values that a ground station set in earlier runs, by parameter name."""
     signing_timestamp: int = 0
-    """The last that may have been used (units of 10 µs since 2015-01-01)."""
+    """Last signing time stamp that an earlier run may have used (units of 10 µs since 2015-01-01)."""
     signing_streams: list[Stream] = []
-    """The last time stamp accepted of each signed stream."""
+    """Last accepted time stamp of each signed stream."""
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):
     """One input of the bridge: bytes from a port, a change of state, or only the passing of time."""
 
     time_us: int
-    """µs since 1970 UTC, when the live edge read it; a multiple of 4, never decreasing."""
+    """Time at which the input was read, µs since 1970 UTC; a multiple of 4, never decreasing."""
     channel: Channel
-    """``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect
-    that says what changed (a port, the host's clock, the log), or nothing when only time has passed."""
+    """Kind of `data`. ``SENSOR``, ``LINK``: bytes as read. ``STATE``: one MAVLink frame of our own dialect
+    about a change of a port, the host's clock or the log; empty if only time has passed."""
     data: bytes
     sensor_id: int = 0
-    """``SENSOR``: which sensor."""
+    """Number of the sensor, for ``SENSOR``."""
 
 
 def port_number(sensor_id: int) -> int:
@@ -67,36 +67,36 @@ def port_number(sensor_id: int) -> int:
 
 
 def source_of(port: int) -> tuple[Channel, int]:
-    """Return channel and sensor id of the bytes that come from a port, by its MAG_PORT_NAME."""
+    """Return channel and sensor id of the bytes from a port, given by its MAG_PORT_NAME."""
     if port > MAG_PORT_NAME.LOG:
         return Channel.SENSOR, port - MAG_PORT_NAME.LOG
     return Channel(port), 0
 
 
 class HostClock:
-    """The bridge's only clock: starts at the host's UTC and follows the host's monotonic clock.
+    """The bridge's only clock, which starts at the host's UTC and follows the host's monotonic clock.
 
-    A step of the host's UTC does not change it but is reported separately (:meth:`step_us`), so that no
-    interval is ever measured across a step.
+    A step of the host's UTC does not change this clock, so that no interval contains a step.
+    :meth:`step_us` reports such steps.
     """
 
     THRESHOLD_US = 50_000
-    """Smaller differences are ignored: they come from the slewing of the host's clock."""
+    """Smallest difference that counts as a step, µs; smaller ones come from slewing of the host's clock."""
 
     AT_ONCE_US = 5_000
-    """µs within which the host's two clocks must be read, else both are read again: a process may be held up
-    between any two lines."""
+    """Longest time in which the host's two clocks are read, µs; if the process stalls longer between the two,
+    both are read again."""
 
     def __init__(self) -> None:
         self._offset_us = self._ahead_us()
         self._known_step_us = 0
 
     def now_us(self) -> int:
-        """Return the time in µs, a multiple of 4."""
+        """Return the time, µs since 1970 UTC, a multiple of 4."""
         return (time.monotonic_ns() // 1000 + self._offset_us) & ~3
 
     def step_us(self) -> int:
-        """Return the step (µs) of the host's clock since the last call; 0 without one."""
+        """Return the step (µs) of the host's UTC since the last call; 0 without a step."""
         difference = self._ahead_us() - self._offset_us - self._known_step_us
         if abs(difference) < self.THRESHOLD_US:
             return 0
@@ -104,7 +104,7 @@ class HostClock:
         return difference
 
     def _ahead_us(self) -> int:
-        """Return by how many µs the host's UTC is ahead of its monotonic clock, to within `AT_ONCE_US`."""
+        """Return the host's UTC minus its monotonic clock, µs, to within `AT_ONCE_US`."""
         while True:
             before, utc, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
             if after - before < 1000 * self.AT_ONCE_US:
@@ -116,30 +116,30 @@ def _frame(name: str, **fields: object) -> bytes:
 
 
 def clock_step(time_us: int, step_us: int) -> bytes:
-    """Return the frame for a step of the host's clock by `step_us` µs."""
+    """Return the state frame for a step of the host's clock by `step_us` (µs)."""
     return _frame("MAG_CLOCK_STEP", time_usec=time_us + step_us, step=step_us)
 
 
 def standstill(time_us: int, duration_us: int) -> bytes:
-    """Return the frame for a stall of the bridge of `duration_us` µs that ends now."""
+    """Return the state frame for a stall of the bridge of `duration_us` (µs) that ended at `time_us`."""
     return _frame("MAG_HOST_STALL", time_usec=time_us, duration=min(duration_us, 2**32 - 1))
 
 
 def interleaved(count: int) -> bytes:
-    """Return the frame for `count` sent frames that are not in the log."""
+    """Return the state frame for `count` frames that were sent but are not in the log."""
     return _frame("MAG_INTERLEAVED", count=count)
 
 
 def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:
-    """Return the frame of a text that the bridge forwards, at most 50 characters."""
+    """Return the state frame for a text, at most 50 characters, that the bridge sends as a STATUSTEXT."""
     return _frame("STATUSTEXT", severity=int(severity), text=text)
 
 
 def port_state(number: int, reason: str = "", dropped: int = 0, *, is_open: bool | None = None) -> bytes:
-    """Return the frame for a port, or the log, that opened (no `reason`) or that is not open.
+    """Return the state frame for a port or the log, which is open if `reason` is empty.
 
-    `number`: its MAG_PORT_NAME. `dropped`: bytes, or records of the log, that were lost. `is_open`: the port
-    is open all the same.
+    `number`: MAG_PORT_NAME of the port. `reason`: why the port is not open. `dropped`: number of lost bytes,
+    or of lost records of the log. `is_open`: state of the port if it does not follow from `reason`.
     """
     well = not reason if is_open is None else is_open
     state = MAG_PORT_STATE.OK if well else MAG_PORT_STATE.LOST
@@ -151,18 +151,19 @@ CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
     spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_HOST_STALL")
 )
 GRACE_US = 500_000
-"""µs after a standstill within which more of what waited comes: what a full buffer had no room for."""
+"""Time after a stall in which delayed inputs still arrive, because the buffers were full, µs."""
 NOTICE_US = 1_000_000
-"""µs from which on a standstill is announced."""
+"""Shortest stall that is reported, µs."""
 
 
 class StateChanges:
-    """Record and announce the changes that state frames report.
+    """Handler of state frames, which applies the changes and sends STATUSTEXTs about them.
 
-    `codec`: the link's: its ``utc_offset_us`` follows the host's clock.
-    `sensors`: by sensor id.
-    `log_lost`: records that the log has lost.
-    `since_us`, `until_us`: µs: inputs up to `until_us` may have waited since `since_us`.
+    `codec`: codec of the link; its ``utc_offset_us`` follows the steps of the host's clock.
+    `sensors`: lines of the sensors, by sensor id.
+    `log_state`: state of the log (MAG_LOG_STATE).
+    `log_lost`: number of records that the log has lost.
+    `since_us`, `until_us`: event times, µs; inputs up to `until_us` may have waited since `since_us`.
     """
 
     def __init__(self, codec: Codec, announcer: Announcer, sensors: Mapping[int, SensorLine]) -> None:
@@ -173,11 +174,11 @@ class StateChanges:
 
     @staticmethod
     def held_up(data: bytes) -> int:
-        """Return the duration (µs) of a stall of the bridge by these frames; 0 without one."""
+        """Return the total duration (µs) of stalls that the state frames in `data` report."""
         return sum(one["duration"] for one in Codec(0, 0).parse(data) if one.id == STANDSTILL)
 
     def receive(self, data: bytes, time_us: int) -> None:
-        """Process frames received at `time_us`."""
+        """Process the state frames in `data`, from an event at `time_us` (µs)."""
         for message in Codec(0, 0).parse(data):
             if message.id == CLOCK_STEP:
                 self._codec.utc_offset_us += message["step"]
@@ -195,7 +196,7 @@ class StateChanges:
                 self._port(message["port"], well, message["reason"], message["dropped"], time_us)
 
     def check_clock(self) -> None:
-        """Announce that the host's clock was never set."""
+        """Send a STATUSTEXT if the host's clock was never set, and another one when it is set."""
         unset = self._codec.utc_us < CLOCK_SET_US
         if unset or self._clock_unset:
             text = "host clock was never set: no date, no main field" if unset else "host clock is set"
@@ -204,7 +205,7 @@ class StateChanges:
         self._clock_unset = unset
 
     def _stood_still(self, time_us: int, duration_us: int) -> None:
-        if time_us > self.until_us:  # else one more of a row of them
+        if time_us > self.until_us:  # else the stall continues an earlier one
             self.since_us = time_us - duration_us
         self.until_us = time_us + GRACE_US
         if duration_us >= NOTICE_US:
@@ -228,16 +229,16 @@ class StateChanges:
 BYTES: Final = spec("MAG_SENSOR_BYTES")
 RAW: Final = spec("MAG_RAW")
 BYTES_HEADER: Final = Struct("<BB")
-"""The fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
+"""Layout of the fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
 RECORDED_BYTES: Final = BYTES.fields["data"].count
 SENT, LINK, SENSOR, STATE = Channel
 
 
 class Recorder:
-    """Collect records until :meth:`drain`.
+    """Collector of the records for the log, which the caller takes out with :meth:`drain`.
 
-    `active`: whether records are collected and counted; False without a log.
-    `count`: records collected since the start.
+    `active`: True if records are collected and counted; False without a log.
+    `count`: number of records since the start.
     """
 
     def __init__(self, system: int, component: int, *, active: bool) -> None:
@@ -254,12 +255,12 @@ class Recorder:
             self.count += len(frames)
 
     def link(self, time_us: int, frames: list[bytes]) -> None:
-        """Record the frames that came over the link."""
+        """Record the frames that were received over the link at `time_us` (µs)."""
         for frame in frames:
             self._add(time_us, LINK, frame)
 
     def sensor(self, time_us: int, data: bytes, sensor_id: int = 0) -> None:
-        """Record bytes as they came from a sensor."""
+        """Record the bytes that were received from a sensor at `time_us` (µs)."""
         if not self.active:
             return
         for start in range(0, len(data), RECORDED_BYTES):
@@ -268,15 +269,15 @@ class Recorder:
             self._add(time_us, SENSOR, frame)
 
     def state(self, time_us: int, frame: bytes) -> None:
-        """Record a frame of :mod:`magbridge.bridge.events`, or of the run's start."""
+        """Record a state frame, or a frame of the start of the run."""
         self._add(time_us, STATE, frame)
 
     def raw(self, time_us: int, payload: bytes) -> None:
-        """Record a MAG_RAW in the log only, because a calibration needs every sample."""
+        """Record a MAG_RAW payload that is not sent over the link; a calibration needs every sample."""
         self._add(time_us, STATE, self._scribe.frame(RAW, payload))
 
     def drain(self) -> list[tuple[int, Channel, bytes]]:
-        """Return and clear the records collected so far, in order: event time in µs, channel, frame."""
+        """Return the collected records in order, as event time (µs), channel and frame; then clear them."""
         records, self._records = self._records, []
         return records
 
@@ -289,7 +290,10 @@ class Recorder:
 def beginning(
     config: Config, start: StartEvent, calibration_id: int, parameters: Mapping[str, float]
 ) -> list[bytes]:
-    """Return the frames that record how a run started, with these values of the parameters by name."""
+    """Return the frames that record the start of a run.
+
+    `parameters`: values of the parameters, by name, in place of the values in `start`.
+    """
     codec = Codec(config.link.system, config.link.component)
     frames = [
         codec.pack(
@@ -319,12 +323,12 @@ def declarations(
     settings: Mapping[str, float] | None = None,
     sensors: Sequence[tuple[Sensor, Driver]] = (),
 ) -> list[bytes]:
-    """Return the frames that declare source and correction of each column of the log.
+    """Return the frames that declare the source and the scale of each column of the log.
 
-    `nt_per_count`: nT per count of the sensor, 0 for one without counts. A reader then takes the channels
-        from the counts, because MAG_RAW's float32 fields are less precise than the values that were
-        corrected.
-    `settings`: what decides about flags and sigmas, by its key in the configuration: attributes of the log.
+    `nt_per_count`: field of one count of the first sensor, nT; 0 for a sensor without counts. If it is not 0,
+        readers of the log compute the channels from the counts, which are more precise than MAG_RAW's float32
+        fields.
+    `settings`: settings that affect flags and sigmas, by key in the configuration, as attributes of the log.
     `sensors`: the sensors after the first. Their columns have the name of the sensor: ``NAME`` for a scalar,
         else ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the reading.
     """
@@ -354,7 +358,7 @@ def declarations(
 
 
 def _sensor_columns(sensor: Sensor, driver: Driver) -> list[dict[str, Any]]:
-    """Return the columns of a sensor after the first."""
+    """Return the declarations of the columns of a sensor after the first."""
     raw: dict[str, Any] = {"message": "MAG_RAW", "match": f"sensor_id={sensor.id}", "unit": "nT"}
     prefix = "count_" if driver.nt_per_count else ""
     raw["scale"] = driver.nt_per_count or 1.0
@@ -365,23 +369,25 @@ def _sensor_columns(sensor: Sensor, driver: Driver) -> list[dict[str, Any]]:
 
 
 PORT_RETRY_S = 0.25
-"""s between attempts to open a port that is down."""
+"""Time between two attempts to open a port that is down, s."""
 CLOSE_TIMEOUT_S = 2.0
-"""s that :meth:`LiveEdge.close` waits for an attempt under way to open a port."""
+"""Time that :meth:`LiveEdge.close` waits for a running attempt to open a port, s."""
 SLOW_US = 10_000_000
-"""µs between two reports that the link is too slow; repeated, because one may be lost as well."""
+"""Shortest time between two reports that the link is too slow, µs."""
 CLOCK_CHECK_INTERVAL_US = 100_000
-"""µs between two checks for a step of the host's clock, and for a link that is too slow."""
+"""Time between two checks for a step of the host's clock and for a link that is too slow, µs."""
 BACKLOG = 1 << 20
-"""Bytes of a link's backlog that are read at once after the process was held up."""
+"""Most bytes of the link's backlog that are read at once after a stall."""
 STANDSTILL_US = 400_000
-"""µs that a turn takes only where the process was held up: none waits for longer than `LOOK_US`."""
+"""Duration of one pass of the event loop that means a stall of the process, µs. A pass waits for at most
+`CLOCK_CHECK_INTERVAL_US`."""
 
 
 class LiveEdge:
-    """Convert the input of the ports to events in order.
+    """Source of live events, which reads the ports and the clock, and sends data to the ports.
 
-    `ports`: by MAG_PORT_NAME: the link and the sensors; opened here, in their order.
+    `ports`: ports of the link and the sensors, by MAG_PORT_NAME; opened in this order by the constructor.
+    `clock`: clock for the times of events.
     """
 
     def __init__(self, ports: Mapping[int, Port], clock: HostClock) -> None:
@@ -399,10 +405,10 @@ class LiveEdge:
             )
             self._openers[number] = opener
             opener.start()
-            tried.wait(PORT_RETRY_S)  # so that a report on the next port can go out over this one
+            tried.wait(PORT_RETRY_S)  # so that a report on the next port can be sent over this port
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield events until :meth:`stop`, and an empty one whenever `deadline` (µs) has passed."""
+        """Yield events until :meth:`stop`; yield an empty event when the time ``deadline()`` (µs) passes."""
         turned_us = self._clock.now_us()
         look_us = turned_us + CLOCK_CHECK_INTERVAL_US
         while not self._stopping:
@@ -412,14 +418,14 @@ class LiveEdge:
             blocked = [fd for number in full for fd in self._ports[number].blocked()]
             try:
                 ready = select.select([*lines, self._woken], blocked, [], max(wait, 0.0))[0]
-            except (OSError, ValueError):  # a descriptor was closed between asking for it and waiting
+            except (OSError, ValueError):  # a descriptor was closed before the call of select()
                 continue
             now_us = self._clock.now_us()
             for number in full:
                 self._flush(number)
             if self._woken in ready:
                 os.read(self._woken, 4096)
-            while not self._changes.empty():  # the news that a port opened comes before its data
+            while not self._changes.empty():  # the event that a port opened comes before its data
                 yield Event(now_us, Channel.STATE, self._changes.get())
             if held := now_us - turned_us > STANDSTILL_US:
                 yield Event(now_us, Channel.STATE, standstill(now_us, now_us - turned_us))
@@ -436,7 +442,7 @@ class LiveEdge:
                 yield Event(now_us, Channel.STATE, b"")
 
     def _look(self, now_us: int) -> Iterator[bytes]:
-        """Yield the state frames of the host's clock and of the link that are due."""
+        """Yield state frames about a step of the host's clock, a notice of the link, and a slow link."""
         if step_us := self._clock.step_us():
             yield clock_step(now_us, step_us)
         if text := self._ports[Channel.LINK].notice():
@@ -447,7 +453,7 @@ class LiveEdge:
             yield port_state(Channel.LINK, reason, link.dropped, is_open=True)
 
     def send(self, number: int, data: bytes) -> None:
-        """Send to a port; while the port is down, data are dropped and counted."""
+        """Send `data` to the port `number` (MAG_PORT_NAME); if the port is down, drop and count `data`."""
         port = self._ports[number]
         if not port.is_open:
             port.dropped += len(data)
@@ -458,7 +464,7 @@ class LiveEdge:
             self._lost(number, error)
 
     def answer(self, sender: tuple[int, int], data: bytes) -> None:
-        """Send data over the link to one system and component only."""
+        """Send `data` over the link, only to the peer of one system and component."""
         link = self._ports[Channel.LINK]
         try:
             if link.is_open:
@@ -467,29 +473,29 @@ class LiveEdge:
             self._lost(Channel.LINK, error)
 
     def credit(self, frames: list[bytes]) -> None:
-        """Report to the link which frames that it read last are signed with the key."""
+        """Pass the frames that were signed with the key to the link, which then replies to their senders."""
         self._ports[Channel.LINK].credit(frames)
 
     def _flush(self, number: int) -> None:
-        """Continue to send pending data over a slow line."""
+        """Send more of the pending data of a slow port."""
         try:
             self._ports[number].flush()
         except PortError as error:
             self._lost(number, error)
 
     def notify(self, state: bytes) -> None:
-        """Add a state frame to the events; from any thread."""
+        """Add an event with a state frame; any thread may call this method."""
         self._changes.put(state)
         os.write(self._waker, b"!")
 
     def stop(self) -> None:
-        """End :meth:`events` at the next turn; from any thread or signal handler, as often as you like."""
+        """End :meth:`events` after the present pass; any thread or signal handler may call this method."""
         if not self._stopping:
             self._stopping = True
             os.write(self._waker, b"!")
 
     def close(self) -> None:
-        """Close the ports; one that is still being opened is left to the end of the process."""
+        """Close the ports, except a port that is still being opened, which the end of the process closes."""
         self._stopping = True
         for number, opener in self._openers.items():
             opener.join(CLOSE_TIMEOUT_S)
@@ -510,7 +516,10 @@ class LiveEdge:
             return b""
 
     def _waiting(self, number: int, fd: int, held: bool) -> bytes:
-        """Return the pending events; after a stall all of the link, because readings need the telemetry."""
+        """Return the waiting bytes of a port.
+
+        After a stall (`held`), return up to `BACKLOG` bytes of the link, because readings need the telemetry.
+        """
         data = self._read(number, fd)
         while held and data and number == Channel.LINK and len(data) < BACKLOG:
             more = select.select([fd], [], [], 0)[0] if fd in self._ports[number].fds() else []
@@ -521,7 +530,10 @@ class LiveEdge:
         return data
 
     def _too_slow(self, now_us: int) -> bool:
-        """Return True if it is due to report that the link has dropped data because its buffer was full."""
+        """Return True if the link has dropped data since the last report because it is too slow.
+
+        After a report, return False for `SLOW_US`.
+        """
         overrun = self._ports[Channel.LINK].overrun
         if overrun == self._overrun or now_us < self._slow_us:
             return False
@@ -532,13 +544,13 @@ class LiveEdge:
         self._report(number, error.reason)
 
     def _report(self, number: int, reason: str) -> None:
-        """Report that a port is not open, or with no `reason` that it opened."""
+        """Add an event that a port is not open because of `reason`, or, without a reason, that it opened."""
         port = self._ports[number]
-        # the name last, because the end of a long text is cut off
+        # the port's name comes last, because the end of a long text is cut off
         self.notify(port_state(number, f"{reason}: {port.name}" if reason else "", port.dropped))
 
     def _keep_open(self, number: int, port: Port, tried: threading.Event) -> None:
-        """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
+        """Open the port whenever it is down; report each change once; set `tried` after the first attempt."""
         reported: str | None = None
         while not self._stopping:
             if port.is_open:

@@ -1,4 +1,4 @@
-"""A commented ``bridge.toml`` from the answers to five questions."""
+"""Creation of a commented ``bridge.toml`` from the user's settings."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from magbridge.sensors.options import Option, options_of
 __all__ = ["PLACEHOLDER", "Answers", "bridge_toml"]
 
 PLACEHOLDER = "FILL IN"
-"""Mark of a setting that the user must complete."""
+"""Text that marks a setting which the user must complete."""
 
 
 @dataclass(frozen=True)
 class Answers:
-    """The settings of a vehicle's bridge that have no default."""
+    """The user's settings for a new configuration."""
 
     driver: str
     port: str
-    """`driver`, `port`: The sensor's."""
+    """`driver`, `port`: Driver and port of the sensor."""
     baudrate: int = 9600
     link: str = "udpout:127.0.0.1:14550"
-    """The MAVLink URL."""
+    """MAVLink URL of the link."""
     system: int = 1
-    """The vehicle's system id."""
+    """System id of the vehicle."""
     parameters: tuple[str, ...] = ()
-    """``name`` or ``name [unit]`` of each moving mass."""
+    """``name`` or ``name [unit]`` of the position of each moving mass."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Options of the driver."""
+    """Options of the driver, by name."""
     calibration: str | None = None
-    """Its file."""
+    """Path of the calibration file; None for none."""
 
 
 def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str:
-    """Return the text of the configuration, with a comment at every key.
+    """Return the text of a ``bridge.toml``, with a comment at every key.
 
-    `answers`: what the user said.
-    `calibration`: its parameters get a table each, in its own units.
-    ConfigError: no such driver.
+    `answers`: the user's settings.
+    `calibration`: each of its parameters gets a ``[telemetry]`` table, in the calibration's unit.
+    ConfigError: the driver does not exist.
     """
     units = {}
     if calibration is not None:
@@ -69,7 +69,7 @@ def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str
 
 
 def _option(option: Option, given: Mapping[str, Any]) -> tuple[str, str, str, bool]:
-    """Return name, value and meaning of a driver's option, and whether the line is not a comment."""
+    """Return name, value and meaning of a driver's option, and True if the user has set the option."""
     meaning = option.meaning.replace("``", "").partition(". ")[0].rstrip(".")
     if option.name in given:
         return option.name, _value(given[option.name]), meaning, True
@@ -79,10 +79,10 @@ def _option(option: Option, given: Mapping[str, Any]) -> tuple[str, str, str, bo
 
 
 def _source(name: str, unit: str) -> Any:
-    """Return the autopilot's own message that carries a parameter; None if there is none.
+    """Return the field of an autopilot's message that contains a parameter; None if no field is known.
 
-    The columns that magbridge reads from a telemetry log are named in ``logs/fields.csv``; a calibration that
-    was fitted to such a log has these names.
+    ``logs/fields.csv`` states the columns that magbridge reads from the messages of a telemetry log. The
+    parameters of a calibration that was fitted to such a log have the names of these columns.
     """
     for fields in field_maps("mavlink").values():
         for one in fields:

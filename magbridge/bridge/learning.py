@@ -1,4 +1,4 @@
-"""``[learning]`` on the link: parameters in, notices, MAG_LEARNING and learned calibrations out."""
+"""Online calibration in the bridge: control by parameters, messages about it, and files of its results."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ __all__ = ["LearningService", "first_calibration", "keep", "kept_path", "open_le
 
 ACCEPT, FORGET = 1.0, 2.0
 FILE_INTERVAL_US = 600_000_000
-"""µs between files of a calibration that is only renewed."""
+"""Shortest time between two files of a learned calibration that was only updated, µs."""
 
 
 def first_calibration(config: Config) -> Calibration | None:
-    """Return the initial calibration of a bridge, or the prior of ``[learning]``, or None.
+    """Return the calibration with which a bridge starts; None without ``[calibration]`` and ``[learning]``.
+
+    Without ``[calibration]``, it is the file ``learning.prior``, or the generic prior of ``[learning]``.
 
     FormatError, CalibrationError: a file is not a calibration.
     """
@@ -50,12 +52,12 @@ def first_calibration(config: Config) -> Calibration | None:
 def open_learner(
     config: Config, calibration: Calibration | None, currents: tuple[str, ...] | None = None
 ) -> Learner | None:
-    """Return the learner of ``[learning]``; None without that table or a calibration.
+    """Return the online estimator of ``[learning]``; None without this table or without a calibration.
 
-    `config`: the bridge's.
-    `calibration`: to begin with.
-    `currents`: names of telemetry in ampere; by default those of ``[telemetry]``.
-    ConfigError: the calibration is none that can be learned.
+    `config`: the bridge's configuration.
+    `calibration`: the initial calibration.
+    `currents`: names of telemetry in ampere; None for the ones in ``[telemetry]``.
+    ConfigError: the calibration cannot be updated in flight.
     FormatError, OutOfRange: ``learning.reference`` is not a grid.
     """
     if currents is None:
@@ -86,7 +88,10 @@ def open_learner(
 
 
 def kept_path(config: Config) -> Path | None:
-    """Return the file of the learned calibration: next to the first, or in ``learning.directory``."""
+    """Return the path of the learned calibration; None without ``[learning]``.
+
+    The file is in ``learning.directory``, or else next to the initial calibration.
+    """
     if config.learning is None:
         return None
     first = config.resolve(config.calibration.file if config.calibration else "cal.json")
@@ -95,9 +100,9 @@ def kept_path(config: Config) -> Path | None:
 
 
 class LearningService:
-    """Connect a learner to the link.
+    """Link interface of the online estimator, with its parameters, STATUSTEXTs and MAG_LEARNING.
 
-    `to_keep`: calibrations published since the caller last emptied it, to be written to a file.
+    `to_keep`: published calibrations to write to a file; the caller empties the queue.
     """
 
     def __init__(self, learner: Learner, component: Component) -> None:
@@ -126,7 +131,7 @@ class LearningService:
             parameters.set(name, 0.0)
 
     def sample(self, time_us: int) -> None:
-        """Publish the changes by a sample, and the messages that are due."""
+        """Send and apply the changes that a sample at `time_us` (µs) caused, and MAG_LEARNING if due."""
         learner, component = self.learner, self._component
         for notice in learner.notices:
             severity = MAV_SEVERITY.WARNING if notice.grave else MAV_SEVERITY.NOTICE
@@ -166,9 +171,10 @@ class LearningService:
 
 
 def keep(learning: LearningService, path: Path) -> str:
-    """Write the last published calibration if it is new; return the reason of a failure, or nothing.
+    """Write the latest published calibration to `path` if it is new; return the reason of a failure, or "".
 
-    The first calibration, gone back to, is written as well: the file is what the bridge corrects with.
+    The file always has the calibration with which the bridge corrects. So the initial calibration is written,
+    too, if the bridge returns to it.
     """
     if not learning.to_keep:
         return ""

@@ -1,4 +1,4 @@
-"""Links by UDP, TCP (client and server) or serial line, and NMEA outputs; HOST:PORT or [IPV6]:PORT."""
+"""Ports of MAVLink links by UDP, TCP (client and server) or serial line, and of NMEA outputs."""
 
 from __future__ import annotations
 
@@ -26,36 +26,39 @@ __all__ = ["LINKS", "NmeaOutput", "nmea_port", "open_link"]
 
 ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
 UNSENT = 4096
-"""Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
+"""Most bytes that wait in the system for a slow connection; the bridge keeps the rest and can drop it."""
 CONNECTIONS = 16
-"""Most clients of a server; for another one, one that has said nothing valid has to go."""
+"""Most clients of a server; a further client replaces a client that has sent nothing valid."""
 GREETING = 0.2
-"""s that a client has to say something valid before it has to go for another."""
+"""Time in which a client may send its first valid frame before another client can replace it, s."""
 ACCEPTED = 4
-"""Most clients that are accepted before the sensor's turn."""
+"""Most clients that are accepted before the sensors are read."""
 PEER_TIMEOUT = 30.0
-"""s without a packet after which the peer of ``udpout`` is connected again."""
+"""Time without a packet after which ``udpout`` resolves the address of its peer again, s."""
 DATAGRAM = 1400
-"""Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
+"""Most bytes of one packet, which any usual network transmits without fragmentation."""
 DATAGRAMS = 512
-"""Most that are read before the sensor's turn: empty ones could keep it waiting for ever."""
+"""Most packets that are read before the sensors are read, since empty packets could delay them for ever."""
 NO_LISTENER_ERRORS = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
-"""What a UDP socket reports when no program listens (yet): not a fault of the port."""
+"""Errors of a UDP socket if no program listens yet, which are not faults of the port."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Return host and port; raises ValueError."""
+    """Return host and port of ``HOST:PORT`` or ``[IPV6]:PORT``; raise ValueError for other texts."""
     match = ADDRESS.fullmatch(text)
     if match is None or int(match["port"]) > 65535:
         raise ValueError(text)
     if match["ipv6"]:
         return str(IPv6Address(match["ipv6"])), int(match["port"])
-    match["host"].encode("idna")  # raises UnicodeError, as looking it up would
+    match["host"].encode("idna")  # raises UnicodeError, as resolving the name would
     return match["host"], int(match["port"])
 
 
 def resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int, Any]:
-    """Return the family and the socket address of a host; of a name that has both, IPv4's. Raises OSError."""
+    """Return address family and socket address of a host, preferably IPv4; raise OSError if it is unknown.
+
+    `kind`: type of the socket. `listen`: True for an address to bind.
+    """
     host, port = address
     found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE if listen else 0)
     family, *_, resolved = min(found, key=itemgetter(0))
@@ -63,17 +66,17 @@ def resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int, 
 
 
 class TcpConnection(PacedPort):
-    """``tcp``: connection to a server at `address`; or, without one, a client of :class:`TcpServer`."""
+    """Port of ``tcp``, a connection to a server at `address`; without address, a client of `TcpServer`."""
 
     def __init__(self, name: str, address: tuple[str, int] | None = None) -> None:
         super().__init__(name, UNSENT, read_bytes=PEER_READ_BYTES, ended="closed by the other end")
         self._address = address
         self._connection: socket.socket | None = None
         self.since = 0.0
-        """When it was made, s, monotonic."""
+        """Time at which the connection was made, s of the monotonic clock."""
 
     def open(self) -> None:
-        """Connect, waiting at most a second; raises :class:`PortError`."""
+        """Connect within a second; raise :class:`PortError` if this fails."""
         if self._address is None:
             raise PortError(self.name, "not connected")
         try:
@@ -82,7 +85,7 @@ class TcpConnection(PacedPort):
             raise PortError(self.name, error.strerror or str(error)) from error
 
     def adopt(self, connection: socket.socket) -> None:
-        """Use `connection`."""
+        """Use `connection` as the port's socket."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
@@ -91,7 +94,7 @@ class TcpConnection(PacedPort):
         self._connection, self._fd = connection, connection.fileno()
 
     def _send(self, data: bytes, address: Any) -> None:
-        """Send as other paced ports do; without a connection, `data` are dropped."""
+        """Send `data` as other paced ports do; without a connection, drop `data`."""
         if self._connection is None:
             self.dropped += len(data)
         else:
@@ -101,14 +104,14 @@ class TcpConnection(PacedPort):
         return self._connection is not None and bool(select.select([], [self._connection], [], 0)[1])
 
     def write_all(self, data: bytes) -> None:
-        """Send `data` whole, waiting for a slow reader."""
+        """Send all of `data`; wait if the reader is slow."""
         assert self._connection is not None
         self._connection.setblocking(True)
         self._connection.sendall(data)
         self._connection.setblocking(False)
 
     def close(self) -> None:
-        """Close the connection and discard the bytes still to be sent on it."""
+        """Close the connection and discard its unsent bytes."""
         if self._connection is not None:
             self._connection.close()
         self._connection, self._fd = None, -1
@@ -116,10 +119,11 @@ class TcpConnection(PacedPort):
 
 
 class TcpServer(Port):
-    """``tcpin``: server that answers the clients which :class:`Peers` accepts.
+    """Port of ``tcpin``, a server that sends to the clients which :class:`Peers` accepts.
 
-    On a link without signatures a client is answered at once, because it may only want to listen, and its
-    address cannot be forged. A client that has sent something valid is never disconnected for another.
+    On a link without signatures, the server sends to every client at once, because a client may only want to
+    receive and cannot forge its address. A client that has sent a valid frame is never disconnected in favour
+    of another one.
     """
 
     def __init__(self, name: str, address: tuple[str, int], peers: Peers, *, signed: bool = False) -> None:
@@ -130,7 +134,7 @@ class TcpServer(Port):
         self._clients: dict[int, TcpConnection] = {}
 
     def open(self) -> None:
-        """Listen; raises :class:`PortError`."""
+        """Start to listen; raise :class:`PortError` if this fails."""
         try:
             family, address = resolve(self._address, socket.SOCK_STREAM, listen=True)
             both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
@@ -141,13 +145,13 @@ class TcpServer(Port):
         self._listener, self._fd = listener, listener.fileno()
 
     def fds(self) -> list[int]:
-        """Return the listener's descriptor and the clients'."""
+        """Return the file descriptors of the listening socket and of the clients."""
         return super().fds() + list(self._clients)
 
     def _receive(self) -> list[tuple[Any, bytes]]:
-        """Accept clients that wait, then return the bytes of all; a client that leaves is not an error."""
+        """Accept waiting clients, then return the received bytes of each client; remove clients that left."""
         assert self._listener is not None
-        with suppress(OSError):  # no client waits, or it has gone, or there are too many open files
+        with suppress(OSError):  # no client waits, or it has left, or too many files are open
             for _ in range(ACCEPTED):
                 self._accept(self._listener.accept()[0])
         received = []
@@ -159,17 +163,17 @@ class TcpServer(Port):
         return [(fd, data) for fd, data in received if data]
 
     def write(self, data: bytes) -> None:
-        """Send to the accepted clients; drop `data` without one."""
+        """Send `data` to the accepted clients; without clients, drop `data`."""
         first = next((fd for fd, _ in self._receivers()), None)
         super().write(data)
         if first is None:
             self.dropped += len(data)
-        elif (client := self._clients.get(first)) is not None:  # the losses of the others are of no use
+        elif (client := self._clients.get(first)) is not None:  # losses of further clients do not count
             self.dropped, self.overrun = self.dropped + client.dropped, self.overrun + client.overrun
             client.dropped = client.overrun = 0
 
     def _send(self, data: bytes, address: Any) -> None:
-        """Send to one client; one that leaves is not an error."""
+        """Send `data` to the client with descriptor `address`; remove the client if it has left."""
         try:
             if address in self._clients:
                 self._clients[address].write(data)
@@ -177,7 +181,10 @@ class TcpServer(Port):
             self._dismiss(address)
 
     def _receivers(self) -> list[tuple[Any, Peer | None]]:
-        """Return the clients to send to by their descriptors, in the order in which to send."""
+        """Return descriptors and peers of the clients to send to, in the order of sending.
+
+        A client without signed frames on an unsigned link has no peer (None).
+        """
         chosen = [(fd, peer) for fd, peer in super()._receivers() if fd in self._clients]
         answered = {fd for fd, _ in chosen}
         others = [] if self._signed else [(fd, None) for fd in self._clients if fd not in answered]
@@ -185,11 +192,11 @@ class TcpServer(Port):
 
     @property
     def waiting(self) -> bool:
-        """Return True if bytes wait that a slow client could not buffer."""
+        """True if bytes wait for a slow client."""
         return any(client.waiting for client in self._clients.values())
 
     def flush(self) -> None:
-        """Send to the clients; one that leaves is not an error."""
+        """Send more of the waiting bytes to the clients; remove clients that left."""
         for fd, client in list(self._clients.items()):
             try:
                 client.flush()
@@ -197,16 +204,16 @@ class TcpServer(Port):
                 self._dismiss(fd)
 
     def blocked(self) -> list[int]:
-        """Return the descriptors of clients that take more once they are writable."""
+        """Return the descriptors of the clients for which bytes wait."""
         return [fd for fd, client in self._clients.items() if client.waiting]
 
     def write_all(self, data: bytes) -> None:
-        """Send `data` whole to every client, waiting for a slow reader."""
+        """Send all of `data` to every client; wait for slow clients."""
         for client in self._clients.values():
             client.write_all(data)
 
     def close(self) -> None:
-        """Close the clients and the listener."""
+        """Close the connections to all clients and the listening socket."""
         for fd in list(self._clients):
             self._dismiss(fd)
         if self._listener is not None:
@@ -214,7 +221,10 @@ class TcpServer(Port):
         self._listener, self._fd = None, -1
 
     def _accept(self, connection: socket.socket) -> None:
-        """Accept a client; if necessary, in place of one that has sent nothing valid for some time."""
+        """Accept a client; if the server is full, replace one older than `GREETING` without valid frames.
+
+        If no client can be replaced, close the new connection.
+        """
         if len(self._clients) >= CONNECTIONS:
             late = time.monotonic() - GREETING
             mute = (fd for fd, one in self._clients.items() if not self._peers.is_known(fd))
@@ -232,7 +242,7 @@ class TcpServer(Port):
 
 
 class UdpPort(Port):
-    """``udpout`` sends to one address; ``udpin``, given its `peers`, answers those of them that are valid."""
+    """Port of ``udpout``, which sends to one address, or of ``udpin``, which sends to accepted `peers`."""
 
     def __init__(self, name: str, address: tuple[str, int], peers: Peers | None = None) -> None:
         super().__init__(name, peers)
@@ -241,7 +251,7 @@ class UdpPort(Port):
         self._received = 0.0
 
     def open(self) -> None:
-        """Bind or connect; raises :class:`PortError`."""
+        """Bind or connect the socket; raise :class:`PortError` if this fails."""
         try:
             opened = self._new()
         except OSError as error:
@@ -249,18 +259,18 @@ class UdpPort(Port):
         self._socket, self._received, self._fd = opened, time.monotonic(), opened.fileno()
 
     def tend(self) -> None:
-        """Connect again if nothing has come for long, and the host, or we, have another address by now."""
+        """Reconnect ``udpout`` if nothing arrived for `PEER_TIMEOUT` and an address of the link changed."""
         opened, now = self._socket, time.monotonic()
         if opened is None or self._peers is not None or now - self._received < PEER_TIMEOUT:
             return
         self._received = now
-        with suppress(OSError), self._new() as new:  # not known at present, or closed meanwhile
+        with suppress(OSError), self._new() as new:  # the host is unknown at present, or the port was closed
             if _ends(new) != _ends(opened):
-                # the same descriptor, because the bridge may be waiting for it
+                # keep the descriptor, because the bridge may be waiting for it
                 os.dup2(new.fileno(), opened.fileno(), inheritable=False)
 
     def _new(self) -> socket.socket:
-        """Return a socket that is bound or connected; raises OSError."""
+        """Return a new socket, bound for ``udpin``, connected for ``udpout``; raise OSError if this fails."""
         listen = self._peers is not None
         family, address = resolve(self._address, socket.SOCK_DGRAM, listen=listen)
         opened = socket.socket(family, socket.SOCK_DGRAM)
@@ -274,10 +284,10 @@ class UdpPort(Port):
         return opened
 
     def _receive(self) -> list[tuple[Any, bytes]]:
-        """Return the datagrams that have come; an unreachable peer is nothing, not an error.
+        """Return the received datagrams, each with its sender; an unreachable peer is not an error.
 
-        All that are waiting are returned at once, as from a stream, so that samples that queued up while the
-        bridge stood still meet the telemetry that queued up with them.
+        All waiting datagrams are returned at once. So samples that queued up during a stall of the bridge get
+        the telemetry that queued up with them.
         """
         assert self._socket is not None
         datagrams: list[tuple[Any, bytes]] = []
@@ -298,7 +308,7 @@ class UdpPort(Port):
         return datagrams
 
     def _send(self, data: bytes, address: Any) -> None:
-        """Send mostly one datagram; what cannot be sent is dropped and counted."""
+        """Send `data` as one or more datagrams; drop and count datagrams that cannot be sent."""
         for datagram in _datagrams(data):
             self._send_one(datagram, address)
 
@@ -313,7 +323,7 @@ class UdpPort(Port):
             self.overran(data)
         except OSError as error:
             self.dropped += len(data)
-            if self._peers is not None:  # an impossible address, as one with port 0, is not a fault
+            if self._peers is not None:  # a peer with an invalid address, such as port 0, is not a fault
                 self._peers.forget(peer)
             elif error.errno not in NO_LISTENER_ERRORS:
                 raise self.lost(error.strerror) from error
@@ -326,7 +336,7 @@ class UdpPort(Port):
 
 
 def _datagrams(data: bytes) -> Iterator[bytes]:
-    """Yield `data` in datagrams of whole messages: after a standstill, thousands are sent at once."""
+    """Yield `data` in datagrams of whole messages, each at most `DATAGRAM` bytes."""
     if len(data) <= DATAGRAM:
         yield data
         return
@@ -340,17 +350,17 @@ def _datagrams(data: bytes) -> Iterator[bytes]:
 
 
 def _ends(connected: socket.socket) -> tuple[Any, Any]:
-    """Return our own address, without its port, and the peer's."""
+    """Return our own address without its port, and the address of the peer with its port."""
     return connected.getsockname()[0], connected.getpeername()
 
 
 CLIENT_LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpConnection}
-"""Kinds of link that go to one peer, by the first part of the URL, as in the MAVLink world."""
+"""Kinds of link to one peer -> class of the port; the kind is the first part of the URL."""
 SHARED: dict[str, Callable[[str, tuple[str, int], Peers, bool], Port]] = {
     "udpin": lambda name, address, peers, _: UdpPort(name, address, peers),
     "tcpin": lambda name, address, peers, signed: TcpServer(name, address, peers, signed=signed),
 }
-"""Kinds of link that anyone can come to; any other URL is a serial device."""
+"""Kinds of link with any number of peers -> function that returns the port."""
 LINKS = ("udpin", "udpout", "tcp", "tcpin")
 
 
@@ -366,14 +376,14 @@ def open_link(
 ) -> Port:
     """Return the (unopened) port for a MAVLink URL.
 
-    `url`: as in ``[link]``.
-    `baudrate`: bit/s of a serial device.
-    `source`, `key`: what an error names.
-    `autopilot`: system and component that a link with many peers answers before all others.
-    `budget`: bytes/s that all other peers get together there.
-    `signed`: peers are answered once :meth:`Port.credit` has named a frame of theirs.
-    ConfigError: an unknown kind of link or of serial URL, no device's name, or an address that is not
-        HOST:PORT.
+    `url`: URL as in ``[link]``; a URL of no kind in `LINKS` is a serial device.
+    `baudrate`: baud rate of a serial device, bit/s.
+    `source`, `key`: file and key that contain `url`, for errors.
+    `autopilot`: system and component of the peer to which a link with many peers sends first.
+    `budget`: bytes/s that a link with many peers sends to all peers other than the autopilot.
+    `signed`: True to send only to peers that have sent a signed frame, according to :meth:`Port.credit`.
+    ConfigError: the kind of link or of serial URL is unknown, the name cannot be a device's, or the address
+        is not HOST:PORT.
     """
     kind, colon, address = url.partition(":")
     if kind not in LINKS:
@@ -394,13 +404,13 @@ def open_link(
 
 
 NMEA_RETRY_US = 1_000_000
-"""µs between two attempts to open the port."""
+"""Time between two attempts to open the NMEA port, µs."""
 
 
 def nmea_port(config: Config) -> Port | None:
-    """Return the (unopened) port of ``[heading] nmea``, None without one.
+    """Return the (unopened) port of ``[heading] nmea``; None if it is not configured.
 
-    ConfigError: it is neither ``udp:HOST:PORT`` nor a serial device.
+    ConfigError: the name is neither ``udp:HOST:PORT`` nor a serial device.
     """
     name = config.heading.nmea
     if name is None:
@@ -410,9 +420,10 @@ def nmea_port(config: Config) -> Port | None:
 
 
 class NmeaOutput:
-    """Sends sentences on a port, which it opens again when it is lost.
+    """Sender of NMEA sentences on a port, which it opens again after a loss.
 
-    `notify`: receives a state frame when the port cannot be opened or is lost, once for each reason.
+    `port`: the port for the sentences.
+    `notify`: called with a state frame, once per reason, if the port is lost or cannot be opened.
     """
 
     def __init__(self, port: Port, notify: Callable[[bytes], None]) -> None:
@@ -421,7 +432,7 @@ class NmeaOutput:
         self._retry_us = 0
 
     def send(self, sentences: deque[bytes], time_us: int) -> None:
-        """Send the sentences and empty the queue; those that come while the port is down are dropped."""
+        """Send the sentences and empty the queue; drop the sentences if the port is down."""
         if not sentences:
             return
         data = b"".join(sentences)
