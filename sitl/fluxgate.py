@@ -123,7 +123,7 @@ class DigitizerEncoder(Encoder):
     Options = DigitizerOptions
 
     def encode(self, reading: Reading) -> bytes:
-        """Return one frame."""
+        """Return the frame of one reading."""
         top, limit = FULL_SCALE - 1, self.options.full_scale or inf
         flags, counts = 0, []
         for channel, value in enumerate(reading.field):

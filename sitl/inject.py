@@ -176,14 +176,14 @@ def jump(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def creep(scene: Scene, size: float, rng: Generator) -> None:
-    """Relax the offset logarithmically (Street & Woolley 1949); the size is in nT over the log."""
+    """Relax the offset logarithmically (Street & Woolley 1949); the size is the total change in nT."""
     tau = rng.uniform(0.3, 1.5) * scene.t[-1]
     crept = np.log1p(scene.t / tau) / np.log1p(scene.t[-1] / tau)
     scene.add(crept, size * direction(rng))
 
 
 def multiplexed(scene: Scene, size: float, rng: Generator) -> None:
-    """Sample the channels in turn without logging it; the size is the time between channels in s."""
+    """Sample one channel after the other, without logged times; the size is the interval in s."""
     order = rng.choice([-1.0, 1.0])
     delays = (0.0, size, 2 * size) if order > 0 else (2 * size, size, 0.0)
     scene.instrument = msgspec.structs.replace(scene.instrument, channel_delay=delays)
@@ -266,7 +266,7 @@ def bad_map(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def wrong_level(scene: Scene, size: float, rng: Generator) -> None:
-    """Add an error of the main-field model that varies slightly along the way; the size is in nT."""
+    """Add an error of the main-field model that varies slightly along the track; the size is in nT."""
     along = scene.when / scene.when[-1] - 0.5
     scene.reference = scene.reference + size * (1.0 + 0.02 * rng.normal() * along)
     scene.truth["bias"] = size
@@ -348,7 +348,7 @@ def ring(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def squeezed(scene: Scene, size: float, rng: Generator) -> None:
-    """Add an offset of hull and mount under pressure, with a little creep; the size is in nT at 100 m."""
+    """Add an offset that the water pressure causes, with a little creep; the size is in nT at 100 m."""
     depth = scene.track.depth
     strain = depth / 100.0 * (1.0 + 0.03 * depth / 100.0)
     strain = 0.93 * strain + 0.07 * first_order(strain, scene.track.step, 120.0)

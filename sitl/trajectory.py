@@ -52,14 +52,14 @@ class Track:
     latitude: FloatArray
     longitude: FloatArray
     depth: FloatArray
-    """`latitude`, `longitude`, `depth`, (n,), deg, deg, m."""
+    """`latitude`, `longitude`, `depth`: True position (n,), deg, deg, m."""
     roll: FloatArray
     pitch: FloatArray
     heading: FloatArray
-    """`roll`, `pitch`, `heading`, (n,), deg; the heading is unwrapped beyond 360 for interpolation."""
+    """`roll`, `pitch`, `heading`: True attitude (n,), deg; the heading is unwrapped beyond 360."""
     parameters: dict[str, FloatArray]
-    """(n,) each: Positions of the moving masses, and other logged channels on which the vehicle's magnetism
-    depends."""
+    """Positions of the moving masses (n,), and other channels on which the vehicle's magnetism depends, by
+    name."""
     run: FloatArray | None = None
     """Number of the leg at each point (n,), from 1."""
     segments: tuple[tuple[str, float, float], ...] = ()
@@ -92,7 +92,7 @@ def fly(
     motion: Motion = STEADY,
     limits: Mapping[str, Limit] = LIMITS,
 ) -> Track:
-    """Fly `legs` one after the other, from a `start` (s since 1970, latitude and longitude in deg).
+    """Return the track of consecutive `legs`, from a `start` (s since 1970, latitude and longitude in deg).
 
     The track has a point every `step` s; `rng` generates the wander. `limits` has every moving mass; a mass
     that no leg moves stays in the middle of its travel.

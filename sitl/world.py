@@ -127,7 +127,7 @@ class World:
         water: Water,
         rng: np.random.Generator,
     ) -> World:
-        """Draw bodies about `origin` (deg), magnetised by the main field at `time` (s since 1970)."""
+        """Return a world with random bodies about `origin` (deg), magnetised at `time` (s since 1970)."""
         latitude, longitude, depth, when = np.array([[origin[0]], [origin[1]], [0.0], [time]])
         return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
 

@@ -73,7 +73,7 @@ class SensorComparison:
         main_field: tuple[float, float],
         quality: int,
     ) -> tuple[float, int]:
-        """Compare a sample with the other sensor's; return the variance (nT²) and the flags to add to it.
+        """Compare a sample with the other sensor; return the variance (nT²) and flags to add to the sample.
 
         `side` (0 or 1) is the sensor's index, `total_field` the total field with its 1-sigma (nT).
         `main_field` is the main field (NaN if unknown) with the 1-sigma of the Earth's field about it (nT).

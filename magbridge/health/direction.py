@@ -57,7 +57,7 @@ class DirectionCheck:
         self._until_us = self._tilted_until_us = 0
 
     def attitude(self, time_us: int, roll: float, pitch: float, yaw: float) -> None:
-        """Set the vehicle's attitude, rad, of forward-starboard-down axes, yaw from true north."""
+        """Set the vehicle's attitude (rad, forward-starboard-down axes, yaw from true north)."""
         if isfinite(roll + pitch + yaw):
             self._roll, self._pitch, self._yaw, self._attitude_us = roll, pitch, yaw, time_us
 

@@ -51,7 +51,7 @@ INNOVATION: Final = 4.0 / 3.0
 FLOOR: Final = 1.125
 """Smallest variance of an innovation, as a multiple of the noise model's."""
 MAX_QUIET_RATIO: Final = 2.5
-"""Ratio of the measured noise to the calibration's above which sigma is widened, until it has halved."""
+"""Ratio of the measured noise to the calibration's above which sigma is widened; half this ratio ends it."""
 REPORTED_RATIO: Final = 5.0
 """Ratio above which the operator receives a message."""
 SCATTER_LAGS: Final = (1, 2, 4, 8)

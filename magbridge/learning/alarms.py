@@ -83,7 +83,7 @@ class LearningAlarm(NamedTuple):
     strength: float
     mapless: bool = False
     """True for a map alarm: an unmapped crustal field explains the data. The corrected field is not affected,
-    and the alarm lasts as long as the bank raises it."""
+    and the alarm lasts as long as the estimator bank raises it."""
 
 
 MAX_CAUSE_LOG_RATIO: Final = log(20.0)
@@ -320,10 +320,10 @@ class LateTelemetryTest:
 MIN_GROWTH: Final = 6.0
 """Least growth of an alarm's log-likelihood ratio before its cause is learned (6 = a factor of 400)."""
 LOG_RATIO_PER_CAUSE: Final = 3.0
-"""Additional growth required for each further cause that fits: more evidence often excludes causes, whereas
-separating them after all were learned takes hours."""
+"""Additional growth required for each further cause that fits. More evidence often excludes causes, but to
+separate causes after all were learned takes hours."""
 MAX_WAIT_SAMPLES: Final = 128
-"""Informative samples for each cause that fits, after which the decision is made at the latest."""
+"""Number of informative samples per fitting cause after which learning no longer waits for more evidence."""
 MIN_UPDATE_GROWTH: Final = 2.0
 """Least growth of an alarm's log-likelihood ratio that updates the alarm."""
 SILENT_SAMPLES: Final = 300
@@ -333,19 +333,19 @@ SILENT_SAMPLES: Final = 300
 RELAPSE_FACTOR: Final = 4
 """Factor by which each relapse multiplies the evidence and the samples required."""
 SIGNIFICANT_SQUARE: Final = 16.0
-"""Squared normalised error from which on a prediction error is significant."""
+"""Squared normalised prediction error above which an error is significant."""
 
 
 class AlarmState:
     """State of the current `alarm`, if there is one; `mapped` is True if the reference is a map.
 
     A relapse is an alarm that comes before the last learned cause has explained :data:`SILENT_SAMPLES`
-    informative samples. Alarms after a relapse continue the first one: it is announced once, and ends once a
-    learned calibration has explained as many samples.
+    informative samples. An alarm after a relapse continues the first alarm, without another announcement. It
+    ends when a learned calibration has explained as many samples.
 
     During an alarm, `flags` has the bit ``unexplained``, and `variance` is that of the unexplained residual,
-    nT². `is_tried` is True if the alarm's cause was learned and no alarm has followed, `is_pending` if in
-    addition no later samples have confirmed the learned calibration, so that it is not published.
+    nT². `is_tried` is True if the alarm's cause was learned and no alarm has followed. `is_pending` is True
+    until later samples confirm the learned calibration, which is not published before.
     """
 
     def __init__(self, *, mapped: bool = False) -> None:
@@ -436,7 +436,7 @@ class AlarmState:
         self._cover()
 
     def _cover(self) -> None:
-        """Set the variance to the cause's effect until it is published, or to the larger observed errors."""
+        """Set the variance to the larger square: unpublished cause's effect or observed errors."""
         # sigma includes the cause's effect until it is published, then the observed errors
         learned = self.is_tried and not self.is_pending
         size = 0.0 if self.alarm is None or learned or self.is_mapless else self.alarm.size

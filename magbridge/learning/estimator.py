@@ -77,7 +77,7 @@ AVERAGING_DISTANCE_M: Final = 250.0
 """Averaging distance of the mean derivative, m: a quarter of the crustal field's correlation length. Faster
 variations are not attributed to the crustal field."""
 MEAN_SAMPLES: Final = 1000
-"""Samples over which the mean derivative of the total field is averaged."""
+"""Averaging time of the total field's mean derivative by the coefficients, in samples."""
 CHANGED: Final = 2.0
 """Smallest significant change of the mean field, in sigmas."""
 SLOPE_MEMORY_S: Final = 24.0 * 3600.0
@@ -90,9 +90,9 @@ STEEPEST: Final = 20.0 / 3600.0
 class Estimator:
     """Kalman filter that estimates coefficients sample by sample, from a prior (K,) of covariance (K, K).
 
-    The states of `filter` with the indices `offsets` (3,) are the constant offset, which walks by `creep` (nT
-    per square root of a second); those of `slope` (3,) are its slope, nT/s. `is_informative` is True if the
-    last sample contributes to the coefficients.
+    The states of `filter` with the indices `offsets` (3,) are the constant offset, a random walk of `creep`
+    (nT per square root of a second). The states with the indices `slope` (3,) are the offset's slope, nT/s.
+    `is_informative` is True if the last sample contributes to the coefficients.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Estimator:
     def know(
         self, coefficients: FloatArray, nuisances: FloatArray, covariance: FloatArray, nuisance: Nuisance
     ) -> None:
-        """Set the state and covariance to a fit's joint result for coefficients (K,) and nuisance (4,)."""
+        """Set the state to a batch fit's joint estimate of coefficients (K,) and `nuisances` (4,)."""
         self._nuisance = nuisance
         both = np.r_[: self.size, self.states - TRACK_STATES : self.states]
         self.filter.mean[both] = np.concatenate([coefficients, nuisances])
@@ -146,7 +146,7 @@ class Estimator:
         return np.asarray(root @ root.T)
 
     def follow(self, s: float) -> None:
-        """Update the total field's mean derivative; `s` is the scale of the last residual."""
+        """Add the last sample to the total field's mean derivative; `s` is the scale of its residual."""
         self._mean += (s * self.filter.row[: self.size] - self._mean) / MEAN_SAMPLES
         self._share += (1.0 - self._share) / MEAN_SAMPLES
 
@@ -156,10 +156,10 @@ class Estimator:
         return self._mean / self._share if self._share else self._mean
 
     def at_level_of(self, published: FloatArray) -> FloatArray:
-        """Return the likeliest coefficients (K,) whose mean field is that of those `published` (K,).
+        """Return the likeliest coefficients (K,) with the mean field of the coefficients `published` (K,).
 
-        The crustal field and the reference hide the level. A learned change of the level is therefore not
-        significant, and the published level is kept where the data allow it.
+        The crustal field and the reference's constant error hide the mean field. A learned change of the mean
+        field is therefore not significant, and the published mean field is kept.
         """
         K = self.size
         # conditional mean of the coefficients, given their mean field: c + P m (m^T P m)^-1 (level)
@@ -168,7 +168,7 @@ class Estimator:
         return np.asarray(self.coefficients + toward * (by / float(self._mean @ toward)))
 
     def keep_level(self, published: FloatArray) -> None:
-        """Move the state to where the mean field is that of the coefficients `published` (K,).
+        """Shift the state so that its mean field equals that of the coefficients `published` (K,).
 
         Unlike :meth:`at_level_of`, the nuisance states absorb the difference. The state is not moved if the
         level drifts or has changed significantly. The covariance to publish includes the difference until
@@ -183,7 +183,7 @@ class Estimator:
             self._kept = toward[:K] * (by / variance**2)
 
     def open(self, variance: float, coefficients: IndexArray | None = None) -> None:
-        """Add `variance` to the variance of `coefficients` (3,), by default the offsets."""
+        """Add `variance` to that of the states of indices `coefficients` (3,), by default the offsets."""
         coefficients = self.offsets if coefficients is None else coefficients
         self.filter.covariance[coefficients, coefficients] += variance
 
@@ -252,7 +252,7 @@ class Estimator:
         return self.filter.update(None if learn else slice(None, -TRACK_STATES))
 
     def leave_map(self, nuisance: Nuisance) -> None:
-        """Replace the nuisance by one for a reference without a map, and reset its states."""
+        """Continue without a map: replace the model of the reference's error, and reset its states."""
         # the nuisance starts again, uncorrelated with the coefficients
         self._nuisance = nuisance
         P, states = self.filter.covariance, slice(-TRACK_STATES, None)
@@ -272,7 +272,7 @@ class Estimator:
 
 
 BEYOND_CHANCE: Final = 13.5
-"""Log-likelihood ratio that is exceeded by chance once in 30 days of 0.25 Hz (Ville's inequality)."""
+"""Log-likelihood ratio that is exceeded by chance once in 30 days at 0.25 Hz (Ville's inequality)."""
 BANK_MEMORY_SAMPLES: Final = 2000.0
 """Time constant, in samples, of the exponential forgetting of predictions."""
 MIN_LEAD: Final = 3.0
@@ -293,8 +293,8 @@ DRIFT_CORRELATION_TIME_S: Final = 2.0 * 3600.0
 class EstimatorBank:
     """Estimators of the coefficients, one for each hypothesis.
 
-    The baseline is the first of `all`. If the reference is a map, the last of them is `without_map`, which
-    does not use it. `map_doubted` is True while `without_map` is selected, because it predicts significantly
+    The baseline is the first of `all`. If the reference is a map, the last is `without_map`, which does not
+    use the map. `map_doubted` is True while `without_map` is selected, because it predicts significantly
     better. `map_lead` is its lead in log w; `map_since` (s) is the time since when it has led.
     """
 
@@ -335,7 +335,7 @@ class EstimatorBank:
         self._weights = [0.0] * len(self.all)
 
     def open(self, variance: float) -> None:
-        """Increase the variance of the offsets of all estimators by `variance` (nT²) an axis."""
+        """Increase the variance of the offsets of all estimators by `variance` (nT²) on each axis."""
         for one in self.all:
             one.open(variance)
 
@@ -362,7 +362,7 @@ class EstimatorBank:
         """Replace the baseline by the estimator that follows the temperature; return True if it is replaced.
 
         The replacement needs significantly better predictions, and a log-likelihood not much lower than an
-        alarm's, `strength`. An estimator that followed the temperature from the start knows it more exactly.
+        alarm's, `strength`. An estimator that followed the temperature from the start is more exact.
         """
         warm = self._warm
         if self._weights[warm] - self._weights[0] < max(BEYOND_CHANCE, strength - MAX_DEFICIT):
@@ -389,7 +389,7 @@ LAST_FIT_SAMPLES: Final = 4096
 """Number of samples of the first and the last fit: 2 minutes and 4.5 hours at 0.25 Hz."""
 MAX_GAUSS_NEWTON_STEPS: Final = 12
 MIN_STEP_SIGMA: Final = 0.01
-"""Step, in sigmas of the prior, that ends the iteration."""
+"""Step below which the iteration ends, in sigmas of the prior."""
 START_NOISE_NT: Final = 2.0
 """1-sigma of a channel's noise until it is estimated, nT."""
 MIN_SAMPLES_FOR_NOISE: Final = 256
@@ -443,7 +443,7 @@ class BatchFit:
 
     @property
     def fitted(self) -> bool:
-        """Return True if a fit was made; before it, the filter is linearised at the prior of the class."""
+        """Return True if a fit was made; before the fit, the filter is linearised at the prior."""
         return self._next > FIRST_FIT_SAMPLES
 
     @property

@@ -43,18 +43,19 @@ MAX_BLOCK_S: Final = 600.0
 """Shortest duration of a block, and duration from which it may end at any distance, s. In between, it may end
 once the vehicle has travelled the crustal field's correlation length."""
 STEADY_TIME_S: Final = 60.0
-"""Time after a turn for which a block does not end, s, so that it contains the whole turn; a vehicle that
-turns all the time ends it after twice the duration."""
+"""Time after a turn in which a block does not end, s, so that the block contains the whole turn. If the
+vehicle turns all the time, the block ends after twice MAX_BLOCK_S."""
 TURN: Final = 0.4
 """Change of the field's direction in sensor axes that counts as another attitude, rad."""
 MIN_BLOCKS: Final = 3
 MAX_BLOCKS: Final = 12
 """Smallest and largest number of recent blocks that a comparison uses."""
 SIGNIFICANCE_SIGMA: Final = 2.0
-"""Normal quantile (2.3 %) at which a share differs from 1/2. Few blocks need Student's larger quantile."""
+"""Normal quantile (2.3 %) at which a share differs significantly from 1/2. Few blocks need
+Student's larger quantile."""
 MIN_DIRECTIONS: Final = 4
-"""Number of directions of the field, :data:`TURN` from each other, from which on a change is
-known at all attitudes."""
+"""Number of field directions, :data:`TURN` from each other, from which on a change can be significant at all
+attitudes."""
 MIN_CHANGE_RATIO: Final = 3.0
 """Least ratio of a change's mean square to its variance, at all attitudes so far."""
 CRUST_FACTORS: Final = np.array([1.0, 0.3, 0.1, 0.03])
@@ -64,7 +65,7 @@ CRUST_MEMORY_SAMPLES: Final = 2000.0
 
 
 def student_quantile(dof: int) -> float:
-    """Return Student's t for the normal quantile 2 (Abramowitz & Stegun 1964, eq. 26.7.5)."""
+    """Return Student's t at the probability of SIGNIFICANCE_SIGMA (Abramowitz & Stegun 1964, eq. 26.7.5)."""
     z = SIGNIFICANCE_SIGMA
     return z + (z**3 + z) / (4.0 * dof) + (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / (96.0 * dof**2)
 
@@ -247,7 +248,7 @@ class Judge:
     def adopt(self, *, expected: bool = False) -> bool:
         """Return True if the candidates have significantly smaller errors than the published calibration.
 
-        Their change is `expected` if an alarm has shown its cause, which explains the samples.
+        Their change is `expected` if an alarm has shown a cause that explains the samples.
         """
         return self._to_published.significance(self._crust, expected=expected) > 1.0
 

@@ -254,7 +254,7 @@ class Publication:
         return replace(made, method=method, inputs=inputs, noise=noise, level=level, reference=reference)
 
     def stale(self, difference: float) -> bool:
-        """Return True if `difference`, learned less published total field (nT), requires an update."""
+        """Return True if `difference`, learned minus published total field (nT), requires an update."""
         far = abs(difference) > MAX_PUBLISHED_DIFFERENCE * self.calibration.noise.sensor
         return self.learned and ((far and self.age >= MIN_UPDATE_SAMPLES) or self.age >= MAX_UPDATE_SAMPLES)
 

@@ -58,9 +58,9 @@ MAX_MISFIT: Final = 2.0
 value shows that the true cause is another, such as a current without telemetry."""
 MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
-"""Flags of samples from which nothing is learned."""
+"""Flags that exclude a sample from learning."""
 MAIN_FIELD_SIGMA_NT: Final = 145.0
-"""1-sigma of the field about the main field alone, nT."""
+"""1-sigma of the Earth's field about the main field, nT."""
 
 
 class Learner:
@@ -129,7 +129,7 @@ class Learner:
 
     @property
     def calibration(self) -> Calibration:
-        """Calibration to publish."""
+        """Published calibration, with which the bridge corrects."""
         return self._publication.calibration
 
     @property
@@ -176,7 +176,7 @@ class Learner:
         self._notify("learning: all forgotten")
 
     def _begin(self, nuisance: Nuisance) -> None:
-        """Begin to learn from the first calibration."""
+        """Reset learning, so that it starts with the first calibration."""
         self._restart(nuisance)
         self._intake = Intake(self._max_rate)
         self.samples = 0
@@ -185,7 +185,7 @@ class Learner:
         self._refuted = False  # another alarm came before later samples confirmed the cause
 
     def _restart(self, nuisance: Nuisance) -> None:
-        """Begin to learn from the published calibration; offsets may have changed at this power-on."""
+        """Restart learning with the published calibration, whose offsets may have changed at power-on."""
         published = self.calibration
         # without the map, the reference is off by the crustal field and its level
         mapless = (
@@ -225,7 +225,7 @@ class Learner:
 
         `field` is the raw field (nT, sensor axes). `regressors` and `values` are the regressors and channel
         values of the calibration at that time. `faulty` is True if the sensor is at fault, or the field
-        cannot be the Earth's. `reference` is the main field's H_e (nT; NaN without a `position`, which is
+        cannot be the Earth's. `reference` is the main field H_e (nT; NaN without a `position`, which is
         latitude and longitude in deg). `watched` are the values of the telemetry :attr:`watched` (NaN if
         unknown). `age` is the age of the parameters' oldest telemetry (s). `settled` is the field of the
         previous sample, if this sample makes it more exact.
@@ -316,7 +316,7 @@ class Learner:
         self._notify(f"explained again: {how}")
 
     def _close_unexplained(self) -> None:
-        """Close an alarm that no coefficient explained, and restart the judge, which its cause affected."""
+        """Close an alarm that no coefficient explained, and restart the judge, whose data it affected."""
         self._publication.judge.restart()
         self._settle("gone")
 
@@ -467,13 +467,13 @@ class Learner:
 
     @property
     def _explained(self) -> str:
-        """The learned causes of the alarm, in words."""
+        """Learned causes of the alarm, with the calibration's id, for a notification."""
         assert self._standing.alarm is not None
         causes = named([one for one in self._standing.alarm.causes if one not in NO_COEFFICIENT])
         return f"{causes}, learned {calibration_id(self._publication.calibration):08x}"
 
     def _take_up(self) -> None:
-        """Learn the cause of the alarm, if coefficients can represent it, on trial."""
+        """Learn the alarm's cause on trial, if coefficients can represent the cause."""
         bank, alarm = self._knowledge.bank, self._standing.alarm
         strength = self._knowledge.detector.strength
         if strength < MIN_CAUSE_LOG_RATIO:

@@ -80,7 +80,7 @@ class ScriptedEdge:
         """Do nothing: a replay has only one peer."""
 
     def flush(self) -> None:
-        """Send all bytes that are waiting."""
+        """Send all collected bytes to the autopilot."""
         self._ports[Channel.LINK].write_all(bytes(self._unsent))
         self._unsent.clear()
 

@@ -65,7 +65,7 @@ class Autopilot:
         return due
 
     def row(self, time_us: int, row: Mapping[str, float]) -> list[bytes]:
-        """Return the frames for one `row`: values by column name, NaN if missing."""
+        """Return the MAVLink frames for one `row`, which has values by column name, NaN if missing."""
         boot_ms = (time_us - self._boot_us) // 1000
         frames = [
             self._parameter(telemetry, row[name], boot_ms)

@@ -57,7 +57,7 @@ class Listener:
                 self.navigation[MAG_NAVIGATION_STATE(message["state"]).name.lower()] += 1
 
     def field(self) -> dict[str, FloatArray]:
-        """Return the main sensor's field (n,) by column: ``time`` (s since 1970 UTC), nT, and ``quality``."""
+        """Return the corrected field as columns (n,): ``time`` (s since 1970 UTC), nT, and ``quality``."""
         table = np.array(self._values).reshape(-1, len(COLUMNS))
         columns = dict(zip(COLUMNS, table.T, strict=True))
         return {**columns, "time": columns["time"] * 1e-6}
