@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 from magbridge.records import Vector
 
 if TYPE_CHECKING:
-    from magbridge.health.scatter import Scatter  # which needs the messages of this module
+    from magbridge.health.scatter import Scatter  # which imports this module
 
 
 class Messages:

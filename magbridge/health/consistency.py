@@ -211,7 +211,7 @@ class ConsistencyCheck:
 
     def _learn_roughness(self, squared: float, unit: FloatArray) -> None:
         """Adapt the crustal field's roughness to a normalised squared residual, unless the vehicle turns."""
-        # straight legs alone: at a turn, an error of the calibration looks like roughness
+        # not in a turn, where an error of the calibration looks like roughness
         turned = float(np.abs(unit - self._last_unit).max())
         self._last_unit = unit
         if turned < STRAIGHT_CHANGE and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:
@@ -235,7 +235,7 @@ class ConsistencyCheck:
         variance[:4] -= np.sum(self._mean_effect[:4] ** 2, axis=1)
         # a^2 = systematic variance / tr Var(f), see the module
         allowed = self._systematic / np.maximum(variance, MIN_EFFECT_NT**2)
-        # no drift and no temperature effect belong to the null hypothesis
+        # the null hypothesis has no drift and no temperature effect
         allowed[1:3] = 0.0
         return np.minimum(np.sqrt(allowed), 1.0)
 
@@ -253,7 +253,7 @@ class ConsistencyCheck:
         test = self._test
         rows, weights = test.competing(COMPETING_LOG_RATIO)
         size = test.rms(rows[0])
-        # an error that sigma covers is not an alarm, nor is one while the crust's roughness is not known
+        # no alarm for an error that sigma covers, or before the crustal field's roughness is known
         matters = size > MIN_ERROR_SIGMA * sigma and self._straight_samples >= MIN_STRAIGHT_SAMPLES
         if self.is_wrong:
             self.is_wrong = largest > CLEAR_LOG_RATIO

@@ -114,7 +114,7 @@ class HealthMonitor:
                 self.flags = IMPLAUSIBLE
             return 0.0
         self._reference_steps.follow(time_us, reference)
-        # the order matters: a wrong field must not become a trend, nor an outlier evidence
+        # order: a wrong field must not enter the trend, and an outlier not the consistency test
         steady = not quality & UNSTEADY
         variance = level.check(time_us, total, sigma, reference, reference_sigma, steady)
         doubtful = stuck or level.is_wrong

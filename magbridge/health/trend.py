@@ -264,7 +264,7 @@ class TrendCheck:
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
-        # a jump that repeats the sum so far: the return was missed, at a motion or a turn
+        # a jump equal to the sum so far: the return in between was missed, at a motion or a turn
         if jump * now.jump_sum > largest_zero and (jump - now.jump_sum) ** 2 <= 2.0 * largest_zero:
             total = jump
         # a jump at a motion recurs at the next motion, so sigma includes it for longer

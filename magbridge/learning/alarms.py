@@ -258,7 +258,7 @@ class DelayTest:
 
         Return an alarm if the log-likelihood ratio exceeds its threshold.
         """
-        # the innovation v at the positions of then against v' at those of now, of variances S and S'
+        # compare v (positions reported then, variance S) with v' (positions reported now, variance S')
         v, S = stored.innovation, stored.variance
         S_late = S + (DELAY_UNCERTAINTY * change) ** 2
         square = min(v * v / S, MAX_HINDSIGHT_SQUARE)
@@ -369,7 +369,7 @@ class AlarmState:
     def update(self, alarm: LearningAlarm) -> str:
         """Update the state with an alarm of the change detector; return the notification, or ""."""
         before = self.alarm
-        # an alarm after its cause was learned is another one, or a relapse
+        # an alarm after the cause was learned is a new alarm, or a relapse
         is_new = before is None or self.is_tried
         if before is not None and (alarm.mapless or before.mapless):
             if alarm.mapless and before.causes == alarm.causes:
@@ -462,7 +462,7 @@ class AlarmState:
         """True if the evidence suffices to learn the alarm's cause."""
         if self.alarm is None or self.is_tried or not self.is_learnable:
             return False
-        # each further candidate needs more growth, so that the attitudes to come separate them
+        # each further candidate needs more growth, so that future attitudes separate the causes
         fit, slower = len(self.alarm.channels), self._slower
         sure = self.alarm.strength > self._required + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
         if self._mapped and "map_error" in self.alarm.causes:

@@ -1,6 +1,6 @@
 r"""Estimate the coefficients: one Kalman filter for each hypothesis, and a batch fit at the start.
 
-The state of an :class:`Estimator` is the coefficients, the slope of the offset (nT/s, an axis), and the
+The state of an :class:`Estimator` consists of the coefficients, the offset's slope (nT/s, each axis), and the
 states of :class:`Nuisance`, the error of the reference. The filter is relinearised at each sample. If the
 crustal field could explain a sample as well as the coefficients, the filter *considers* the coefficients and
 does not update them (:mod:`magbridge.estimation.kalman`).
@@ -13,8 +13,8 @@ assumes no change. Further estimators assume from the start that
 - the offset follows the sensor's temperature;
 - the offset drifts, at a rate that changes within hours;
 - the map, if there is one, does not show the crustal field. A map error no larger than the crustal field
-  hardly moves single samples, so no test of innovations shows it. If this estimator predicts significantly
-  better, the bank selects it until its lead is lost.
+  hardly changes single samples, so no test of innovations detects the error. If this estimator predicts
+  significantly better, the bank selects it until it loses its lead.
 
 The selection is dynamic model selection (Raftery, Karny & Ettler 2010, Technometrics 52:52): with each
 innovation v of variance S,
@@ -175,7 +175,7 @@ class Estimator:
         further samples reduce it; the filter's own covariance does not change.
         """
         K = self.size
-        # the same conditional mean for the whole state; the nuisance takes up what the level loses
+        # the same conditional mean for the whole state; the nuisance states absorb the difference
         toward = self.filter.covariance[:, :K] @ self._mean
         by, variance = float(self._mean @ (published - self.coefficients)), float(self._mean @ toward[:K])
         if not self._sloping and by * by < CHANGED * CHANGED * variance:
@@ -377,7 +377,7 @@ class EstimatorBank:
         `step` and its log-likelihood ratio `strength` come from the alarm's cause; `strength` is added to the
         baseline's score.
         """
-        # the evidence for the cause is what the baseline would have gained with it
+        # with the cause, the baseline's score would have been higher by the log-likelihood ratio
         self.quiet.shift(step, covariance)
         self._weights[0] += strength
         if self._weights[0] > self._weights[self._best] + MIN_LEAD:

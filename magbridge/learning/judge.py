@@ -4,14 +4,13 @@ Time is divided into blocks. A block contains a turn, and lasts until the crusta
 decorrelated (or 10 minutes). The coefficients learned before a block are its *candidate*. They stay fixed in
 the block, so all of its samples test them, most samples at another attitude and position. The predictions of
 both calibrations use one model of the reference's error (:class:`.Nuisance`), with the standard deviation of
-the crustal field under which the better calibration predicts best. With
-innovations v of the first calibration and v + d of the candidate, of variance S, the share of the candidate's
-change that the samples confirm is
+the crustal field under which the better calibration predicts best. The innovations are v (first calibration)
+and v + d (candidate), of variance S. The samples confirm this share of the candidate's change:
 
 .. math:: \beta = -\frac{\sum v d / S}{\sum d^2 / S}
 
 This is the generalised least-squares coefficient of the first calibration's error on the change: 1 if the
-change is right, 0 if the first calibration is. From :math:`\beta > 1/2` on, the candidate has the smaller
+change is right, 0 if the first calibration is right. If :math:`\beta > 1/2`, the candidate has the smaller
 error; the log-likelihood ratio of both is :math:`(\beta - 1/2) \sum d^2 / S`. The standard error of the share
 is the larger of two: the model's, and one from the differences between the blocks. The latter includes errors
 that neither calibration explains (Liang & Zeger 1986, Biometrika 73:13).
@@ -225,7 +224,7 @@ class Judge:
         self._likelihoods -= 0.5 * (np.minimum(squares, MAX_JUDGE_SQUARE) + np.log(S)[:, None])
         smaller = squares.min(axis=1)
         self._noisier += share * (min(float(smaller[0]), MAX_JUDGE_SQUARE) - self._noisier)
-        # more noise than the model's, and outliers of both calibrations, have less weight
+        # reduce the weight of excess noise, and of outliers of both calibrations
         S = S * np.maximum(max(1.0, self._noisier), smaller / MAX_JUDGE_SQUARE)
         for blocks, which in ((self._to_first, FIRST), (self._to_published, PUBLISHED)):
             blocks.add(v[:, which], v[:, CANDIDATE] - v[:, which], S)

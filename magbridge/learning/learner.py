@@ -19,7 +19,7 @@ from magbridge.learning.samples import Intake, LearnedTerms, LearningSample, Obs
 from magbridge.records import Quality, Vector
 
 if TYPE_CHECKING:
-    from magbridge.field.grid import AnomalyGrid  # it brings scipy
+    from magbridge.field.grid import AnomalyGrid  # which imports scipy
 
 
 class Notice(NamedTuple):

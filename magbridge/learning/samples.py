@@ -239,7 +239,7 @@ class LearnedTerms:
         found = []
         for axis in range(3):
             only = np.zeros(self._tensor.shape[1:])
-            # a coefficient of the offset moves one of the last three of the nine, by one regressor
+            # a coefficient of the offset changes one of the three coefficients of T, by one regressor
             only[row, 6 + axis] = 1.0
             same = np.flatnonzero((self._tensor == only).all(axis=(1, 2)))
             if not same.size:
@@ -270,7 +270,7 @@ class LearnedTerms:
         """Return all regressors (m,): the calibration's `calibrated`, and the further ones of `watched`."""
         for place, k in enumerate(self._further):
             value = watched[k]
-            if not isnan(value):  # while the value is unknown, the last one holds
+            if not isnan(value):  # an unknown value leaves the last one in force
                 # the first known temperature is the origin, so that the term starts at zero
                 if isnan(self._origins[k]):
                     self._origins[k] = value

@@ -206,7 +206,7 @@ def _reference(deployment: xr.Dataset) -> FloatArray:
 def _rms(values: FloatArray) -> float | None:
     """Return the root mean square of the finite values; None if no value is finite."""
     values = values[np.isfinite(values)]
-    with np.errstate(over="ignore"):  # an absurd value is infinitely wrong
+    with np.errstate(over="ignore"):  # the square of an absurd value may overflow to infinity
         return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 

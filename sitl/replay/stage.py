@@ -64,7 +64,7 @@ class Stage:
                 opened.callback(os.close, self._masters[sensor_id])
                 opened.callback(os.close, slave)
                 os.set_blocking(self._masters[sensor_id], False)
-                # bytes written before the bridge opens it must not be edited as a terminal would
+                # raw mode: a terminal would edit bytes written before the bridge opens the pty
                 tty.setraw(slave)
                 devices.append(os.ttyname(slave))
             times_out, times = os.pipe()
@@ -178,7 +178,7 @@ class Stage:
     def _write_sensors(self) -> None:
         """Write as many bytes as the ptys accept now; the bridge reads them in the timetable's order."""
         waiting = select.poll()
-        waiting.register(self._times, 0)  # it breaks when the bridge, its only reader, ends
+        waiting.register(self._times, 0)  # the pipe breaks when the bridge, its only reader, ends
         masters = {self._masters[one]: due for one, due in self._sensors_due.items() if due}
         for master in masters:
             waiting.register(master, select.POLLOUT)
