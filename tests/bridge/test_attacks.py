@@ -1,4 +1,4 @@
-"""A running bridge on a network that is not friendly: attacks of tools/attacks.py, and one siege."""
+"""Test a running bridge under the attacks of tools/attacks.py and under one combined attack."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SIEGE = [one for one in ATTACKS if one.reported or "garbage" in one.name or "hal
 
 
 def test_a_signed_bridge_that_anyone_can_reach(make_rig: MakeRig) -> None:
-    """Restarted in haste, between strangers' headers, asked for too much, and told a key."""
+    """Restart it quickly among strangers' headers, flood it with requests, and send it a key."""
     rig = make_rig("udpin", key=KEY)
     rig.start()
     for _ in range(3):
@@ -75,7 +75,7 @@ def test_a_signed_bridge_that_anyone_can_reach(make_rig: MakeRig) -> None:
 
 @pytest.fixture(scope="module")
 def besieged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Rig]]:
-    """Return the bridge that is reached by a link; one for all attacks on it."""
+    """Return the bridge on a kind of link; all attacks on this link share the bridge."""
     rigs: dict[str, Rig] = {}
 
     def reached_by(link: str) -> Rig:

@@ -1,4 +1,4 @@
-"""``run --check``: all that would go wrong with a configuration; ``--live``: what arrives on the ports."""
+"""Test ``run --check``, which lists the errors of a configuration, and ``--live``, which tests the ports."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ LISTEN_S = 4.0
 
 
 class Sender:
-    """Answers the requests of a rig's bridge, and sends ATTITUDE as requested."""
+    """Autopilot that replies to a bridge's requests and sends ATTITUDE at the requested rate."""
 
     def __init__(self, rig: Rig, result: int) -> None:
         self._rig, self._result, self._mark = rig, result, 0

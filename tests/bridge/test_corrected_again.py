@@ -1,4 +1,4 @@
-"""`magbridge correct` on a bridge's own log: the field, the sigmas and the flags that were published."""
+"""Test that `magbridge correct` on a bridge's own log reproduces the published field, sigmas and flags."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
 def test_what_was_set_in_the_course_of_the_log_is_reported(
     tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Neither refused values nor the rate of a message are corrected again."""
+    """The correction repeats neither rejected values nor the rate of a message."""
     pipeline = small_bridge(tmp_path, StartEvent(START), BATTERY, ["MAG_FIELD"])
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
@@ -54,7 +54,7 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
 
 @pytest.mark.parametrize(("suffix", "precision"), [("nc", 1e-7), ("csv", 1e-7), ("tlog", 1e-6)])
 def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, precision: float) -> None:
-    """Telemetry comes every few seconds, once not for a minute, once as not known."""
+    """Telemetry arrives every few seconds, is missing for a minute once, and is unknown once."""
     rng = np.random.default_rng(1)
     pipeline = small_bridge(tmp_path, StartEvent(START, KEPT), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
@@ -85,7 +85,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
 
 
 def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
-    """The rows of a log do not tell that the bridge stood still for 5 s, while the mass moved."""
+    """The rows of a log do not show that the bridge paused for 5 s while the mass moved."""
     pipeline = small_bridge(tmp_path, StartEvent(START), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:

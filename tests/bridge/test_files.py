@@ -1,4 +1,4 @@
-"""A station reads a log while the bridge measures; the bridge's own log is unchanged."""
+"""Test that a station can read a log while the bridge measures, without a change of the bridge's log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MakeRig = Callable[..., Rig]
 
 
 class Station:
-    """255:190 on a socket of its own."""
+    """Ground station 255:190 on its own socket."""
 
     def __init__(self, rig: Rig, key: bytes | None) -> None:
         self._rig = rig
@@ -35,7 +35,7 @@ class Station:
         self._socket.send(self._codec.pack(name, **fields))
 
     def ask(self, opcode: int, data: bytes = b"", *, session: int = 0, size: int = 0, offset: int = 0) -> int:
-        """Send an FTP request; return the position of the next message in the received ones."""
+        """Send an FTP request; return the number of messages received before its reply."""
         mark, self._sequence = len(self.received), self._sequence + 1
         header = FTP_HEADER.pack(self._sequence, session, opcode, size or len(data), 0, 0, offset)
         payload = (header + data).ljust(251, b"\0")
@@ -43,7 +43,7 @@ class Station:
         return mark
 
     def replies(self, mark: int) -> Iterator[tuple[int, int, bytes]]:
-        """Yield opcode, whether the burst is complete, data of the FTP replies heard since."""
+        """Yield opcode, end of burst (bool) and data of each FTP reply received since a position."""
         for message in self.received[mark:]:
             if message.name == "FILE_TRANSFER_PROTOCOL":
                 _, _, opcode, size, _, complete, _ = FTP_HEADER.unpack_from(message["payload"])

@@ -1,4 +1,4 @@
-"""When fixes go to the autopilot, and their messages."""
+"""Test when the bridge sends fixes to the autopilot, and the content of their messages."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_an_autopilot_that_does_not_answer_is_reported() -> None:
 
 
 def test_what_ardupilot_would_believe_too_much_is_not_sent() -> None:
-    """Its EKF takes no position for worse than 10 m, and five equal ones a second as five new ones."""
+    """Its EKF limits the claimed error to 10 m, and fuses five equal positions a second as independent."""
     bench = Bench("ODOMETRY")
     bench.receive("HEARTBEAT", autopilot=ARDUPILOT)
     bench.receive("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
@@ -205,7 +205,7 @@ def test_a_later_ardupilot_fuses_and_accepts_both_messages(
 
 
 def test_an_autopilot_that_does_not_use_the_fixes_is_reported() -> None:
-    """It answers ACCEPTED, or nothing at all, and flies on 600 m away: this is reported within a minute."""
+    """An autopilot that ignores fixes flies on 600 m away; the bridge reports this within a minute."""
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
     there = {"lat": round(PLACE[0] * 1e7) + 54_000, "lon": round(PLACE[1] * 1e7)}
     for k in range(60):

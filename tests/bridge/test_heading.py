@@ -1,4 +1,4 @@
-"""The live heading: computed from the corrected vector, and sent as receivers read it."""
+"""Test the live heading: its computation from the corrected vector, and its messages."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def bridge_with(
     folder: Path, heading: str = "", *, boresight: bool = True, port: str = "/dev/null",
     link: str = "udpout:127.0.0.1:14550",
 ) -> Path:  # fmt: skip
-    """Write a configuration with a calibration that changes nothing."""
+    """Write a configuration with a calibration that changes nothing; return its path."""
     turn = aligned(radians(0.2) ** 2) if boresight else None
     known = polynomial(np.zeros(9), variance=1e-4, noise_nt=5.0, method="nominal", boresight=turn)
     return write_bridge(
@@ -149,7 +149,7 @@ def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) ->
 @pytest.mark.parametrize("stack", [ARDUPILOT, PX4])
 @pytest.mark.parametrize("send", ["odometry", "vision_position_estimate"])
 def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stack: int) -> None:
-    """ArduPilot: GCS_Common.cpp, cbrt of the sum of squares; PX4: mavlink_receiver.cpp, entry 20."""
+    """ArduPilot takes the cube root of a sum of squares (GCS_Common.cpp), PX4 entry 20 of the covariance."""
     bridge = set_up(load(bridge_with(tmp_path, f'send = "{send}"')), StartEvent(START))
     messages = fly(bridge, level_flight(stack))
     message, sigma = last(messages, send.upper()), radians(last(messages, "MAG_FIELD")["heading_sigma"])

@@ -1,4 +1,4 @@
-"""``[learning]`` on the link: what a station sees, and that live, replayed and ashore are the same."""
+"""Test ``[learning]``: messages to a station, and equal results live, in a replay and offline."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from magbridge.records import Channel, Quality
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, list[tuple[int, bytes]]]:
-    """Fly once, with a log."""
+    """Simulate a flight once, with a log."""
     folder = tmp_path_factory.mktemp("flight")
     pipeline = bridge(folder)
     sent = []
@@ -66,7 +66,7 @@ def test_what_was_learned_is_announced_and_named_in_every_message(
 def test_the_same_events_give_the_same_bytes(
     flight: tuple[Path, Pipeline, list[tuple[int, bytes]]], tmp_path: Path
 ) -> None:
-    """Learning included."""
+    """A replay with in-flight calibration gives the same bytes."""
     again = bridge(tmp_path)
     assert [one for event in events(tmp_path) for one in again.feed(event)] == flight[2]
 
@@ -74,7 +74,7 @@ def test_the_same_events_give_the_same_bytes(
 def test_ashore_it_learns_what_it_learned_live(
     flight: tuple[Path, Pipeline, list[tuple[int, bytes]]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From the bridge's own log, bit for bit."""
+    """Offline, the bridge's own log gives the same calibration bit for bit."""
     folder, pipeline, sent = flight
     out, learned = folder / "out.nc", folder / "learned.json"
     log = sorted((folder / "logs").iterdir())
@@ -122,7 +122,7 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
 
 
 def test_it_is_off_unless_asked_for(tmp_path: Path) -> None:
-    """Without the table there is nothing; with it, it waits to be enabled."""
+    """Without the table, there is no in-flight calibration; with the table, it waits until it is enabled."""
     assert bridge(tmp_path, "").learning is None
     waiting = bridge(tmp_path, "[learning]\n")
     for event in events(tmp_path)[:300]:
@@ -142,18 +142,18 @@ def test_it_is_off_unless_asked_for(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_key_is_one_line(tmp_path: Path, text: str, why: str) -> None:
-    """It names the key."""
+    """The error message of a wrong key has one line and names the key."""
     with pytest.raises(ConfigError, match=why):
         bridge(tmp_path, f"[learning]\n{text}\n")
 
 
 def test_the_causes_bits_are_those_of_the_dialect() -> None:
-    """In the same order."""
+    """The bits of the causes have the order of the dialect's enumeration."""
     assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSE_UNITS)
 
 
 def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
-    """Without a calibration, the field is flagged until there is one; the log gives the same again."""
+    """Without a calibration, the field is flagged until one is published; the log reproduces this."""
     pipeline, sent = bridge(tmp_path, known=False), []
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for event in events(tmp_path):
@@ -194,7 +194,7 @@ print({one["num_threads"] for one in threadpool_info() if one["user_api"] == "bl
 
 @pytest.mark.parametrize("name", ["run", "replay", "correct"])
 def test_the_same_bytes_on_another_number_of_cores(name: str) -> None:
-    """Linear algebra has one thread where samples are learned from: several round otherwise."""
+    """Linear algebra uses one thread while samples are processed: several threads round differently."""
     free = {key: value for key, value in os.environ.items() if "NUM_THREADS" not in key}
     command = [sys.executable, "-c", THREADS, name, "nowhere.toml"]
     reported = subprocess.run(command, env=free, capture_output=True, text=True, check=True).stdout
@@ -202,7 +202,7 @@ def test_the_same_bytes_on_another_number_of_cores(name: str) -> None:
 
 
 def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line, and nothing is written."""
+    """Without a start, `correct` prints one line and writes no file."""
     bridge(tmp_path)
     log, out = tmp_path / "log.csv", tmp_path / "out.nc"
     log.write_text("time,mag_x,mag_y,mag_z\n1,2,3,4\n", encoding="utf-8")
@@ -234,7 +234,7 @@ Flown = tuple[Path, Pipeline, LearningService]
 
 @pytest.fixture
 def flown(tmp_path: Path) -> Flown:
-    """Fly until something is learned; return the folder, the bridge and its learning."""
+    """Simulate a flight until a calibration is published; return the folder, the bridge and its learner."""
     pipeline, feed = bridge(tmp_path), iter(events(tmp_path))
     assert pipeline.learning is not None
     while not pipeline.learning.to_keep:
@@ -243,7 +243,7 @@ def flown(tmp_path: Path) -> Flown:
 
 
 def test_it_is_kept_next_to_the_first(flown: Flown) -> None:
-    """An ordinary calibration with its provenance; only changes are written."""
+    """The file is an ordinary calibration with its provenance; the bridge writes it only after changes."""
     folder, _, learning = flown
     path = kept_path(load_config(folder / "bridge.toml"))
     assert path == folder / "cal-learned.json"
@@ -275,7 +275,7 @@ def test_a_disk_that_does_not_take_it_leaves_the_old_one(flown: Flown, to: str, 
 
 
 def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown: Flown) -> None:
-    """The next saved file removes the remains."""
+    """The next write of the file removes the remains of the interrupted write."""
     folder, _, learning = flown
     path, first = folder / "cal-learned.json", calibration_id(load(folder / "cal.json"))
     assert keep(learning, path) == ""

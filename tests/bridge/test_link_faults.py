@@ -1,4 +1,4 @@
-"""What goes wrong on the link, one fault after the other, to one bridge that must survive all of them."""
+"""Test faults of the link, in sequence, on one bridge that must survive all of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of the log and abrupt ends: a full disk, a deleted folder, kill -9, several bridges or files."""
+"""Test faults of the log and abrupt ends: full disk, deleted folder, kill -9, several bridges or files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LOG_OK, LOG_FAILED = 1, 2
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path | None]:
-    """A file system of 128 kB; None without the right to mount one."""
+    """Return the folder of a file system of 128 kB, or None if the user may not mount one."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=128k", "tmpfs", str(disk)]
@@ -51,7 +51,7 @@ def ballast(disk: Path) -> tuple[Callable[[], None], Callable[[], None]]:
 
 
 def limit(rig: Rig) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return what any user can do instead: limit the size of the process's files, and lift that again."""
+    """Return functions that limit the size of the process's files, and that remove this limit."""
 
     def allow(size: int) -> None:
         assert rig.process is not None

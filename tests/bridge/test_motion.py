@@ -1,4 +1,4 @@
-"""Dead reckoning follows what does not contain our own fixes."""
+"""Test that dead reckoning uses only telemetry that does not contain the bridge's own fixes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from magbridge.records import Corrected
 
 
 def made(kind: str = "GLOBAL_POSITION_SENSOR", stack: int = PX4) -> Bench:
-    """Return a bench whose position is known."""
+    """Return a bench with a known position."""
     bench = Bench(kind)
     bench.receive("HEARTBEAT", autopilot=stack)
     bench.navigation.navigator.fix(bench.now_us, *PLACE, 5.0)
@@ -26,7 +26,7 @@ def made(kind: str = "GLOBAL_POSITION_SENSOR", stack: int = PX4) -> Bench:
 
 
 def moved(bench: Bench) -> tuple[float, float]:
-    """Return how far dead reckoning has come, m north and east."""
+    """Return the displacement by dead reckoning, m north and east."""
     return separation(*PLACE, *bench.navigation.navigator.reckoned(bench.now_us))
 
 
@@ -111,7 +111,7 @@ def test_two_streams_are_not_mixed() -> None:
 
 @pytest.mark.parametrize("counted", [True, False])
 def test_a_jump_is_not_a_motion(counted: bool) -> None:
-    """Announced in ODOMETRY, or seen by the velocity that does not explain it."""
+    """A jump is announced in ODOMETRY, or detected because the velocity does not explain it."""
     bench = made()
     for k in range(1, 11):
         bench.to(k)
@@ -206,7 +206,7 @@ def test_a_turn_between_two_reports_is_averaged_and_uncertain() -> None:
 
 
 def sample(bench: Bench, latitude: float, longitude: float) -> None:
-    """Give the navigation the field of a place."""
+    """Feed the field of a place to the navigation."""
     field = total_field(longitude, latitude, 0.0, bench.now_us * 1e-6).item()
     field += hills().look_up(longitude, latitude, 0.0).anomaly
     bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))

@@ -1,4 +1,4 @@
-"""Live navigation: telemetry and samples in, fixes out, in the message that the stack takes."""
+"""Test live navigation: fixes from telemetry and samples, in the message that the autopilot uses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SPEED, HEADING, OFF, DEPTH = 0.5, 60.0, 150.0, 1.0
 ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
 """Origin of the autopilot's local frame (deg, deg, m), on a hill near the water."""
 QUATERNION = (0.8487626, 0.0993347, -0.1720527, 0.4900333)
-"""Of 60 deg of yaw and -0.4 rad of pitch."""
+"""Attitude with a yaw of 60 deg and a pitch of -0.4 rad."""
 SENSOR = {"sensitivity": 5e-5, "reference_voltage": 5.0}
 CONFIG = bridge_text(
     "digitizer",
@@ -54,7 +54,7 @@ options = {start_sigma = 200.0, current_sigma = 0.02, bias_sigma = 1.0, interval
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map with hills of 300 m and 40 nT, and a calibration that changes nothing."""
+    """Return a folder with a map (hills of 300 m and 40 nT) and a calibration that changes nothing."""
     path = tmp_path_factory.mktemp("navigation")
     perfect = replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal")
     save(perfect, path / "cal.json")
@@ -74,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def events(folder: Path) -> tuple[Event, ...]:
-    """A glider whose dead reckoning is 150 m off: an hour on one heading."""
+    """Return the events of a glider on one heading for an hour, with dead reckoning wrong by 150 m."""
     return tuple(glide(read_grid(folder / "grid.nc")))
 
 
@@ -119,7 +119,7 @@ def received(stream: bytes) -> dict[str, list[Message]]:
 
 
 def where(time_us: int) -> tuple[float, float]:
-    """Return where the vehicle is at a time."""
+    """Return the true position of the vehicle at a time."""
     along = SPEED * (time_us - START) * 1e-6
     start = offset(*PLACE, OFF, -OFF)
     return offset(*start, along * np.cos(radians(HEADING)), along * np.sin(radians(HEADING)))
@@ -133,7 +133,7 @@ MESSAGES = {
 
 
 class Sailed(NamedTuple):
-    """The fix, the bridge, the frames that it sent with their times, and the fixes among them."""
+    """Result of a run: the kind of fix, the bridge, its frames with their times, and its fixes."""
 
     kind: str
     pipeline: Pipeline
@@ -150,7 +150,7 @@ def sailed(request: pytest.FixtureRequest, folder: Path) -> Sailed:
 
 
 def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None:
-    """Decoded, each is within its sigma of the truth, and in its frame."""
+    """Each decoded fix is within its sigma of the truth, in the frame of its message."""
     kind, _, sent, fixes = sailed
     last = received(b"".join(frame for _, frame in sent))["MAG_NAVIGATION"][-1]
     honest = np.sqrt(0.5 * (last["covariance_nn"] + last["covariance_ee"]))
@@ -213,7 +213,7 @@ def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> No
 
 
 def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
-    """At 5 Hz with growing uncertainty; it ends with the field."""
+    """The bridge sends ODOMETRY at 5 Hz with a growing uncertainty, until the field ends."""
     if sailed.kind != "ODOMETRY":
         pytest.skip("the others go out with each update")
     times = np.array([one["time_usec"] for one in sailed.fixes])

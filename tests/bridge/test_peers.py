@@ -1,4 +1,4 @@
-"""A link with any number of peers: which ones get replies, and that none blocks the frames of another."""
+"""Test a link with many peers: which peers get replies, and that none blocks the frames of another."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def beat(component: int = 1, system: int = 1) -> bytes:
 
 
 def header(size: int) -> bytes:
-    """Return the start of an unknown message: a parser that waits for its end loses `size` bytes."""
+    """Return the header of an unknown message, after which a waiting parser loses `size` bytes."""
     return bytes((0xFD, size, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
 
 
@@ -48,7 +48,7 @@ def receive(port: Port, size: int) -> bytes:
 
 
 def answered(everyone: list[socket.socket], port: Port) -> list[int]:
-    """Return which of them an answer reaches."""
+    """Return the indices of the peers that receive a reply of the port."""
     port.write(b"field")
     time.sleep(0.02)
     return [k for k, one in enumerate(everyone) if select.select([one], [], [], 0)[0] and one.recv(9)]
@@ -71,7 +71,7 @@ def test_a_header_swallows_nothing_of_another_peer() -> None:
 
 
 def test_frames_come_first_and_a_frame_in_pieces_is_whole() -> None:
-    """So a parser needs no more bytes to distinguish a frame from other data."""
+    """So a parser can distinguish a frame from other data without further bytes."""
     both = Peers()
     noise, frame = b"noise" + header(30) + bytes(9), beat()
     for who, data in ((1, frame[:7]), (2, noise), (1, frame[7:]), (2, bytes(5000)), (3, frame)):
@@ -166,7 +166,7 @@ def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 def test_others_share_a_budget_and_the_autopilot_has_none(kind: str) -> None:
-    """One that only listens by TCP is one of them; files count as well."""
+    """A peer that only listens by TCP shares the budget; file transfers count as well."""
     with opened(kind, budget=2000.0) as (port, place), ExitStack() as stack:
         make = socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM
         everyone = [stack.enter_context(socket.socket(socket.AF_INET, make)) for _ in range(3)]

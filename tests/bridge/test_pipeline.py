@@ -1,4 +1,4 @@
-"""A bridge without ports: its log after a restart, and the numbers that it is given."""
+"""Test a bridge without ports: its log after a restart, and its input values."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
 
 
 def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
-    """As after a bridge stood still: the sensor's bytes of a second, in one read, are many records."""
+    """After a pause, the sensor's bytes of a second arrive in one read and fill many records."""
     pipeline = bridge(tmp_path, StartEvent(START))
     fed = list(events(pipeline, 0, 60))
     lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
@@ -181,7 +181,7 @@ def fields(sent: list[tuple[int, bytes]]) -> list[Message]:
 
 
 def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
-    """It begins at 1970, where a filter's delay leads to before it: one line, and no main field."""
+    """The clock begins in 1970, and a filter's delay leads to earlier times: one message, no main field."""
     battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
     published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "DEBUG_VECT"]
     pipeline = small_bridge(tmp_path, StartEvent(0), battery, published)
@@ -231,7 +231,7 @@ print(steps)
 
 
 def test_a_process_that_is_held_up_tells_no_step() -> None:
-    """Stopped again and again for longer than the threshold, each time somewhere in a look at the clocks."""
+    """Pause the process repeatedly for longer than the threshold, at random points of its clock readings."""
     with subprocess.Popen([sys.executable, "-c", LOOKS], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         assert process.stdout.readline() == "begun\n"

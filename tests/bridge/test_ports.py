@@ -1,4 +1,4 @@
-"""A link's ports by themselves: what a slow, a rude or an absent reader does to them."""
+"""Test the ports of a link with slow, disturbing and absent readers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BEAT = Codec(1, 1).pack("HEARTBEAT", type=12)
 
 
 def waiting(terminal: int) -> int:
-    """Return how many bytes a terminal holds for its reader."""
+    """Return the number of bytes that a terminal holds for its reader."""
     return int.from_bytes(fcntl.ioctl(terminal, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
@@ -110,7 +110,7 @@ def sample(codec: Codec, count: int) -> bytes:
 
 
 def test_a_saturated_line_carries_what_is_new() -> None:
-    """A pty that is read at half the rate at which it is written to; how late, when it has once been full."""
+    """Read a pty at half the rate of the writer; measure the age of the data once it has been full."""
     baud, codec, reader = 230_400, Codec(1, 191), Codec(255, 190)
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -145,7 +145,7 @@ def test_a_saturated_line_carries_what_is_new() -> None:
 
 @pytest.mark.parametrize("key", [None, bytes(32)])
 def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
-    """Of samples only the newest, in every message and name; all texts; in order, as the signatures want."""
+    """Only the newest sample of each message and name, but all texts, in the order of their signatures."""
     codec, reader = (Codec(*who, Signing(key) if key else None) for who in ((1, 191), (255, 190)))
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}", 0)
@@ -180,7 +180,7 @@ def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
 
 
 def test_a_backlog_of_a_line_is_read_at_once() -> None:
-    """Without a clock only the last reading of a backlog tells when it was sent: none is missing."""
+    """Without a device clock, only the last reading of a backlog shows its time; no reading is lost."""
     driver = open_driver("ascii", {"columns": ["x", "y", "z"], "rate": 100.0})
     clock = DeviceClock.for_driver(driver)
     master, slave = pty.openpty()
@@ -311,12 +311,12 @@ def test_a_port_that_cannot_be_opened_says_why(tmp_path: Path) -> None:
 
 
 class Unresolved(TcpServer):
-    """A link to a name that the network does not resolve, and takes its time to say so."""
+    """Link to a host name whose look-up fails after a delay."""
 
     asked = 0
 
     def open(self) -> None:
-        """Open for ever."""
+        """Try to open the link without an end."""
         self.asked += 1
         threading.Event().wait()
 
@@ -361,7 +361,7 @@ def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
 
 
 def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """While it is heard it is not looked up; the silence counts from the last packet, or the last look."""
+    """The link looks the host up again only after silence since the last packet or the last look-up."""
     host, look_up, looks = ["127.0.0.1"], socket.getaddrinfo, []
 
     def resolver(name: str, *rest: Any, **options: Any) -> object:
@@ -429,7 +429,7 @@ def test_what_is_sent_at_once_after_a_standstill_goes_in_datagrams_that_a_networ
 
 
 def test_datagrams_that_waited_come_at_once() -> None:
-    """So a bridge that stood still has the telemetry before it looks at the samples."""
+    """After a pause, the bridge reads the telemetry before it processes the samples."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         peer.bind(("127.0.0.1", 0))
         port = open_link(f"udpout:127.0.0.1:{peer.getsockname()[1]}", 0)

@@ -1,4 +1,4 @@
-"""The device on a serial line is recognised by its bytes, through real pseudo-terminals."""
+"""Test that the bridge identifies the device on a serial line by its bytes, on real pseudo-terminals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ SPEAKERS = {
 
 @contextmanager
 def speaking(data: bytes) -> Iterator[str]:
-    """Give a pseudo-terminal that says `data` again and again."""
+    """Yield a pseudo-terminal on which a device sends `data` repeatedly."""
     master, slave = pty.openpty()
     stop = threading.Event()
 

@@ -1,4 +1,4 @@
-"""The bridge's position, and GNSS receivers that are wrong."""
+"""Test the bridge's position with GNSS receivers that are wrong."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_why_there_is_no_field_is_reported() -> None:
 
 
 BEGIN, END = 180.0, 420.0
-"""s: GPS is wrong or absent between these times, of a flight of 9 minutes."""
+"""Begin and end of the GPS fault, s after the start of a flight of 9 minutes."""
 NEVER = 1e9
 
 
@@ -130,7 +130,7 @@ def window(run: Run, begin: float, end: float) -> np.ndarray:
 
 
 def first(run: Run, state: GnssState, after: float) -> float:
-    """Return the seconds after a time at which GPS first was in a state."""
+    """Return the time (s) from a moment until GPS first has a state."""
     found = run.seconds[(run.gnss == state) & (run.seconds >= after)]
     return float(found[0] - after) if found.size else np.inf
 
@@ -156,7 +156,7 @@ def test_a_jammed_receiver_is_rejected_and_fixes_go_out(accuracy: float | None) 
 
 
 def test_a_receiver_that_is_led_away_is_rejected() -> None:
-    """3 m/s, in a wind of which the navigator knows 4 m/s (1-sigma)."""
+    """The receiver drifts by 3 m/s; the navigator assumes a wind of 4 m/s (1-sigma)."""
     run = fly(carried_off(BEGIN, 3.0, 0.0))
     assert first(run, GnssState.REJECTED, BEGIN) <= 15.0
     wrong = window(run, BEGIN + 15.0, NEVER)
@@ -236,10 +236,7 @@ def test_the_receiver_s_own_report_counts(jamming: int, spoofing: int, word: str
 
 
 def test_positions_that_go_on_drifting_are_not_used_again() -> None:
-    """A wide covariance of the navigator agrees with any position; a carry-off of 3 m/s goes on all the same.
-
-    A real ArduPlane that followed the wrong GPS had a wrong heading, so that its covariance grew.
-    """
+    """A wide covariance agrees with any position, but the position still drifts by 3 m/s."""
     returned = {}
     for drift in (0.0, 3.0):
         monitor = GnssMonitor(steep_map(), AIRCRAFT)

@@ -1,4 +1,4 @@
-"""Faults that need their own bridge: a start with nothing there, another device, link or clock, a key."""
+"""Test faults that need their own bridge: a start without devices, another device, link, clock or key."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row
 
 @pytest.mark.parametrize("speaks", [True, False])
 def test_another_device_fits_the_pattern_too(make_rig: MakeRig, table: Row, speaks: bool) -> None:
-    """A GPS, on or off, is found before the sensor; and again after the sensor was unplugged."""
+    """The pattern also matches a GPS, found before the sensor, and again after the sensor was unplugged."""
     rig = make_rig()
     gps, far = open_line(rig.fluxgate.folder / "ttyUSB0")
     if speaks:
@@ -97,7 +97,7 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
 
 
 def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
-    """Nobody reads the line for as long as it takes to fill what the system keeps for it."""
+    """The line has no reader until the buffer of the operating system is full."""
     rig = make_rig("serial")
     rig.start()
     mark, deadline = rig.mark, time.monotonic() + 60.0

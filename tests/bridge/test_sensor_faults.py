@@ -1,7 +1,7 @@
-"""What goes wrong on the sensor's line, one fault after the other, to one bridge that survives all of them.
+"""Test faults of the sensor's line, in sequence, on one bridge that must survive all of them.
 
-Every test waits for a good state, makes the fault, and checks the published messages, the time and the
-losses. In the end the log is replayed."""
+Every test waits for a normal state, causes a fault, and checks the published messages, the recovery time and
+the losses. The last test replays the log."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_all_of_it_again_from_the_log(rig: Rig) -> None:
 
 
 SLOPE = np.array([300.0, -200.0, 100.0])
-"""nT that the mass adds, from the middle of its range to the end."""
+"""Change of the field as the mass moves from the middle of its range to the end, nT."""
 TOTAL = float(np.linalg.norm(TRUTH))
 LINES = 'columns = ["x", "y", "z"]'
 

@@ -1,4 +1,4 @@
-"""What the sensor's line is taken for: half a line, an instrument that sends rarely, another instrument."""
+"""Test the interpretation of the sensor's line: half a line, rare readings, another instrument."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"
 
 
 class Bench:
-    """A bridge and its messages."""
+    """Bridge without ports, and the messages that it sent."""
 
     def __init__(self, folder: Path) -> None:
         self.bridge: Pipeline = small_bridge(
@@ -55,7 +55,7 @@ def bench(tmp_path: Path) -> Bench:
 
 
 def test_half_a_line_is_not_a_sample(bench: Bench) -> None:
-    """Neither the one that the bridge came into, nor two halves from before and after an unplugging."""
+    """The bridge uses neither a partial line at its start nor halves from before and after unplugging."""
     whole = LINE % 1.0
     bench.receive(0.1, whole[4:])
     bench.receive(0.2, whole + whole[:9])
@@ -74,7 +74,7 @@ def test_an_instrument_that_sends_rarely_is_received_each_time(bench: Bench) -> 
 
 
 def test_an_instrument_that_hangs_is_reported(bench: Bench) -> None:
-    """After a minute, and that it changes again; a few readings that happen to be equal are none."""
+    """The bridge reports constant readings after a minute, and their end; a few equal readings are normal."""
     for k in range(130):
         z = -234.5 if 5 <= k < 30 or 40 <= k < 110 else float(k)
         bench.receive(k, b"12340.5 43210.9 %.1f 4.0 %d 7\r\n" % (z, k))
@@ -150,7 +150,7 @@ def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
 
 
 def test_commands_are_a_tenth_of_a_second_apart() -> None:
-    """An instrument answers one before it reads the next."""
+    """An instrument replies to one command before it reads the next."""
     timers, codec = Timers(), Codec(1, 191)
     announcer = Announcer(Outbox(codec), timers)
     line = SensorLine("hmr2300", lambda: (b"1", b"2", b"3"), 10_000_000, announcer, timers, 0)

@@ -1,4 +1,4 @@
-"""What somebody sees who starts a bridge by hand."""
+"""Test the output of a bridge that a user starts in a terminal."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such fi
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_terminal_gets_the_state_of_the_link(tmp_path: Path, number: signal.Signals) -> None:
-    """Until it receives a signal, or the terminal is closed."""
+    """The terminal shows the state until the bridge receives a signal or the terminal is closed."""
     with on_a_terminal(tmp_path) as (process, terminal):
         read_until(terminal, WANTED)
         process.send_signal(number)
@@ -79,7 +79,7 @@ def test_a_service_tells_the_journal_how_severe_it_is(tmp_path: Path) -> None:
 def test_kept_parameters_that_cannot_be_read_keep_no_vehicle_ashore(
     tmp_path: Path, content: str | None
 ) -> None:
-    """A file is set aside; a folder of that name stays."""
+    """An unreadable file is renamed; a folder of this name stays."""
     kept = tmp_path / "bridge.parameters.json"
     kept.write_text(content) if content else kept.mkdir()
     with on_a_terminal(tmp_path) as (process, terminal):

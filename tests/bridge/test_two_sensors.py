@@ -1,4 +1,4 @@
-"""Two sensors on one bridge: ids, messages, the comparison of both, and the compensation of a scalar."""
+"""Test a bridge with two sensors: ids, messages, comparison, and compensation of a scalar sensor."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from sitl.replay.stage import Stage
 START = 1_780_000_000_000_000
 FIELD_NT = 50_000.0
 PATIENCE_S = 60.0
-"""s that the bridge has to start and to publish."""
+"""Time limit for the bridge to start and publish, s."""
 CONFIG = """\
 [sensor.flux]
 driver = "ascii"
@@ -93,7 +93,7 @@ def calibration(*sensors: ScalarSensor) -> Calibration:
 
 
 class Bench:
-    """A bridge with two sensors, and the messages that it sent."""
+    """Bridge with two sensors, and the messages that it sent."""
 
     def __init__(
         self, folder: Path, name: str, columns: str, settings: str, *sensors: ScalarSensor, more: str = ""
@@ -181,7 +181,7 @@ def test_a_sensor_that_jumps_is_named_and_its_sigma_grows(tmp_path: Path, wrong:
 def test_the_learner_does_not_use_samples_that_another_sensor_contradicts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_at: int, is_used: bool
 ) -> None:
-    """The tail is wrong: by its jump that is known, and without a jump either sensor may be wrong."""
+    """The sensor in the tail is wrong: a jump identifies it; without a jump, either sensor may be wrong."""
     bench = Bench(tmp_path, "tail", *VECTOR, more="[learning]\n")
     assert bench.bridge.learning is not None
     faulty: list[bool] = []

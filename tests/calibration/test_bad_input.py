@@ -1,4 +1,4 @@
-"""What bad calibration data get at the command line: exit 1, one clear line, no file."""
+"""Test that bad calibration data give exit code 1, one clear line and no file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
 
 
 def test_a_log_is_known_by_its_file(runs: xr.Dataset, command: Command) -> None:
-    """In addition to the statement of its source."""
+    """The message names the file of a log and its stated source."""
     write(runs.drop_vars("mag_x"), "bad.nc")
     output = command.refuses("calibrate", "bad.nc", *PARAMETERS, "-o", "cal.json")
     assert output.startswith("bad.nc (simulated: demo): column 'mag_x': expected this column")
@@ -124,7 +124,7 @@ def later(runs: xr.Dataset, days: int) -> xr.Dataset:
 def test_a_log_that_adds_nothing_is_reported(
     runs: xr.Dataset, good: tuple[Path, Path], command: Command
 ) -> None:
-    """Its samples were missing from the fit without a word."""
+    """The command reports a log whose samples do not enter the fit."""
     write(changed(later(runs, 1), mag_x=np.nan), "no_x.csv")
     write(later(runs, 2).drop_vars("battpos"), "no_mass.csv")
     write(runs.assign(mag_x=runs["mag_x"] + 100.0), "same_times.csv")
@@ -144,7 +144,7 @@ def test_a_log_that_adds_nothing_is_reported(
 def test_logs_of_two_vehicles_are_distinguished(
     runs: xr.Dataset, good: tuple[Path, Path], command: Command
 ) -> None:
-    """But not those of one, on two days."""
+    """Logs of two vehicles are distinguished, but not logs of one vehicle on two days."""
     iron = {f"mag_{axis}": runs[f"mag_{axis}"].to_numpy() + 5000.0 for axis in "xy"}
     write(changed(later(runs, 1), **iron), "other.csv")
     write(later(runs, 1), "own.csv")
@@ -155,7 +155,7 @@ def test_logs_of_two_vehicles_are_distinguished(
 
 
 def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Command) -> None:
-    """It was put down to too few attitudes."""
+    """The message names the two vehicles, not a lack of attitudes."""
     other = segments(demo_log(3))["calibration"].isel(time=slice(0, None, 4))
     write(runs, "one.csv")
     write(later(other.drop_vars("reference_field"), 1), "two.csv")

@@ -1,4 +1,4 @@
-"""Correcting: against a naive oracle, the same numbers live and in batch, nothing silent."""
+"""Test the correction against a naive implementation, and live against batch."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def random_samples(seed: int, n: int, channels: int) -> tuple[np.ndarray, np.nda
 
 
 def naive(cal: Calibration, c: np.ndarray, h: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """b = A (h - T), as the equation stands, one sample, polynomials only."""
+    """Return b = A (h - T) of one sample, straight from the equation, for polynomials only."""
     x = np.array([(v - par.centre) / par.scale for v, par in zip(p, cal.parameters, strict=True)])
     (polynomial,) = cal.terms
     assert isinstance(polynomial, Polynomial)
@@ -223,7 +223,7 @@ def test_a_boresight_turns_the_vector_and_leaves_the_magnitude() -> None:
 
 
 def test_the_boresight_s_covariance_turns_the_vector() -> None:
-    """``V + [b] Omega [b]^T``, with an Omega that leaves no element out; the total does not notice."""
+    """The covariance is ``V + [b] Omega [b]^T``, tested with a full Omega; the total field is unaffected."""
     field, positions, time = random_samples(8, 5, 2)
     root = np.array([[2.0, 0.0, 0.0], [0.7, 1.0, 0.0], [-0.5, 0.4, 1.5]]) * 1e-3
     sharp = replace(random_calibration(8), boresight=Boresight((0.0, 0.0, 0.0), ((0.0,) * 3,) * 3))

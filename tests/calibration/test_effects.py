@@ -1,4 +1,4 @@
-"""Each effect does what its equation says: its regressors on short logs whose answer is known."""
+"""Test each effect's regressors against its equation, on short logs with a known result."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ P = Parameter("p", "in", -1.0, 1.0, 0.0, 1.0)
 
 
 def with_effect(effect: Effect, c: np.ndarray | None = None, of_p: np.ndarray | None = None) -> Calibration:
-    """A calibration whose only term is ``(a, T) = of_p p`` (nT), with the effect of coefficients c."""
+    """Return a calibration with the term ``(a, T) = of_p p`` (nT) and the effect of coefficients c."""
     coefficients = np.zeros(18 + effect.size)
     if of_p is not None:
         coefficients[9:18] = of_p
@@ -84,7 +84,7 @@ EFFECTS = (
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda one: one.kind)
 def test_an_effect_has_one_physics_in_two_forms(effect: Effect) -> None:
-    """Sample by sample and over a log: with jitter, gaps, unknown values, and readings that are missing."""
+    """The forms for a sample and for a log agree, with jitter, gaps, unknown values and missing readings."""
     rng, n = np.random.default_rng(3), 300
     time = np.cumsum(rng.choice([4.0, 4.1, 37.0, 400.0], n, p=[0.6, 0.3, 0.09, 0.01]))
     values = np.clip(0.15 * rng.normal(size=n).cumsum(), -1.0, 1.0)
@@ -254,7 +254,7 @@ def test_a_term_that_lacks_a_method_cannot_be_made() -> None:
 
 
 EARTH_NED = (18_000.0, 0.0, 50_000.0)
-"""nT, the field at the site."""
+"""Main field at the site, nT."""
 
 
 def turned(gain: float, tilt: float, noise: float = 100.0, n: int = 1200) -> Observations:

@@ -1,4 +1,4 @@
-"""A calibration in other hands: compiled C gives the field of Python, autopilots' formulae that of theirs."""
+"""Test exported calibrations: C code gives Python's field, and the autopilots' formulae give theirs."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ CURRENT = Parameter("battery_current", "A", 0.0, 20.0, 0.0, 20.0)
 
 @pytest.mark.parametrize("current", [False, True])
 def test_autopilots_correct_as_we_do(current: bool) -> None:
-    """By their formulae, as their source has them, on a calibration that they can hold."""
+    """The formulae from the autopilots' source agree with magbridge on a calibration that they can hold."""
     calibration = made(*([CURRENT] if current else []), order=1, turned=False)
     if current:  # a current has a field of its own, and leaves the scales alone
         coefficients = calibration.coefficients.copy()

@@ -79,7 +79,7 @@ def test_round_trip_corrects_with_the_same_bits(cal: Calibration, tmp_path: Path
 
 
 def test_its_arrays_are_its_own(cal: Calibration) -> None:
-    """Those that it was made from stay the caller's to write to, and do not change it."""
+    """The caller may change the arrays that made the calibration without a change of the calibration."""
     coefficients, covariance = np.zeros(39), np.eye(39)
     made = replace(cal, coefficients=coefficients, covariance=covariance)
     coefficients[0] = covariance[0, 0] = 7.0
@@ -212,7 +212,7 @@ def test_not_positive_semidefinite(cal: Calibration) -> None:
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_edit_is_read_or_refused_in_one_line(data: st.DataObject, cal: Calibration) -> None:
-    """Whatever a hand puts in place of a value: a calibration, or one of the two errors."""
+    """Any edited value gives a calibration or one of the two errors."""
     content = json.loads(encode_calibration(cal))
     place: Any = content
     while isinstance(place, (dict, list)) and place:
@@ -261,7 +261,7 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 
 def from_paper(M: ArrayLike, S: ArrayLike, field: float) -> np.ndarray:
-    """``A = H_e M S^-1 M^T``."""
+    """Return A of the paper's equation ``A = H_e M S^-1 M^T``."""
     return np.asarray(M) @ np.diag(field / np.asarray(S)) @ np.asarray(M).T
 
 

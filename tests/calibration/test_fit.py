@@ -1,4 +1,4 @@
-"""Fits: derivatives, recovery, errors out of sample near the noise floor, consistent sigmas."""
+"""Test fits: derivatives, recovered parameters, errors out of sample near the noise floor, sigmas."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from magbridge.estimation.residual import ResidualSamples, residuals
 
 
 def survey_error(calibration: Calibration, glider: Glider) -> tuple[float, float]:
-    """RMS over the noise floor on the survey, and deviation of the standardised error."""
+    """Return the survey's RMS over the noise floor, and the deviation of the normalised error."""
     k = len(calibration.parameters)
     noisy, quiet = (
         correct(calibration, field, glider.survey.parameters[:, :k], glider.survey.time)
@@ -289,7 +289,7 @@ def test_by_default_the_level_is_known_as_well_as_the_reference(
 
 
 def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
-    """What the reference may be wrong by, the corrected field may be wrong by, and nothing else changes."""
+    """The sigma of the corrected field includes the reference's sigma; nothing else changes."""
     runs = glider(1, 2).runs
     without, with_bias = (fit(runs, site_bias=bias).calibration for bias in (0.0, 30.0))
     before, after = (correct(c, runs.field, runs.parameters, runs.time) for c in (without, with_bias))
@@ -310,7 +310,7 @@ def test_least_squares_of_the_whitened_is_generalised_least_squares_next_to_gaps
 
 
 def test_slow_and_white_noise_are_whitened_in_any_blocks() -> None:
-    """Against the naive oracle, as above; and in blocks as at once."""
+    """Compare with the dense inverse covariance; processing in blocks gives the same as at once."""
     rng = np.random.default_rng(3)
     place = np.flatnonzero(rng.random(150) > 0.2)
     run = np.arange(len(place)) // 45
@@ -354,7 +354,7 @@ def test_what_the_model_lacks_is_in_its_sigmas(glider: Gliders) -> None:
 
 
 def test_a_long_log_is_fitted_with_a_part_of_its_samples() -> None:
-    """Every second one of 300,000: as good as with all, and the runs' labels stay."""
+    """A fit of every second of 300,000 samples is as good as a full fit, and the runs' labels stay."""
     rng, n = np.random.default_rng(8), 300_000
     u = rng.normal(size=(n, 3))
     truth = 5e4 * u / np.linalg.norm(u, axis=1)[:, None]

@@ -1,4 +1,4 @@
-"""What a fit may be given: known iron, a free mean, a range of support."""
+"""Test options of a fit: known iron, a free mean, a range of support."""
 
 from __future__ import annotations
 

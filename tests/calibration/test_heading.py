@@ -1,4 +1,4 @@
-"""Heading with its standard deviation, and the boresight from roll and pitch alone."""
+"""Test the heading with its standard deviation, and the boresight from roll and pitch only."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ DECLINATION_DEG = float(np.degrees(np.arctan2(NED[1], NED[0])))
 
 
 def body_field(roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:
-    """Return the field in body axes, (n, 3), from angles in rad: the naive oracle."""
+    """Return the field in body axes, (n, 3), from angles in rad, by a naive implementation."""
     attitude = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
     return np.asarray(attitude.inv().apply(np.tile(NED, (len(roll), 1))))
 

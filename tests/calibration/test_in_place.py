@@ -1,4 +1,4 @@
-"""A survey without runs and map separates the vehicle's field from the crustal field."""
+"""Test that a survey without runs and map separates the vehicle's field from the crustal field."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_parts_are_predicted_from_the_others_to_the_noise(survey: Survey) -> Non
 
 
 def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
-    """An IGRF alone does not know the level: the sigma counts that, and says how much of it there is."""
+    """An IGRF does not determine the bias: sigma includes this uncertainty, and the result states it."""
     data, true, found = survey
     level = found.calibration.reference.level_sigma
     assert 0.8 * MAIN_FIELD_SIGMA_NT < level < 1.5 * MAIN_FIELD_SIGMA_NT
@@ -251,7 +251,7 @@ def test_a_track_that_drifts_is_bent_to_where_the_crustal_field_repeats() -> Non
 
 
 def slowly(data: Observations) -> Observations:
-    """Return the same survey flown in 6 h, a sample every 12 s: time for an offset to creep."""
+    """Return the survey performed in 6 h, a sample every 12 s, so that an offset has time to creep."""
     return replace(data, time=1e9 + 3.0 * (data.time - data.time[0]))
 
 
@@ -333,7 +333,7 @@ def test_creep_of_the_offset_goes_neither_into_the_field_nor_into_the_map() -> N
 
 
 def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
-    """By 37 nT in the survey: the crustal field is found, and the error on another day agrees with sigma."""
+    """The offset jumps by 37 nT: the fit finds the crustal field, and the error of another day fits sigma."""
     data, true = flown()
     data = slowly(data)
     jump = np.outer(np.arange(len(data)) > 0.6 * len(data), [30.0, -20.0, 10.0])

@@ -1,4 +1,4 @@
-"""A real aircraft's calibration flight: the claimed sigma is the same at any rate, and holds elsewhere."""
+"""Test a real aircraft's calibration flight: the claimed sigma is right at any sample rate."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from magbridge.field.igrf import igrf
 pytestmark = pytest.mark.real
 
 FLOWN = 1_592_611_200.0
-"""s, the day of the flight, 2020-06-20, since 1970."""
+"""Start of the day of the flight, 2020-06-20, s since 1970 UTC."""
 
 
 @pytest.fixture(scope="module")
 def line(real_data: Path) -> Observations:
-    """The line, at 10 Hz: time of day, fluxgate, pitch, roll, heading, the IGRF."""
+    """Return the columns of the line at 10 Hz: time of day, fluxgate, pitch, roll, heading, IGRF."""
     rows = np.loadtxt(real_data / "magnav_flt1002" / "Flt1002_1002.02.txt")
     return Observations(
         rows[:, 1:4], np.linalg.norm(rows[:, 7:10], axis=1), np.empty((len(rows), 0)), time=FLOWN + rows[:, 0]
@@ -82,12 +82,12 @@ def test_the_half_that_was_not_seen_bears_out_the_sigma(
 
 UTC = 1.7e9
 OFFSETS = np.array([[30, -20, 10], [-150, 60, 200]])
-"""mG, of two compasses."""
+"""Offsets of two compasses, mG."""
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log in which two compasses, and a third that is dead, saw every attitude."""
+    """Return a log in which two compasses, and a third dead compass, cover all attitudes."""
     log = Log()
     earth = igrf(np.array([-63.0]), np.array([45.0]), np.array([0.0]), np.array([UTC]))[0]
     for k, body in enumerate(Rotation.random(300, rng=np.random.default_rng(7)).inv().apply(earth) / 100.0):

@@ -1,4 +1,4 @@
-"""Observations from a deployment's columns."""
+"""Test the observations that are made from a deployment's columns."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_log_with_its_own_reference_has_a_boresight_from_headings_of_either_no
 
 
 def test_a_channel_that_is_sampled_more_rarely_than_the_rows_is_brought_to_their_time() -> None:
-    """It repeats its reading, and the time of that: of which no slope is."""
+    """The channel repeats its reading and time, from which no slope can be computed."""
     time = 100.0 + 0.1 * np.arange(60)
     sampled = time + 0.03
     sampled[1::3] = sampled[0::3]
@@ -79,7 +79,7 @@ FIELD = np.array([21_000.0, 2_000.0, 42_000.0])
 
 
 def drone(crash: int, n: int = 500) -> Observations:
-    """All attitudes, 3 % of soft iron, 200 nT of noise; the last `crash` samples are near other iron."""
+    """Return a drone's log: all attitudes, soft iron of 3 %, 200 nT noise, `crash` last samples near iron."""
     rng, other = np.random.default_rng(1), np.random.default_rng(2)
     body = Rotation.random(n, random_state=1).inv().apply(FIELD)
     body[n - crash :] = body[-1] + other.normal(0.0, 20_000.0, 3) + other.normal(0.0, 2_000.0, (crash, 3))

@@ -1,4 +1,4 @@
-"""``--parameter auto``: the columns that move the field are found, the others are not taken."""
+"""Test that ``--parameter auto`` selects the columns that move the field, and no others."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ BOOTS = np.repeat([0, 1, 2], [400, 100, 100])
 
 
 def copter(seed: int, n: int = 600, size: float = 800.0, memory: float = 0.97) -> Observations:
-    """All headings, tilted by 12 deg; disturbed for long, and three times as much in the first third."""
+    """Return a copter's log: all headings, tilts of 12 deg, the first third disturbed three times as much."""
     rng = np.random.default_rng(seed)
     angles = np.column_stack([lfilter([0.2], [1.0, -0.98], rng.normal(size=n)) * 3.0 for _ in range(2)])
     heading = np.cumsum(rng.normal(0.0, 6.0, n)) + np.linspace(0.0, 1500.0, n)
@@ -167,7 +167,7 @@ def test_auto_is_better_than_one_ellipsoid_where_the_first_part_differs() -> Non
 
 
 def smoothed(window: int, roll: float = 0.0, pitch: float = 20.0, n: int = 7200) -> Observations:
-    """Circles of 150 s, ten minutes up and ten down; a reading is the mean of so many seconds."""
+    """Return circles of 150 s, ten minutes up and ten down; each reading is the mean of some seconds."""
     rng, second = np.random.default_rng(7), np.arange(n)
     dive = lfilter([0.08], [1.0, -0.92], np.where(second // 600 % 2, pitch, -pitch))
     roll_s, pitch_s = (lfilter([0.06], [1.0, -0.94], rng.normal(0.0, size, n)) for size in (8.0, 2.0))
@@ -203,7 +203,7 @@ def test_a_smoothed_field_is_as_unsure_as_it_is_wrong_in_attitudes_not_seen() ->
 
 
 COUNT_NT = 100.0
-"""A step of the Seaglider's magnetometer."""
+"""Resolution of the Seaglider's magnetometer, nT."""
 
 
 @pytest.mark.real

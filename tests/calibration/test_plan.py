@@ -1,4 +1,4 @@
-"""The error expected on a mission, and the runs to fly next."""
+"""Test the predicted error of a mission, and the proposal of the next runs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_expected_error_is_what_comes(glider: Gliders) -> None:
 
 
 def test_planned_runs_beat_table_1(glider: Gliders) -> None:
-    """Six against ten, trimmed as the glider trims itself, banked no more than the paper's spirals."""
+    """Six planned runs, with the glider's trim and the paper's bank at most, against the ten of Table 1."""
     one = glider(2, 2)
     parameters = one.runs.ranges()
     before = expected_calibration(parameters, 52_000.0)
@@ -103,7 +103,7 @@ AMPLITUDES = (10.0, 5.0, 5.0)
 
 
 def box(first_heading: float = 20.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return times (n,), angles (n, 3) roll pitch heading, and which axis swings (n,), -1 for none."""
+    """Return times (n,), angles (n, 3) (roll, pitch, heading), and the swinging axis (n,), -1 for none."""
     n = int(4 * LEG_S * RATE)
     time = np.arange(n) / RATE
     within = time % LEG_S

@@ -1,4 +1,4 @@
-"""Compensation of a scalar magnetometer: half of a simulated flight is fitted, the other corrected."""
+"""Test the compensation of a scalar magnetometer: fit half of a simulated flight, correct the other half."""
 
 import numpy as np
 import pytest

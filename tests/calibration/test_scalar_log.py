@@ -1,4 +1,4 @@
-"""A scalar magnetometer with a vector magnetometer: files, commands, and one sensor checked by the other."""
+"""Test a scalar with a vector magnetometer: files, commands, and the check of one sensor by the other."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SCALAR = "mag_cabin"
 
 
 def flown(seed: int, noise: float = 0.3) -> ScalarSeries:
-    """Return a flight over a known field, by dipoles and currents that the model does not share code with."""
+    """Return a simulated flight over a known field, with dipoles and currents independent of the model."""
     random = np.random.default_rng(seed)
     n = int(MINUTES * 60 * RATE)
     t = np.arange(n) / RATE

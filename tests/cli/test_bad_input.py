@@ -1,4 +1,4 @@
-"""What a command refuses: one clear line, the exit code, nothing half-written."""
+"""Test that a command rejects bad input with one clear line, its exit code, and no partial file."""
 
 from __future__ import annotations
 

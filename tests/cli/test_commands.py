@@ -1,4 +1,4 @@
-"""What each command does and says."""
+"""Test the results and messages of each command."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_simulated_world_has_a_map(deployment: Path, like: bool, command: Co
 
 
 def test_a_simulated_log_need_not_know_the_true_field(command: Command) -> None:
-    """All else is the same."""
+    """The results are otherwise equal."""
     command("simulate", "demo", "-o", "known.nc", "--seed", "5")
     command("simulate", "demo", "-o", "unknown.nc", "--seed", "5", "--reference", "none")
     known, unknown = read("known.nc"), read("unknown.nc")

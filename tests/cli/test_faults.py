@@ -1,4 +1,4 @@
-"""The same fault of a file gets the same exit code in every command, and one line."""
+"""Test that a fault of a file gives the same exit code and one line in every command."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ FAULTS: dict[str, Callable[[Path], object] | None] = {
     "wrong format": binary,
 }
 NO_FAULT = ("fleet add", "wrong format")
-"""The file is only put on record; `fleet process` reads it."""
+"""Pairs of command and fault without an error: the file is only registered; `fleet process` reads it."""
 
 
 @pytest.fixture

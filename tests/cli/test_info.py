@@ -214,7 +214,7 @@ def only_object(text: str) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def short(deployment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The made log, a sixth of it: enough for one ellipsoid."""
+    """Return a sixth of the made log, enough for one ellipsoid."""
     path = tmp_path_factory.mktemp("short") / "short.nc"
     write(read(deployment).isel(time=slice(0, None, 6)), path)
     return path

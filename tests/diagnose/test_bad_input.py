@@ -1,4 +1,4 @@
-"""What `diagnose` says about deployments that it cannot use: one line each, naming the column it needs."""
+"""Test that `diagnose` reports an unusable deployment in one line that names the required column."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plain() -> tuple[xr.Dataset, Calibration]:
 
 
 def some(ds: xr.Dataset, count: int) -> xr.DataArray:
-    """False for the first so many samples."""
+    """Return a mask (n,) that is False for the first samples."""
     return ds["time"] >= ds["time"][count]
 
 
@@ -40,13 +40,13 @@ def some(ds: xr.Dataset, count: int) -> xr.DataArray:
 def found(
     plain: tuple[xr.Dataset, Calibration], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[DiagnosisResult, Path]:
-    """A diagnosis, and the folder it was written to."""
+    """Return a diagnosis and the folder to which it was written."""
     folder = tmp_path_factory.mktemp("found")
     return diagnose([plain[0]], plain[1], folder, remarks=["a<b>.csv: fitted to this log"]), folder
 
 
 def test_the_demonstrations_survey_is_plain(found: tuple[DiagnosisResult, Path]) -> None:
-    """And report and findings say what their reader must know of the log."""
+    """The report and the findings also state the properties of the log."""
     assert found[0].diagnosis.verdict == "nothing_found"
     remarks = json.loads((found[1] / "findings.json").read_text())["remarks"]
     assert remarks == ["a<b>.csv: fitted to this log"]
@@ -86,7 +86,7 @@ def test_a_number_beyond_all_measure_is_not_a_reading(plain: tuple[xr.Dataset, C
 
 
 def test_how_old_a_parameter_was_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
-    """The log of a bridge says it; nothing can follow it."""
+    """A bridge's log has the age of a parameter, to which the field cannot respond."""
     aged = plain[0].assign(age_battpos=plain[0]["time"] % 3.0)
     assert load_survey([aged], plain[1]).channels.keys() == load_survey([plain[0]], plain[1]).channels.keys()
 
@@ -205,7 +205,7 @@ def test_without_dives_no_dives_are_reported_as_held_out(
 
 
 def test_another_magnetometer_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
-    """It would explain whatever the Earth's field does."""
+    """A second magnetometer would explain any change of the Earth's field."""
     ds, calibration = plain
     both = ds.assign(second=ds["mag_x"].assign_attrs(units="nT"))
     assert "second" not in load_survey([both], calibration).channels

@@ -1,4 +1,4 @@
-"""Effects hidden by finer physics than the detector's, a sample of each; ``tools/blind.py`` is the study."""
+"""Test some hidden effects of finer physics than the detector's; ``tools/blind.py`` is the full study."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
 
 SAFE = 0.97
-"""Theory's chance that the set holds the truth, from which on it must."""
+"""Ideal probability that the set holds the truth, from which the set must hold it."""
 FAR = 8.0
-"""Signal-to-noise left by a competing cause's best imitation, beyond which it has no place by the truth."""
+"""Maximum signal-to-noise ratio that the best fit of a competing cause may leave."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Iterator[None]:
-    """Two hours where the study has six."""
+    """Set the length of the study's deployments to two hours instead of six."""
     hours, deployment.HOURS = deployment.HOURS, 2.0
     deployment.vehicle.cache_clear()
     yield
@@ -58,7 +58,7 @@ ELSEWHERE = {
     "unmodelled_actuator",
     "current_field",
 }
-"""Causes that another test hides and names."""
+"""Causes whose hidden effects another test covers."""
 
 
 @pytest.mark.parametrize("name", [name for name in CAUSES if name not in ELSEWHERE])
@@ -125,7 +125,7 @@ def warm(short: None) -> tuple[xr.Dataset, Calibration]:
 def written(
     warm: tuple[xr.Dataset, Calibration], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, str]:
-    """The folder of a diagnosis and the channel that it names."""
+    """Return the folder of a diagnosis and the channel that it names."""
     ds, calibration = warm
     out = tmp_path_factory.mktemp("diagnosis")
     return out, diagnose([ds], calibration, out / "out").diagnosis.findings[0].candidate.channel

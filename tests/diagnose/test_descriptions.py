@@ -1,4 +1,4 @@
-"""Descriptions without a name, and the absence of any."""
+"""Test the descriptions of residuals without a named cause."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_feedback_that_falters_at_zero_is_described(width: float) -> None:
 
 
 def left_of(y: np.ndarray, X: np.ndarray) -> float:
-    """Share of the power of y (n,) that the columns X (n, k) and a constant do not hold."""
+    """Return the fraction of the power of y (n,) that the columns X (n, k) and a constant leave."""
     return missed(y - y.mean(), X - X.mean(axis=0))
 
 
@@ -180,7 +180,7 @@ def test_descriptions_of_a_long_log_do_not_fill_the_memory(problem: Problem) -> 
 
 
 def drawn(problem: Problem, rho: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Noise of unit variance, of which a log with gaps has a part."""
+    """Return noise of unit variance on a log with gaps."""
     place = np.cumsum(np.append(0, problem.survey.steps[1:]))
     r = rng.normal(size=int(place[-1]) + 1)
     for k in range(1, len(r)):

@@ -1,4 +1,4 @@
-"""The effects that a diagnosis adds: live and in batch the same bits, and the search's derivative."""
+"""Test the effects that a diagnosis adds: equal bits live and in batch, and right derivatives."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def calibration() -> Calibration:
 
 
 def with_values(calibration: Calibration, effect: Effect, values: np.ndarray) -> Calibration:
-    """The calibration with the effect, whose coefficients are perfectly known."""
+    """Return the calibration with the effect and exactly known coefficients."""
     return replace(
         calibration,
         effects=(effect,),
@@ -86,7 +86,7 @@ def sizes(effect: Effect) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def agreeing(survey: Survey, calibration: Calibration) -> Survey:
-    """Repeat where the measured field equals the simulated one: derivatives are taken there."""
+    """Return the survey with the corrected field as reference, because derivatives are taken there."""
     channels = survey.values(calibration.channels)
     return replace(survey, reference=correct(calibration, survey.field, channels, survey.time).total)
 

@@ -1,4 +1,4 @@
-"""What a likelihood ratio is worth, by the prior that its numbers have."""
+"""Test the evidence of a likelihood ratio, given the prior of its coefficients."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from magbridge.diagnose.joint import RIDGE, fit_joint
 
 
 def sized(cause: str, size: int = 1, **more: object) -> Candidate:
-    """A candidate of so many coefficients."""
+    """Return a candidate with a given number of coefficients."""
     return candidate(cause, np.zeros((1, size)), **more)
 
 

@@ -1,4 +1,4 @@
-"""What an extended calibration says of its own uncertainty."""
+"""Test the uncertainty that an extended calibration states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from magbridge.diagnose.survey import MAX_LAG, Past, Survey
 
 
 def current(size: int) -> Candidate:
-    """A cause of so many numbers."""
+    """Return a current's effect with a given number of coefficients."""
     return candidate("current_field", np.zeros((9, size)), channel="amps")
 
 
@@ -97,7 +97,7 @@ def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
 
 
 def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:
-    """A vehicle that sways with this period, and a calibration that knows a late channel and a step.
+    """Return a swaying vehicle and a calibration with the effects of a late channel and of a step.
 
     The channel is 0.3 s late.
     """

@@ -1,4 +1,4 @@
-"""What the dives that were left out say."""
+"""Test the improvement that held-out dives show."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def problem() -> Problem:
 
 
 def gaussian(fit: Joint) -> Joint:
-    """Return the fit with Gaussian tails of the noise: then the formula is exact."""
+    """Return the fit with Gaussian noise, for which the formula is exact."""
     return replace(fit, noise=replace(fit.noise, nu=1e12))
 
 

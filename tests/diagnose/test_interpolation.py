@@ -1,4 +1,4 @@
-"""Channels that a log interpolated linearly to its rows, of a vehicle that sways from sample to sample."""
+"""Test channels that a log has interpolated linearly to its rows, of a vehicle that sways quickly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import Survey
 
 TAKEN = np.array([0.0, 0.16, 0.32])
-"""s, of a converter that takes the channels in turn."""
+"""Delays of a converter that samples the channels in turn, s."""
 
 
 def swaying(time: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def swaying(time: np.ndarray) -> np.ndarray:
 
 
 def interpolated(time: np.ndarray) -> np.ndarray:
-    """What a logger makes of it that lays a line between the samples of each channel."""
+    """Return the field as a logger records it that interpolates each channel linearly between its samples."""
     taken = time[:, None] + TAKEN
     field = np.stack([swaying(taken[:, k])[:, k] for k in range(3)], axis=1)
     return np.stack([np.interp(time, taken[:, k], field[:, k]) for k in range(3)], axis=1)
@@ -56,7 +56,7 @@ def test_a_line_leaves_its_delay_times_what_it_is_bent_by() -> None:
 
 
 def test_the_delays_are_found() -> None:
-    """All but what they share: a field of one size does not see a vector that is late."""
+    """All delays except their common part are found: a constant total field does not show a late vector."""
     whole = right(3000)
     time = whole.survey.time
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)

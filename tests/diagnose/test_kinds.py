@@ -1,4 +1,4 @@
-"""What kind of quantity a telemetry series is, and that no name contradicts it."""
+"""Test the kinds of telemetry series, and that no named cause contradicts a kind."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_on_a_multirotors_log_what_is_seen_stands_apart_from_what_it_may_be(hidd
 N = 1500
 NORTH = 2000.0 * (1.0 - np.abs(np.linspace(-1.0, 1.0, N)))
 DOWN = 75.0 * (1.0 - np.cos(2.0 * np.pi * np.arange(N) / 170.0))
-"""m, a line there and back at other depths."""
+"""Depth of a line there and back, m."""
 
 
 def drawn(whole: Problem, error: NDArray[np.float64], down: NDArray[np.float64]) -> Problem:
@@ -141,7 +141,7 @@ def fitted(problem: Problem, chart: Candidate) -> Joint:
 
 
 def flown(altitude: float) -> NDArray[np.float64]:
-    """(n,) nT that a map from an altitude lacks of two waves, which do not average out along the track."""
+    """Return the difference (n,), nT, of a map at altitude from the field, for two waves."""
     found = np.zeros(N)
     for length, phase in ((1600.0, 0.3), (5000.0, 1.0)):
         k = 2.0 * np.pi / length
@@ -199,7 +199,7 @@ def test_a_gradient_over_the_whole_region_is_the_maps_error_alone() -> None:
 
 ROOM = Path(causes.__file__).parent
 ELSEWHERE = {"magbridge/learning"}
-"""A learning bridge has a filter of its own, with states that are named after what they stand for."""
+"""Packages that may contain the names of causes: in-flight calibration names its filter's states by them."""
 
 
 def strings(path: Path) -> set[str]:

@@ -17,7 +17,7 @@ from magbridge.diagnose.survey import MAX_LAG, Past
 
 
 def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """A noise, and steps that tell of two breaks in it."""
+    """Return noise, and steps that show two gaps in it."""
     rng = np.random.default_rng(seed)
     v = rng.standard_t(3.0, n) if kind == "heavy" else rng.normal(size=n)
     if kind == "uneven":
@@ -65,7 +65,7 @@ def test_filtering_in_pieces_is_filtering_the_whole() -> None:
 
 
 def covariance(ar: np.ndarray, reach: int) -> np.ndarray:
-    """(reach,) of an autoregression, from its response to an impulse."""
+    """Return the covariance (reach,) of an autoregression, from its response to an impulse."""
     impulse = np.append(1.0, np.zeros(4000))
     for k in range(1, len(impulse)):
         before = impulse[max(k - len(ar), 0) : k][::-1]

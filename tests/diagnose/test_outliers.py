@@ -1,4 +1,4 @@
-"""Wrong samples are distinguished from a passing source: the samples next to an isolated one are good."""
+"""Test that wrong samples are distinguished from a passing source, and good neighbours are kept."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from magbridge.diagnose.survey import MAX_LAG, Past
 N = 5000
 SPIKE = np.array([0.0, 12.0, 0.0])
 PULSE = np.array([6.0, 12.0, 6.0])
-"""Return a source that passes within a few samples, in units of the innovations."""
+"""Signature of a source that passes within a few samples, in units of the innovations."""
 
 
 def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float = 50.0) -> Outliers | None:

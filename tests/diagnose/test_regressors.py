@@ -1,4 +1,4 @@
-"""What the search puts into its columns is what the live correction would step through."""
+"""Test that the columns of the search equal the regressors of the live correction."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from magbridge.diagnose.survey import MAX_LAG, TelemetryChannel
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    """Half an hour of turning: a gap, jitter, a mass that rests and moves, a temperature and a current."""
+    """Return half an hour of turns with a gap, jitter, a moving mass, a temperature and a current."""
     rng = np.random.default_rng(1)
     n = 450
     t = 1.7e9 + 4.0 * np.arange(float(n)) + np.where(np.arange(n) > 300, 500.0, 0.0)

@@ -1,4 +1,4 @@
-"""What the report says, as people read it."""
+"""Test the sentences of the report."""
 
 from __future__ import annotations
 

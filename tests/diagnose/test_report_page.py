@@ -1,4 +1,4 @@
-"""The whole page: the decision on its first screen, the unknown parts, and its figures."""
+"""Test the report page: its first screen with the decision, its unknown parts and its figures."""
 
 from __future__ import annotations
 

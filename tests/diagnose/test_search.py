@@ -1,4 +1,4 @@
-"""The search, on residuals that are made."""
+"""Test the search on artificial residuals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from magbridge.diagnose.state import SearchState
 
 
 def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
-    """A vehicle's fault of one free number that adds x (n,) times `width`, nT."""
+    """Return a candidate fault with one coefficient that adds x (n,) times `width`, nT."""
     effects = (TimeEffect(cause=cause, shape="step", start=0.0),)
     return candidate(cause, width * x, width=np.array([width]), effects=effects)
 

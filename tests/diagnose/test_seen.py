@@ -1,4 +1,4 @@
-"""Properties of a signal, independent of its cause, and a residual that is far from white."""
+"""Test the reported properties of a signal of unknown cause, and a residual far from white noise."""
 
 from __future__ import annotations
 

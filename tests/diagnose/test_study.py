@@ -1,4 +1,4 @@
-"""The arithmetic of the blind study (``tools/blind.py``), and a run of it."""
+"""Test the computations of the blind study (``tools/blind.py``), and a short run of it."""
 
 from __future__ import annotations
 

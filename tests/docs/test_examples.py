@@ -1,4 +1,4 @@
-"""What the documentation shows is what there is: its code is run, or read as it would be."""
+"""Test the code that the documentation shows: run it, or parse it."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ LEAST = {
     "sensor": '[sensor]\ndriver = "hmr2300"\nport = "/dev/ttyUSB0"\n',
     "link": '[link]\nurl = "udpout:192.0.2.1:14550"\n',
 }
-"""What a bridge.toml cannot do without: put before a block that shows only some of its tables."""
+"""Tables that every bridge.toml needs, added to a block that shows only some tables."""
 
 
 def ours() -> Iterator[tuple[str, list[str]]]:
-    """Yield each command of ``magbridge`` that a page shows, with where it stands."""
+    """Yield each ``magbridge`` command that a page shows, with its place."""
     for block in SHELL:
         for words in commands(block):
             if words[0].endswith("magbridge") and len(words) > 1 and words[1] in app:

@@ -1,4 +1,4 @@
-"""The page on the architecture shows the layers, modules and types that there are."""
+"""Test that the page on the architecture shows the existing layers, modules and types."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ CODE = re.compile(r"```.*?```|`[^`]+`", re.DOTALL)
 COMMAND = re.compile(r"(?<![\w/-])(tools/)?([a-z_]+)\.py\b((?:[ \\\n]+(?![#`])[^\s`|;)]+)*)")
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 FIGURE = re.compile(r"\d ?(?:%|nT|km|µs|ms|s|m)(?!\w)|\d\.\d")
-"""A number with its unit, or with a decimal point: what a measurement gives."""
+"""Measured figure in a text: a number with its unit or with a decimal point."""
 SOME = 4
 
 
 def commands(text: str) -> list[tuple[Path, list[str]]]:
-    """The tools that are named as code, each with its options; a module of the package is none of them."""
+    """Return the tools that a text names as code, each with its options, without modules of the package."""
     return [
         (ROOT / "tools" / f"{found[2]}.py", re.findall(r"(?<=\s)--[a-z][\w-]*", found[3]))
         for code in CODE.findall(text)
@@ -75,7 +75,7 @@ def commands(text: str) -> list[tuple[Path, list[str]]]:
 
 
 def source_of(tool: Path) -> str:
-    """The text of a tool and of the tools that it imports or runs, whose options it has, too."""
+    """Return the source of a tool and of the tools that it imports or runs, whose options it shares."""
     text = tool.read_text(encoding="utf-8")
     names = re.findall(r"^(?:from|import) (\w+)|tools/(\w+)\.py", text, re.MULTILINE)
     parts = [ROOT / "tools" / f"{imported or called}.py" for imported, called in names]

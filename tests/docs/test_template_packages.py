@@ -1,4 +1,4 @@
-"""The templates in ``examples/`` are installed as a contributor would install theirs, and used."""
+"""Test the templates in ``examples/``, installed and used as by a contributor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TEMPLATES = sorted(path.parent for path in ROOT.glob("examples/*/pyproject.toml"
 
 
 def install(template: Path, folder: Path) -> None:
-    """Put a template where pip would: its module and its entry points."""
+    """Install a template as pip would: its module and its entry points."""
     project = tomllib.loads((template / "pyproject.toml").read_text())["project"]
     info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     info.mkdir(parents=True)

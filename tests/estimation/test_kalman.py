@@ -1,4 +1,4 @@
-"""The Kalman filter against least squares, the sequential test against densities of scipy."""
+"""Test the Kalman filter against least squares, and the sequential test against densities of scipy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise of residuals: its size and autocorrelation as it was drawn, whatever the outliers."""
+"""Test that the estimated size and autocorrelation of noise equal the simulated ones, despite outliers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STEPS = np.r_[np.inf, np.ones(N - 1)]
 
 
 def drawn(rho: float, sigma: float = 4.0, seed: int = 1) -> FloatArray:
-    """Draw an AR(1) of that 1-sigma."""
+    """Return an AR(1) process of the given 1-sigma."""
     rng = np.random.default_rng(seed)
     e = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, sigma, N + 500))
     return np.asarray(e[500:])

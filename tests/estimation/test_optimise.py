@@ -1,4 +1,4 @@
-"""The solver finds the minimum of an independent optimiser, and reports when it does not converge."""
+"""Test that the solver finds the minimum of an independent optimiser, or reports its failure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FREE = Prior(np.diag(np.full(9, 1e-8)), np.eye(9))
 
 @pytest.fixture
 def samples() -> ResidualSamples:
-    """A sensor with soft and hard iron that is turned to anywhere, 5 nT of noise."""
+    """Return readings of a sensor with soft and hard iron at random attitudes, with 5 nT of noise."""
     rng = np.random.default_rng(1)
     b = rng.normal(size=(300, 3))
     b *= FIELD / np.linalg.norm(b, axis=1)[:, None]
@@ -34,7 +34,7 @@ def samples() -> ResidualSamples:
 
 
 def slope(samples: ResidualSamples, z: FloatArray) -> FloatArray:
-    """What the objective changes by along each coefficient over the width that the data leave it."""
+    """Return the objective's slope along each coefficient over the width that the data allow."""
 
     def value(c: FloatArray) -> float:
         e = residuals(samples, c)[0]
