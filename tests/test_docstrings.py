@@ -18,18 +18,18 @@ SHAPE = re.compile(r"\((\.\.\.|[\w+ ]+),[\w+*., ()-]*\)|\bshape\b|[Aa]rguments a
 
 
 def functions(scope: ast.Module | ast.ClassDef) -> list[ast.FunctionDef]:
-    """Those with a docstring; an overload or a property's setter has none."""
+    """Return the functions with a docstring; overloads and setters of properties have none."""
     return [n for n in scope.body if isinstance(n, ast.FunctionDef) and ast.get_docstring(n)]
 
 
 @cache
 def trees() -> dict[Path, ast.Module]:
-    """Every module of the packages."""
+    """Return the syntax tree of every module of the packages."""
     return {path: ast.parse(path.read_text()) for room in ROOMS for path in room.rglob("*.py")}
 
 
 def offered(tree: ast.Module) -> list[str]:
-    """Names in a module's ``__all__``."""
+    """Return the names in a module's ``__all__``."""
     lists = [
         n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"
     ]
@@ -38,7 +38,7 @@ def offered(tree: ast.Module) -> list[str]:
 
 @cache
 def public() -> dict[str, ast.FunctionDef]:
-    """Functions in ``__all__``, and methods of the classes there that override no other method."""
+    """Return the functions in ``__all__`` and the methods of its classes that override no other method."""
     classes = {n.name: n for tree in trees().values() for n in tree.body if isinstance(n, ast.ClassDef)}
 
     def above(one: ast.ClassDef) -> set[str]:

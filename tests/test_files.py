@@ -1,4 +1,4 @@
-"""Files are whole or not there, whatever happens to the process that writes them."""
+"""Test that a file is complete or missing, whatever happens to the process that writes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures for notebooks: drawn on the axes given, or on new ones, with the numbers in them."""
+"""Test the plots for notebooks: drawn on given or new axes, with the right values."""
 
 from __future__ import annotations
 

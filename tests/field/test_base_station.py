@@ -1,4 +1,4 @@
-"""A base station's variation: calibrations and surveys of a day on which the field was not still."""
+"""Test a base station's variation in calibrations and surveys on a day with a varying field."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ OFFSET = np.array([300.0, -200.0, 100.0])
 
 
 def varied(time: np.ndarray) -> np.ndarray:
-    """nT: a storm's."""
+    """Return the variation of the field by a storm, nT."""
     return 250.0 * np.sin(2 * np.pi * (time - START) / 5400.0)
 
 
 @pytest.fixture
 def storm(here: Path) -> Path:
-    """A vehicle's log, and the observatory's minutes of that day."""
+    """Return a vehicle's log, and the minute values of an observatory on that day."""
     time = START + 30.0 * np.arange(400.0)
     earth = igrf(np.array([-63.0]), np.array([45.0]), np.array([0.0]), time[:1])[0]
     field = earth * (1.0 + varied(time) / np.linalg.norm(earth))[:, None]
@@ -61,7 +61,7 @@ def test_a_calibration_on_a_day_of_storm(storm: Path, command: Command) -> None:
 
 
 def test_an_observatory_among_the_logs_of_a_survey(storm: Path) -> None:
-    """Or named: the vehicle's logs alone remain, with what the field varied by."""
+    """The observatory's file is used as the base station, whether found among the logs or named."""
     log, station = read("log.csv"), read("mde.min")
     for logs, base in (([log, station], None), ([log], Path("mde.min"))):
         (found,) = by_base_station(logs, base)

@@ -1,4 +1,4 @@
-"""What axes and columns are is decided by units, names, reference system and range, not by their place."""
+"""Test that units, names, reference system and range identify axes and columns, not their order."""
 
 from __future__ import annotations
 

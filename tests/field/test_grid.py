@@ -1,4 +1,4 @@
-"""The spline of an anomaly map, compared with scipy's and with finite differences."""
+"""Test the spline of an anomaly map against scipy's spline and finite differences."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def test_the_worse_axis_is_the_larger_eigenvalue() -> None:
 
 @pytest.mark.parametrize("depth", [0.5, 1.0, 1.5])
 def test_what_lies_between_the_nodes_is_predicted(depth: float) -> None:
-    """Sources `depth` spacings below, every fourth node given: the spline's error at the others, within 2."""
+    """The predicted spline error is right within a factor of 2, for sources `depth` spacings deep."""
     rng, n = np.random.default_rng(7), 241
     k = 2.0 * np.pi * np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))
     waves = np.fft.fft2(rng.normal(size=(n, n))) * np.exp(-4.0 * depth * k)

@@ -1,4 +1,4 @@
-"""The main field: against another program, against published values, and as a potential field must be."""
+"""Test the main field against another program, published values, and the properties of a potential field."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_agrees_with_the_published_calculator() -> None:
 
 
 def test_is_a_potential_field(places: tuple[np.ndarray, ...]) -> None:
-    """Its divergence vanishes: three central differences over 1 km, against the field's own scale."""
+    """The divergence vanishes, by three central differences over 1 km, relative to the field's scale."""
     lon, lat, depth = places
     keep = np.abs(lat) < 80
     lon, lat, depth = lon[keep], lat[keep], depth[keep]
@@ -165,7 +165,7 @@ NEARBY_S = 1.7e9
 
 @pytest.mark.parametrize("place", [(49.5, -57.9), (-30.0, 10.0), (75.0, 179.9), (0.0, -70.0)])
 def test_is_the_series_within_its_reach(place: tuple[float, float]) -> None:
-    """0.05 nT anywhere within 20 km, a dive and twenty days; and it goes along when the vehicle leaves."""
+    """The error is below 0.05 nT within 20 km, a dive and twenty days; the series moves with the vehicle."""
     rng = np.random.default_rng(0)
     nearby = NearbyField()
     nearby.field_and_slopes(*place, 0.0, NEARBY_S)

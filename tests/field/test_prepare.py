@@ -1,4 +1,4 @@
-"""Map preparation: continuation against the field of a real source, the merge, the mask, the kernel."""
+"""Test map preparation: continuation against the field of a real source, the merge, the mask, the kernel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LON, LAT = np.linspace(-58.1, -57.9, 81), np.linspace(49.45, 49.55, 61)
 
 
 def monopole(altitude: float, depth: float = 800.0) -> np.ndarray:
-    """Vertical field of a magnetic pole under the map's middle, nT: harmonic, known at any height."""
+    """Return the vertical field of a magnetic pole under the map's centre, nT, at any height."""
     per_lat, per_lon = metres_per_degree(49.5)
     x, y = np.meshgrid((LON + 58.0) * per_lon, (LAT - 49.5) * per_lat)
     z = altitude + depth
@@ -89,7 +89,7 @@ def test_nothing_is_prepared_downward() -> None:
 
 
 def test_a_survey_of_unknown_height_is_not_continued_until_it_is_declared() -> None:
-    """It stayed as it was, without a word, while the map claimed the altitude that was asked for."""
+    """The command refuses a survey of unknown height if an altitude is requested."""
     silent = AnomalyGrid(LON, LAT, monopole(60.0), name="a.grd")
     known = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="b.nc")
     for grids, altitude in (([silent], 90.0), ([known, silent], None)):
@@ -118,7 +118,7 @@ def test_merge_is_the_mean_in_the_overlap() -> None:
 
 
 def test_surveys_that_disagree_are_not_exact() -> None:
-    """Each of two that differ by 10 nT is off by 7 nT, alone; their mean is off by 5."""
+    """Each of two surveys that differ by 10 nT has an error of 7 nT, and their mean an error of 5 nT."""
     west = AnomalyGrid(LON[:50], LAT, np.full((61, 50), 10.0))
     east = AnomalyGrid(LON[30:], LAT, np.full((61, 51), 20.0), sigma=8.0)
     both, _ = merge([west, east])
@@ -143,7 +143,7 @@ def test_the_difference_of_surveys_is_reported() -> None:
 
 
 def test_a_map_that_would_fill_the_memory_is_refused() -> None:
-    """Two fine surveys of opposite coasts: what lies between them would be nodes as well."""
+    """Two fine surveys of opposite coasts would need nodes in the whole area between them."""
     west = AnomalyGrid(LON, LAT, monopole(60.0))
     east = AnomalyGrid(LON + 40.0, LAT + 10.0, monopole(60.0))
     with pytest.raises(OutOfRange, match=r"146\d{6} nodes: at most 10000000: set a spacing of 0\.0067 deg"):
@@ -168,7 +168,7 @@ def test_nothing_is_smoothed_unless_asked_for() -> None:
 
 
 def test_smoothing_is_by_wavelength_and_what_goes_becomes_sigma() -> None:
-    """Half of a wave of the cutoff length stays, 84 % of one twice as long; sigma is the RMS loss."""
+    """A wave of the cutoff length keeps half its amplitude, twice the length 84 %; sigma is the RMS loss."""
     per_latitude, _ = metres_per_degree(49.5)
     north = (LAT - LAT[0]) * per_latitude
     middle = slice(20, -20), slice(20, -20)

@@ -62,7 +62,7 @@ def cf(
 
 
 def gmt(path: Path) -> None:
-    """GMT's own netCDF: x, y, z, rows ascending; long names, no standard names."""
+    """Write a netCDF grid as GMT does: x, y, z, rows ascending; long names, no standard names."""
     cf(path, unit="", names=("y", "x"), long_name="longitude")
 
 
@@ -84,7 +84,7 @@ def folder(path: Path, altitude: tuple[float, ...] = (305.0,)) -> None:
 
 
 def marked(path: Path, write: Callable[[Path], None]) -> None:
-    """What `write` writes, each file with a byte order mark."""
+    """Write a grid by `write`, then add a byte order mark to each of its files."""
     write(path)
     for file in path.iterdir() if path.is_dir() else [path]:
         file.write_text("\ufeff" + file.read_text(), encoding="utf-8")
@@ -272,7 +272,7 @@ def test_a_polygon_may_have_a_header(tmp_path: Path) -> None:
     ],
 )
 def test_grids_that_once_failed(cases: Path, name: str, answer: str) -> None:
-    """The three that are read are the same map."""
+    """The three readable grids are the same map."""
     if answer:
         with pytest.raises(FormatError, match=answer) as error:
             read_grid(cases / name)

@@ -1,4 +1,4 @@
-"""Equation 4: what the total field should be."""
+"""Test equation 4, the reference of the total field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The catalogue: each row once for any number of writers; newer and damaged ones are refused in one line."""
+"""Test the catalogue: unique rows for any number of writers; one line for a newer or damaged catalogue."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_a_damaged_or_foreign_catalogue_is_one_line(
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A log of a sensor, and its calibration."""
+    """Write a log of a sensor, and its calibration."""
     folder = tmp_path_factory.mktemp("made")
     log, cal = fly(folder / "log.nc", 1, 0, sensor="HMR 1"), folder / "cal.json"
     assert main(["calibrate", str(log), "--parameter", "battpos", "-o", str(cal)]) == 0
@@ -285,7 +285,7 @@ EXPONENTS = ((0,), (1,), (2,), (3,))
 
 
 def coefficients(at: FloatArray, moment: FloatArray) -> FloatArray:
-    """(36,) nT, of a mass with a permanent moment (nT at the sensor, from :data:`AT`) at a place."""
+    """Return the coefficients (36,), nT, of a mass at `at` with a permanent moment (nT from :data:`AT`)."""
     numbers = np.zeros(LATENT)
     numbers[:3] = moment
     numbers[6:9] = at - AT
@@ -294,7 +294,7 @@ def coefficients(at: FloatArray, moment: FloatArray) -> FloatArray:
 
 @pytest.fixture
 def known() -> tuple[FloatArray, FloatArray]:
-    """The vehicle's moment, and the shapes found where the mass was measured 2 cm off."""
+    """Return the vehicle's moment, and the shapes for a position of the mass that is wrong by 2 cm."""
     moment = np.array([1500.0, -800.0, 2100.0])
     where = {"battpos": Mounting(tuple(np.add(AT, [0.02, -0.01, 0.0])), tuple(TRAVEL))}
     P = np.diag(np.tile([0.1] * 6 + [1.0] * 3, 4) ** 2)

@@ -1,4 +1,4 @@
-"""The hierarchical model equals a dense Gaussian, with consistent sigmas."""
+"""Test that the hierarchical model equals a dense Gaussian, with consistent sigmas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scheduler is killed, then the command; run again by two at once, it ends in the same catalogue."""
+"""Test that a killed scheduler or command, run again by two processes, ends in the same catalogue."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from fleets import content
 from magbridge.fleet.catalogue import FolderCatalogue
 
 PATIENCE = 120.0
-"""Longest wait on a busy computer, s."""
+"""Time limit on a busy computer, s."""
 
 
 def until(what: Callable[[], bool], *processes: subprocess.Popen[str]) -> None:
-    """Wait until something is so; none of the processes may end before."""
+    """Wait until a condition holds; fail if one of the processes ends before."""
     end = time.monotonic() + PATIENCE
     while not what():
         assert time.monotonic() < end

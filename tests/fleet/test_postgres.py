@@ -1,4 +1,4 @@
-"""A catalogue on a server equals one in a folder, with several writers at once."""
+"""Test that a catalogue on a server equals one in a folder, with several simultaneous writers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def running() -> Iterator[str]:
 
 @pytest.fixture
 def url(running: str) -> str:
-    """A database of nothing."""
+    """Return the URL of an empty database."""
     with psycopg.connect(running) as connection:
         connection.execute("drop schema if exists magbridge_fleet cascade")
     return running

@@ -1,4 +1,4 @@
-"""Processing: a deployment's rows, faults of a log, a killed and repeated run, and two workers."""
+"""Test processing: a deployment's rows, faults of a log, a killed and repeated run, and two workers."""
 
 from __future__ import annotations
 

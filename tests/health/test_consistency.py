@@ -1,4 +1,4 @@
-"""Errors that follow the attitude widen sigma; a fast vehicle over a steep anomaly raises nothing."""
+"""Test that attitude-dependent errors widen sigma, and that a fast flight over an anomaly does not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wrong mounting, which the total field does not tell; and attitudes that tell nothing of it."""
+"""Test the detection of a wrong mounting, which the total field does not show."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from magbridge.health.direction import DirectionCheck
 from magbridge.records import Quality
 
 NED = np.array([17_000.0, -5_500.0, 48_500.0])
-"""nT, as off Newfoundland: inclination 70 deg, declination -18 deg."""
+"""Main field off Newfoundland, nT: inclination 70 deg, declination -18 deg."""
 
 
 def flight(n: int = 400, seed: int = 1) -> Iterator[tuple[int, FloatArray, FloatArray]]:
-    """Yield µs, attitude (roll, pitch, yaw) as it is, and the field in body axes: turns and dives."""
+    """Yield time (µs), true attitude (roll, pitch, yaw) and field in body axes, in turns and dives."""
     rng = np.random.default_rng(seed)
     for k in range(n):
         attitude = np.array([rng.normal(0.0, 5.0), 25.0 * np.sign(np.sin(k / 50)), (0.7 * k) % 360.0])

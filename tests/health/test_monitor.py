@@ -1,4 +1,4 @@
-"""What can be the Earth's field: each fault is seen, told once, and a healthy sensor is left alone."""
+"""Test that the monitor detects and reports each fault once, and does not flag a healthy sensor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGMA, FIELD, PERIOD_US = 1.9, 52_000.0, 4_000_000
 
 
 class Flight:
-    """A vehicle in a main field of 52,000 nT and a crustal field, with 1 nT of noise."""
+    """Simulated vehicle in a main field of 52,000 nT and a crustal field, with 1 nT of noise."""
 
     def __init__(self, n: int = 1500, seed: int = 1, steps: float = 0.01) -> None:
         rng = np.random.default_rng(seed)
@@ -50,7 +50,7 @@ class Flight:
 
 
 def along(raw: FloatArray, by: float) -> FloatArray:
-    """What makes the total field of `raw` (n, 3) larger by so many nT."""
+    """Return the change of `raw` (n, 3) that increases the total field by a number of nT."""
     return np.asarray(by * raw / np.linalg.norm(raw, axis=1)[:, None])
 
 

@@ -1,4 +1,4 @@
-"""A ground station on MAVSDK that prints its results as JSON lines. Arguments: URL of the link, our XML."""
+"""Run a MAVSDK ground station that prints JSON lines. Arguments: URL of the link, magbridge's XML."""
 
 from __future__ import annotations
 

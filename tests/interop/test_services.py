@@ -1,4 +1,4 @@
-"""Files and parameters by third-party programs, also through a router, and by old peers."""
+"""Test files and parameters with third-party programs, through a router, and with old peers."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def indices(values: list[Message]) -> set[int]:
 
 
 class Ear:
-    """A station on a socket that sends frames and keeps the received ones."""
+    """Ground station on a socket that sends frames and stores the received frames."""
 
     def __init__(self, system: int) -> None:
         self.codec, self.ear = Codec(system, 190), Codec(0, 0)
@@ -149,7 +149,7 @@ def test_two_stations_and_a_vehicle_behind_a_router(
 
 
 def test_an_autopilot_that_sends_mavlink_1(tmp_path: Path) -> None:
-    """Its telemetry counts; what we send stays MAVLink 2."""
+    """The bridge uses MAVLink 1 telemetry, and still sends MAVLink 2."""
     rig = Rig(tmp_path, "udpin")
     station = version_1.MAVLink(None, 1, 1)
     try:
@@ -165,7 +165,7 @@ def test_an_autopilot_that_sends_mavlink_1(tmp_path: Path) -> None:
 
 
 def old(station: Any, name: str, fields: dict[str, Any]) -> bytes:
-    """Return a frame of version 1; nothing for a message or a field that it lacks."""
+    """Return a MAVLink 1 frame with the fields that version 1 of the message has."""
     if "name" in fields:
         fields = {**fields, "name": fields["name"].encode()}
     make = getattr(version_1, f"MAVLink_{name.lower()}_message")
@@ -197,7 +197,7 @@ def test_a_station_behind_the_autopilot(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of two seconds, in which the parameters were asked for."""
+    """Return a log of two seconds with a request for the parameters."""
     rig = Rig(tmp_path_factory.mktemp("rig"))
     try:
         rig.start()

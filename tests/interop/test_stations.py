@@ -1,4 +1,4 @@
-"""Third-party ground stations find the bridge, set its parameters, and read its messages."""
+"""Test that third-party ground stations find the bridge, set its parameters, and read its messages."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_mavsdk(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
 
 
 def layout(name: str) -> dict[str, object]:
-    """What node-mavlink needs to know of one of our messages."""
+    """Return the layout of one of magbridge's messages for node-mavlink."""
     message = spec(name)
     fields = [
         {"name": field.name, "offset": field.offset, "size": field.struct.size, "type": TYPES[field.code]}

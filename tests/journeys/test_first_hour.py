@@ -1,4 +1,4 @@
-"""Ten first hours, each the commands of the documentation, word for word, on files that look like theirs."""
+"""Test ten first hours: the commands of the documentation, word for word, on files like those of users."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def right(file: str, within: float) -> None:
 
 @pytest.fixture
 def calibration(here: Path) -> Calibration:
-    """cal.json: a mass that moves, and no boresight."""
+    """Return the calibration of a vehicle with a moving mass and without a boresight."""
     coefficients = np.random.default_rng(1).normal(size=18) * 300.0
     made = polynomial(coefficients, Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0))
     save(made, here / "cal.json")

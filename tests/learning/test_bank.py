@@ -1,4 +1,4 @@
-"""Estimators side by side: which is believed, and what the quiet one takes over."""
+"""Test the bank of estimators: the selection, and what the baseline takes from the selected estimator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PER_DEGREE = np.array([4.0, -3.0, 5.0])
 
 
 def bank_of(known: Calibration) -> tuple[EstimatorBank, LearnedTerms, Nuisance]:
-    """Return one that begins with a calibration and the IGRF as reference."""
+    """Return a bank that begins with a calibration and the IGRF as reference."""
     model, nuisance = LearnedTerms(known, ()), Nuisance(known.noise, 145.0)
     coefficients, covariance = model.coefficients(known)
     quiet = Estimator(coefficients, covariance, model.offsets, nuisance, 0.01)
@@ -35,7 +35,7 @@ def bank_of(known: Calibration) -> tuple[EstimatorBank, LearnedTerms, Nuisance]:
 
 
 def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[EstimatorBank, LearnedTerms]:
-    """Learn from a world whose offset follows the temperature (n,) by so much (3,)."""
+    """Process a world whose offset follows the temperature (n,) with the coefficients (3,)."""
     known = calibration()
     bank, model, _ = bank_of(known)
     world, corrector = World(known, len(temperature)), Corrector(known)
@@ -57,7 +57,7 @@ def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[EstimatorBan
 
 
 def test_a_warming_is_taken_over_from_the_one_that_follows_the_temperature() -> None:
-    """It is believed, has found by how much, and the quiet one goes on with that."""
+    """The bank selects this estimator, which has found the coefficient; the baseline takes it over."""
     warming = 12.0 * (1.0 - np.exp(-np.arange(400) / 150.0))
     bank, model = flown(warming, PER_DEGREE)
     warm = bank.all[1]
@@ -70,14 +70,14 @@ def test_a_warming_is_taken_over_from_the_one_that_follows_the_temperature() -> 
 
 
 def test_a_temperature_that_does_nothing_is_not_believed() -> None:
-    """However much it changes."""
+    """A temperature without effect is not selected, however much it changes."""
     bank, _ = flown(4.0 + 8.0 * np.sin(np.arange(300) / 40.0), np.zeros(3))
     assert bank.best is not bank.all[1]
     assert not bank.take_over(0.0)
 
 
 def test_the_result_of_an_alarm_is_accepted_if_it_is_far_better() -> None:
-    """Otherwise the selected one stays."""
+    """Otherwise the bank keeps the selected estimator."""
     warming = 12.0 * (1.0 - np.exp(-np.arange(400) / 150.0))
     bank, _ = flown(warming, PER_DEGREE)
     nothing = np.zeros(bank.quiet.states), np.zeros((bank.quiet.states, bank.quiet.states))
@@ -88,7 +88,7 @@ def test_the_result_of_an_alarm_is_accepted_if_it_is_far_better() -> None:
 
 
 def test_a_calibration_that_follows_the_temperature_is_not_supposed_to() -> None:
-    """Then only the drifting one and the quiet one remain."""
+    """Then only the drifting estimator and the baseline remain."""
     known = calibration()
     assert len(bank_of(known)[0].all) == 3
     effect = ChannelEffect(cause="temperature_offset", channel="sensor_temperature", origin=0.0)
@@ -142,7 +142,7 @@ STEP_M, STEP_S = 1.4, 4.0
 
 
 def judged(hours: float, first: float, candidate: float, pulses: float = 0.0) -> Judge:
-    """Return it after a glider's legs, each with errors (nT) that change sign at every dive and climb.
+    """Return the comparison after a glider's legs, with errors (nT) that change sign at every dive and climb.
 
     `pulses` (nT) are added in two of every ten minutes, for both calibrations.
     """
@@ -175,7 +175,7 @@ def test_a_candidate_with_errors_of_its_own_is_not_adopted() -> None:
 
 
 def test_an_expected_change_is_adopted_after_one_turn() -> None:
-    """As after an alarm whose cause explains the samples."""
+    """An alarm whose cause explains the samples gives such an expected change."""
     judge = judged(0.3, 3.0, 0.0)
     assert judge.adopt(expected=True)
     assert not judge.adopt()
@@ -219,7 +219,7 @@ def alarm(strength: float, *causes: str) -> LearningAlarm:
 
 
 def standing(*alarms: LearningAlarm, telling: int = 0) -> AlarmState:
-    """Return how it stands after these, and so many telling samples and as many that are not."""
+    """Return the state after these alarms, then `telling` informative and as many uninformative samples."""
     one = AlarmState()
     for each in alarms:
         one.update(each)
@@ -227,7 +227,7 @@ def standing(*alarms: LearningAlarm, telling: int = 0) -> AlarmState:
 
 
 def counted(one: AlarmState, telling: int, error: float = 0.0) -> AlarmState:
-    """Return it after so many telling samples, predicted within `error` (nT), and as many that are not."""
+    """Return the state after informative samples with an `error` (nT) and as many uninformative ones."""
     for _ in range(telling):
         one.count(error, 1.0, informative=True)
         one.count(0.0, 1.0, informative=False)
@@ -235,7 +235,7 @@ def counted(one: AlarmState, telling: int, error: float = 0.0) -> AlarmState:
 
 
 def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
-    """One more cause asks for as much more evidence."""
+    """Each further cause requires more evidence."""
     two = "offset_drift", "temperature_offset"
     first = alarm(20.0, *two)
     assert not standing(first, alarm(20.1 + MIN_GROWTH, *two)).is_certain
@@ -245,7 +245,7 @@ def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
 
 
 def relapsed() -> AlarmState:
-    """Return one whose cause was learned, and mistaken: errors of 30 nT were seen."""
+    """Return a state whose cause was learned by mistake: errors of 30 nT occurred."""
     one = standing(alarm(20.0, "offset_step"))
     one.try_cause()
     assert one.variance == 25.0  # until it is confirmed

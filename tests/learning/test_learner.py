@@ -1,4 +1,4 @@
-"""In-flight calibration: the equation of a sample is that of the fit; results of many samples."""
+"""Test in-flight calibration: the equation of a sample equals the fit's; results of many samples."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_what_waits_while_learning_is_off_is_settled_by_its_own_next_reading() -
 
 
 def test_a_changed_offset_is_learned_and_published() -> None:
-    """The published one is as good as the noise lets it be; its id and its history are its own."""
+    """The published calibration is as good as the noise allows, with its own id and history."""
     known, world = calibration(), None
     world = World(known, 1500)
     learner = Learner(known)
@@ -91,7 +91,7 @@ def test_a_changed_offset_is_learned_and_published() -> None:
 
 
 def test_nothing_is_published_where_nothing_has_changed() -> None:
-    """Nor is there an alarm."""
+    """Without a change, the learner publishes nothing and raises no alarm."""
     known = calibration()
     learner = Learner(known)
     assert learn(learner, World(known, 1500)) == []
@@ -165,7 +165,7 @@ def test_sigma_covers_what_is_not_explained() -> None:
 
 
 def test_flagged_samples_teach_nothing() -> None:
-    """Nor do those without a position."""
+    """Neither flagged samples nor samples without a position update the learner."""
     known = calibration()
     for quality in (Quality.MOVING, Quality.STALE_TELEMETRY, Quality.SATURATED, Quality.LATE_JOIN):
         learner = Learner(known)

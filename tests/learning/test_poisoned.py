@@ -1,4 +1,4 @@
-"""Wrong references: the published field keeps its accuracy, and the error is reported."""
+"""Test wrong references: the published field keeps its accuracy, and the bridge reports the error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from magbridge.records import Quality
 
 
 def reported(learner: Learner) -> list[str]:
-    """Return the texts of its notices."""
+    """Return the texts of the learner's messages."""
     return [notice.text for notice in learner.notices]
 
 
@@ -101,7 +101,7 @@ def test_a_map_in_other_units_is_reported() -> None:
 
 @pytest.mark.parametrize("mapped", [False, True])
 def test_a_gps_that_jumps_by_a_kilometre_teaches_nothing(*, mapped: bool) -> None:
-    """To and fro, with a map and without one."""
+    """GPS jumps to and fro, with and without a map."""
     known, n = calibration(), 1200
     world = World(known, n)
     world.where = [
@@ -186,7 +186,7 @@ def test_a_motion_that_began_before_its_telemetry_raises_no_alarm() -> None:
 
 
 def test_two_outliers_raise_no_alarm() -> None:
-    """Three that agree are."""
+    """Two outliers raise no alarm; three consistent ones do."""
     known, n = calibration(), 400
     added = np.zeros((n, 3))
     added[350:352] = [0.0, 0.0, 40.0]

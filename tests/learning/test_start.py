@@ -1,4 +1,4 @@
-"""From nothing: a vehicle of which only the class is known."""
+"""Test the start without a calibration, from the class of the vehicle only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HARD_IRON = np.array([2500.0, -1800.0, 3000.0])
 
 
 def vehicle() -> Calibration:
-    """Return one with thousands of nanotesla of hard iron."""
+    """Return a vehicle with thousands of nanotesla of hard iron."""
     known = calibration()
     coefficients = known.coefficients.copy()
     coefficients[6:9] += HARD_IRON
@@ -74,7 +74,7 @@ def test_a_jump_that_a_young_calibration_made_is_over_with_the_next_fit() -> Non
 
 
 def test_what_was_learned_from_nothing_can_be_forgotten() -> None:
-    """It then begins with nothing again."""
+    """After the reset, the learner begins without a calibration again."""
     learner = Learner(class_prior((MASS,), FIELD))
     learn(learner, World(vehicle(), 300))
     assert learner.calibration.method == "learned"

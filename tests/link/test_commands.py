@@ -1,4 +1,4 @@
-"""Commands, acknowledged to the asker."""
+"""Test that commands are acknowledged to their sender."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ NEEDED = {ATTITUDE: (10.0, 4.0), VFR_HUD: (5.0, 2.0)}
 
 
 class Bench:
-    """An autopilot that sends messages at given rates, and answers each request with one result."""
+    """Autopilot that sends messages at given rates, and replies to each request with one result."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""The component as a station sees it."""
+"""Test the component from the point of view of a ground station."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each fix, decoded, is the position that went in, in the frame and the units of its message."""
+"""Test that each decoded fix is the original position, in the frame and units of its message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MAVLink FTP and the older log transfer, without a link: granted and refused requests."""
+"""Test MAVLink FTP and the older log transfer, without a link: accepted and rejected requests."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_a_file_by_reads_and_its_checksum(server: FtpServer, folder: Path) -> No
 
 
 def slow_crc32(data: bytes) -> int:
-    """As the guide's example computes it, bit by bit, from 0 and not inverted."""
+    """Return the CRC of the guide's example, bit by bit, from 0 and not inverted."""
     total = 0
     for byte in data:
         total ^= byte

@@ -1,4 +1,4 @@
-"""Every tunable over the parameter protocol."""
+"""Test the access to every parameter by the parameter protocol."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samples as a station sees them."""
+"""Test the messages of samples that a station receives."""
 
 from __future__ import annotations
 

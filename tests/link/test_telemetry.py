@@ -1,4 +1,4 @@
-"""Any field of any message becomes a parameter."""
+"""Test that any field of any message can become a parameter."""
 
 from __future__ import annotations
 

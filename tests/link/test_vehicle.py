@@ -1,4 +1,4 @@
-"""The autopilot comes, goes, reboots, and may not be alone; its clock."""
+"""Test an autopilot that appears, disappears and reboots, several autopilots, and its clock."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def exchange(
     slow: float = 300.0,
     drift_ppm: float = 0.0,
 ) -> None:
-    """One request and its answer over a link that delays each way by a random time."""
+    """Update the clock with a request and its reply over a link with a random delay each way."""
     there, back = (slow + rng.expovariate(1 / 2000) for _ in range(2))
     asked = clock.ask(now_us)
     vehicle_us = now_us + there + offset_us + drift_ppm * 1e-6 * (now_us - START)

@@ -1,4 +1,4 @@
-"""A log written in layouts drawn at random: it is read right, or asked about; never wrong without a word."""
+"""Test that a log in a random layout is read correctly or rejected with a question, never silently wrong."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from magbridge import logs
 from magbridge.errors import FormatError
 
 GPS = 315_964_800 - 18
-"""s, from GPS time to that since 1970."""
+"""Difference of Unix time and GPS time, s."""
 SIGNS = (",", "."), (";", ","), (";", "."), ("\t", "."), ("|", ","), ("|", ".")
-"""Between fields, and in a number."""
+"""Field separator and decimal sign."""
 PARTS = {"year": "%Y", "month": "%m", "day": "%d", "hour": "%H", "min": "%M"}
 Stamps = Callable[[pd.DatetimeIndex, np.ndarray[Any, np.dtype[np.float64]]], dict[str, list[str]]]
 
@@ -65,7 +65,7 @@ NAMES = "mag_{}", "Mag{}", "B{}", "imu.magnetic_field.{}", "RAW_IMU.{}mag"
 
 
 def drawn(random: np.random.Generator) -> tuple[str, str, Any, Any]:
-    """Return the kind of its times, a text in a layout drawn, its times (n,), field (n, 3) in nT."""
+    """Return kind of times, text in a random layout, times (n,) and field (n, 3), nT."""
     kind = str(random.choice(list(STAMPS)))
     separator, decimal = SIGNS[random.integers(len(SIGNS))]
     rows, step = int(random.choice([3, 40])), float(random.choice([0.1, 1.0, 4.0]))
@@ -93,7 +93,7 @@ def drawn(random: np.random.Generator) -> tuple[str, str, Any, Any]:
 
 
 def read_or_asked(path: Path) -> xr.Dataset | None:
-    """Return the log; None where it is asked what its times mean."""
+    """Return the log; None if the reader asks for the meaning of the times."""
     try:
         return logs.read(path)
     except FormatError as error:

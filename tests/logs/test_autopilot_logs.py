@@ -1,4 +1,4 @@
-"""``.BIN`` and ``.ulg``, built here byte by byte as their formats say; nothing of them is kept."""
+"""Test ``.BIN`` and ``.ulg`` logs that the tests write by the specification of the formats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each bad file gives one line with file, row, column and the expected content."""
+"""Test that each bad file gives one line with file, row, column and the expected content."""
 
 from __future__ import annotations
 
@@ -369,7 +369,7 @@ def test_a_slocums_number_that_is_too_large_for_its_reader(
 
 @pytest.mark.parametrize("name", ["no_row_group.parquet", "attribute.nc", "hangs.ulg", "short.dbd"])
 def test_files_that_once_failed(cases: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result, or one line: within the guard's processor time."""
+    """Each file gives a result or one line, within the processor time of the guard."""
     monkeypatch.setattr(guard, "SECONDS", 2.0)
     path = cases / "files" / name
     output = f"{path}: "

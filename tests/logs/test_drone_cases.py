@@ -1,4 +1,4 @@
-"""Logs of drones that were once read wrong without a message or refused for a small fault."""
+"""Test drone logs that were once silently read wrong, or rejected for a small fault."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text files of programs that were not asked: what they mean is found, and told; or they are refused."""
+"""Test third-party text files: the reader finds and reports their meaning, or rejects them."""
 
 from __future__ import annotations
 

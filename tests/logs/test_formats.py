@@ -1,4 +1,4 @@
-"""Every format that can be written is read back, whole or in pieces."""
+"""Test that every written format can be read back, whole or in pieces."""
 
 from __future__ import annotations
 

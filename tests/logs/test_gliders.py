@@ -1,4 +1,4 @@
-"""Logs of Seagliders, SeaExplorers and Slocums."""
+"""Test the readers of Seaglider, SeaExplorer and Slocum logs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DIVE = {
     "gc_end_secs": ("gc_event", 1e9 + np.array([25.0, 50.0])),
     "gc_vbd_i": ("gc_event", np.array([1.5, 2.0])),
 }
-"""Variable -> its dimension, and its values."""
+"""Variables of a dive by name: dimension and values."""
 
 
 def dive(path: Path, **changed: tuple[str, np.ndarray]) -> xr.Dataset:

@@ -1,4 +1,4 @@
-"""Every column equals that of another reader: xarray, pyulog, pymavlink, on made and on measured files."""
+"""Test that every column equals the result of another reader: xarray, pyulog or pymavlink."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from magbridge import logs
 from magbridge.logs.fields import MAX_AGE
 
 Series = tuple[list[float], list[float]]
-"""Times, s, and values."""
+"""Times (s) and values of a column."""
 
 
 def carried(at: np.ndarray, series: Series) -> list[float]:

@@ -1,4 +1,4 @@
-"""What the readers make of data measured by others."""
+"""Test the readers on third-party measured data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bags of robots: written by rosbags, read in this project's frames, and compared with rosbags' reader."""
+"""Test ROS bags: written by rosbags, read in magbridge's axes, and compared with rosbags' reader."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 T0 = 1_700_000_000
 ANGLES = np.random.default_rng(0).uniform([-180, -89, 0], [180, 89, 360], (40, 3))
 FIELD = np.random.default_rng(1).normal(0, 3e-5, (40, 3))
-"""T, in ROS' axes."""
+"""Field in ROS' axes, T."""
 RC_OUT = "std_msgs/Header header\nuint16[] channels\n"
 
 

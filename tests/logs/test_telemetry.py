@@ -1,4 +1,4 @@
-"""Logs of live links: the telemetry that each row gets."""
+"""Test logs of live links: the telemetry of each row."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ S = 1_000_000
 
 
 class Log:
-    """A log in the making; times in s after its start."""
+    """Telemetry log that a test writes; times are in s after its start."""
 
     def __init__(self) -> None:
         self.data = b""

@@ -1,4 +1,4 @@
-"""Any bytes, however cut: messages or counted loss."""
+"""Test that any bytes in any pieces give messages or a counted loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs read to their end, whatever happened to them."""
+"""Test that logs are read to their end, whatever their damage."""
 
 from __future__ import annotations
 

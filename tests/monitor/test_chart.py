@@ -1,4 +1,4 @@
-"""The curve, its axis and its marks; the history behind them; the map."""
+"""Test the chart's curve, axis and marks, the stored history, and the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page as a browser gets it, from the command itself, fed with real datagrams."""
+"""Test the page of the real command in a browser, with real datagrams."""
 
 from __future__ import annotations
 

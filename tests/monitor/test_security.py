@@ -1,4 +1,4 @@
-"""Who is let in: real requests and websockets, as a browser of another site would send them."""
+"""Test the access control with real requests and websockets, as a browser of another site sends them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SOCKET = "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
 
 
 def status(url: str, path: str = "/", method: str = "GET", **headers: str) -> http.client.HTTPResponse:
-    """Return the answer; the names of `headers` have _ for -, and those given replace the usual ones."""
+    """Return the status of a reply; names of `headers` have _ for -, and replace the usual headers."""
     parts = urlsplit(url)
     connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=20)
     connection.putrequest(method, path, skip_host="Host" in headers)

@@ -1,4 +1,4 @@
-"""What the page knows, from frames as a bridge sends them."""
+"""Test the state of the page from the frames of a bridge."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ NOW = 1_700_000_000.0
 
 
 class Air:
-    """A bridge's codec and a station's ear."""
+    """Codec of a bridge and state of a station that receives its frames."""
 
     def __init__(self) -> None:
         self.fleet, self.bridge, self.codec = ReceivedBridges(), Codec(1, 191), Codec(255, 190)
 
     @property
     def state(self) -> BridgeState:
-        """The state of the bridge that sends."""
+        """Return the state of the sending bridge."""
         return self.fleet.states.get((self.bridge.system, self.bridge.component), BridgeState())
 
     def feed(self, now: float, name: str, /, **fields: object) -> None:
@@ -324,7 +324,7 @@ def test_a_long_text_is_one_alarm(air: Air) -> None:
 
 
 class Exchange:
-    """The station and a real bridge, whose first answers for the parameters of `lose` are lost."""
+    """Station and real bridge, with the first replies for the parameters of `lose` lost."""
 
     def __init__(self, air: Air, *lose: str) -> None:
         self.bridge = Component(Link("udpout:h:1"), {}, alignment(Align()), start_us=round(NOW * 1e6))

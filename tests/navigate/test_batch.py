@@ -1,4 +1,4 @@
-"""A log against a map: the track, the backward pass, the findings, the refusals."""
+"""Test a log against a map: the track, the backward pass, the findings, the rejections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a position is valid: only once the field could tell, and not against the field."""
+"""Test when a position is valid: only if the field can distinguish places, and agrees with it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERIOD = 700.0
 
 @pytest.fixture(scope="module")
 def alike() -> AnomalyGrid:
-    """A map on which every place has a twin 700 m away: no measurement can distinguish them."""
+    """Return a map on which every place has a twin 700 m away, which no measurement can distinguish."""
     per_latitude, per_longitude = metres_per_degree(PLACE[0])
     metres = np.arange(-6_000.0, 6_001.0, 50.0)
     waves = np.cos(2.0 * np.pi * metres / PERIOD)

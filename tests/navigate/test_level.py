@@ -1,4 +1,4 @@
-"""An unknown level is one bias, not noise."""
+"""Test that an unknown reference bias is treated as one bias, not as noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The device clock against injected truth: drift, jitter, wraps, restarts, steps, losses."""
+"""Test the device clock against simulated truth: drift, jitter, wraps, restarts, steps, losses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EPOCH = 1_700_000_000_000_000
 
 
 def arrivals(true: FloatArray, jitter: float, seed: int = 1) -> FloatArray:
-    """s; the delay is exponential with mean `jitter`, and bytes do not overtake each other."""
+    """Return arrival times, s: exponential delays of mean `jitter`, in the order of sending."""
     random = np.random.default_rng(seed)
     arrived: FloatArray = np.maximum.accumulate(true + random.exponential(jitter, true.size))
     return arrived

@@ -1,4 +1,4 @@
-"""What holds for every driver: any bytes in any chunks, and what its encoder sends."""
+"""Test each driver with any bytes in any chunks, and with the output of its encoder."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def instrument(case: str) -> tuple[Driver, Encoder]:
 
 
 def fed(driver: Driver, chunks: Iterator[bytes]) -> tuple[list[bytes], int, int]:
-    """Readings (packed, so that NaN equals NaN) and counters."""
+    """Return the readings (packed, so that NaN equals NaN) and the counters."""
     readings = [reading for chunk in chunks for reading in driver.feed(chunk)]
     return [msgspec.msgpack.encode(reading) for reading in readings], driver.bytes_skipped, driver.frames_bad
 
@@ -67,7 +67,7 @@ def stream(encoder: Encoder, fields: list[tuple[float, float, float]]) -> list[b
 
 @st.composite
 def damaged(draw: st.DrawFn, case: str) -> list[bytes]:
-    """Frames with garbage between, bytes lost and bytes changed; cut into chunks."""
+    """Return frames with garbage between, and lost and changed bytes, cut into chunks."""
     _, encoder = instrument(case)
     parts = []
     for frame in stream(encoder, draw(st.lists(FIELDS, max_size=12))):

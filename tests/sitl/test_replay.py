@@ -35,13 +35,13 @@ from sitl.replay.stage import Stage
 
 @pytest.fixture(scope="module")
 def flown() -> xr.Dataset:
-    """A simulated survey."""
+    """Return a simulated survey."""
     return segments(simulate(load("demo"), 3))["survey"]
 
 
 @pytest.fixture(scope="module")
 def survey(flown: xr.Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its first ten minutes."""
+    """Return the first ten minutes of the simulated survey."""
     path = tmp_path_factory.mktemp("survey") / "survey.nc"
     write(flown.isel(time=slice(0, 150)), path)
     return path
@@ -249,7 +249,7 @@ def test_a_bridge_that_ends_before_it_connects_says_why_at_once(tmp_path: Path) 
 
 
 def lines(count: int) -> Event:
-    """So many readings of an instrument that sends lines, read at once."""
+    """Return the lines of a number of readings, received at once."""
     return Event(1_700_000_000_000_000, Channel.SENSOR, b"20000 1000 40000\n" * count)
 
 

@@ -1,4 +1,4 @@
-"""Raw logs to one map: several vehicles, a base station, and the message for a bad log."""
+"""Test one map from raw logs: several vehicles, a base station, and the message for a bad log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Corrected lines to a levelled map: what goes in comes out, with a sigma that holds."""
+"""Test that corrected lines give a levelled map equal to the true field, with a valid sigma."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Rock:
 
 
 def lines(rock: Rock, rng: np.random.Generator) -> Samples:
-    """Ten lines north and three ties east, each with a level of its own (20 nT)."""
+    """Return ten lines north and three ties east, each with its own level (20 nT, 1-sigma)."""
     places, label, tie, level = [], [], [], []
     along = np.arange(-3000.0, 3000.0, 120.0)
     for k, across in enumerate([*np.linspace(-2700, 2700, 10), -2000.0, 100.0, 2100.0]):

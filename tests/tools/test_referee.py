@@ -1,4 +1,4 @@
-"""The referee keeps real autopilots' rules, and in closed loop with it the bridge does not go astray."""
+"""Test that the emulated autopilots keep the real rules, and that the bridge does not diverge with them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from magbridge.mavlink import Codec, spec
 
 BRIDGE = Codec(1, 191)
 FIXED_WING = 1
-"""MAV_TYPE"""
+"""MAV_TYPE of a fixed-wing aircraft."""
 ORIGIN = (*PLACE, 0.0)
 START_US = 1_780_000_000_000_000
 POSE = {
@@ -32,7 +32,7 @@ POSE = {
     "pose_covariance": (4.0,) * 21, "quality": 100,
 }  # fmt: skip
 HERE = {"lat": round(PLACE[0] * 1e7) + 2700, "lon": round(PLACE[1] * 1e7), "eph": 5.0, "id": 1}
-"""30 m north."""
+"""Position 30 m north of `PLACE`, in 1e-7 deg."""
 
 
 STACKS: dict[str, type[Autopilot]] = {"ArduPilot": ArduPilot, "Px4": Px4}

@@ -1,4 +1,4 @@
-"""A study runs its cases, keeps their rows, and tabulates them."""
+"""Test that a study runs its cases, stores their rows, and tabulates them."""
 
 from __future__ import annotations
 
