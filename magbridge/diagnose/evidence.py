@@ -1,28 +1,29 @@
-"""The evidence for each candidate, its test, and the causes that a log can show or distinguish.
+"""The evidence for each candidate, its significance test, and which causes a log can show or distinguish.
 
 Notes
 -----
-*Information.* One matrix serves the whole search: the inner products of the whitened columns of
-all candidates.
+*Information.* The inner products of the whitened columns of all candidates form one matrix, which the whole
+search uses.
 
-*Score.* For a candidate with score b and information S, the calibration projected out, ``R = b^T S^-1 b`` is
-its likelihood ratio to second order. Its k coefficients have Zellner's prior ``N(0, g S^-1)`` with the
-likeliest g: log evidence ``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410,
-sec. 2.4).
+*Score.* A candidate with score b and information S, the calibration projected out, has the likelihood ratio
+``R = b^T S^-1 b`` to second order. Its k coefficients have Zellner's prior ``N(0, g S^-1)`` with the
+likeliest g. The log evidence is ``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA
+103:410, sec. 2.4).
 
-*Test.* A cause's p-value is that of its likelihood ratio, times the number N of independent hypotheses behind
-the cause, times the number of causes; it is found if that is below 1 %. Under no effect scores are
-``N(0, S)``, and N is ``P(any of its n hypotheses passes) / a`` at the level a at which each is tested. By
-importance sampling, each hypothesis in turn is made to pass, and with m that pass then ``N = n E[1 / m]``
-(Owen, Maximov & Chertkov 2019, Electron. J. Statist. 13:231).
+*Test.* A cause's p-value is the p-value of its likelihood ratio, times the number N of independent hypotheses
+of the cause, times the number of causes. The cause is found if the product is below 1 %. Without an effect
+the scores are ``N(0, S)``. N is ``P(any of the n hypotheses passes) / a`` with a the level at which each is
+tested. Importance sampling makes each hypothesis in turn pass and counts the m that pass then: ``N = n E[1 /
+m]`` (Owen, Maximov & Chertkov 2019, Electron. J. Statist. 13:231).
 
-Two kinds of coefficients have a prior of their own. For those of one common size (:mod:`.joint`) the
-ratio contains the prior: the evidence is R / 2, less the log of the number of spectra that were tried. One
-that cannot be negative has half a Gaussian, of twice the density: ``log 2 Phi(sqrt(R))`` is added.
+Two kinds of coefficients have another prior. For coefficients of one common size (:mod:`.joint`) the ratio
+contains the prior, and the log evidence is R / 2, less the log of the number of spectra that were tried. A
+coefficient that cannot be negative has half a Gaussian, of twice the density, which adds
+``log 2 Phi(sqrt(R))``.
 
-*Isolability.* An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k
-degrees of freedom and noncentrality ``a^2`` passes the threshold. Between two causes whose signatures
-correlate by rho, the wrong one wins with the chance ``Phi(-a sqrt(1 - rho^2) / 2)``.
+*Isolability.* An effect of signal-to-noise a is found with the probability that a noncentral chi-square of k
+degrees of freedom and noncentrality ``a^2`` exceeds the threshold. If the signatures of two causes have the
+correlation rho, the wrong cause wins with the probability ``Phi(-a sqrt(1 - rho^2) / 2)``.
 """
 
 from __future__ import annotations
@@ -44,41 +45,42 @@ from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem, side_by_side
 
 FALSE_ALARM_RATE = 0.01
-"""Family-wise false-alarm rate."""
+"""Probability of any false finding in a log without faults (family-wise)."""
 ODDS = float(np.log(20.0))
 """Log evidence by which a cause with an exact regressor must win to be named alone."""
 IDEAL = 0.2
-"""Error of an idealised regressor, as a share of its norm."""
+"""Assumed error of an idealised regressor, as a fraction of its norm."""
 REMNANT = 0.3
-"""Fraction of the strongest cause's signal-to-noise, below which a signal may be that cause's remnant."""
+"""Fraction of the strongest cause's signal-to-noise, below which another signal may be its remnant."""
 SMOOTH, MOST_REMAINING = 0.1, 8.0
-"""Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant."""
+"""Replacement of :data:`REMNANT` for a Gaussian process, and largest signal-to-noise of its remnant."""
 SIMULATIONS = 400
 CONFOUNDED = 0.85
-"""Correlation above which two causes are listed as a pair: distinguished in 95 % of cases at S/N 6."""
+"""Correlation above which two causes are listed as a pair. At this value S/N 6 distinguishes them in 95 % of
+cases."""
 MAX_PLAUSIBLE_MULTIPLE = 50.0
-"""Multiple of its plausible size from which on a cause is not plausible at all."""
+"""Multiple of its plausible size from which on an effect is impossible."""
 FREE = 1e-3
 """Prior precision of free coefficients, in units of a plausible size's; 1 for those of one common size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Score and information of all candidates' coefficients, with calibration (and model) projected out."""
+    """Score and Fisher information of m coefficients, with calibration (and perhaps a model) projected out."""
 
     matrix: FloatArray
     """(m, m) Fisher information, in units of the prior widths."""
     score: FloatArray
-    """(m,)."""
+    """(m,) score of the coefficients."""
     shift: FloatArray
-    """(q + k, m) by how much calibration and model decrease for one unit of each coefficient."""
+    """(q + k, m) decrease of the coefficients of calibration and model per unit of each coefficient."""
 
     def moved(self, base: Joint, places: slice | IndexArray, taken: FloatArray) -> FloatArray:
-        """Return the likeliest calibration and model (q + k,) if the coefficients at `places` are `taken`."""
+        """Return the likeliest coefficients (q + k,) of calibration and model, given `taken` at `places`."""
         return np.append(base.z, base.coefficients) - self.shift[:, places] @ taken
 
     def fitted(self, base: Joint) -> Information:
-        """Project out the model of `base` as well, whose columns are the last."""
+        """Return the information with the model of `base`, whose columns are the last, also projected out."""
         m = len(self.score) - base.coefficients.size
         prior = base.prior[len(base.z) :]
         K = np.asarray(np.linalg.solve(self.matrix[m:, m:] + np.diag(prior), self.matrix[m:, :m]), float)
@@ -89,7 +91,10 @@ class Information:
         )
 
     def released(self, base: Joint, *places: slice) -> Information:
-        """Remove the coefficients at these places from the model of `base`, and project out its others."""
+        """Return the information without the coefficients at `places` of the model of `base`.
+
+        The other coefficients of the model are projected out.
+        """
         first, own = len(self.score) - base.coefficients.size, np.r_[*places]
         others = np.setdiff1d(np.arange(first, len(self.score)), own)
         S = self.matrix[np.ix_(others, others)] + np.diag(base.prior[len(base.z) + others - first])
@@ -106,10 +111,10 @@ def information(
     unshared: int = 0,
     stride: int = 1,
 ) -> Information:
-    """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
+    """Return the information of columns at the fit `base` under `noise`, with the calibration projected out.
 
-    The products of the first `unshared` columns with each other are not computed. With a `stride`, only every
-    so many pieces of the log count.
+    Products of the first `unshared` columns with each other are not computed. With a `stride` k, only every
+    k-th piece of the log counts.
     """
     # Sums are taken over the distinct parts X_i; the candidates are their mixtures X_i M_i
     q, shared = len(problem.centre), join_columns(columns).parts
@@ -133,7 +138,7 @@ def information(
 
 
 class Score(NamedTuple):
-    """Score of a candidate under a noise: likelihood ratio, freedoms, log evidence, estimate."""
+    """Likelihood ratio, degrees of freedom, log evidence and estimate (k,) of a candidate under a noise."""
 
     ratio: float
     freedom: int
@@ -142,7 +147,7 @@ class Score(NamedTuple):
 
 
 def score(info: Information, place: slice, candidate: Candidate) -> Score:
-    """Score the candidate whose columns stand at `place`; one of the wrong sign scores zero."""
+    """Return the score of the candidate whose columns are at `place`; zero if its sign is impossible."""
     # A size that cannot be negative has no evidence where its score is negative
     b, statistic = info.score[place], Statistic(info.matrix[place, place], candidate.spectra)
     freedom = statistic.freedom
@@ -157,7 +162,7 @@ def score(info: Information, place: slice, candidate: Candidate) -> Score:
 
 
 def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
-    """Log evidence of one candidate's likelihood ratio, by the prior that its numbers have."""
+    """Return the log evidence of a candidate's likelihood ratio, under the prior of its coefficients."""
     if candidate.spectra is not None:
         return 0.5 * ratio - float(np.log(len(candidate.spectra)))
     sided = float(one_sided(ratio)) if candidate.positive else 0.0
@@ -165,31 +170,31 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
 
 
 def log_bayes(ratio: float | FloatArray, freedom: float | FloatArray) -> FloatArray:
-    """Log evidence (Bayes factor against no effect) of likelihood ratios (...,) of `freedom` coefficients."""
+    """Return the log Bayes factor against no effect, (...,), of a likelihood ratio of `freedom` coefficients."""
     # (R - k)/2 - (k/2) log(R/k), and 0 below R = k: Zellner's prior with the likeliest g
     over = np.maximum(ratio / np.maximum(freedom, 1e-12), 1.0)
     return np.asarray(0.5 * freedom * (over - 1.0 - np.log(over)))
 
 
 def one_sided(ratio: float | FloatArray) -> FloatArray:
-    """Log evidence (...,) that half a prior of twice the density adds where the estimate has its sign."""
+    """Return the log evidence (...,) that the constraint to a nonnegative coefficient adds."""
     return np.asarray(np.log(2.0) + log_ndtr(np.sqrt(ratio)))
 
 
 def bayes_factor_threshold(ratio: float) -> float:
-    """Return the log evidence by which a cause of this likelihood ratio must win to be named alone."""
+    """Return the margin in log evidence by which a cause of this likelihood ratio excludes another one."""
     return ODDS + regressor_error(ratio)
 
 
 def regressor_error(ratio: float) -> float:
-    """Log evidence that another cause may gain from the errors of the regressors in a model of this ratio."""
+    """Return the log evidence that another cause may gain from the regressor errors of a model."""
     return 0.5 * IDEAL**2 * ratio
 
 
 def look_elsewhere_factors(
     info: Information, candidates: Sequence[Candidate], places: Sequence[slice]
 ) -> dict[str, float]:
-    """Return the number of independent hypotheses behind each cause."""
+    """Return the number of independent hypotheses of each cause (module notes), by its name."""
     causes = dict.fromkeys(candidate.cause for candidate in candidates)
     found = {}
     for cause in causes:
@@ -204,9 +209,9 @@ def look_elsewhere_factors(
 
 
 def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
-    """Return the number of independent hypotheses that pass as often as any of those at `places`.
+    """Return the number of independent hypotheses that pass as often as any hypothesis at `places`.
 
-    All together they are tested at `level`.
+    S is the information of all their coefficients, and `level` the level of their joint test.
     """
     # Draws of the scores N(0, S) under no effect
     rng = np.random.default_rng(20131212)  # the same answer every time
@@ -235,11 +240,11 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
 def log_odds(
     ratio: float, model: Sequence[Candidate], look_elsewhere: Mapping[str, float], shaped: float
 ) -> float:
-    """Return the log posterior odds of a whole model of this likelihood ratio against no effect.
+    """Return the log posterior odds of a model of this likelihood ratio against no effect.
 
     `shaped` is the part of the ratio that causes of flexible shape do not explain (:func:`.shaped_ratio`).
-    Every regressor pays for the hypotheses of its cause; each after the first also pays for the prior odds of
-    a further fault, and for its choice among the causes.
+    The number of hypotheses of each regressor's cause is a penalty. Each regressor after the first adds the
+    prior odds of a further fault, and of its choice among the causes.
     """
     regressors, free = sum(len(c.pieces) for c in model), sum(c.size for c in model if c.spectra is None)
     # Price of each further regressor, of the grids, and of the spectra that were tried
@@ -254,21 +259,21 @@ def log_odds(
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One cause, fitted together with the others of a model."""
+    """A cause, fitted jointly with the other causes of a model, and its test."""
 
     candidate: Candidate
     ratio: float
-    """Twice the gain in log likelihood."""
+    """Twice the gain in log likelihood by this cause."""
     evidence: float
     """Log Bayes factor against the model without it."""
     p_value: float
-    """Times the hypotheses behind the cause (look-elsewhere) and the number of causes."""
+    """p-value, times the hypotheses of the cause (look-elsewhere) and the number of causes."""
     fit: Joint
     """Fit of the whole model; this cause's coefficients are the last."""
 
     @property
     def signal_to_noise(self) -> float:
-        """Whitened norm of the effect, calibration and model projected out, less what noise alone gives."""
+        """Whitened norm of the effect beyond calibration and model, less the expected norm of noise."""
         own = slice(-self.candidate.size, None)
         known = self.fit.prior[own] * np.diag(self.fit.covariance)[own]
         power = self.fit.wald(own) - float(np.sum(1.0 - known))
@@ -279,9 +284,9 @@ class Best(NamedTuple):
     """The best candidate of a grid under one noise."""
 
     place: int
-    """Place among all candidates."""
+    """Index among all candidates."""
     price: float
-    """Log of the grid's average evidence, relative to the best."""
+    """Log of the average evidence of the grid, relative to the best candidate."""
     score: Score
     info: Information
 
@@ -293,30 +298,30 @@ def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: 
 
 
 def wald_ratio(fit: Joint, candidate: Candidate) -> float:
-    """Return likelihood ratio of the last candidate's coefficients under the noise that is left."""
+    """Return the likelihood ratio of a fit's last candidate, under the noise of that fit."""
     own = slice(-candidate.size, None)
     spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
     return fit.wald(own) - 2.0 * spread
 
 
 class Visible(NamedTuple):
-    """How large one cause must be to be found."""
+    """Smallest sizes at which one cause is found."""
 
     cause: str
     channel: str | None
     sizes: dict[str, tuple[float, str]]
-    """Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it."""
+    """Size found with 95 % probability, and its unit, by coefficient; infinite if a log cannot show it."""
 
 
 @dataclass(frozen=True)
 class Isolability:
-    """What a log can show, before its residual is looked at."""
+    """The causes that a log can show and distinguish, by its design matrix alone."""
 
     visible: tuple[Visible, ...]
     pairs: tuple[tuple[Visible, Visible, float], ...]
-    """Causes with correlated effects, and their correlation."""
+    """Pairs of causes with correlated effects, and their correlation."""
     untestable: dict[str, str]
-    """Cause that this log cannot test -> what a log would need for it."""
+    """Content that a test needs and this log lacks, by cause."""
 
 
 def isolability(
@@ -326,7 +331,7 @@ def isolability(
     causes: int,
     untestable: Mapping[str, str],
 ) -> Isolability:
-    """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
+    """Return what the log can show by `info`, with the most visible candidate of each cause and channel."""
     at, visible, alike = slices(candidates), {}, []
     # One candidate for each cause and channel, with the price of all hypotheses behind it
     for k in most_visible(candidates, info, at):
@@ -341,7 +346,7 @@ def isolability(
 
 
 def most_visible(candidates: Sequence[Candidate], info: Information, places: Sequence[slice]) -> list[int]:
-    """Return the place of the candidate of each cause and channel that the log shows best."""
+    """Return the index of the most visible candidate of each cause and channel."""
     best: dict[Group, tuple[float, int]] = {}
     for k, candidate in enumerate(candidates):
         total = float(np.trace(info.matrix[places[k], places[k]])) / candidate.size
@@ -351,7 +356,7 @@ def most_visible(candidates: Sequence[Candidate], info: Information, places: Seq
 
 
 def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: float) -> Visible:
-    """Return the signal-to-noise ratio and the sizes at which a candidate is found."""
+    """Return the sizes at which a candidate is found, if it is chosen from so many `hypotheses`."""
     # Noncentrality at which a noncentral chi-square passes the threshold in 95 %
     freedom = max(score(info, place, candidate).freedom, 1)
     sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))
@@ -373,7 +378,7 @@ def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: 
 
 
 def likeness(info: Information, first: Candidate, a: slice, second: Candidate, b: slice) -> float:
-    """Return the correlation of two signatures: root of the mean fraction that one imitates of the other."""
+    """Return the correlation of two signatures: root of the larger power fraction that one imitates."""
     # Share of A's power that B imitates, C B^-1 C^T, and the reverse
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (first, second))

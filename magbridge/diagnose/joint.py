@@ -3,10 +3,10 @@ r"""The joint fit of calibration, effects and noise, and its prediction of held-
 Notes
 -----
 *Likelihood ratio of one candidate.* With projected information S and score b of k columns in units of their
-widths, free coefficients have the likelihood ratio ``R = b^T S^-1 b``, with as many degrees of freedom as the
-data determine directions. A smooth function of the place, or a slow curve, has more coefficients than that.
-They have a Gaussian prior of variance g w, with a common size g and a spectrum w, the likeliest of each. With
-``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
+widths, free coefficients have the likelihood ratio ``R = b^T S^-1 b``. Its degrees of freedom are the
+directions that the data determine. A smooth function of the place, or a slow curve, has more coefficients
+than these. Its coefficients have a Gaussian prior of variance g w, with the likeliest common size g and
+spectrum w. With ``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
 
 .. math:: E = \max_{g, w} \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
 
@@ -15,9 +15,9 @@ Under no effect ``R = 2 E`` is at most a chi-square of one degree of freedom (Se
 *Joint likelihood.* Noise that is fitted without a large and slow effect absorbs it, so two hypotheses are
 compared only after the noise has been fitted under each.
 
-*Score of a model*: the log predictive density of every fold of dives, given the others. With l the log
+*Score of a model*: the log predictive density of every fold of dives, given the other folds. l is the log
 likelihood of the noise at the fit c to all dives, c_-f the fit without fold f, ``A_f^T A_f`` the information
-of that fold and P that of all folds and the prior, Laplace's approximation is
+of fold f, and P the information of all folds and the prior. Laplace's approximation is
 
 .. math:: S = l - \tfrac12 |z|^2 - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
               + \log\det P - \log\det (P - A_f^T A_f) \right]
@@ -46,32 +46,32 @@ from magbridge.estimation.residual import robust_scale
 S = TypeVar("S")
 T = TypeVar("T")
 MAX_STORED_NUMBERS = 12_500_000
-"""Most numbers of columns that are kept in memory: 100 MB."""
+"""Largest number of matrix elements of columns that are kept in memory: 100 MB."""
 ALL_PRODUCTS = ((slice(None), slice(None)),)
-"""Products of every column with every other."""
+"""Blocks of ``X^T X`` to compute: all."""
 THREADS, LONG, POOL = 2, 32768, "diagnose"
-"""Threads that share the work on a log, rows from which they are worth their while, and their name."""
+"""Number of threads, rows of a log above which they are used, and the prefix of their names."""
 PRIOR_SIZES = np.logspace(-7, 2, 64)
-"""Values of g that are tried, in units of the widths squared."""
+"""Common sizes g that are tried, in units of the squared widths."""
 VISIBLE = 1e-3
 """Information, as a fraction of the prior's own, below which a direction is ignored."""
 RIDGE = 0.1
-"""Prior precision of an effect, in units of a plausible size's: without it, a nonlinearity and the
+"""Prior precision of an effect's coefficients, in units of their widths. Without it, a nonlinearity and the
 calibration's scales could cancel each other and fit the noise."""
 FLAT_PRECISION = 1e-6
-"""Prior precision of coefficients that are free, or of no known size."""
+"""Prior precision of coefficients whose common size is not yet known."""
 FOLDS = 8
-"""Folds at most: each costs one solution of the normal equations."""
+"""Largest number of folds: each costs one solution of the normal equations."""
 DRAWS = 2000
-"""Bootstrap samples: an end of the interval then scatters by 1.5 % of its width."""
+"""Number of bootstrap samples: an end of the interval then scatters by 1.5 % of the interval's width."""
 QUANTILES = (0.025, 0.975)
-"""Quantiles of the bootstrap samples: the ends of the interval."""
+"""Quantiles of the bootstrap samples at the ends of the interval."""
 CONFIDENCE_LEVEL = QUANTILES[1] - QUANTILES[0]
 """Confidence level of the interval."""
 
 
 def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
-    """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
+    """Return the columns of n rows, precomputed unless they would need too much memory."""
     # the fits of a long log are made by two threads, each with columns of its own
     if n * sum(map(size_of, columns)) > MAX_STORED_NUMBERS / (THREADS if n > LONG else 1):
         return list(columns)
@@ -83,7 +83,7 @@ def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 class JointDesign:
-    """The columns of a hypothesis, the calibration's and those of the effects."""
+    """Design matrix X of a hypothesis: q columns of the calibration, then k of the effects."""
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
         self.problem, self.columns, self.pieces = problem, columns, row_blocks(len(problem))
@@ -91,11 +91,11 @@ class JointDesign:
         self.at, self.effects = places(sizes, self.q), sum(sizes)
 
     def rows(self, rows: slice) -> FloatArray:
-        """Return (m, q + k) rows of all columns."""
+        """Return m rows of X, (m, q + k)."""
         return side_by_side([self.problem.calibration_rows(rows), *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
-        """Return (n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
+        """Return ``X c`` (n,) for coefficients c (q + k,)."""
 
         def piece(rows: slice) -> FloatArray:
             out = np.asarray(self.problem.calibration_rows(rows) @ c[: self.q])
@@ -116,9 +116,9 @@ def normal(
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``X^T X`` (k, k) and ``X^T y`` (k,), X whitened if a noise is given.
 
-    They are summed up in pieces that fit the processor's cache, which threads share always in the same way,
-    so any machine returns the same numbers. Of ``X^T X`` only the blocks that are `asked` for are computed,
-    and their transposes. With a `stride`, only every so many pieces of the log count.
+    Only the blocks `asked` of ``X^T X``, pairs of row and column slices, and their transposes are computed.
+    With a `stride` k, only every k-th piece of the log counts. The order of the sums does not depend on the
+    machine.
     """
     k = size_of(X)
 
@@ -142,9 +142,9 @@ def normal(
 
 
 def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:
-    """Return the function's results for each argument `given`.
+    """Return the results of `function` for each argument in `given`.
 
-    For a log of many rows n the calls are shared out among threads, but not from within one of those.
+    For a log of more than :data:`LONG` rows n, threads share the calls, except for a call from such a thread.
     """
     if n <= LONG or current_thread().name.startswith(POOL):
         return [function(one) for one in given]
@@ -159,15 +159,15 @@ def _pool() -> ThreadPoolExecutor:
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """The estimate at the likeliest size and spectrum."""
+    """Estimate of coefficients of one common size, at the likeliest size and spectrum."""
 
     ratio: float
     estimate: FloatArray
-    """(k,)."""
+    """(k,) posterior mean of the coefficients."""
     variance: FloatArray
     """(k,) prior variance of each coefficient."""
     price: float
-    """Log evidence that the prior costs: its density at the estimate, and the volume (Occam's factor)."""
+    """Cost of the prior in log evidence: density at the estimate, and volume (Occam's factor)."""
     signal_to_noise: float
     """Whitened norm of the estimate."""
 
@@ -175,8 +175,8 @@ class Ridge:
 class Statistic:
     """The likelihood ratio of one candidate's coefficients, of information S (k, k).
 
-    `spectra` (l, k) are alternatives for the prior variances, up to a common factor; without them each
-    coefficient is free.
+    `spectra` (l, k) are alternative prior variances, up to a common factor. Without them each coefficient is
+    free.
     """
 
     def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:
@@ -193,7 +193,7 @@ class Statistic:
         self.freedom = 1
 
     def ratio(self, b: FloatArray) -> FloatArray:
-        """Return (m,) likelihood ratios of scores b (k, m)."""
+        """Return the likelihood ratios (m,) of m scores b (k, m)."""
         if self.spectra is None:
             return np.asarray(np.sum((self.vectors.T @ b) ** 2 / self.values[:, None], axis=0))
         return np.asarray(
@@ -201,14 +201,14 @@ class Statistic:
         )
 
     def _evidences(self, k: int, b: FloatArray) -> FloatArray:
-        """Return (sizes, m) log evidence with the k-th spectrum."""
+        """Return the log evidence (sizes, m) of m scores at each of the prior sizes, with the k-th spectrum."""
         y2, grown = (self.vectors[k].T @ b) ** 2, PRIOR_SIZES[:, None] * self.values[k]
         return np.asarray(
             0.5 * ((PRIOR_SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])
         )
 
     def best(self, b: FloatArray) -> Ridge:
-        """Return the best size and spectrum for a score b (k,)."""
+        """Return the estimate at the likeliest size and spectrum for a score b (k,)."""
         assert self.spectra is not None
         # E(g, w) on the grid of sizes and spectra: its maximum gives both
         tables = [self._evidences(k, b[:, None])[:, 0] for k in range(len(self.spectra))]
@@ -224,25 +224,25 @@ class Statistic:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A hypothesis at its maximum."""
+    """Joint fit of calibration, effects and noise at the maximum of the likelihood."""
 
     log_likelihood: float
     """Penalised log-likelihood; coefficients of one common size are integrated out (Laplace)."""
     z: FloatArray
-    """(q,)."""
+    """(q,) unknowns of the calibration, as in :mod:`.problem`."""
     coefficients: FloatArray
-    """(k,) of the effects, in units of their prior width."""
+    """(k,) coefficients of the effects, in units of their prior widths."""
     covariance: FloatArray
-    """(q + k, q + k)."""
+    """(q + k, q + k) covariance of z and the coefficients."""
     noise: ResidualNoise
     residual: FloatArray
-    """(n,) nT, residual of the fit."""
+    """(n,) residual of the fit, in the sensor's nT."""
     prior: FloatArray
-    """(q + k,) prior precision of every coefficient, effects in units of their widths."""
+    """(q + k,) prior precision of z and of the coefficients, in their units."""
 
     @property
     def effects_covariance(self) -> FloatArray:
-        """(k, k) of the effects' coefficients."""
+        """(k, k) covariance of the effects' coefficients."""
         return self.covariance[len(self.z) :, len(self.z) :]
 
     def wald(self, places: slice | IndexArray) -> float:
@@ -268,11 +268,11 @@ def fit_joint(
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise by at most `rounds` steps.
 
-    Start from the best of the `starts` (q + k,), among them plain least squares if `plain`. The k columns of
-    the effects have the prior precision `ridge`, in units of their widths; those with `spectra` (l, k) have
-    one common size and l alternatives for their variances. The autoregression has this `order` and starts
-    from that of the fit `like`; `blocks` and `brief` are those of :func:`.fit_noise`. Of the log's pieces,
-    one in `stride` counts in the normal equations.
+    The fit starts from the best of the `starts` (q + k,) and, if `plain`, of least squares under white noise.
+    The k coefficients of the effects have the prior precision `ridge`, in units of their widths. Columns with
+    `spectra` (l, k) have one common size instead, and l alternative variances. The autoregression has this
+    `order`, and its fit starts from the noise of the fit `like`. `blocks` and `brief` are arguments of
+    :func:`.fit_noise`. With a `stride` k, every k-th piece of the log counts in the normal equations.
     """
     # Coefficients c = (z, b): the calibration's, then the effects'. Prior precision 1 for z, `ridge` for b
     X = JointDesign(problem, precomputed(len(problem), columns))
@@ -329,12 +329,15 @@ def fit_joint(
 
 
 def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
-    """Return ``1/2 ln det(1 + g S)`` of coefficients: posterior covariance (k, k), prior precision (k,)."""
+    """Return ``1/2 ln det(1 + g S)`` by posterior `covariance` (k, k) and `prior` precision (k,)."""
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
 
 
 def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, place: slice, spectra: FloatArray) -> FloatArray:
-    """Return prior precision of the coefficients at `place`, by their likeliest common size and spectrum."""
+    """Return the prior precision of the coefficients at `place` for their likeliest size and spectrum.
+
+    P and h are the information and the score at zero of all coefficients.
+    """
     # Schur complement: information and score of the block, all other coefficients projected out
     others = np.delete(np.arange(len(h)), place)
     K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, place])
@@ -345,7 +348,7 @@ def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, place: slice, spectr
 def _plain(
     X: JointDesign, residual: FloatArray, prior: FloatArray, centre: FloatArray, stride: int
 ) -> FloatArray:
-    """Least squares as if the noise were white, outliers cut off."""
+    """Return the coefficients (q + k,) of least squares under white noise, with outliers clipped."""
     level = robust_scale(residual - np.median(residual)) + 1e-12
     # First all samples, then again with those beyond 8 sigma cut off
     P, b = normal(X.rows, residual, stride=stride)
@@ -358,16 +361,16 @@ def _plain(
 
 
 class HeldOut(NamedTuple):
-    """Result of leaving out dives, fold by fold."""
+    """Result of cross-validation over folds of dives."""
 
     residual: FloatArray
-    """(n,) of every sample by the linear fit without its fold, nT of the sensor."""
+    """(n,) residual of each sample by the linear fit without its fold, in the sensor's nT."""
     score: float
-    """Log predictive density of all folds."""
+    """Log predictive density, summed over the folds."""
     fold: IntArray
     """(n,) number of each sample's fold."""
     coefficients: FloatArray
-    """(f, q + k) of calibration and effects, fitted without each fold."""
+    """(f, q + k) coefficients of calibration and effects, fitted without each of f folds."""
 
 
 def held_out(
@@ -378,10 +381,10 @@ def held_out(
     interleaved: bool = False,
     groups: IntArray | None = None,
 ) -> HeldOut:
-    """Refit all coefficients without each fold; nonlinear parameters and noise stay those of `fit`.
+    """Refit all coefficients without each fold of dives; noise and nonlinear parameters stay as in `fit`.
 
-    Folds are stretches of dives, which extrapolate a slow change, or, `interleaved`, every eighth dive, which
-    interpolates it. `groups` (n,) replaces the dives' numbers.
+    A fold is a stretch of consecutive dives, so the fit extrapolates a slow change. If `interleaved`, a fold
+    is every eighth dive, so the fit interpolates. `groups` (n,) replaces the numbers of the dives.
     """
     X, noise, prior = JointDesign(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
@@ -417,7 +420,7 @@ def held_out(
 
 
 class Improvement(NamedTuple):
-    """Held-out RMS before and after, nT, their ratio, its interval over dives (:data:`CONFIDENCE_LEVEL`)."""
+    """Held-out RMS before and after, nT, their ratio, and its bootstrap interval over dives."""
 
     before: float
     after: float
@@ -426,14 +429,17 @@ class Improvement(NamedTuple):
 
     @property
     def shown(self) -> bool:
-        """Return True if the held-out dives show a gain: the interval lies below 1."""
+        """Return True if the held-out dives show an improvement: the whole interval is below 1."""
         return self.interval[1] < 1.0
 
 
 def paired(
     error_before: FloatArray, error_after: FloatArray, dive: IntArray, counts: BoolArray
 ) -> Improvement:
-    """Compare two errors (n,), nT, on the samples that count, by a bootstrap of whole dives."""
+    """Return the improvement between two errors (n,), nT, over the samples where `counts` (n,) is true.
+
+    Its interval is a bootstrap over whole dives.
+    """
     # Sums of squares of each dive: the bootstrap then draws dives, not samples
     number = np.unique(dive[counts], return_inverse=True)[1]
     b, a = np.bincount(number, error_before[counts] ** 2), np.bincount(number, error_after[counts] ** 2)

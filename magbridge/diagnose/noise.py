@@ -1,4 +1,4 @@
-"""The noise of a residual: autoregressive, heavy-tailed, of a level that changes; its model and its fit.
+"""Model and fit of a residual's noise: autoregressive, with heavy tails and a level that may change.
 
 Notes
 -----
@@ -7,9 +7,9 @@ distribution of nu degrees of freedom and a scale s that may change from block t
 
     v_t = f_t (r_t - sum_k a_k r_(t-k)),   v_t / s_t ~ t_nu
 
-Without a gap f is 1. After a gap the p samples before have other lags l: there a are the best predictor from
-those lags, and ``1 / f`` is by how much larger its error is, both from the autocovariance C of the
-autoregression (Vecchia 1988, JRSS B 50:297),
+Without a gap f is 1. After a gap the p samples before have other lags l. There a is the best predictor from
+these lags, and ``1 / f`` the ratio of its error to that without a gap. Both follow from the autocovariance C
+of the autoregression (Vecchia 1988, JRSS B 50:297),
 
     a = G^-1 c,   G_ij = C(|l_i - l_j|),   c_i = C(l_i),   f^-2 = C(0) - c^T a   in units of s^2
 
@@ -38,61 +38,62 @@ from magbridge.diagnose.survey import MAX_LAG, Past
 from magbridge.estimation.residual import robust_scale
 
 BAND = 32
-"""Rows that are filtered by one product of matrices."""
+"""Number of rows that one matrix product filters."""
 SOLVED = 4096
-"""Patterns of lags whose predictors are solved for at a time."""
+"""Number of lag patterns whose predictors are computed at a time."""
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 NOISE_BLOCK_SAMPLES = 150
-"""Samples over which the noise's level is taken as constant."""
+"""Number of samples in a block of constant noise level."""
 AR_ORDERS = (1, 2, 3, 5, 8, 13)
 MAX_NOISE_ORDER = AR_ORDERS[-1]
 GAUSSIAN = 1e5
-"""Degrees of freedom from which on the tails are taken for Gaussian."""
+"""Degrees of freedom above which the noise is treated as Gaussian."""
 NOISE_ITERATIONS = 3
-"""Rounds of fitting autoregression, tails and level in turn, at most."""
+"""Largest number of alternating fits of autoregression, tails and level."""
 ALTERNATIONS = 6
-"""Alternations between the weights of the samples and the level, at most."""
+"""Largest number of alternations between the weights of the samples and the level."""
 MIN_GAIN = 0.01
 """Gain in log likelihood below which the fit has converged."""
 LOSS = 0.02
-"""Largest order p as a share of the n samples of a whole past: p / n adds to the prediction's variance."""
+"""Largest ratio p / n of the order to the number of samples without a gap in their past: p / n is the
+relative increase of the prediction's variance."""
 MAX_PARTIAL_CORRELATION = 0.9999
-"""Largest partial correlation."""
+"""Largest partial correlation of an autoregression, which keeps it stable."""
 TIMES = 20.0
-"""Least number of the noise's time constants in a log: slower noise would absorb slow effects."""
+"""Least ratio of a log's length to the noise's time constant: slower noise would absorb slow effects."""
 BRIEFEST, SLOWEST = 20.0, 2000.0
-"""Limits of the longest time constant in short and in long logs, in samples."""
+"""Longest allowed time constant in short and in long logs, in samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualNoise:
-    """Noise as fitted."""
+    """Noise model fitted to a residual (module notes)."""
 
     ar: FloatArray
     """(p,) autoregressive coefficients."""
     scale: FloatArray
-    """(n,) nT, s of every sample."""
+    """(n,) scale s of every sample, nT."""
     nu: float
-    """Degrees of freedom of the tails; 1e6 is Gaussian."""
+    """Degrees of freedom of Student's distribution; 1e6 stands for a Gaussian."""
     past: Past
-    """The samples before each one."""
+    """Lags of the samples before each sample."""
     log_likelihood: float
     innovations: FloatArray
-    """(n,) v / s."""
+    """(n,) normalised innovations v / s."""
 
     @property
     def kappa(self) -> float:
-        """Fisher information of a location, against a Gaussian's of the same scale."""
+        """Fisher information of a location, relative to a Gaussian of the same scale."""
         return (self.nu + 1.0) / (self.nu + 3.0)
 
     @property
     def uneven(self) -> bool:
-        """Return True if its level changes: likelihoods are comparable only under one kind of noise."""
+        """Return True if the level changes from block to block."""
         return bool(np.ptp(self.scale))
 
     @property
     def independent(self) -> float:
-        """Number of independent samples that determine a constant as well: ``n (1 - sum a)^2 C(0)``."""
+        """Equivalent number of independent samples for a constant: ``n (1 - sum a)^2 C(0)``."""
         return float(len(self.scale) * (1.0 - self.ar.sum()) ** 2 * autocovariance(self.ar, 0)[0])
 
     @property
@@ -107,12 +108,15 @@ class ResidualNoise:
         return Predictors(self.past, self.ar)
 
     def whitened(self, columns: Columns, rows: slice) -> FloatArray:
-        """Return these rows of whitened columns (m, k), stored column by column."""
+        """Return m rows of the whitened columns, (m, k), stored column by column."""
         first = max(rows.start - len(self.ar), 0)
         return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
-        """Return whitened columns (m, k) of the rows from `start` on; the first `skip` are only a past."""
+        """Return the whitened columns (m, k) of `values`, whose first row is row `start` of the log.
+
+        The first `skip` rows of `values` only serve as the past, and are not returned.
+        """
         # Band matrix of f (1, -a) in blocks of BAND rows: one dense product for each block
         p, k, own = len(self.ar), values.shape[1], len(values) - skip
         count = -(-own // BAND)
@@ -140,7 +144,7 @@ class ResidualNoise:
         return out[:, :own].T
 
     def whiten(self, y: FloatArray) -> FloatArray:
-        """Return (n,) whitened y (n,): :meth:`filter` of a single whole column."""
+        """Return a whole column y (n,) whitened (n,)."""
         return np.asarray(np.sqrt(self.kappa) * self.near_gaps.innovations(y) / self.scale)
 
     def filter_back(self, y: FloatArray) -> FloatArray:
@@ -158,7 +162,10 @@ class ResidualNoise:
         return out
 
     def response(self, residual: FloatArray) -> FloatArray:
-        """Return y (n,) of the module's notes; the weights of psi are those of the fitted residual."""
+        """Return the response y (n,) of the module notes for a residual (n,), nT.
+
+        The weights in psi come from the fitted residual.
+        """
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
         return np.asarray(weight * self.whiten(residual) / self.kappa)
 
@@ -166,7 +173,7 @@ class ResidualNoise:
 class Predictors:
     """Predictors of the samples shortly after a gap, for each of l patterns of lags.
 
-    `a` (l, p) and `f` (l,) are those of the module's notes, `weights` (l, p + 1) are f and ``-f a``.
+    `a` (l, p) and `f` (l,) are defined in the module notes. `weights` (l, p + 1) are f and ``-f a``.
     """
 
     def __init__(self, history: Past, ar: FloatArray) -> None:
@@ -188,7 +195,7 @@ class Predictors:
         self.weights = self.f[:, None] * np.hstack([np.ones((len(lags), 1)), -self.a])
 
     def innovations(self, residual: FloatArray) -> FloatArray:
-        """Return (n,) innovations v of a residual (n,)."""
+        """Return the innovations v (n,), nT, of a residual (n,), nT."""
         past, p = self.past, len(self.ar)
         # a view of the p samples before each, which takes no memory
         lags = sliding_window_view(np.append(np.zeros(p), residual), p)[:-1, ::-1]
@@ -200,10 +207,10 @@ class Predictors:
 
 
 def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
-    """Return (reach + 1,) C of an autoregression whose innovations have variance 1.
+    """Return the autocovariance C (reach + 1,) of an autoregression with innovations of variance 1.
 
-    The first p + 1 solve Yule and Walker's equations ``C_i - sum_k a_k C_|i-k| = (i = 0)``, each later one
-    follows from the p before it (Brockwell & Davis 1991, sec. 3.3).
+    The first p + 1 values solve the Yule-Walker equations ``C_i - sum_k a_k C_|i-k| = (i = 0)``. Each later
+    value follows from the p values before it (Brockwell & Davis 1991, sec. 3.3).
     """
     p = len(ar)
     i, k = np.arange(p + 1)[:, None], np.arange(1, p + 1)
@@ -218,7 +225,10 @@ def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
 
 
 def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
-    """Return p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals."""
+    """Return the order p of the autoregression by Akaike's criterion, with the residual's outliers clipped.
+
+    `slots` (n,) are the times of the samples, in sampling intervals.
+    """
     n = len(residual)
     scale = robust_scale(residual) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
@@ -235,7 +245,7 @@ def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
 
 
 def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
-    """Return the mean product of samples at a distance of `lag` intervals."""
+    """Return the mean product of samples of r (n,) that are `lag` intervals apart; 0 if there are none."""
     before = np.searchsorted(slots, slots - lag)
     pair = slots[before] == slots - lag
     return float(np.mean(r[pair] * r[before[pair]])) if pair.any() else 0.0
@@ -251,8 +261,8 @@ def fit_noise(
 ) -> ResidualNoise:
     """Fit the noise model to a residual (n,), nT, with an autoregression of the order of its `history`.
 
-    The level changes from block to block if `blocks` is true; None lets the data decide. The fit starts from
-    the noise `like`. `brief` allows no longer time constant than :data:`BRIEFEST`.
+    The level changes from block to block if `blocks` is true; for None a test decides. The fit starts from
+    the noise `like`. If `brief`, no time constant exceeds :data:`BRIEFEST` samples.
     """
     n, order, whole = len(residual), history.order, history.whole
     # Blocks of equal length, in each of which the level is constant
@@ -286,7 +296,7 @@ def fit_noise(
 
 
 def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return (p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
+    """Return the coefficients (p,) of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
     p = lags.shape[1]
     P, b = np.zeros((p, p)), np.zeros(p)
     for rows in row_blocks(len(r)):
@@ -298,7 +308,7 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
 
 
 def _stable(ar: FloatArray, n: int) -> FloatArray:
-    """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
+    """Return the coefficients (p,) with all roots moved inside the circle that n samples allow."""
     # Roots beyond the longest allowed time constant are moved to it
     roots, longest = np.roots(np.append(1.0, -ar)), np.clip(n / TIMES, BRIEFEST, SLOWEST)
     size, largest = np.abs(roots), 1.0 - 1.0 / longest
@@ -321,12 +331,15 @@ def _uneven(v: FloatArray, count: IntArray) -> bool:
 
 
 def _sums(values: FloatArray, count: IntArray) -> FloatArray:
-    """Return (blocks,) sum of each block."""
+    """Return the sum of `values` (n,) over each block; `count` (b,) are the blocks' lengths."""
     return np.asarray(np.add.reduceat(values, np.cumsum(count) - count))
 
 
 def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray, float]:
-    """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
+    """Return the likeliest of :data:`TAILS`, the level of each sample (n,), nT, and the log likelihood.
+
+    The search starts from `nu`. `v` (n,) are the innovations, nT, and `count` the blocks' lengths.
+    """
     # Hill climbing over the list of tails, which has one peak
     at = TAILS.index(nu)
     square = v * v
@@ -343,7 +356,10 @@ def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray
 
 
 def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -> tuple[float, FloatArray]:
-    """Return the log likelihood and the level of each block, from a first guess."""
+    """Return the log likelihood and the likeliest level (b,), nT, of each block under tails `nu`.
+
+    `square` (n,) are squared innovations, nT², `count` (b,) the blocks' lengths, and `level` a first guess.
+    """
     n = len(square)
     power = level**2
     # Expectation maximisation of a Student scale, all blocks at once

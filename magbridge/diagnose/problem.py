@@ -1,25 +1,25 @@
-r"""The comparison of the measured field with a calibration, as a linear problem.
+r"""The linearised comparison of the measured field with a calibration.
 
 Notes
 -----
 *Forward model.* With the scalar residual e of :mod:`magbridge.estimation.residual` and its
-derivative g by the nine coefficients, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves e
-by
+derivative g by the nine coefficients, a term or effect adds ``c_k sum_r phi_r C_krs`` to the coefficient in
+slot s, and changes e by
 
 .. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
 
-A coefficient that the vehicle has and the calibration lacks adds minus that to the residual. Derivatives are
-taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes. At the reading itself they
-would correlate with its noise (errors in variables).
+An effect that the vehicle has and the calibration lacks changes the residual by minus this amount.
+Derivatives are taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes. At the reading
+itself they would correlate with its noise (errors in variables).
 
 *Unknowns.* The calibration's coefficients are free, ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L spans the
-directions that these data determine. The prior is the calibration's posterior, without the information of
-samples that are compared again, and with a drift between days. Three delays of the sensor's axes are free as
-well (:func:`interpolation_error`): they are a fault of the log, and change no coefficient.
+directions that these data determine. The prior is the calibration's posterior with a drift between days, but
+without the information of samples that are compared again. Three delays of the sensor's axes are free as well
+(:func:`interpolation_error`). They are a fault of the log and change no coefficient.
 
 *Slow noise* is free if the data need it (:func:`with_slow_noise`). The autoregression of :mod:`.noise` ends
 after few samples, and underestimates the power of 1/f noise at the lowest frequencies by a factor of five to
-nine. So the noise of axis i may have a slow part (Keshner 1982, Proc. IEEE 70:212), of one common size g:
+nine. Therefore the noise of axis i may have a slow part of a common size g (Keshner 1982, Proc. IEEE 70:212):
 
 .. math:: o_i(t) = \sum_k c_{ki} \cos(\pi k t / T), \qquad \operatorname{var} c_{ki} = g / k
 """
@@ -46,39 +46,43 @@ from magbridge.estimation.priors import HARD_IRON_SIGMA_NT, SOFT_IRON_SIGMA
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, robust_scale
 
 EACH, LAST = 16, 64
-"""Half waves per log along each axis, and further ones along the field alone."""
+"""Highest number of half waves per log in slow noise: along each axis, and along the field."""
 MAX_MISSING_SAMPLES = 3
-"""Largest number of samples missing in a row within a leg: the rate next to such a gap still has 98 % of the
-true one's power."""
+"""Largest number of consecutive missing samples within a leg: a spline's rate beside such a gap keeps 98 % of
+the true power."""
 WHITENED_ROWS = 2048
 """Rows that are whitened at a time, few enough for the processor's cache."""
 DERIVATIVE_ROWS = 8192
-"""Rows at a time: the memory is bounded, whatever the log."""
+"""Rows of derivatives that are computed at a time, which bounds the memory."""
 BROADEST = 1e-3
-"""Least precision, in units of the posterior's, of a direction that only the repeated logs determined."""
+"""Lower bound of the prior precision, in units of the posterior's, in any direction."""
 FALL = 0.3
-"""Share of a coefficient's plausible size that remains from one power of a mass' position to the next."""
+"""Ratio of a coefficient's plausible size to that of the next lower power of a mass' position."""
 MIN_PRECISION = 0.1
-"""Least precision, in units of the posterior's, of a direction that other logs determined, too."""
+"""Remaining precision, in units of the posterior's, above which logs other than the repeated ones determined
+a direction."""
 STABLE = 2e-5
 """Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better
 than 20 ppm."""
 T = TypeVar("T")
 AXIS_DELAY_SIGMA_S = 0.3
-"""Plausible size of an axis' delay after its row, s."""
+"""Plausible delay (1-sigma) of an axis' sample after the time of its row, s."""
 DELAYS = slice(-3, None)
-"""Places of the axes' delays in z."""
+"""Slice of the axes' delays in the unknowns z."""
 MIN_INFORMATION = 0.01
-"""Share of a prior's information that data must add for its direction to be kept."""
+"""Information of the data, as a fraction of the prior's, above which a direction is fitted."""
 
 
 def waves() -> FloatArray:
-    """Return (k,) k of each coefficient: each axis in turn, then along the field."""
+    """Return the number of half waves (k,) of each slow-noise coefficient: three axes, then the field."""
     return np.append(np.repeat(np.arange(1.0, EACH + 1.0), 3), np.arange(EACH + 1.0, LAST + 1.0))
 
 
 def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
-    """Return the contribution of 1 nT of each coefficient to rows of a residual, (m, k)."""
+    """Return the change of m rows of a residual per nT of each slow-noise coefficient, (m, k).
+
+    `slopes` (n, 3) are the derivatives of the residual by the offsets of the axes.
+    """
     # cos(pi k t / T) at the middle of each sample's interval
     n, part = len(slopes), slopes.T[:, rows]
     phase = np.pi * (np.arange(n)[rows] + 0.5) / n
@@ -88,11 +92,11 @@ def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
 
 
 def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
-    """Return the first or second derivative (k, n) of H (k, n), of a cubic spline through each leg.
+    """Return the first or second time derivative (k, n) of H (k, n), by a cubic spline through each leg.
 
-    A leg is a run of samples without a gap of more than :data:`MAX_MISSING_SAMPLES`. The derivative matrix of
-    a spline has no trace, so the rates of noise do not correlate with the noise itself; those of a one-sided
-    difference do. A central difference would underestimate the rate of an oscillation.
+    A leg is a run of samples without a gap of more than :data:`MAX_MISSING_SAMPLES`. A spline's rate of noise
+    does not correlate with the noise itself, unlike a one-sided difference. A central difference would
+    underestimate the rate of an oscillation.
     """
     t, out = survey.time, np.zeros_like(H)
     # One spline for each leg, so that none reaches across a gap
@@ -105,9 +109,10 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
 
 
 def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
-    """Return (3, n) error of axes H (3, n) sampled late and interpolated to their row, nT per s of delay.
+    """Return the error (3, n), nT per s of delay, of axes sampled late and interpolated to their row.
 
-    `H` must be free of the readings' noise: the difference is one-sided and would correlate with it.
+    The readings `H` (3, n), nT, must be free of noise, because the one-sided difference would correlate with
+    it.
     """
     # Linear interpolation between t - h + tau and t + tau: H + tau (dH/dt - (H_0 - H_-) / h), per unit of tau
     rate, follows = rates(survey, H), survey.follows()
@@ -118,12 +123,12 @@ def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
 
 
 def row_blocks(n: int) -> list[slice]:
-    """Return the pieces in which n rows are processed."""
+    """Return the slices of at most :data:`WHITENED_ROWS` rows in which n rows are processed."""
     return [slice(start, min(start + WHITENED_ROWS, n)) for start in range(0, n, WHITENED_ROWS)]
 
 
 def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return (m, k) blocks of columns side by side, stored column by column."""
+    """Return blocks of columns, (m, k_i) each, side by side as (m, sum of k_i), stored column by column."""
     out = np.empty((sum(block.shape[1] for block in blocks), len(blocks[0])))
     return np.concatenate([block.T for block in blocks], out=out).T
 
@@ -131,7 +136,10 @@ def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
 def derivatives(
     calibration: Calibration, samples: ResidualSamples, g: FloatArray, L: FloatArray, dtype: type = float
 ) -> FloatArray:
-    """Return (n, q) derivatives of the residual by all coefficients, times L (K, q), in bounded memory."""
+    """Return the derivatives of the residual by all K coefficients times L (K, q): (n, q).
+
+    `g` (n, 9) are the derivatives by the nine coefficients of each sample.
+    """
     # Sum over r, s of phi_r C_krs g_s, by one product of matrices for each block of rows
     tensor, _ = coefficient_tensor(calibration)  # C_krs of :mod:`.problem`
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], tensor[0].size).T
@@ -143,7 +151,7 @@ def derivatives(
 
 
 def noise_sigma(calibration: Calibration, e: FloatArray) -> float:
-    """Return the noise's 1-sigma, nT: the calibration's, or that of the residual e (n,)."""
+    """Return the 1-sigma of the noise, nT: as the calibration states, else of the residual e (n,), nT."""
     return calibration.noise.sensor or robust_scale(e) or 1.0
 
 
@@ -165,7 +173,7 @@ def isotropic(calibration: Calibration) -> FloatArray:
 
 
 def _constants(calibration: Calibration) -> list[slice]:
-    """Return the places of the nine constants (of exponents zero) of each polynomial that has them."""
+    """Return the slice of the nine constants (exponents zero) of each polynomial that contains them."""
     found, k, none = [], 0, (0,) * len(calibration.parameters)
     for term in calibration.terms:
         if isinstance(term, Polynomial) and none in term.exponents:
@@ -176,7 +184,7 @@ def _constants(calibration: Calibration) -> list[slice]:
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
-    """Return L with ``L L^T`` the covariance, of as many columns as it has rank."""
+    """Return L (K, r) with ``L L^T`` equal to the covariance (K, K) of rank r."""
     # Of the correlations: coefficients have units that differ by orders of magnitude
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -197,10 +205,11 @@ def prior(
 def _without_repeats(
     survey: Survey, calibration: Calibration, samples: ResidualSamples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L and m of the posterior without the information of samples that are compared here again.
+    """Return L and m of the posterior without the information of samples that are compared again.
 
-    It would count twice. In the posterior's own units the remaining precision is ``P_0 = 1 - H`` with H the
-    information of those samples (`survey.fitted`), and ``P_0 m = L^T J^T W e``, the sum over them.
+    That information would count twice. In units of the posterior the remaining precision is ``P_0 = 1 - H``,
+    with H the information of the samples `survey.fitted`. The mean is ``P_0 m = L^T J^T W e``, summed over
+    them.
     """
     L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
@@ -227,7 +236,7 @@ def _without_repeats(
 
 
 def _physical(calibration: Calibration) -> FloatArray:
-    """Return the plausible 1-sigma (K,), nT, of each coefficient on any vehicle; infinite if unknown.
+    """Return the plausible size (K,), 1-sigma, nT, of each coefficient on any vehicle; infinite if unknown.
 
     Without this bound, scale and offset can cancel each other at a glider's few attitudes and fit the noise.
     """
@@ -244,69 +253,69 @@ def _physical(calibration: Calibration) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A survey compared with a calibration and linearised: what a search works on."""
+    """A survey compared with a calibration, linearised in all coefficients (module notes)."""
 
     survey: Survey
     calibration: Calibration
     reading: FloatArray
-    """(n, 3) nT, ``H_r - e w / |w|^2``: the reading without noise, for effects that depend on it."""
+    """(n, 3) nT, noise-free readings ``H_r - e w / |w|^2``, for effects that depend on the reading."""
     residual: FloatArray
-    """(n,) e, in the sensor's nanotesla."""
+    """(n,) residual e, in the sensor's nT."""
     jacobian: FloatArray
-    """(n, 9) g."""
+    """(n, 9) g, derivatives of e by the nine coefficients."""
     reference_jacobian: FloatArray
-    """(n,) change of e per nT by which the true field exceeds the reference."""
+    """(n,) change of e per nT of the true field above the reference."""
     delay_jacobian: FloatArray
     """(n, 3) ``-de/dz`` of the delays, in units of :data:`AXIS_DELAY_SIGMA_S`."""
     directions: FloatArray
-    """(K, q) L; zero for slow noise and the delays."""
+    """(K, q) L, change of the coefficients per unit of z; zero for slow noise and delays."""
     centre: FloatArray
     """(q,) m, prior mean of z."""
     unseen: FloatArray
-    """(K, K) nT², covariance in the directions that these data cannot see."""
+    """(K, K) nT², prior covariance in the directions that these data do not determine."""
     waves: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(k,) half waves per log, or a power, by which slow noise's variances fall; empty without such noise."""
+    """(k,) factors by which the variances of slow noise are divided; empty without slow noise."""
 
     def __len__(self) -> int:
         return len(self.residual)
 
     def channels_of(self, kind: str) -> list[str]:
-        """Name the channels that may be of this kind, except the calibration's own parameters."""
+        """Return the names of channels that may be of this kind, except the calibration's parameters."""
         own = {parameter.name for parameter in self.calibration.parameters}
         return [name for name, c in self.survey.channels.items() if kind in c.kinds and name not in own]
 
     @property
     def known(self) -> slice:
-        """Places in z of the calibration's own coefficients."""
+        """Slice of the calibration's own directions in z."""
         return slice(len(self.centre) - len(self.waves) - 3)
 
     @property
     def slow(self) -> slice:
-        """Places in z of slow noise."""
+        """Slice of the slow-noise coefficients in z."""
         return slice(self.known.stop, len(self.centre) - 3)
 
     def slow_noise(self, z: FloatArray) -> FloatArray:
-        """Return (n,) what slow noise of z (q,) adds to the residual."""
+        """Return the contribution (n,) of slow noise to the residual for unknowns z (q,)."""
         if not self.waves.size:
             return np.zeros(len(self))
         slopes = self.jacobian[:, 6:]
         return np.concatenate([slow_columns(slopes, rows) @ z[self.slow] for rows in row_blocks(len(self))])
 
     def series(self, effect: Effect, rows: slice = slice(None)) -> LogSeries:
-        """Return rows of the log as the array form of an effect takes them."""
+        """Return rows of the log as the argument of an effect's array form (:meth:`.Effect.batch`)."""
         names = dict.fromkeys([*(p.name for p in self.calibration.parameters), *effect.channels()])
         values = {name: self.survey.channels[name].values[rows] for name in names}
         return LogSeries(self.survey.time[rows], self.reading[rows], values, self.calibration.kernel)
 
     @cached_property
     def coefficient_jacobian(self) -> FloatArray:
-        """(n, k) ``-de/dz`` of the calibration's own coefficients (:attr:`known`), single precision."""
+        """(n, k) ``-de/dz`` by the calibration's own directions (:attr:`known`), in single precision."""
         samples, _ = samples_of(self.survey, self.calibration)
         L = -self.directions[:, self.known]
         return derivatives(self.calibration, samples, self.jacobian, L, np.float32)
 
     def calibration_rows(self, rows: slice) -> FloatArray:
-        """Return rows (m, q) of ``-de/dz``: coefficients, slow noise (nT), delays of the axes."""
+        """Return rows (m, q) of ``-de/dz``: own directions, slow noise (per nT), delays of the axes."""
         blocks = [self.coefficient_jacobian[rows]]
         # Computed for each block: for a month, all columns of slow noise would fill 500 MB
         if self.waves.size:
@@ -319,13 +328,13 @@ class Problem:
 
     @property
     def stated(self) -> FloatArray:
-        """(n,) nT², variance that the calibration states: of the noise, and of its coefficients."""
+        """(n,) nT², variance of the residual that the calibration states: of noise and of coefficients."""
         noise, J = self.calibration.noise, self.coefficient_jacobian
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J, dtype=float))
 
 
 def cached_per_problem(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
-    """Cache a function's result for each problem: causes share regressors, of 50 MB for a month."""
+    """Return a function that caches its result for each problem, as long as the problem exists."""
     known: WeakKeyDictionary[Problem, T] = WeakKeyDictionary()
 
     @wraps(made)
@@ -338,7 +347,7 @@ def cached_per_problem(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
 
 
 def samples_of(survey: Survey, calibration: Calibration) -> tuple[ResidualSamples, FloatArray]:
-    """Return the residual's samples, with effects among the regressors, and its coefficients (9 m,)."""
+    """Return the samples of the residual with all m regressors, effects included, and coefficients (9 m,)."""
     phi = regressors(calibration, survey.field, survey.values(calibration.channels), survey.time)
     # The residual takes A - 1 in nT of the usual field
     unit = calibration.reference.field
@@ -357,8 +366,8 @@ def linearised(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the residual (n,), nT, its derivatives (n, 9) and (n,), and the moved readings (n, 3), nT.
 
-    The derivatives are those by the nine coefficients and by the true field, at readings that are moved until
-    the residual vanishes. The `coefficients` (9 m,) are those of all m regressors.
+    The derivatives, by the nine coefficients and by the true field, are taken at readings that are moved
+    until the residual vanishes. The `coefficients` (9 m,) belong to all m regressors.
     """
     n = len(samples.field)
     e, g, reference_jacobian, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
@@ -376,7 +385,7 @@ def linearised(
 
 
 def pose(survey: Survey, calibration: Calibration) -> Problem:
-    """Linearise the comparison about `calibration`."""
+    """Return the problem of a survey, linearised about `calibration`."""
     samples, coefficients = samples_of(survey, calibration)
     n = len(survey)
     # Residual and derivatives at readings without noise, and the prior of the coefficients
@@ -401,7 +410,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
 
 
 def with_slow_noise(problem: Problem, power: int = 1) -> Problem:
-    """Return the problem with slow noise, its power 1/f or that to a higher `power`."""
+    """Return the problem with free slow noise of the spectral density ``1 / f^power``."""
     if problem.waves.size:
         made = replace(problem, waves=waves() ** power)
     else:

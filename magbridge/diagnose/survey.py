@@ -1,4 +1,4 @@
-"""Deployments as the arrays that a diagnosis compares: columns, channels and their kinds, dives, gaps."""
+"""Deployments as arrays for a diagnosis: field, reference, telemetry channels by kind, dives and gaps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 ANY = ("temperature", "current", "pressure", "position")
 DRIVE = ("current", "position")
-"""Quantities of a drive: its current flows when it turns, and the part that it turns may carry iron."""
+"""Kinds of a drive's quantity: current flows while the drive turns, and the turned part may carry iron."""
 UNIT_KINDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("degC", "K", "degF"), ("temperature",)),
     **dict.fromkeys(("A", "mA", "uA", "W", "mW"), ("current",)),
@@ -36,9 +36,9 @@ UNIT_KINDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("rpm", "1/min", "rad/s", "us", "PWM"), DRIVE),
     **dict.fromkeys(("V", "mV"), DRIVE),
 }
-"""Kinds of a series by its unit, where that decides."""
+"""Possible kinds of a series by its unit, for units that determine them."""
 VAGUE = {"", "1", "%", "m"}
-"""Units that any kind of series may have, or that lengths and depths share: there the name decides."""
+"""Units that do not determine the kind of a series; its name decides instead."""
 NAME_KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("temp therm", ("temperature",)),
     ("current curr amps ampere", ("current",)),
@@ -46,25 +46,26 @@ NAME_KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("throttle motor thrust thruster esc rpm pwm servo prop propeller winch pump", DRIVE),
     ("pos position fin rudder elevator aileron flap ballast vbd ctl ctrl piston valve gear", ("position",)),
 )
-"""Kinds by the words of a name. The quantity comes first: a motor's temperature is a temperature."""
+"""Kinds by the words of a name. The first entry that matches counts: ``motor_temp`` is a temperature."""
 PART = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
 BEGINNING, END = 4, 3
-"""Letters from which a word is also recognised as the beginning, or the end, of a longer one."""
+"""Least number of letters of a word that is also recognised at the beginning, or end, of a longer word."""
 DAY_S, NIGHT_S = 86400.0, 21600.0
-"""Longest day, and the gap after which another day begins, s."""
+"""Longest duration of a day, and shortest gap that ends a day, s."""
 MIN_SAMPLES_A_DAY = 100
-"""Fewest samples of a day that is left out by itself."""
+"""Least number of samples of a day in cross-validation."""
 Table = dict[str, FloatArray]
-"""Columns (n,) in order of time, each with a value somewhere; ``learned`` is 1 where it was learned from."""
+"""Columns (n,) in order of time, none empty. ``learned`` is 1 in logs that are only compared with."""
 MAX_LAG = 1000
-"""Largest lag, in sampling intervals; a sample that long ago does not predict this one's noise."""
+"""Largest lag, in sampling intervals. A sample so long ago does not predict the noise of the present one."""
 MIN_SURVEY_SAMPLES = 60
-"""Samples below which noise and effect cannot both be estimated."""
+"""Least number of samples from which noise and an effect can both be estimated."""
 SHORT = 0.25
-"""Quantile of the time steps that is the sampling interval: some gliders sample faster near the surface."""
+"""Quantile of the time steps that is taken as the sampling interval: some gliders sample faster near the
+surface."""
 INTERNAL_PREFIXES = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
-"""Units of another magnetometer, which follows everything that this one does and so explains nothing."""
+"""Units of a magnetic field. A second magnetometer repeats all effects and so cannot explain any."""
 NOT_TELEMETRY = {
     "time", "fitted", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude",
     "run", "dive", "quality", "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly",
@@ -73,11 +74,12 @@ NOT_TELEMETRY = {
 TRUSTED = 0.5
 """Largest cubic term in the interpolation of an axis to its row's time, as a multiple of the noise."""
 MAX_HALF_RANGES = 10.0
-"""Distance from the middle of the calibrated range, in half ranges, beyond which a value is a code."""
+"""Distance of a parameter from the middle of its calibrated range, in half ranges, beyond which it is no
+valid position."""
 
 
 def kinds_of(name: str, unit: str) -> tuple[str, ...]:
-    """Return the kinds that a telemetry series may be, of ``temperature current pressure position``."""
+    """Return the possible kinds of a telemetry series: temperature, current, pressure or position."""
     # A unit decides where it is specific; else the words of the name; else every kind is possible
     if unit in UNIT_KINDS:
         return UNIT_KINDS[unit]
@@ -101,7 +103,7 @@ def _is_among(part: str, words: str) -> bool:
 
 
 def dives_of(table: Table) -> IntArray:
-    """Return the dive number (n,) of each sample: the log's, else from surface to surface, else eighths."""
+    """Return the dive number (n,) of each sample: by the log, else by depth, else the eighth of the log."""
     # As the log counts; a log that lacks the count has its dives found by itself
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
@@ -148,22 +150,22 @@ def held(values: FloatArray) -> FloatArray:
 
 
 def eighths(n: int) -> IntArray:
-    """Return (n,) number of the eighth of a log that each sample is in."""
+    """Return the number (n,), 0 to 7, of the eighth of a log to which each of n samples belongs."""
     return np.arange(n) * 8 // n
 
 
 def _part(table: Table, rows: BoolArray) -> Table:
-    """Return these rows of the columns that have any value there."""
+    """Return the selected rows of a table, without columns that have no value in them."""
     part = {name: column[rows] for name, column in table.items()}
     return {name: column for name, column in part.items() if np.isfinite(column).any()}
 
 
 class Past:
-    """The p samples before each sample (`order` p), and their lags.
+    """Lags of the p samples before each sample, for autoregressive noise of `order` p.
 
-    `steps` (n,) are the intervals since the previous sample. A sample is `whole` (n,) if the p samples before
-    it have the lags 1 to p. The other `rows` (m,), after a gap, have the `lags` (l, p) of their `pattern`
-    (m,).
+    `steps` (n,) are the intervals since the previous sample. `whole` (n,) is true for a sample whose p
+    predecessors have the lags 1 to p. The other samples are `rows` (m,), shortly after a gap. Their lags are
+    row `pattern` (m,) of the l distinct `lags` (l, p).
     """
 
     def __init__(self, steps: IntArray, order: int) -> None:
@@ -183,7 +185,7 @@ class Past:
 
 
 class TelemetryChannel(NamedTuple):
-    """A telemetry series: values (n,), unit, kinds of quantity that it may be."""
+    """A telemetry series: values (n,), unit, and possible kinds of quantity (:func:`kinds_of`)."""
 
     values: FloatArray
     unit: str
@@ -191,40 +193,40 @@ class TelemetryChannel(NamedTuple):
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Its smallest and its largest value."""
+        """Smallest and largest value of the series."""
         return float(self.values.min()), float(self.values.max())
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A deployment as arrays, of the rows that have field, reference and the position of every mass."""
+    """Deployments as arrays of the n samples with field, reference and the position of every mass."""
 
     time: FloatArray
-    """(n,) s since 1970 UTC."""
+    """(n,) time, s since 1970 UTC."""
     field: FloatArray
-    """(n, 3) nT, the sensor's raw axes at `time`."""
+    """(n, 3) raw readings of the sensor's axes at `time`, nT."""
     reference: FloatArray
-    """(n,) nT."""
+    """(n,) reference of the total field, nT."""
     channels: dict[str, TelemetryChannel]
-    """All telemetry that varies, and what the calibration needs."""
+    """Telemetry that varies, and all channels that the calibration needs, by name."""
     still: tuple[str, ...]
-    """Telemetry that never changes."""
+    """Names of telemetry that never changes."""
     steps: IntArray
-    """(n,) intervals since the previous sample, at most :data:`MAX_LAG`."""
+    """(n,) sampling intervals since the previous sample, at most :data:`MAX_LAG`."""
     dive: IntArray
     """(n,) number of the dive, the unit of cross-validation."""
     place: FloatArray | None
-    """(n, 3) m north and east of the middle, and below the surface: 0 in a log without a depth."""
+    """(n, 3) position, m: north and east of the track's middle, depth (0 in a log without depth)."""
     attitude: FloatArray | None
-    """(n, 3) deg, roll, pitch, heading."""
+    """(n, 3) roll, pitch and heading, deg."""
     fitted: BoolArray
-    """(n,) the calibration was fitted to this sample."""
+    """(n,) True if the calibration was fitted to the sample."""
     learned: BoolArray
-    """(n,) it was, and the sample is given only to be compared with: its log is not diagnosed."""
+    """(n,) True in logs of the calibration that are only compared with, not diagnosed."""
     cycles: FloatArray
-    """(c,) s, when the instrument was power-cycled, as the log says."""
+    """(c,) times of power cycles of the sensor in the log, s since 1970 UTC."""
     source: str
-    """The logs that are diagnosed, for people to read."""
+    """Names of the diagnosed logs, for messages."""
 
     def __len__(self) -> int:
         return len(self.time)
@@ -237,21 +239,21 @@ class Survey:
 
     @cached_property
     def slots(self) -> IntArray:
-        """(n,) intervals since the first sample; a gap counts at most :data:`~.survey.MAX_LAG`."""
+        """(n,) sampling intervals since the first sample; a gap counts at most :data:`~.survey.MAX_LAG`."""
         return np.asarray(np.cumsum(self.steps) - self.steps[0])
 
     def follows(self, lost: int = 0) -> BoolArray:
-        """Return which samples (n,) follow at the median interval, with at most `lost` missing."""
+        """Return True (n,) where at most `lost` samples are missing between a sample and the previous one."""
         apart = np.diff(self.time, prepend=np.inf)
         return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < MAX_LAG))
 
     @property
     def parts(self) -> str:
-        """The units of cross-validation, in words."""
+        """Name of the folds of cross-validation: ``dives`` or ``eighths of the log``."""
         return "eighths of the log" if np.array_equal(self.dive, eighths(len(self))) else "dives"
 
     def history(self, order: int) -> Past:
-        """Return the samples before each one that autoregressive noise of this order depends on."""
+        """Return the lags of each sample's predecessors for autoregressive noise of this order, cached."""
         if order not in self._pasts:
             self._pasts[order] = Past(self.steps, order)
         return self._pasts[order]
@@ -261,7 +263,7 @@ class Survey:
         return {}
 
     def values(self, names: Sequence[str]) -> FloatArray:
-        """Return (n, k) channels, in this order; DataError: one is missing."""
+        """Return the values (n, k) of channels, in the order of `names`; DataError: a channel is missing."""
         missing = [name for name in names if name not in self.channels]
         if missing:
             raise DataError(
@@ -274,9 +276,9 @@ class Survey:
 def assemble(
     table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
 ) -> Survey:
-    """Make a survey from complete columns (n,) in order of time: find channels, dives and gaps.
+    """Return the survey of complete columns (n,) in order of time; find its channels, dives and gaps.
 
-    The `needed` channels are kept even if they never change.
+    Channels in `needed` are kept even if they never change.
     """
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
@@ -345,10 +347,11 @@ def load_survey(
     training_logs: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
 ) -> Survey:
-    """Read the deployments to be diagnosed, and the logs that the calibration was fitted to.
+    """Return the survey of the deployments to diagnose and the logs that the calibration was fitted to.
 
-    A log that is among both is diagnosed. The `grid` is added to the main field where a log has no reference
-    of its own. DataError: a column is missing, too few samples are complete, or a parameter is out of range.
+    A log that is among both is diagnosed. If a log has no reference of its own, its reference is the main
+    field plus the `grid`. DataError: a column is missing, too few samples are complete, or a parameter is out
+    of range.
     """
     # A training log that is diagnosed as well is read once, as diagnosed
     own = [any(ds is one for one in training_logs) for ds in datasets]
@@ -385,12 +388,15 @@ def load_survey(
 
 
 def _sources(logs: Sequence[xr.Dataset]) -> str:
-    """Name logs, each once."""
+    """Return the names of logs as a list in words, each name once."""
     return ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
 
 
 def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
-    """Return the rows that have field, reference and parameters, each instant once."""
+    """Return the rows with field, reference and all parameters, one row for each time.
+
+    DataError: fewer than :data:`MIN_SURVEY_SAMPLES` samples, or complete rows.
+    """
     needed = [*CHANNELS, "reference_field", *calibration.units]
     size = table["time"].size
     if size < MIN_SURVEY_SAMPLES:
@@ -413,7 +419,10 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
 def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
 ) -> dict[str, FloatArray]:
-    """Return every numeric column, the axes interpolated to the rows' times, and the reference field."""
+    """Return the numeric columns of a log, with axes interpolated to the rows' times, and its reference.
+
+    DataError: the log is of another sensor, or lacks a column.
+    """
     source = str(ds.attrs.get("source", "deployment"))
     sensor = str(ds.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):
