@@ -66,7 +66,7 @@ FREE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Score and Fisher information of m coefficients, with calibration (and perhaps a model) projected out."""
+    """Score and Fisher information of m coefficients, with calibration (and any model) projected out."""
 
     matrix: FloatArray
     """(m, m) Fisher information, in units of the prior widths."""
@@ -170,7 +170,7 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
 
 
 def log_bayes(ratio: float | FloatArray, freedom: float | FloatArray) -> FloatArray:
-    """Return the log Bayes factor against no effect, (...,), of a likelihood ratio of `freedom` coefficients."""
+    """Return the log Bayes factor (...,) against no effect for likelihood ratios (...,) and freedoms."""
     # (R - k)/2 - (k/2) log(R/k), and 0 below R = k: Zellner's prior with the likeliest g
     over = np.maximum(ratio / np.maximum(freedom, 1e-12), 1.0)
     return np.asarray(0.5 * freedom * (over - 1.0 - np.log(over)))

@@ -201,7 +201,7 @@ class Statistic:
         )
 
     def _evidences(self, k: int, b: FloatArray) -> FloatArray:
-        """Return the log evidence (sizes, m) of m scores at each of the prior sizes, with the k-th spectrum."""
+        """Return the log evidence (sizes, m) of m scores at each prior size, with the k-th spectrum."""
         y2, grown = (self.vectors[k].T @ b) ** 2, PRIOR_SIZES[:, None] * self.values[k]
         return np.asarray(
             0.5 * ((PRIOR_SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])

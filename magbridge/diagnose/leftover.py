@@ -1,10 +1,10 @@
-"""The part of a signal that no cause of the table accounts for.
+"""The part of a residual that no known cause explains, modelled by free descriptions.
 
 Notes
 -----
-The coefficients of a free description have one common free size (:mod:`.joint`). Descriptions are
-scored under two noises: that of the fit, which may have absorbed an effect, and that which is left when slow
-curves are fitted as well. The best are compared by the whole likelihood, with the noise refitted.
+The coefficients of a free description have one common free size (:mod:`.joint`). Descriptions are scored
+under two noise models. One is of the given fit, whose noise may have absorbed an effect. The other is of a
+fit with slow curves. The best descriptions are compared by the full likelihood, with the noise refitted.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.estimation.residual import rms, robust_scale
 
 MAX_TESTED_COEFFICIENTS = 6
-"""Most coefficients of a cause whose size is tested for variation: with more, it takes almost any shape."""
+"""Largest number of coefficients of a cause whose amplitude is tested for variation: with more, a cause can
+have almost any shape."""
 COMPARED_DESCRIPTIONS = 3
-"""Best descriptions under each noise that are compared by the full likelihood."""
+"""Number of descriptions, the best under each noise, that are compared by the full likelihood."""
 TURNS = 6
-"""Alternations between fitting a curve and fitting its direction."""
+"""Number of alternations between the fit of a curve and the fit of its direction."""
 CALM = 2
-"""Rounds of fitting slow curves and noise in turn."""
+"""Number of alternations between the fit of slow curves and the fit of noise."""
 LOUD = 2.0
-"""Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
+"""Ratio of a residual to the calibration's stated sigma above which a structureless residual is reported."""
 SLOW, SMOOTH, NEGLIGIBLE = 0.4, 5.0, 1e-5
 """Limits of a residual that is far from white: fraction of its power in means over 64 samples, ratio of its
 RMS to that of its differences; and the RMS, as a fraction of the field, below which it is negligible."""
@@ -46,10 +47,10 @@ RMS to that of its differences; and the RMS, as a fraction of the field, below w
 def varying(
     problem: Problem, candidate: Candidate, look_elsewhere: Mapping[str, float]
 ) -> Description | None:
-    """Describe a named cause whose size follows other telemetry, the attitude, or time.
+    """Return a description of a named cause whose amplitude varies with other telemetry, attitude or time.
 
-    A true cause has one size in a log; a wrong name may leave its regressor times a function of something
-    else. None is returned for a cause that takes almost any shape.
+    A true cause has a constant amplitude in a log. A wrong one may leave its regressor times a function of
+    another series. Return None for a cause with so many coefficients that it can have almost any shape.
     """
     if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
         return None
@@ -75,7 +76,7 @@ def varying(
 
 
 def _followed(problem: Problem, channel: str | None) -> list[FloatArray]:
-    """List what a size might follow, (n,) each: time, telemetry except the cause's `channel`, attitude."""
+    """Return the series (n,) that an amplitude may follow: time, telemetry except `channel`, and attitude."""
     survey = problem.survey
     channels = [c.values for name, c in survey.channels.items() if name not in (channel, *survey.still)]
     if survey.attitude is None:
@@ -86,7 +87,7 @@ def _followed(problem: Problem, channel: str | None) -> list[FloatArray]:
 
 
 class Scored(NamedTuple):
-    """A description scored under one noise; `shift` is that of :class:`.Information`."""
+    """A description with its score under one noise; `shift` is defined in :class:`.Information`."""
 
     evidence: float
     kind: str
@@ -96,7 +97,7 @@ class Scored(NamedTuple):
 
 
 class FittedDescription(NamedTuple):
-    """A description fitted with its noise: the log evidence, its columns, the fit, and its trials."""
+    """A description fitted jointly with noise: log evidence, columns, fit, and number of hypotheses."""
 
     evidence: float
     columns: Columns
@@ -105,10 +106,10 @@ class FittedDescription(NamedTuple):
 
 
 class Leftover(NamedTuple):
-    """Unexplained structure: its kind, its size, and the channel it follows."""
+    """Unexplained structure in a residual: its kind, its strength, and the channel that it follows."""
 
     kind: str
-    """``switching drift tone transient broadband``."""
+    """``switching``, ``drift``, ``tone``, ``transient`` or ``broadband``."""
     signal_to_noise: float
     p_value: float
     evidence: float
@@ -116,30 +117,31 @@ class Leftover(NamedTuple):
     period_s: float | None
     """Period of a tone, s."""
     best_channel: str | None
-    """The telemetry that its description is a function of."""
+    """Telemetry channel of the description; None if it is not a function of one."""
     description: Description | None = None
-    """The description that found it."""
+    """Best description; None if other tests found the structure."""
     choice: int = 1
-    """Number of descriptions that it was chosen from."""
+    """Number of descriptions from which the best one was chosen."""
     within: tuple[CompetingHypothesis, ...] = ()
-    """The causes that remain possible: it is likelier than they are, but by less than their margin."""
+    """Causes that remain possible, because the description is better by less than their margin."""
     fitted: tuple[FittedDescription, ...] = ()
-    """The likeliest descriptions."""
+    """Best descriptions with their fits."""
     size: float | None = None
-    """RMS, nT, of the description."""
+    """RMS of the structure in the total field, nT; None if unknown."""
     shifts: tuple[int, ...] = ()
-    """Samples from which on the level is shifted, of what switches."""
+    """Indices of the samples at which the level shifts, for ``switching``."""
 
     @property
     def evidence_of_choice(self) -> float:
-        """Log evidence, with the price of the choice."""
+        """Log evidence, less the log of the number of descriptions to choose from."""
         return self.evidence - float(np.log(self.choice))
 
 
 def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, free: Ridge) -> Ridge:
-    """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
+    """Return the estimate of one curve along one direction of the body, ``c = f d^T``.
 
-    The two free numbers of the direction pay as in :func:`~.evidence.log_bayes`.
+    `free` is the estimate with a curve for each axis, S and b are information and score of its coefficients.
+    The penalty of the direction's two parameters is as in :func:`~.evidence.log_bayes`.
     """
     # Start from the first singular vector of the `free` estimate; then fit f given d, and d given f, in turn
     count = len(width) // 3
@@ -164,9 +166,10 @@ def leftover(
     but: Sequence[Candidate] = (),
     also: Sequence[Description] = (),
 ) -> Leftover | None:
-    """Return the best significant description of what the fit of `model` leaves, or None.
+    """Return the best significant description of the residual of `model`, or None.
 
-    A description that only repeats the regressors of the causes in `but` is not tried; those in `also` are.
+    Descriptions that only repeat the regressors of the causes in `but` are not tried. Those in `also` are
+    tried in addition.
     """
     # Descriptions that only repeat an excluded cause's own regressors are no alternatives
     listed = [one for one in (*descriptions(problem, fit), *also) if not one.covers(but)]
@@ -206,7 +209,7 @@ def _scored(
     model: Sequence[Columns],
     listed: Sequence[Description],
 ) -> Iterator[Scored]:
-    """Score each description with each of its widths under `noise`."""
+    """Yield the score of each description with each of its prior widths under `noise`."""
     columns = [*(one.columns for one in listed), *model]
     info = information(problem, noise, fit, columns, unshared=len(listed)).fitted(fit)
     for one, at in zip(listed, places(one.widths[0][1].size for one in listed), strict=True):
@@ -223,7 +226,7 @@ def _scored(
 def _calm(
     problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence[Description]
 ) -> ResidualNoise:
-    """Return the noise that is left when slow curves are fitted, beginning with white noise."""
+    """Return the noise of a fit with the `slow` curves, which starts from white noise."""
     level = np.full(len(problem), robust_scale(np.diff(fit.residual)) / np.sqrt(2.0) + 1e-12)
     ar, innovations = np.zeros_like(fit.noise.ar), fit.residual / level
     noise = replace(fit.noise, ar=ar, scale=level, nu=1e6, innovations=innovations)
@@ -239,7 +242,7 @@ def _calm(
 
 
 def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> FittedDescription:
-    """Fit a description with the model and the noise; its log evidence by Laplace's approximation."""
+    """Return a description fitted with model and noise, and its log evidence by Laplace's approximation."""
     one, best, q = scored.description, scored.best, len(fit.z)
     c, columns = best.estimate, one.columns
     moved = -scored.shift @ c
@@ -265,7 +268,7 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
 
 
 def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return (m, k) columns along one direction of (m, 3 k) along each axis."""
+    """Return the columns (m, k) along one direction (3,), from columns (m, 3 k) along each axis."""
     return np.asarray(part.reshape(len(part), -1, 3) @ direction)
 
 
@@ -277,9 +280,9 @@ def unlisted(
     error: FloatArray,
     counts: BoolArray,
 ) -> Leftover | None:
-    """Return the part that the `named` causes leave unexplained, or None.
+    """Return the structure that `named` causes leave unexplained, other than by a description; or None.
 
-    `error` (n,) is the residual on held-out parts, nT, of which the samples `counts` (n,) count.
+    `error` (n,), nT, is the residual of held-out parts. Samples with `counts` (n,) true are tested.
     """
     return _passing(wrong) or _slow(problem, fit, named) or _loud(problem, error, counts)
 
@@ -287,7 +290,7 @@ def unlisted(
 def switching(
     problem: Problem, fit: Joint, named: Sequence[Hypothesis], wrong: Outliers | None, *, ended: bool
 ) -> Leftover | None:
-    """Describe a switching signal if it is stronger than all `named` causes, or has ended the search."""
+    """Return a switching signal if it is stronger than all `named` causes, or has `ended` the search."""
     if wrong is None or not wrong.lasting:
         return None
     slow = _slow(problem, fit, named)
@@ -299,7 +302,7 @@ def switching(
 
 
 def _passing(wrong: Outliers | None) -> Leftover | None:
-    """Describe wrong samples that are not isolated: something passed by, rang for a few samples, switched."""
+    """Return outliers that are not isolated as a transient or switching signal; None if all are isolated."""
     if wrong is None or wrong.isolated:
         return None
     kind = "switching" if wrong.lasting else "transient"
@@ -310,7 +313,7 @@ def _passing(wrong: Outliers | None) -> Leftover | None:
 
 
 def _loud(problem: Problem, error: FloatArray, counts: BoolArray) -> Leftover | None:
-    """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
+    """Return a structureless residual above :data:`LOUD` times the calibration's stated sigma, or None."""
     # Chi-square of the error by the variance that the calibration states
     power = float(np.sum(error[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
@@ -320,13 +323,13 @@ def _loud(problem: Problem, error: FloatArray, counts: BoolArray) -> Leftover | 
 
 
 def far_from_white(problem: Problem, found: Memory) -> bool:
-    """Return True if a residual of this memory is more than noise of the sensor."""
+    """Return True if a residual of this autocorrelation is more than noise of a sensor."""
     lasts = found.slow >= SLOW or found.rms >= SMOOTH * found.white
     return lasts and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference))
 
 
 def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
-    """Describe a residual that is far from white, or slow noise that is not the strongest cause's remnant."""
+    """Return the drift in a residual: far from white, or slow noise above the causes' remnants; or None."""
     # Slow noise belongs to what is left: no sensor makes it
     slow = problem.slow_noise(fit.z)
     residual = (fit.residual + slow) / problem.reference_jacobian

@@ -1,16 +1,16 @@
-"""The search for the causes that the data support, one after the other.
+"""The search for the causes that the data support, by forward selection and backward elimination.
 
 Notes
 -----
-1. Score all candidates (:mod:`.evidence`) under two noises: that of the model so far, and that which is left
-   when the best candidate of every cause is fitted. The former may have absorbed an effect.
-2. Fit the best of each cause jointly with noise and calibration. Add the best that passes the test, and
-   repeat. The regressors of a cause that is found again become one candidate.
-3. Exchange causes for competing hypotheses, and drop those that later findings have made redundant.
+1. Score all candidates (:mod:`.evidence`) under two noise models: of the fit so far, and of a fit with the
+best candidate of every cause. The noise of the fit so far may have absorbed an effect. 2. Fit the best
+candidate of each cause jointly with noise and calibration. Add the best one that passes the test, and repeat.
+If a cause is found again, its regressors become one candidate. 3. Exchange causes for competing hypotheses,
+and drop causes that later findings have made redundant.
 
-A second start finds causes under noise of a short correlation, because other noise may have absorbed the
-joint effect of several causes. The search ends where a signal switches (:func:`switches`). Asserted causes
-are then searched for again with slow noise (:mod:`.problem`), and the likelier result is kept.
+A second start searches under noise of a short correlation, because other noise may have absorbed the joint
+effect of several causes. The search ends if the signal switches (:func:`switches`). If the causes found are
+asserted, a search with slow noise (:mod:`.problem`) follows, and the likelier result is kept.
 """
 
 from __future__ import annotations
@@ -56,27 +56,29 @@ from magbridge.diagnose.state import (
 from magbridge.estimation.residual import robust_scale
 
 Rival = Callable[[Problem, Sequence[Candidate], Joint, Candidate], float | None]
-"""Problem, model, fit, further cause -> held-out score of the best free description in its place, or None."""
+"""Function of problem, model, fit and further cause: held-out score of the best free description in place of
+the further cause, or None."""
 LOST, PLACES = 2, 6
-"""Regressors of a model, and shifts of the level, from which on a signal is called switching."""
+"""Numbers at which a signal is called switching: at least so many regressors, more than so many level
+shifts."""
 AFTERWARDS = 16
-"""Samples beyond the noise's order in which a shift of the level is looked for."""
+"""Samples beyond the noise's order over which a shift of the level is tested."""
 MAX_REGRESSORS = 6
-"""Regressors found one by one in a log, at most."""
+"""Largest number of regressors that forward selection adds."""
 
 
 class Outliers(NamedTuple):
-    """Wrong samples, and how surely they are isolated."""
+    """Outliers, with their significance and the evidence that they are isolated."""
 
     rows: IndexArray
-    """(k,)."""
+    """(k,) indices of the outliers."""
     ratio: float
-    """Twice the gain in log likelihood."""
+    """Twice the gain in log likelihood of the mixture over heavy tails."""
     p_value: float
     neighbours: float
-    """Probability of errors as large as the neighbours' in good samples."""
+    """p-value of the neighbouring samples under the hypothesis that they are good."""
     lasting: bool
-    """From them on the level stays shifted: something switched."""
+    """True if the level stays shifted after the outliers: something switched."""
 
     @property
     def isolated(self) -> bool:
@@ -85,7 +87,10 @@ class Outliers(NamedTuple):
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
-    """Test for wrong samples: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the best ``t_nu``."""
+    """Return the significant outliers of a fit, or None.
+
+    The mixture ``(1 - eps) t_nu + eps N(0, S^2)`` is tested against the best ``t_nu``.
+    """
     v = fit.noise.innovations
     n = len(v)
     if np.abs(v).max() < 5.0:
@@ -104,7 +109,7 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
 
 
 def switches(fit: Joint, model: Sequence[Candidate], causes: int) -> bool:
-    """Return True if the level shifts at many places that a model's first few regressors do not explain."""
+    """Return True if a fit with several regressors leaves many shifts of the level unexplained."""
     if sum(len(candidate.pieces) for candidate in model) < LOST:
         return False
     off = outliers(fit, causes)
@@ -123,18 +128,19 @@ def _lasting(fit: Joint, rows: IndexArray) -> bool:
 
 
 def _neighbours(fit: Joint, rows: IndexArray) -> float:
-    r"""Return the p-value of good samples before and after `rows` (k,): 1 where gaps leave none to test.
+    r"""Return the p-value of the samples before and after `rows` (k,) if they are good; 1 if none is
+    testable.
 
     Notes
     -----
-    A wrong sample i is an additive outlier, or one of the innovations (Fox 1972, JRSS B 34:350). In the first
-    case three impulses c are fitted, at i - 1, i and i + 1; with the whitening filter ``h = (1, -a)`` and the
-    innovations v in units of the noise's scale,
+    A wrong sample i is an additive or an innovation outlier (Fox 1972, JRSS B 34:350). For an additive one,
+    three impulses c are fitted at i - 1, i and i + 1, with the whitening filter ``h = (1, -a)`` and
+    innovations v in units of the noise's scale:
 
     .. math:: G c = b, \qquad G_{jk} = \sum_l h_l h_{l+|j-k|}, \qquad b_j = \sum_l h_l v_{j+l}
 
-    The outer c, or else the innovations next to i, are noise if the neighbours are good. Their p-values are
-    ranks among those of all samples, combined by Fisher's method for the better of the two cases.
+    If the neighbours are good, the outer c, or the innovations next to i, are noise. Their p-values are ranks
+    among all samples, combined by Fisher's method for the better of the two kinds of outlier.
     """
     # Whitening filter h, and b: the filter's transpose applied to the innovations
     noise, p = fit.noise, len(fit.noise.ar)
@@ -158,7 +164,7 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
 
 
 def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
-    """Log likelihood of the mixture after expectation maximisation, and each sample's chance to be wrong."""
+    """Return the largest log likelihood of the mixture, and each sample's probability of being an outlier."""
     s, wide = robust_scale(v), float(np.abs(v).max())
     at_zero = gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
     member = np.zeros(len(v))
@@ -185,23 +191,23 @@ class SearchOutcome:
     """The result of a search."""
 
     problem: Problem
-    """With slow noise, if that is the likelier."""
+    """Problem of the search, with slow noise if that is likelier."""
     chosen: tuple[Hypothesis, ...]
-    """In the order found; each against the model without it; none where names are not asserted."""
+    """Causes found, each tested against the model without it; empty if no names are asserted."""
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
-    """For each chosen one, the others within :func:`.bayes_factor_threshold`, the best first."""
+    """Competing hypotheses of each chosen cause, the likeliest first."""
     null: Joint
     """Fit without any cause."""
     fit: Joint
-    """Fit with the chosen ones."""
+    """Fit with the chosen causes."""
     p_value: float
-    """The smallest of the first round."""
+    """Smallest p-value of the first round."""
     info: Information
-    """Of all candidates under the noise that is left, only the calibration projected out."""
+    """Information of all candidates, then the model, under the noise of `fit`."""
     look_elsewhere: dict[str, float]
-    """Cause -> number of independent hypotheses behind it."""
+    """Number of independent hypotheses of each cause, by its name."""
     evidence: float
-    """Log evidence of the causes found and of their noise, against the null without slow noise."""
+    """Log evidence of causes and noise, relative to the null without slow noise."""
     switches: bool
     """True if the search ended because of a switching signal that no cause describes."""
 
@@ -211,7 +217,7 @@ class SearchOutcome:
         return [hypothesis.candidate for hypothesis in self.chosen]
 
     def with_chosen(self, places: Sequence[int], fit: Joint) -> SearchOutcome:
-        """Return the outcome with only the causes at some places, whose joint fit is given."""
+        """Return the outcome with only the causes at these indices, whose joint fit is `fit`."""
         competing = tuple(self.competing[k] for k in places)
         return replace(self, chosen=tuple(self.chosen[k] for k in places), competing=competing, fit=fit)
 
@@ -223,10 +229,10 @@ def search(
     rival: Rival | None = None,
     plain: Joint | None = None,
 ) -> SearchOutcome:
-    """Find the causes, of so many `causes`, that the data support under one noise model.
+    """Return the causes that the data support under one noise model; `causes` is the number of causes tested.
 
-    Each further cause must predict held-out dives better than the `rival`, a free description. `plain` is the
-    null without slow noise, where the problem has such noise.
+    Each further cause must predict held-out dives better than a free description (`rival`). For a problem
+    with slow noise, `plain` is the fit without causes and without slow noise.
     """
     # Order of the noise, forward selection with exchanges, backward elimination, competing hypotheses
     rough = fit_joint(problem, [], 1, rounds=2)
@@ -253,7 +259,7 @@ def search(
 def beside_slow_noise(
     found: SearchOutcome, candidates: Sequence[Candidate], causes: int, rival: Rival | None = None
 ) -> SearchOutcome:
-    """Repeat the search of the causes found, with slow noise; return the likelier outcome."""
+    """Return the likelier of the outcome `found` and of a search with slow noise."""
     noisy, null = with_slow_noise(found.problem), found.null
     slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
     gain = slow.log_likelihood - null.log_likelihood
@@ -274,7 +280,7 @@ def beside_slow_noise(
 
 
 def _likeliest(state: SearchState, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Return the likeliest of the models found with any noise, and with a short-lived one if need be."""
+    """Return the likelier model, and its fit, of searches under any noise and under short-lived noise."""
     model, base = _forward_selection(state, first)
     if switches(base, model, state.causes):
         return model, base
@@ -290,7 +296,7 @@ def _likeliest(state: SearchState, first: list[Hypothesis]) -> tuple[list[Candid
 
 
 def _forward_selection(state: SearchState, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Add cause after cause while one passes the test, beginning with the best of `first`."""
+    """Return the model, and its fit, of causes added one after the other, from the hypotheses `first` on."""
     model: list[Candidate] = []
     base, found = state.null, first
     strengths: dict[str, float] = {}
@@ -314,16 +320,16 @@ def _forward_selection(state: SearchState, first: list[Hypothesis]) -> tuple[lis
 
 
 def _remnant(found: Hypothesis) -> float:
-    """Return the signal-to-noise of what a cause's idealised regressor may leave of it."""
+    """Return the largest signal-to-noise that errors of a cause's idealised regressor may leave."""
     size = found.signal_to_noise
     return min(SMOOTH * size, MOST_REMAINING) if found.candidate.nonparametric else REMNANT * size
 
 
 def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
-    """Return the best that passes the test and exceeds the remnants of the causes in the model, or None.
+    """Return the best significant hypothesis that exceeds the remnants of the model's causes, or None.
 
-    `strengths` holds the remnants by cause, `ratio` is the likelihood ratio of the causes of fixed shape.
-    Candidates within the error of their regressors count as equal: the one of fewest coefficients is taken.
+    `strengths` holds the remnants by cause, and `ratio` is the likelihood ratio of the causes of fixed shape.
+    Among candidates within the errors of their regressors, the one with the fewest coefficients is returned.
     """
 
     def remnant(cause: str) -> float:
@@ -338,7 +344,7 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
 
 
 def _added(state: SearchState, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
-    """Add a candidate to the model; a cause that is in the model already gains its columns."""
+    """Return the model, and its fit, with a candidate added, or joined to the candidate of the same cause."""
     new = best.candidate
     for k, own in enumerate(model):
         if own.cause == new.cause:
@@ -353,9 +359,10 @@ def _added(state: SearchState, model: list[Candidate], best: Hypothesis) -> tupl
 def _backward_elimination(
     state: SearchState, model: list[Candidate], base: Joint, rival: Rival | None
 ) -> tuple[list[Hypothesis], Joint]:
-    """Drop causes that fail their test given the others, or without which the model is likelier.
+    """Return the causes that remain, each with its test, and the fit of their model.
 
-    Then drop further causes that are remnants (:func:`_surplus`).
+    A cause is dropped if it fails its test given the others, if the model is likelier without it, or if it is
+    redundant (:func:`_surplus`).
     """
     # Each cause in turn against the model without it; a drop starts the pass again
     chosen: list[Hypothesis] = []
@@ -384,10 +391,10 @@ def _backward_elimination(
 def _surplus(
     state: SearchState, chosen: Sequence[Hypothesis], base: Joint, rival: Rival | None
 ) -> int | None:
-    """Return the place of the weakest cause if it is redundant given the others, else None.
+    """Return the index of the weakest cause if it is redundant given the others, else None.
 
-    It is redundant if it is the remnant of a Gaussian process, if it correlates with another cause and does
-    not improve held-out dives, or if a free description predicts these better.
+    The cause is redundant if it is the remnant of a Gaussian process, if it correlates with another cause and
+    does not improve held-out dives, or if a free description predicts held-out dives better.
     """
     smooth = max((_remnant(h) for h in chosen if h.candidate.nonparametric), default=0.0)
     k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
@@ -413,7 +420,7 @@ def _surplus(
 
 
 def _like_another(state: SearchState, model: Sequence[Candidate], base: Joint, k: int) -> bool:
-    """Return True if in this log the k-th cause is strongly correlated with another of the model."""
+    """Return True if in this log the effect of the k-th cause correlates strongly with that of another."""
     # The most visible candidate of each group stands for its grid
     info = state.conditional_on(model, base)
     every = {state.candidates[n].group: n for n in most_visible(state.candidates, info, state.at)}

@@ -1,6 +1,7 @@
-"""The steps of a search: score every cause given a model, fit the likeliest, profile it, exchange it.
+"""The steps of a search: score all causes given a model, fit the likeliest, profile and exchange causes.
 
-The model is not part of the state: every step takes one and returns another.
+A model is a list of candidates. It is not part of the state: each step has a model as argument and returns
+another.
 """
 
 from __future__ import annotations
@@ -35,20 +36,20 @@ from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem
 
 MAX_SCREENED_SAMPLES = 65_536
-"""Samples of a long log, in pieces spread evenly over it, by which a round chooses what it fits to all."""
+"""Number of samples of a long log, in pieces spread evenly, on which a round screens the candidates."""
 JOINTLY_FITTED_CAUSES, WORTH_FITTING = 9, 0.3
-"""Most causes that are fitted jointly in a round, and their least score as a fraction of the best's."""
+"""Largest number of causes fitted jointly in a round; their least log evidence as a fraction of the best."""
 MAX_EXCHANGES, TRIED = 6, 3
-"""Exchanges at most, and replacements tried in each."""
+"""Largest number of exchanges, and of replacements tried in each."""
 COLUMNS, STAGES = 144, 2
-"""Columns of all values tried within a nonlinear parameter's bracket, and stages of narrowing it."""
+"""Total columns of the values tried in a nonlinear parameter's bracket; number of narrowing stages."""
 
 
 class SearchState:
-    """The problem of one search, its candidates, and quantities of the log.
+    """Problem and candidates of one search, with quantities that its steps share.
 
-    `null` is the fit without any cause, `look_elsewhere` the number of hypotheses of each cause. One piece of
-    a long log in `stride` screens the candidates. If `brief`, noise is correlated for a short time only.
+    `null` is the fit without any cause, and `look_elsewhere` the number of hypotheses of each cause. Every
+    `stride`-th piece of a log serves to screen candidates. If `brief`, noise has a short correlation time.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
@@ -66,7 +67,7 @@ class SearchState:
         self.blocks = self.null.noise.uneven
 
     def with_brief_noise(self) -> SearchState:
-        """Return the same search, with noise whose correlation is too short to pass for a slow cause."""
+        """Return a copy of the state whose noise has a correlation too short to imitate a slow cause."""
         brief = copy(self)
         brief.brief, brief.last = True, (None, None)
         brief.null = brief.fit([])
@@ -80,7 +81,7 @@ class SearchState:
         like: Joint | None = None,
         rounds: int = 4,
     ) -> Joint:
-        """Fit a model jointly with calibration and noise; arguments as of :func:`~.joint.fit_joint`."""
+        """Return the joint fit of a model, with arguments as for :func:`~.joint.fit_joint`."""
         columns = [candidate.columns for candidate in model]
         return fit_joint(
             self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],
@@ -92,7 +93,7 @@ class SearchState:
         return 2.0 * (fit.log_likelihood - (null or self.null).log_likelihood)
 
     def value(self, model: Sequence[Candidate], fit: Joint, null: Joint | None = None) -> float:
-        """Return the log evidence of a model relative to `null`, less what idealised regressors may gain."""
+        """Return the log evidence of a model relative to `null`, less the allowance for regressor errors."""
         ratio = self.ratio(fit, null)
         if not model:
             return 0.5 * ratio
@@ -106,7 +107,7 @@ class SearchState:
         )
 
     def best(self, info: Information) -> dict[Group, Best]:
-        """Return best member of each group."""
+        """Return the best candidate of each group (cause and channel) by log evidence."""
         found = {}
         for group, members in self.groups.items():
             scores = [score(info, self.at[k], self.candidates[k]) for k in members]
@@ -117,7 +118,7 @@ class SearchState:
         return found
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
-        """Fit the best causes given `model`, each on its own, and list them, the likeliest first."""
+        """Return fits of the best causes, each added alone to `model`, the likeliest first."""
         # Score all candidates: under the noise of the model, then under that without the best of every cause
         screened = self._information_under(base.noise, model, base, self.stride) if self.stride > 1 else None
         as_fitted = (screened or self.conditional_on(model, base)).fitted(base)
@@ -140,7 +141,7 @@ class SearchState:
         return sorted(found, key=lambda h: -h.evidence)
 
     def conditional_on(self, model: Sequence[Candidate], base: Joint) -> Information:
-        """Return the information of all candidates, then of `model`, with the calibration projected out."""
+        """Return the information of all candidates, then `model`, with the calibration projected out."""
         known, info = self.last
         if known is not base:
             info = self._information_under(base.noise, model, base)
@@ -149,7 +150,7 @@ class SearchState:
         return info
 
     def _cleared(self, model: list[Candidate], base: Joint, info: Information) -> Information:
-        """Return the information under the noise that the best candidate of every cause leaves."""
+        """Return the information under the noise of a fit with the best candidate of every cause."""
         # The best candidate of each cause, all in one model with the prior of plausible sizes
         top: dict[str, Best] = {}
         for (cause, _), best in self.best(info).items():
@@ -175,12 +176,12 @@ class SearchState:
     def _information_under(
         self, noise: ResidualNoise, model: Sequence[Candidate], base: Joint, stride: int = 1
     ) -> Information:
-        """Return information of all candidates and of `model` under a noise, in every `stride`-th piece."""
+        """Return the information of candidates and `model` under a noise; `stride` as :func:`.information`."""
         columns = [*self.columns, *(candidate.columns for candidate in model)]
         return information(self.problem, noise, base, columns, stride=stride)
 
     def _joint(self, model: list[Candidate], base: Joint, won: list[Best]) -> Hypothesis:
-        """Fit one cause jointly at the grid points that won under either noise."""
+        """Return the best joint fit of one cause at the grid points `won`, the best under either noise."""
         found = []
         for k in {best.place for best in won}:
             candidate, here = self.candidates[k], [best for best in won if best.place == k]
@@ -205,7 +206,7 @@ class SearchState:
         return max(found, key=lambda h: h.evidence)
 
     def p_value(self, candidate: Candidate, ratio: float, freedom: int) -> float:
-        """Return the p-value of a likelihood ratio, times the hypotheses of its cause, times the causes."""
+        """Return the p-value of a likelihood ratio, times hypotheses of the cause, times number of causes."""
         hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.point.likelier))
         tests = candidate.tail * hypotheses * self.causes
         return min(1.0, tests * float(chdtrc(max(freedom, 1), ratio)))
@@ -219,15 +220,19 @@ def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:
-    """Return (k,) prior precision that a fit begins from: nature's sizes are known, a fault's hardly."""
+    """Return the prior precision (k,) of a model's coefficients, in units of their widths.
+
+    It is 1 for errors of the reference and coefficients of one common size, else :data:`.RIDGE`.
+    """
     natural = [not c.effects or c.spectra is not None for c in model]
     return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
 
 
 def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
-    """Profile the nonlinear parameters of a cause given `model`, whose fit is `base`, one after the other.
+    """Return the hypothesis with its nonlinear parameters profiled, one after the other.
 
-    Many values are scored at once, because the likelihood of an onset has several peaks.
+    The other causes are `model`, and `base` is their fit. Many values are scored at once, because the
+    likelihood of an onset has several peaks.
     """
     best, narrow = hypothesis, 0.0
     if best.candidate.point.rebuild is None:
@@ -251,7 +256,10 @@ def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, 
 def _profiled(
     state: SearchState, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
 ) -> tuple[Candidate, FloatArray, float]:
-    """Return the best value's candidate, coefficients to begin from, and its share of the bracket."""
+    """Return the candidate at the best value of parameter `name`, its start coefficients, and a log ratio.
+
+    The ratio is the width of a grid cell over the width of the likelihood in the parameter.
+    """
     rebuild = best.candidate.point.rebuild
     assert rebuild is not None
     columns = [candidate.columns for candidate in model]
@@ -281,7 +289,7 @@ def _profiled(
 
 
 def _bracket(state: SearchState, candidate: Candidate, name: str) -> tuple[float, float]:
-    """Return the values of one nonlinear parameter's grid between which a candidate stands."""
+    """Return the grid values of a nonlinear parameter next below and above a candidate's value."""
     here = candidate.point.shape[name][0]
     if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
         share = 0.6 * here / float(np.ptp(state.problem.survey.time))
@@ -298,7 +306,10 @@ def _bracket(state: SearchState, candidate: Candidate, name: str) -> tuple[float
 def refined(
     state: SearchState, model: list[Candidate], base: Joint, members: int | None = None
 ) -> tuple[list[Candidate], Joint]:
-    """Profile the nonlinear parameters of the first `members`, each given the others; they end up last."""
+    """Return the model, and its fit, with the nonlinear parameters of its first `members` profiled.
+
+    Each is profiled given the others, and then moves to the end of the model.
+    """
     for _ in range(len(model) if members is None else members):
         own, others = model[0], model[1:]
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
@@ -314,11 +325,11 @@ def refined(
 
 @dataclass(frozen=True)
 class CompetingHypothesis:
-    """A competing hypothesis, by the best candidate of its grid."""
+    """A cause that the data do not exclude in place of another, by the best candidate of its grid."""
 
     candidate: Candidate
     behind: float
-    """Log evidence by which it loses, averaged over the grid of its nonlinear parameters."""
+    """Log evidence by which the other cause is better, averaged over the grids of nonlinear parameters."""
 
 
 def competing_hypotheses(
@@ -349,7 +360,7 @@ def competing_hypotheses(
 
 
 def exchanged(state: SearchState, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Replace a regressor by another, or drop one, while the evidence of the whole model grows."""
+    """Return the model, and its fit, after exchanges and drops of regressors that raise its evidence."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
     # Steepest ascent over the neighbours of the model, each fitted with its noise
     for _ in range(MAX_EXCHANGES):
@@ -366,7 +377,10 @@ def exchanged(state: SearchState, model: list[Candidate], base: Joint) -> tuple[
 
 
 def _changes(state: SearchState, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], int]]:
-    """List replacements and the place they would take: first none in each place, then the likeliest."""
+    """Return the changes of the model to try: the new candidates, and the index of the piece they replace.
+
+    The first changes drop each piece; the likeliest replacements follow.
+    """
     info = state.conditional_on(pieces, base)
     found = [
         (one.behind, [one.candidate], place)
@@ -379,7 +393,7 @@ def _changes(state: SearchState, pieces: list[Candidate], base: Joint) -> list[t
 
 
 def _gathered(state: SearchState, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
-    """Join the pieces of each cause into one candidate."""
+    """Return the model, and its fit, with the pieces of each cause joined into one candidate."""
     # Pieces of one cause stand next to each other, so that one candidate can hold them
     causes = list(dict.fromkeys(piece.cause for piece in pieces))
     if len(causes) == len(pieces):
