@@ -1,6 +1,7 @@
-"""Free descriptions: structure of any kind in a residual, without a name.
+"""Free descriptions: columns that model structure of any kind in a residual, without a physical cause.
 
-Arguments are histories of the log's n samples, (n,) or (n, 3); results are :mod:`.columns`, (m, k) of m rows.
+Functions here have histories of the log's n samples as arguments, (n,) or (n, 3), and return
+:mod:`.columns`: (m, k) for m rows.
 """
 
 from __future__ import annotations
@@ -31,29 +32,30 @@ from magbridge.diagnose.packets import packets, passage
 from magbridge.diagnose.problem import Problem, rates, row_blocks
 
 BEND = 32
-"""Order of the polynomials of an axis' response: fine enough for a converter's coarsest steps."""
+"""Order of the polynomials of an axis' response, enough to follow a converter's coarsest steps."""
 PLAYS = (0.3, 0.8)
-"""Widths of the play operators that describe a channel's past, in half ranges."""
+"""Widths of the play operators that model hysteresis in a channel, in half ranges of the channel."""
 HULL_LAGS_S = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
-"""Lags with which the inside of a hull follows, s: heat, water that seeps, stress that relaxes."""
+"""Lags of processes in a hull, s: heat flow, seeping water, relaxing stress."""
 SWAYS = (0.0, 10.0, 30.0)
-"""Lags with which something loose, or on a line, follows a turn, s."""
+"""Lags with which a loose or towed object follows a turn, s."""
 SKIN = (5.0, 20.0)
-"""Depths over which light, warmth and waves fade, m."""
+"""Depths over which effects of the surface (light, heat, waves) decay, m."""
 REPEATED = 8
-"""Half waves per dive of what repeats with every dive."""
+"""Number of half waves per dive in a signal that every dive repeats."""
 ZERO = (500.0, 1000.0, 2000.0)
-"""Widths, nT, of errors where an axis reads zero."""
+"""Widths of errors near the zero reading of an axis, nT."""
 SLIDING_TILT_SINES = (0.0, 0.1, 0.2)
-"""Sines of the angles at which a loose object in the hull starts to slide."""
+"""Sines of the tilt at which a loose object in the hull starts to slide."""
 BODY, EARTH = 24, 48
-"""Half waves per log of slow curves along the axes of the body, and along the field."""
+"""Number of half waves per log in slow curves: along each body axis, and along the field."""
 
 
 def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
-    """Return prior widths of half waves for an exponential correlation (relaxation, switching), by kind.
+    """Return kinds of slow curve with the prior widths, nT, of `count` half waves along each of `axes`.
 
-    The k-th has ``1 / sqrt(1 + (k / k_0)^2)``, k_0 the corner of the kind.
+    The widths are those of an exponential correlation: the k-th half wave has ``10 / sqrt(1 + (k / k_0)^2)``,
+    with k_0 the corner of the kind.
     """
     k = np.repeat(np.arange(1, count + 1), axes)
     corners = {"drift": 1.0, "switching": 8.0}
@@ -61,7 +63,10 @@ def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
 
 
 def direction(body: Columns) -> Columns:
-    """Return functions up to quartic of the field's direction in the body, that of `body` (m, 3)."""
+    """Return the monomials of order 1 to 4 of the field's direction in the body.
+
+    `body` returns (m, 3) vectors in that direction.
+    """
     exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
 
     def columns(rows: slice) -> FloatArray:
@@ -74,7 +79,7 @@ def direction(body: Columns) -> Columns:
 
 
 def response(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Return each axis' error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
+    """Return errors of each axis that are Chebyshev polynomials of its own `reading` (n, 3), nT.
 
     `jacobian` gives the change (m, 3) of the residual per nT in each axis.
     """
@@ -90,7 +95,7 @@ def response(reading: FloatArray, jacobian: Columns) -> Columns:
 
 
 def bends() -> tuple[tuple[str, FloatArray], ...]:
-    """Return prior widths (3 BEND,) of a response's polynomials: with steps, with a corner, or smooth."""
+    """Return prior widths (3 BEND,) of the polynomials of :func:`response`, by smoothness."""
     k = np.arange(1.0, BEND + 1.0)
     return tuple(
         ("broadband", np.tile(30.0 / width, 3)) for width in (np.sqrt(1.0 + (k / 8.0) ** 2), k**2, k**3)
@@ -98,7 +103,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 
 
 def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Return each axis' error where it passes zero (Hermite's functions); arguments as :func:`response`."""
+    """Return errors of each axis near its zero reading (Hermite functions); arguments as :func:`response`."""
 
     def columns(rows: slice) -> FloatArray:
         x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
@@ -109,13 +114,13 @@ def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
 
 
 def curve(values: FloatArray) -> Columns:
-    """Return powers of a channel (n,)."""
+    """Return the powers 1 to 4 of a channel's `values` (n,), scaled to -1 to 1, less their means."""
     y = _scaled(values)
     return _centred(lambda rows: np.stack(powers(y(rows), 4)).T, len(values))
 
 
 def hysteresis(values: FloatArray) -> Columns:
-    """Return functions of a channel's past (n,): branches of hysteresis, narrow and wide; its direction."""
+    """Return hysteresis of a channel (n,): branches of a narrow and a wide play, and direction of motion."""
     scaled = _scaled(values)
     y = scaled(slice(None))
     # Branches v^k - x^k of the play operator at two widths, and the direction of motion
@@ -132,12 +137,12 @@ def hysteresis(values: FloatArray) -> Columns:
 
 
 def delayed(time: FloatArray, values: FloatArray) -> Columns:
-    """Return a channel (n,) with each of :data:`HULL_LAGS_S`: mixed, they make any smooth response to it."""
+    """Return a channel (n,) with each of :data:`HULL_LAGS_S`; their sums imitate any smooth response."""
     return _centred(_followed(time, _scaled(values)(slice(None))[None], HULL_LAGS_S), len(values))
 
 
 def swings(time: FloatArray, rate: FloatArray) -> Columns:
-    """Return functions of a turn's rate (n,), with lags: the rate; its square, the same to either side."""
+    """Return the rate of turn (n,) and its square, each with each of the lags :data:`SWAYS`."""
     low, high = np.quantile(rate, (0.001, 0.999))  # a jump of the telemetry is not a turn
     y = np.clip(rate, low, high) / max(high, -low, 1e-12)
     swung = _followed(time, y[None], SWAYS)
@@ -145,13 +150,13 @@ def swings(time: FloatArray, rate: FloatArray) -> Columns:
 
 
 def near_surface(time: FloatArray, depth: FloatArray) -> Columns:
-    """Return effects of the surface that fade with depth (n,), m, and, with lags, afterwards."""
+    """Return surface effects that decay exponentially with depth (n,), m, each with each hull lag."""
     near = np.exp(-(depth - depth.min()) / np.array(SKIN)[:, None])
     return _centred(_followed(time, near, HULL_LAGS_S[:-1]), len(depth))
 
 
 def repeated(problem: Problem) -> Columns:
-    """Return half waves in the course of a dive, the same in all."""
+    """Return half waves of the time since the start of each dive, in units of a usual dive's duration."""
     dive, time = problem.survey.dive, problem.survey.time
     # Phase in the dive, 0 to 1, of the usual duration
     start = np.flatnonzero(np.diff(dive, prepend=dive[0] - 1))
@@ -163,7 +168,7 @@ def repeated(problem: Problem) -> Columns:
 
 
 def lower_end(tilt: FloatArray) -> Columns:
-    """Return the end of the hull at which a loose object lies; `tilt` (n,) is the sine of the tilt."""
+    """Return the end of the hull, -1 or 1, at which a loose object lies, by the sine of the `tilt` (n,)."""
     place = np.arange(len(tilt))
     sides = []
     for slope in SLIDING_TILT_SINES:
@@ -173,7 +178,7 @@ def lower_end(tilt: FloatArray) -> Columns:
 
 
 def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Columns:
-    """Return each of `values` (k, n) with each lag, in single precision to save memory."""
+    """Return each series of `values` (k, n) with each of the `lags`, s."""
     followed = np.stack([lagged(time, y, lag).astype(np.float32) for y in values for lag in lags])
     return lambda rows: followed[:, rows].T.astype(float)
 
@@ -184,42 +189,42 @@ def _centred(columns: Columns, n: int) -> Columns:
 
 
 def _scaled(values: FloatArray) -> Columns:
-    """Return values (n,) moved to the range -1 to 1, (m,) of m rows."""
+    """Return a function of m rows: `values` (n,) scaled linearly to the range -1 to 1, (m,)."""
     low, span = values.min(), max(float(np.ptp(values)), 1e-12)
     return lambda rows: np.asarray(2.0 * (values[rows] - low) / span - 1.0)
 
 
 def _is(*kinds: type[Effect]) -> Callable[[Candidate], bool]:
-    """Return the question whether a candidate has an effect of these kinds."""
+    """Return a function that returns True if a candidate has an effect of one of these classes."""
     return lambda candidate: any(isinstance(effect, kinds) for effect in candidate.effects)
 
 
 class Description(NamedTuple):
-    """A description without a name."""
+    """A free description: columns with their prior, and the properties that make it an alternative."""
 
     columns: Columns
-    """What its coefficients add to the residual."""
+    """Changes of the residual, nT, per unit of each coefficient."""
     widths: tuple[tuple[str, FloatArray], ...]
-    """Kind, and the prior widths (1-sigma) of the coefficients up to a common factor; each is tried."""
+    """Alternatives: kind, and prior widths (1-sigma) of the coefficients up to a common factor."""
     channel: str | None = None
-    """The telemetry that it is a function of."""
+    """Telemetry channel of which the columns are functions; None if there is none."""
     look_elsewhere: float = 1.0
-    """Number of independent descriptions that it was chosen from."""
+    """Number of independent descriptions from which this one was chosen."""
     period: float | None = None
     """Period of a tone, s."""
     holds: Callable[[Candidate], bool] = _is()
-    """Return True if the columns include a candidate's own regressors, not only those of the same channel."""
+    """Function that returns True if the columns contain a candidate's own regressors."""
     turned: bool = False
-    """The columns are the same functions along each of the body's axes."""
+    """True if the columns are the same functions along each axis of the body."""
     remembers: bool = False
-    """It follows the channel's past (from which side it came), not its value."""
+    """True if the columns depend on the channel's past (hysteresis), not only on its value."""
     scales: bool = False
-    """The effect is in proportion to each reading: a change of sensitivity, not of offset."""
+    """True if the effect is proportional to each axis' reading: a change of sensitivity."""
     wider: bool = False
-    """It is much more general than a cause that it holds: what it finds in addition is not a remnant."""
+    """True if the columns are much more general than a cause that they contain."""
 
     def covers(self, model: Sequence[Candidate]) -> bool:
-        """Return True if it contains a cause of `model`, with more coefficients; a wider one, all causes."""
+        """Return True if the description contains a cause of `model`; if it is `wider`, all causes."""
         heat = "scale" if self.scales else "offset"
         same = [
             self.holds(candidate)
@@ -235,7 +240,7 @@ class Description(NamedTuple):
 
 
 def _heat(candidate: Candidate) -> Literal["offset", "scale"] | None:
-    """Return the target of a lagged temperature effect, offset or scale; None if there is none."""
+    """Return whether a candidate's lagged temperature effect is of offset or scale; None without one."""
     soaked = (e for e in candidate.effects if isinstance(e, ChannelEffect) and e.stages > 1)
     return next((effect.on for effect in soaked), None)
 
@@ -245,7 +250,7 @@ def _bends(candidate: Candidate) -> bool:
 
 
 def descriptions(problem: Problem, fit: Joint) -> list[Description]:
-    """List the descriptions of any structure, with passages and packets in the residual of a `fit`."""
+    """Return all free descriptions of a log, with passages and packets in the residual of a `fit`."""
     return [
         *_in_time(problem, fit),
         *_of_reading(problem),
@@ -255,7 +260,7 @@ def descriptions(problem: Problem, fit: Joint) -> list[Description]:
 
 
 def _in_time(problem: Problem, fit: Joint) -> list[Description]:
-    """Return slow curves, a constant, passages, what each dive repeats, oscillations that end."""
+    """Return slow curves, a constant, a passage, a signal that dives repeat, and wave packets."""
     time, dive, field = problem.survey.time, problem.survey.dive, problem.reference_jacobian
     constant = field * ~problem.survey.learned
     turn = np.exp(1j * np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1.0))
@@ -285,7 +290,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
 
 
 def _of_reading(problem: Problem) -> list[Description]:
-    """Return functions of the field's direction, its rates and each axis' reading; one common delay."""
+    """Return functions of the field's direction, rates and axis readings, and a delay of the masses."""
     rate = field_rates(problem)
 
     def body(rows: slice) -> FloatArray:
@@ -304,12 +309,12 @@ def _of_reading(problem: Problem) -> list[Description]:
 
 
 def _of_channels(problem: Problem) -> list[Description]:
-    """Return for each channel functions of its value, of its past, and of its lagged value."""
+    """Return for each channel functions of its value, of its past (hysteresis), and of lagged values."""
     masses = {parameter.name for parameter in problem.calibration.parameters}
     survey, listed = problem.survey, []
 
     def moves(candidate: Candidate) -> bool:
-        """Return True if a candidate adds to what the calibration's masses do."""
+        """Return True if a candidate changes the effect of a mass of the calibration."""
         return any(
             isinstance(e, LegendreEffect) or (isinstance(e, PathEffect) and e.channel in masses)
             for e in candidate.effects
@@ -334,7 +339,7 @@ def _of_channels(problem: Problem) -> list[Description]:
 
 
 def _of_attitude(problem: Problem) -> list[Description]:
-    """Return functions of pitch, roll and turns: of what hangs, slides or swings in the hull."""
+    """Return functions of pitch, roll and rate of turn, for objects that hang, slide or swing in the hull."""
     if problem.survey.attitude is None:
         return []
     listed = []
@@ -349,7 +354,10 @@ def _of_attitude(problem: Problem) -> list[Description]:
 def _in_body(
     problem: Problem, basis: Columns, *, scales: bool = False, kind: str = "broadband", **more: Any
 ) -> Description:
-    """Describe a field by each function of `basis` along each body axis; with `scales`, times its reading."""
+    """Return a description with each function of `basis` along each body axis.
+
+    With `scales`, each function is multiplied by the axis' reading in units of the usual field.
+    """
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)
@@ -362,5 +370,5 @@ def _in_body(
 
 
 def _described(columns: Columns, kind: str = "broadband", width: float = 30.0, **more: Any) -> Description:
-    """Return a description whose coefficients are all as large."""
+    """Return a description whose coefficients have one common prior `width`."""
     return Description(columns, ((kind, np.full(size_of(columns), width)),), **more)

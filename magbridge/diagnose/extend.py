@@ -1,10 +1,11 @@
-r"""From findings to a calibration: effects become terms, and all coefficients are refitted.
+r"""Extension of a calibration by the effects of findings, with all coefficients refitted.
 
 Notes
 -----
-The nonlinear parameters s of a cause have the derivatives ``J_s = d(X b)/ds``. With M their information,
-calibration and effects projected out, K the change of all other coefficients for a unit of each, and the
-prior N(0, 1) in units of a cell of their grid, the covariance of the other coefficients is
+The nonlinear parameters s of a cause have the derivatives ``J_s = d(X b)/ds``. M is their information with
+calibration and effects projected out, and K the change of all other coefficients per unit of each parameter.
+The prior of each parameter is N(0, 1) in units of a cell of its grid. The covariance of the other
+coefficients is then
 
 .. math:: C + K (M + 1)^{-1} K^T
 """
@@ -33,13 +34,14 @@ from magbridge.version import __version__
 STEP_CELL_FRACTION = 0.05
 """Fraction of a grid cell by which a parameter is moved for its derivative."""
 MAX_STEPS = 12
-"""Most Gauss-Newton steps; a second one is rarely needed."""
+"""Largest number of Gauss-Newton steps; a second one is rarely needed."""
 MAX_HALVINGS = 6
-"""Most halvings of one step."""
+"""Largest number of halvings of one step."""
 MAX_MISMATCH = 0.1
-"""Convergence: RMS difference of linear prediction and nonlinear residual, as a fraction of the noise."""
+"""Largest RMS difference of linear prediction and nonlinear residual at convergence, as a fraction of the
+noise."""
 MODES = 64
-"""Directions among which the misfit of an idealised regressor is spread; measured in the blind study."""
+"""Number of directions over which the misfit of an idealised regressor is spread, from the blind study."""
 
 
 def loosened(
@@ -48,7 +50,10 @@ def loosened(
     columns: Sequence[Columns],
     fit: Joint,
 ) -> Joint:
-    """Return the fit with its covariance widened for free nonlinear parameters; `columns` are the model's."""
+    """Return the fit with its covariance widened for free nonlinear parameters.
+
+    `columns` are the columns of the model's pieces.
+    """
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if not any(piece.point.rebuild and piece.point.cells for piece in pieces):
         return fit
@@ -63,7 +68,7 @@ def loosened(
 
 
 def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
-    """Yield the derivative of the residual by each nonlinear parameter, in units of its cell."""
+    """Yield the derivative of ``X b`` (b: coefficients) by each nonlinear parameter, per grid cell."""
     if piece.point.rebuild is None:
         return
     values = [value for value, _ in piece.point.shape.values()]
@@ -78,9 +83,10 @@ def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
 
 
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
-    """Return the calibration with the effects of `model` added, at the values and covariance of `fit`.
+    """Return the calibration with the effects of `model` added, with values and covariance of `fit`.
 
-    Of errors of the reference only a constant bias is kept, as the reference's.
+    A constant error of the reference becomes the bias of the calibration's reference. Its other errors are
+    not part of the calibration.
     """
     calibration, q = problem.calibration, len(problem.centre)
     widths = np.concatenate([np.empty(0), *(candidate.width for candidate in model)])
@@ -119,9 +125,10 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
 
 
 def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list[int]]:
-    """Return the calibration without the rates and delays that worsen the live correction, and their places.
+    """Return the calibration without rates and delays that worsen the live correction, and their indices.
 
-    Live, a rate is a backward difference, which is mostly noise if the vehicle sways from sample to sample.
+    The live correction computes a rate as a backward difference, which is mostly noise if the vehicle sways
+    from sample to sample.
     """
     dropped: list[int] = []
     # Greedy: each rate is dropped if the residual with live differences is smaller without it
@@ -135,12 +142,12 @@ def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list
 
 
 def _power(survey: Survey, calibration: Calibration) -> float:
-    """Return the mean square of the residual over the new samples, nT², corrected as the bridge would."""
+    """Return the mean square residual of the new samples, nT², with the live correction."""
     return float(np.mean(residuals_of(*samples_of(survey, calibration))[~survey.learned] ** 2))
 
 
 def without_effects_at(calibration: Calibration, places: Sequence[int]) -> Calibration:
-    """Return the calibration without the effects at some places; other places may hold equal ones."""
+    """Return the calibration without the effects at these indices."""
     if not places:
         return calibration
     # Coefficients stand in the order of terms, then effects
@@ -159,10 +166,10 @@ def without_effects_at(calibration: Calibration, places: Sequence[int]) -> Calib
 def relinearised(
     problem: Problem, model: Sequence[Candidate], fit: Joint
 ) -> tuple[Problem, list[Columns], Joint]:
-    """Fit again about the extended calibration until the linear model predicts the nonlinear residual.
+    """Refit about the extended calibration until the linear model predicts the nonlinear residual.
 
-    Returned are the problem linearised at the last point, the columns of the model's pieces there, and the
-    fit. Rates of change keep the central differences of the search.
+    Return the problem linearised at the last point, the columns of the model's pieces there, and the fit.
+    Rates of change are computed as in the search, not as in the live correction.
     """
     ridge, order, blocks = fit.prior[len(fit.z) :], fit.noise.past.order, fit.noise.uneven
     # The calibration as given is the point that a step which overshoots is halved towards
@@ -194,7 +201,7 @@ def relinearised(
 
 
 def _cost(residual: FloatArray, fit: Joint, problem: Problem) -> float:
-    """Return the negative log posterior of a nonlinear residual (n,), nT, under the noise of `fit`."""
+    """Return the negative log posterior of a nonlinear residual (n,), nT, with noise and prior of `fit`."""
     noise, c = fit.noise, np.append(fit.z, fit.coefficients)
     centre = np.append(problem.centre, np.zeros(len(c) - len(problem.centre)))
     x2 = noise.whiten(residual) ** 2 / noise.kappa
@@ -203,13 +210,13 @@ def _cost(residual: FloatArray, fit: Joint, problem: Problem) -> float:
 
 
 def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
-    r"""Return the fit with the error of idealised regressors added to the covariance.
+    r"""Return the fit with errors of idealised regressors added to the covariance.
 
     Notes
     -----
-    A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. A
-    regressor that is off by a share :data:`~.evidence.IDEAL` of it leaves a misfit of unknown shape, of the
-    power ``IDEAL^2 W / MODES`` in every direction, where the data's whitened noise has 1:
+    A cause of Wald's statistic ``W = b^T C_bb^-1 b`` has a signal of the whitened norm ``sqrt(W)``. If its
+    regressor is wrong by the fraction :data:`~.evidence.IDEAL`, a misfit of unknown shape remains. Its power
+    is ``IDEAL^2 W / MODES`` in every direction, where the whitened noise has 1:
 
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
@@ -222,7 +229,7 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
 
 
 def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
-    """Return the problem and a column block for each piece of the model, linearised at `fit`."""
+    """Return the problem, and the columns of each piece of the model, linearised at `fit`."""
     # Residual and derivatives of the extended calibration's own equations
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
@@ -265,5 +272,5 @@ def _counts(calibration: Calibration) -> list[int]:
 
 
 def _counts_of(effects: Sequence[Effect], calibration: Calibration) -> list[int]:
-    """Return the number of regressors of each of the effects."""
+    """Return the number of regressors of each of these effects."""
     return [effect.columns(calibration.reference.field).shape[1] for effect in effects]

@@ -1,14 +1,16 @@
-r"""The improvement of an extended calibration: the corrector's own output on samples outside the fit.
+r"""The improvement by an extended calibration, measured on the corrected field of held-out samples.
 
 Notes
 -----
-The log is divided into folds of whole dives, runs or eighths. A calibration that is fitted to the other folds
-corrects each fold with :func:`magbridge.calibration.correct.correct`. The calibration as given, refitted in
-the same way without any cause, is the comparison.
+The log is divided into folds of whole dives, runs or eighths. Each fold is corrected by
+:func:`magbridge.calibration.correct.correct` with a calibration that is fitted to the other folds. For
+comparison, the calibration as given is refitted in the same way without any cause.
 
-An extension is refused where the linear model's held-out prediction and the corrected field differ by more
-than the noise, where it moves the corrected field further than the calibration's covariance allows and the
-log determines, and where the held-out field does not improve.
+An extension is refused for one of three reasons:
+
+- the linear model's held-out prediction and the corrected field differ by more than the noise;
+- the corrected field moves further than the given covariance allows, where the log does not determine it;
+- the held-out field becomes worse.
 """
 
 from __future__ import annotations
@@ -48,39 +50,39 @@ if TYPE_CHECKING:
 TIGHTENING = (1.0, 0.3, 0.1)
 """Factors on the prior sigma of the calibration's coefficients that are tried until an extension passes."""
 MAX_DEPARTURE_SIGMA = 4.0
-"""Most that a corrected sample may move where the log does not determine it, in sigmas as given."""
+"""Largest move of a corrected sample that the log does not determine, in sigmas of the given calibration."""
 DETERMINED = 0.25
 """Fraction of a sample's prior variance below which the log determines that sample's corrected field."""
 DOMAIN_TURN_DEG = 10.0
 """Angle by which the attitudes of the log are turned to probe the calibration's domain, degrees."""
 MAX_DOMAIN_SAMPLES = 1500
-"""Most samples at which the domain is probed."""
+"""Largest number of samples, with turned ones, at which the domain is probed."""
 MAX_FRACTION_OUTSIDE = 0.01
 """Fraction of the probes that may exceed the limit."""
 MAX_CHECKED_ROWS = 20_000
-"""Most rows of a log that are corrected with the written file."""
+"""Largest number of rows of a log that are corrected with the written file."""
 MAX_RATIO = 1.02
-"""Upper end of the interval of the RMS ratio, from which the corrected field may become worse."""
+"""Largest upper end of the interval of the RMS ratio; above it the corrected field may have become worse."""
 MAX_PROMISE_RATIO = 1.1
-"""Ratio of the corrected field's held-out RMS to the linear prediction from which the two disagree."""
+"""Largest ratio of the corrected field's held-out RMS to the linear prediction."""
 
 
 @dataclass(frozen=True, eq=False)
 class Extension:
-    """An extended calibration with the errors of the fields that it corrects."""
+    """An extended calibration with its fit, its held-out errors, and the result of the checks."""
 
     calibration: Calibration
-    """Extended calibration, or the one as given where the extension is refused."""
+    """Extended calibration, or the given one if every extension is refused."""
     problem: Problem
-    """Comparison, linearised at the extended calibration."""
+    """Problem linearised at the extended calibration."""
     columns: tuple[Columns, ...]
-    """Columns of the causes in that problem."""
+    """Columns of the causes' pieces in `problem`."""
     fit: Joint
     """Joint fit at the extended calibration."""
     error: FloatArray
-    """Corrected field less reference (n,), nT, each sample by a calibration that was not fitted to it."""
+    """Held-out error (n,), nT: corrected field less reference."""
     reference_error: FloatArray
-    """Error (n,) of the reference by its named causes, nT, fitted without the sample."""
+    """Held-out error (n,) of the reference by its named causes, nT."""
     sigma: FloatArray
     """Stated sigma (n,) of the corrected field, nT."""
     score: float
@@ -88,13 +90,13 @@ class Extension:
     day_error: FloatArray | None = None
     """Like `error`, with whole days left out; None for a log of one day."""
     refused: str = ""
-    """Code of the reason for a refusal; empty where the extension stands."""
+    """Code of the reason for a refusal; empty if the extension is accepted."""
     details: tuple[float, float] = (0.0, 0.0)
-    """Expected and found value behind the refusal, nT."""
+    """Allowed and actual value of the check that refused the extension, nT."""
 
 
 def corrected(survey: Survey, calibration: Calibration) -> CorrectedArrays:
-    """Return the samples of a survey, corrected as ``magbridge correct`` does."""
+    """Return the corrected samples of a survey, as ``magbridge correct`` computes them."""
     return correct(calibration, survey.field, survey.values(calibration.channels), survey.time)
 
 
@@ -106,8 +108,9 @@ def extension_of(
 ) -> Extension:
     """Extend the calibration by the causes of a model; without a model, refit its own coefficients.
 
-    `counts` (n,) are the samples by which the improvement is measured. Returned is the first attempt, each
-    with a tighter prior than the one before, that passes all checks; or else the first, with its refusal.
+    `counts` (n,) are the samples by which the improvement is measured. Attempts with ever tighter priors are
+    made. Return the first one that passes all checks, else the first attempt with its refusal and the given
+    calibration.
     """
     first = None
     for factor in TIGHTENING:
@@ -127,7 +130,7 @@ def attempt(
     counts: BoolArray,
     factor: float = 1.0,
 ) -> Extension:
-    """Extend the calibration with its prior sigma multiplied by `factor`, and check the result."""
+    """Return the extension with the calibration's prior sigma multiplied by `factor`, and its checks."""
     if factor < 1.0:
         ridge, start = fit.prior[len(fit.z) :], np.append(factor * fit.z, fit.coefficients)
         problem = tightened(problem, factor)
@@ -170,7 +173,7 @@ def attempt(
 def _held_out_error(
     problem: Problem, model: Sequence[Candidate], fit: Joint, held: HeldOut, dropped: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return held-out errors (n,), nT: of the corrected field, and as predicted for the reference."""
+    """Return the held-out errors (n,), nT, of the corrected field and of the reference by its causes."""
     q, survey = len(fit.z), problem.survey
     # Each fold is corrected by a calibration that was fitted to the others
     error, reference_error = np.zeros(len(problem)), np.zeros(len(problem))
@@ -189,7 +192,7 @@ def _held_out_error(
 def _refusal(
     problem: Problem, extension: Extension, held: HeldOut, counts: BoolArray, dropped: bool
 ) -> tuple[str, tuple[float, float]]:
-    """Return the code of the reason why an extension is refused, empty if it is not, and the two values."""
+    """Return the code of the reason for a refusal, or empty, and the allowed and actual value, nT."""
     noise = float(np.median(extension.fit.noise.scale))
     # The corrector cannot undo the axes' delays, which the linear model takes out
     linear = held.residual + extension.problem.delay_jacobian @ extension.fit.z[DELAYS]
@@ -213,8 +216,8 @@ def _refusal(
 def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
     """Return the limit and the value of the largest undetermined move of the corrected field, nT.
 
-    It is evaluated at the log's attitudes and at those turned by :data:`DOMAIN_TURN_DEG` about each axis,
-    with the calibration's own coefficients alone: the effects of the causes are not limited.
+    The move is evaluated at the log's attitudes, and at these turned by :data:`DOMAIN_TURN_DEG` about each
+    axis. Only the calibration's own coefficients count: the effects of the causes are not limited.
     """
     calibration = problem.calibration
     own, K = _own_part(calibration, extension.calibration), calibration.coefficients.size
@@ -237,7 +240,7 @@ def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
 
 
 def _turned(samples: ResidualSamples) -> ResidualSamples:
-    """Return samples with their readings, and these turned both ways about each axis of the sensor."""
+    """Return the samples seven times: as they are, and with readings turned both ways about each axis."""
     angle, readings = np.radians(DOMAIN_TURN_DEG), [samples.field]
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -260,10 +263,10 @@ def _turned(samples: ResidualSamples) -> ResidualSamples:
 def check_written(
     content: bytes, given: Calibration, datasets: Sequence[xr.Dataset], grid: AnomalyGrid | None
 ) -> tuple[float, float] | None:
-    """Read a written calibration back and correct the logs with it as ``magbridge correct`` does.
+    """Decode a written calibration and correct the logs with it, as ``magbridge correct`` does.
 
-    Returned are the RMS errors with the calibration as `given` and with the written one, nT, if the latter is
-    larger by more than the noise; else None. Of a long log :data:`MAX_CHECKED_ROWS` rows are corrected.
+    Return the RMS errors, nT, with the calibration as `given` and with the written one if the latter is
+    larger by more than the noise; else None. At most :data:`MAX_CHECKED_ROWS` rows of a log are corrected.
     """
     written = decode_calibration(content, "calibration.json")
     errors: dict[bool, list[FloatArray]] = {False: [], True: []}
@@ -294,9 +297,9 @@ def tightened(problem: Problem, factor: float) -> Problem:
 
 
 def with_level_variance(calibration: Calibration, variance: float) -> Calibration:
-    """Return the calibration with a variance, nT², of its corrected field's level added: ``C + v s s^T``.
+    """Return the calibration with a constant bias of `variance` v, nT², in its covariance: ``C + v s s^T``.
 
-    s are the coefficients that raise the corrected field by 1 nT at any attitude.
+    s is the change of coefficients that raises the corrected field by 1 nT at any attitude.
     """
     s = isotropic(calibration)
     return replace(calibration, covariance=calibration.covariance + variance * np.outer(s, s))
@@ -305,18 +308,19 @@ def with_level_variance(calibration: Calibration, variance: float) -> Calibratio
 def _excess_variance(
     problem: Problem, calibration: Calibration, error: FloatArray, parts: Sequence[BoolArray]
 ) -> float:
-    """Return the excess of the mean square held-out error (n,), nT, over the stated variance, largest part.
+    """Return the largest excess, nT², of the mean square held-out error over the stated variance.
 
-    The covariance of a fit counts noise alone, not the error of its model.
+    The excess is computed for each set of samples (n,) in `parts`; 0 is the smallest result. The covariance
+    of a fit contains noise alone, not the error of its model.
     """
     sigma = corrected(problem.survey, calibration).sigma
     return max(0.0, *(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any()))
 
 
 def map_error_variance(problem: Problem, model: Sequence[Candidate], fit: Joint) -> float:
-    """Return the mean square of half of a map's error, nT², if the calibration's own logs have the same map.
+    """Return the mean square of half of a map's error, nT², if the calibration's own logs are compared too.
 
-    The mean of the map's error may have gone into the calibration then; half of it is taken to be uncertain.
+    The calibration may have absorbed the mean of the map's error, of which half is assumed to be uncertain.
     """
     power = 0.0
     for candidate, place in zip(model, slices(model), strict=True):
@@ -327,17 +331,17 @@ def map_error_variance(problem: Problem, model: Sequence[Candidate], fit: Joint)
 
 
 def _own_part(given: Calibration, extended: Calibration) -> Calibration:
-    """Return the calibration as given with the coefficients that the extension moved, without new effects."""
+    """Return the given calibration with the refitted coefficients of the extension, without new effects."""
     K = given.coefficients.size
     return replace(given, coefficients=extended.coefficients[:K], covariance=extended.covariance[:K, :K])
 
 
 def level_change_variance(problem: Problem, extended: Calibration) -> float:
-    """Return the variance, nT², of the difference in level between this log and a later one.
+    """Return the variance, nT², of the difference in the reference's bias between this log and a later one.
 
-    A reference without the crustal field has another level in each log. Where the calibration's own
-    coefficients move the mean of the corrected field by m, beyond the sigma as given, each log has the
-    variance ``m^2 - sigma^2``, and the difference of two logs twice that.
+    A reference without the crustal field has another bias in each log. If the refitted coefficients move the
+    mean of the corrected field by m, more than the given sigma, the bias of a log has the variance
+    ``m^2 - sigma^2``. The difference of two logs has twice this variance.
     """
     fresh = ~problem.survey.learned
     given = corrected(problem.survey, problem.calibration)
@@ -349,7 +353,7 @@ def level_change_variance(problem: Problem, extended: Calibration) -> float:
 def fit_without(
     problem: Problem, model: Sequence[Candidate], left_out: Sequence[int], fit: Joint
 ) -> tuple[list[Candidate], Joint]:
-    """Return a model without the causes at some places, and its fit, about the calibration as given."""
+    """Return a model without the causes at indices `left_out`, and its fit about the given calibration."""
     others = [candidate for k, candidate in enumerate(model) if k not in left_out]
     own = slices(model)
     kept = np.delete(np.arange(fit.coefficients.size), np.r_[*(own[k] for k in left_out)])

@@ -128,8 +128,7 @@ def _lasting(fit: Joint, rows: IndexArray) -> bool:
 
 
 def _neighbours(fit: Joint, rows: IndexArray) -> float:
-    r"""Return the p-value of the samples before and after `rows` (k,) if they are good; 1 if none is
-    testable.
+    r"""Return the p-value of the samples next to `rows` (k,) if they are good; 1 if none is testable.
 
     Notes
     -----

@@ -176,7 +176,7 @@ class SearchState:
     def _information_under(
         self, noise: ResidualNoise, model: Sequence[Candidate], base: Joint, stride: int = 1
     ) -> Information:
-        """Return the information of candidates and `model` under a noise; `stride` as :func:`.information`."""
+        """Return the information of all candidates, then `model`, under the given noise."""
         columns = [*self.columns, *(candidate.columns for candidate in model)]
         return information(self.problem, noise, base, columns, stride=stride)
 
