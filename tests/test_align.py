@@ -1,4 +1,4 @@
-"""One time base: interpolation, ages, and a flag for everything that makes a sample doubtful."""
+"""Test the alignment: interpolation, ages, and a flag for each reason that makes a sample uncertain."""
 
 from __future__ import annotations
 

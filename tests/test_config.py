@@ -1,4 +1,4 @@
-"""bridge.toml: accepted settings, and the one-line message for every other."""
+"""Test bridge.toml: accepted settings, and a message of one line for every other."""
 
 from __future__ import annotations
 

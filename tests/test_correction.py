@@ -33,7 +33,7 @@ from magbridge.rows import correct_rows
 START, SECOND = 1_780_000_000_000_000, 1_000_000
 FIELD = (20_000.0, -1_000.0, 45_000.0)
 LINE, T_X = 3_000.0, 9 + 6
-"""nT along x that the mass makes at 1 in, and the coefficient's place: monomial 1, slot 6."""
+"""Field along x by the mass at 1 in, nT, and index of its coefficient: monomial 1, slot 6."""
 
 
 @pytest.fixture

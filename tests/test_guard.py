@@ -1,4 +1,4 @@
-"""A reader that hangs, crashes or asks for all memory ends in one line; a whole file is read as ever."""
+"""Test that a reader that hangs, crashes or exhausts the memory ends in one line."""
 
 from __future__ import annotations
 

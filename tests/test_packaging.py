@@ -46,7 +46,7 @@ def test_systemd_finds_nothing_wrong_with_the_service(tmp_path: Path) -> None:
 
 
 MAX_EXPOSURE = 3.0
-"""Of ten, as `systemd-analyze security` computes it."""
+"""Maximum exposure of the service, of ten, by `systemd-analyze security`."""
 
 
 def test_the_service_is_confined() -> None:

@@ -26,7 +26,7 @@ GOOD = bridge_text("hmr2300", "", masses={"battpos": "in"})
 
 
 def of(*names: str) -> Calibration:
-    """Return a calibration that needs these parameters, in inches."""
+    """Return a calibration that needs the given parameters, in inches."""
     parameters = tuple(Parameter(name, "in", -1.0, 1.0, 0.0, 1.0) for name in names)
     terms = (Polynomial(exponents=((0,) * len(names),)),)
     return replace(identity(), sensor=CalibratedSensor("hmr2300"), parameters=parameters, terms=terms)

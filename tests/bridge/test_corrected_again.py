@@ -24,7 +24,7 @@ from magbridge.records import Channel, Quality
 from magbridge.rows import correct_rows
 
 KEPT = {"MB_AGE_BATTPOS": 3.0, "MB_SETTLE_TIME": 4.0, "MB_STALE_GROW": 20.0}
-"""Set over the link in an earlier run."""
+"""Parameters that an earlier run set over the link."""
 BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
 
 

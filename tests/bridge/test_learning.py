@@ -45,7 +45,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, li
 def test_what_was_learned_is_announced_and_named_in_every_message(
     flight: tuple[Path, Pipeline, list[tuple[int, bytes]]],
 ) -> None:
-    """The id changes when the learned calibration is published, both in MAG_FIELD and in MAG_STATUS."""
+    """The id in MAG_FIELD and MAG_STATUS changes when the bridge publishes the learned calibration."""
     folder, pipeline, sent = flight
     messages = received(sent)
     first = calibration_id(load(folder / "cal.json"))
@@ -90,7 +90,7 @@ def test_ashore_it_learns_what_it_learned_live(
 
 
 def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
-    """The command parameter returns to 0; the forgotten calibration is no longer published."""
+    """The command parameter returns to 0; the bridge no longer publishes the discarded calibration."""
     pipeline = bridge(tmp_path)
     station = Codec(255, 190)
     to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}

@@ -35,7 +35,7 @@ def bridge(folder: Path, start: StartEvent) -> Pipeline:
 
 
 def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
-    """20 samples/s, each 30 ms old on arrival; a mass that always moves, told at 5 Hz by the boot clock."""
+    """Yield events: 20 samples/s, 30 ms old on arrival, and telemetry of a moving mass at 5 Hz."""
     autopilot = Codec(1, 1)
     for k in range(begin, end):
         t_us = START + 50_000 * k

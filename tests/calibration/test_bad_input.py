@@ -29,7 +29,7 @@ def runs() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def good(runs: xr.Dataset, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A good log and its calibration."""
+    """Return a good log and its calibration."""
     folder = tmp_path_factory.mktemp("good")
     write(runs, folder / "runs.csv")
     assert main(["calibrate", str(folder / "runs.csv"), *PARAMETERS, "-o", str(folder / "cal.json")]) == 0

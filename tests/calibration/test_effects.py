@@ -52,7 +52,7 @@ def with_effect(effect: Effect, c: np.ndarray | None = None, of_p: np.ndarray | 
 def stepped(
     effect: Effect, time: np.ndarray, values: np.ndarray | None = None, field: np.ndarray | None = None
 ) -> np.ndarray:
-    """(n, r) regressors of the effect; its channel, or else the position, has these values."""
+    """Return the (n, r) regressors of an effect whose channel, or else whose position, has `values`."""
     n, cal = len(time), with_effect(effect, of_p=np.arange(1.0, 10.0))
     channels = {name: np.zeros(n) for name in cal.channels}
     if values is not None:
@@ -102,7 +102,7 @@ def test_every_effect_is_held_to_it() -> None:
 
 
 def test_a_lag_approaches_a_new_temperature_as_heat_stores_do() -> None:
-    """One store: 1 - exp(-t/L); two in series, of half the lag each: 1 - (1 + 2t/L) exp(-2t/L)."""
+    """A first-order lag gives 1 - exp(-t/L); two of half the lag in series 1 - (1 + 2t/L) exp(-2t/L)."""
     t = np.arange(0.0, 600.0, 5.0)
     warm = np.where(t > 0.0, 7.0, 5.0)
     one, two, none = (
@@ -148,7 +148,7 @@ SWEEP = np.concatenate(
 
 
 def test_backlash_is_a_loop_of_its_width() -> None:
-    """The load trails the drive by half the width; a motion within the play leaves it where it is."""
+    """The load trails the drive by half the width; a motion within the play does not move it."""
     slack = PlayEffect(cause="", channel="fin", width=0.4, centre=0.0, scale=1e6)
     t = np.arange(float(len(SWEEP)))
     behind = stepped(slack, t, SWEEP)[:, 0]
@@ -185,7 +185,7 @@ def test_functions_of_time() -> None:
 
 
 def test_the_rate_of_a_steadily_accelerating_field_is_exact() -> None:
-    """From three samples at any interval; a missing one is bridged, a long gap restarts the derivative."""
+    """The rate is from three samples at any interval; it skips a missing one and restarts after a gap."""
     t = np.array([0.0, 4.0, 7.0, 12.0, 16.0, 16.5, 90.0, 94.0, 98.0])
     a, b = np.array([300.0, -200.0, 50.0]), np.array([2.0, 1.0, -3.0])
     field = 2e4 + np.outer(t, a) + np.outer(t**2, b)

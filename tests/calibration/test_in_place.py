@@ -64,7 +64,7 @@ def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
 
 
 def test_crustal_field_is_not_taken_for_noise(survey: Survey) -> None:
-    """Amplitude and length are those of the crustal field, the noise is the sensor's."""
+    """The estimated amplitude and length are the crustal field's; the noise is the sensor's."""
     rock = survey[2].details["crustal_field"]
     assert 20.0 < rock["amplitude_nT"] < 100.0
     assert 300.0 < rock["length_m"] < 2000.0
@@ -85,7 +85,7 @@ def test_a_field_larger_than_any_crust_is_not_taken(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) -> None:
-    """The level is the reference's, with its sigma; independent parts stay."""
+    """The bias is the reference's, with its sigma; independent parts stay."""
     data, _, found = survey
     samples = pose(data, 3, None, None).samples
     doubted, believed = (
@@ -294,7 +294,7 @@ def test_offset_that_follows_the_temperature_is_found_and_written(lag: float) ->
 
 
 def test_temperature_that_moves_nothing_is_left_out(survey: Survey) -> None:
-    """A clean survey's calibration needs no temperature and knows of no creep, whatever the log holds."""
+    """A clean survey's calibration needs neither temperature nor drift, whatever telemetry the log has."""
     data, true, plain = survey
     water = 20.0 - 10.0 * np.abs(np.sin(data.time / 140.0))
     found = fit(slowly(replace(data, temperature=water)))
@@ -356,7 +356,7 @@ EARTH = np.array([21_000.0, 1_500.0, 43_000.0])
 
 
 def circles(disturbed: float) -> Observations:
-    """Return a flight in turns that crosses its own track, with motors that disturb it slowly."""
+    """Return a circling flight that crosses its own track, with slow disturbances by motors."""
     rng = np.random.default_rng(3)
     n = 600
     angle = np.linspace(0.0, 8.0 * np.pi, n)

@@ -38,7 +38,7 @@ def every(data: Observations, number: int) -> Observations:
 
 
 def test_the_claimed_sigma_does_not_depend_on_the_rate(line: Observations) -> None:
-    """Of the second half, corrected with the fit to the first one, at 3.3 and 1 Hz."""
+    """The sigma of the second half, corrected by a fit of the first half, is equal at 3.3 and 1 Hz."""
     sigmas = []
     for step in (3, 10):
         data = every(line, step)

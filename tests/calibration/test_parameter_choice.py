@@ -153,7 +153,7 @@ def copter(seed: int, n: int = 600, size: float = 800.0, memory: float = 0.97) -
 
 
 def test_auto_is_better_than_one_ellipsoid_where_the_first_part_differs() -> None:
-    """Fitted to the first half, tested on the second, of six logs."""
+    """Each method is fitted to the first half and tested on the second half of six logs."""
     squares = {"nominal": 0.0, "auto": 0.0}
     for seed in range(6):
         data = copter(seed, 1200)

@@ -150,7 +150,7 @@ def test_a_field_that_the_earth_does_not_have_is_reported(
 def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
     deployment: Path, command: Command
 ) -> None:
-    """As one of runs that all head one way; `calibrate` refuses it without --force."""
+    """The calibration is from runs that all head one way; `calibrate` refuses it without --force."""
     log = read(deployment)
     write(log.where((log["heading"] > 200.0) & (log["heading"] < 260.0), drop=True), "one_way.csv")
     fit = "calibrate", "one_way.csv", "--method", "nominal", "-o", "cal.json"
@@ -169,7 +169,7 @@ def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
 
 
 def test_correct_gives_the_same_in_pieces(deployment: Path, calibration: Path) -> None:
-    """A month is corrected in pieces: the state goes on from one to the next."""
+    """`correct` processes a month in pieces and passes the state from one to the next."""
     rows = read(deployment)
     whole = correct_rows(Correction(load_calibration(calibration)), rows)
     pieces = Correction(load_calibration(calibration))
@@ -244,7 +244,7 @@ def test_a_log_that_the_calibration_was_made_from_is_reported(deployment: Path, 
 
 
 def test_logs_of_one_name_are_all_remembered(deployment: Path, command: Command) -> None:
-    """As of two days, each in a folder of its own."""
+    """Two logs of equal name, of two days in two folders, are both recorded."""
     rows = read(deployment)
     for day, begin in (("one", 0), ("two", FEW)):
         Path(day).mkdir()

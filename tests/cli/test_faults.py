@@ -57,7 +57,7 @@ COMMANDS = {
 
 
 def binary(path: Path) -> None:
-    """Write a file of every byte."""
+    """Write a file that contains every byte value."""
     path.write_bytes(bytes(range(256)) * 40)
 
 

@@ -83,7 +83,7 @@ def test_a_vector_that_is_never_known_has_no_length() -> None:
 
 
 def test_what_moves_the_field_is_not_a_state_of_the_vehicle() -> None:
-    """Nor a counter, nor a statement that a value is valid."""
+    """Neither a counter nor a validity flag counts as a state of the vehicle."""
     names = {"pump": "A", "water": "degC", "supply": "V", "mast": "1", "speed": "m/s", "still": "A"}
     names |= {"MagValid": "1", "Counter": "1"}
     columns = {name: np.arange(9.0) ** 2 * (name != "still") for name in names}

@@ -186,7 +186,7 @@ def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Cali
 
 
 def test_a_place_is_in_metres_on_the_ellipsoid(plain: tuple[xr.Dataset, Calibration]) -> None:
-    """A sphere would be 56 m off in 10 km on the equator."""
+    """On a sphere, positions would be wrong by 56 m in 10 km at the equator."""
     ds, calibration = plain
     track = np.linspace([-5e3, 10e3], [5e3, -10e3], ds.sizes["time"])
     latitude, longitude = offset(0.0, 10.0, *track.T)

@@ -63,7 +63,7 @@ ELSEWHERE = {
 
 @pytest.mark.parametrize("name", [name for name in CAUSES if name not in ELSEWHERE])
 def test_a_hidden_effect_is_found_and_named(name: str) -> None:
-    """It is in the set of names where the ideal detector has it, with close imitations only."""
+    """The set of names holds the truth if the ideal detector's set does, with close imitations only."""
     row = blind("named", (name,), 12.0)
     (theory,) = row["theory"]
     assert row["verdict"] != "nothing_found"
@@ -81,7 +81,7 @@ def test_outliers_are_found() -> None:
     [*product(("white", "ar", "half"), [""]), *zip(("mixed", "heavy", "uneven", "map"), LOSSES, strict=True)],
 )
 def test_nothing_is_found_where_nothing_is(noise: str, losses: str) -> None:
-    """In noise of each kind; nor where samples are lost, and noise remembers longer than between gaps."""
+    """A log without an effect gives no finding, in each kind of noise and with lost samples."""
     assert blind("null", (), 0.0, noise, number=6, losses=losses)["verdict"] == "nothing_found"
 
 
@@ -132,7 +132,7 @@ def written(
 
 
 def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Path, str]) -> None:
-    """The contract's three files; the calibration is an ordinary one, and corrects the named effect."""
+    """The diagnosis writes three files; its calibration is an ordinary one that corrects the named effect."""
     ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"
@@ -163,7 +163,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
 
 
 def test_a_maps_error_is_reported_by_its_size(short: None) -> None:
-    """A hundred functions of the place say nothing to anyone; their RMS does."""
+    """The report states the RMS of a map's error instead of its hundred coefficients."""
     here = deployment.Background.of(deployment.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)
     diagnosis = diagnose([here.log(hidden.ds)], here.deployment.calibration).diagnosis

@@ -30,7 +30,7 @@ from magbridge.diagnose.problem import Problem, pose
 
 
 def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:
-    """Against the naive oracle: the density of the data with the prior integrated out."""
+    """Compare with the density of the data with the prior integrated out, computed naively."""
     rng = np.random.default_rng(1)
     X, width = rng.normal(size=(60, 5)), np.array([3.0, 1.0, 1.0, 0.3, 0.0])
     y = X @ np.array([2.0, -1.0, 0.5, 0.0, 0.0]) + rng.normal(size=60)
@@ -92,7 +92,7 @@ def followed(time: np.ndarray, x: np.ndarray, lag: float) -> np.ndarray:
 
 
 def test_a_slab_that_follows_a_temperature_is_described() -> None:
-    """Its centre's two slowest modes (Carslaw & Jaeger 1959, sec. 3.4), the water as dives change it."""
+    """The description has the centre's two slowest modes (Carslaw & Jaeger 1959, sec. 3.4), in real dives."""
     time = 4.0 * np.arange(5400.0)
     water = np.tanh(3.0 * np.sin(2.0 * np.pi * time / 5500.0)) + time / time[-1]
     core = followed(time, water, 1800.0) - followed(time, water, 200.0) / 3.0
@@ -132,7 +132,7 @@ def test_a_sensitivity_that_follows_a_channel_is_not_an_offset(
 def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
     problem: Problem, listed: list[Description]
 ) -> None:
-    """To 1 % of what a calibration's constants do not hold: the field hardly changes its size."""
+    """The functions hold a nonlinearity to 1 % of the part that a calibration's constants do not hold."""
     rows = slice(0, len(problem))
     (bend, more, _), (step, *_) = (
         CAUSES[name].candidates(problem) for name in ("nonlinearity", "offset_step")

@@ -113,7 +113,7 @@ def test_live_and_batch_agree_and_survive_the_file(
 def test_the_search_uses_the_models_own_derivative(
     effect: Effect, agreeing: Survey, calibration: Calibration
 ) -> None:
-    """What a coefficient leaves in the residual, against a difference of the whole model."""
+    """Compare a coefficient's derivative of the residual with a difference of the whole model."""
     problem = pose(agreeing, calibration)
     columns = effect_columns(problem, effect, regressors_of(agreeing, calibration, effect))(
         slice(0, len(agreeing))
@@ -158,7 +158,7 @@ def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibra
 def test_play_remembers_the_side(
     survey: Survey, calibration: Calibration, centre: float, scale: float
 ) -> None:
-    """Half the loop's width on either side: all the way if straight, else only near the steel."""
+    """The backlash shifts by half its width, in full on a straight way, else only near the steel."""
     effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=centre, scale=scale)
     phi = regressors_of(survey, calibration, effect)[0]
     p = survey.channels["p"].values
@@ -204,7 +204,7 @@ def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibratio
     ids=lambda v: v if isinstance(v, str) else v.cause,
 )  # fmt: skip
 def test_a_number_that_cannot_be_is_one_line(effect: Effect, line: str, calibration: Calibration) -> None:
-    """Edited by hand; a division by it would end the bridge in a traceback."""
+    """An impossible value from manual editing gives one line; division by it would crash the bridge."""
     extended = with_values(calibration, effect, np.zeros(effect.size))
     with pytest.raises(FormatError, match=re.escape(line)):
         decode_calibration(encode_calibration(extended))

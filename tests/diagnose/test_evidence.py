@@ -26,7 +26,7 @@ def sized(cause: str, size: int = 1, **more: object) -> Candidate:
 
 
 def test_evidence_asks_its_price() -> None:
-    """Of many ratios at once, or of one; where nothing is free there is none."""
+    """The evidence accepts many ratios or one; it is zero without free coefficients."""
     np.testing.assert_allclose(
         log_bayes(np.array([2.0, 3.0, 60.0]), 3), [0.0, 0.0, 28.5 - 1.5 * np.log(20.0)]
     )
@@ -62,7 +62,7 @@ def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: floa
 
 
 def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
-    """A free shape has a prior of its own: the evidence of a cause does not depend on it."""
+    """The evidence of a cause does not depend on a free shape, which has its own prior."""
     step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
     look_elsewhere = {"offset_step": 1.0, "map_error": 1.0}
     worth = log_odds(225.0, [step, chart], look_elsewhere, 25.0) - log_odds(

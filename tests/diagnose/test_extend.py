@@ -58,7 +58,7 @@ def test_what_is_hardly_seen_is_hardly_widened() -> None:
 
 
 def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
-    """Runs turn in five minutes, the survey in an hour; what the runs lost has gone into the gain."""
+    """Runs turn in five minutes, the survey in an hour; the gain has absorbed the runs' attenuation."""
     rng, tau = np.random.default_rng(5), 1.5
     leg, row = np.divmod(np.arange(1600), 100)
     learned = leg < 8
@@ -125,7 +125,7 @@ def test_a_rate_is_flown_with_where_a_difference_backwards_tells_it() -> None:
 
 
 def test_a_rate_that_is_noise_live_is_left_out() -> None:
-    """A sway of two and a half samples."""
+    """A sway with a period of two and a half samples is noise in a live rate of change."""
     survey, calibration = skewed(right(300), 10.0)
     calm, dropped = flyable(survey, calibration)
     assert dropped == [0]

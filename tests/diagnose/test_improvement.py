@@ -83,7 +83,7 @@ def test_what_the_calibration_would_have_to_become_counts_against_it(problem: Pr
 
 
 def test_what_acts_in_one_dive_only_is_not_a_surprise_that_counts_against_it(problem: Problem) -> None:
-    """Its own dive is predicted with the prior's uncertainty, not with a zero that it contradicts."""
+    """The prediction of the only dive with an effect has the prior's uncertainty, not a contradicted zero."""
     once = (problem.survey.dive == 2).astype(float)[:, None]
     columns = [lambda rows: 10.0 * once[rows]]
     posed = replace(problem, residual=problem.residual + 6.0 * once[:, 0])
@@ -105,7 +105,7 @@ def test_a_level_that_moved_beyond_its_sigma_may_move_as_much_again(
 
 
 def test_what_a_calibration_learned_from_a_log_does_not_count_twice() -> None:
-    """Freed from that, it shows a filter's attenuation in the turns, most of which it has absorbed."""
+    """With the calibration's own fit projected out, the log shows a filter's attenuation in the turns."""
     ds = segments(simulate(load("demo"), 2))["calibration"]
     calibration = fit(observations(ds, ("battpos", "ballast")), "auto").calibration
 

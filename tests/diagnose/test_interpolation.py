@@ -79,7 +79,7 @@ def test_channels_taken_at_once_have_none() -> None:
 
 
 def test_delays_that_are_not_there_leave_a_skew_its_power() -> None:
-    """But where noise looks like them."""
+    """A skew keeps its power if there are no delays, except if noise resembles them."""
     whole = right(3000)
 
     def power(of: Problem) -> float:
@@ -104,7 +104,7 @@ MASS_CAUSES = ("clock_offset", "filter_lag", "actuator_order", "hysteresis", "te
 
 
 def flight(delay: float, cubic: float, seed: int) -> xr.Dataset:
-    """A log of a mass that moves now and then: its telemetry is late, and its iron acts with its cube."""
+    """Return a log with a mass that moves rarely: late telemetry, and an iron effect with its cube."""
     rng, n = np.random.default_rng(seed), 1500
     time = INTERVAL_S * np.arange(n)
     stops = np.cumsum(rng.uniform(120.0, 300.0, 60))

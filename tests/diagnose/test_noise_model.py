@@ -127,7 +127,7 @@ ROWS, LAG, CELL = 300, 60.0, 40.0
 
 
 def decay(lag: float) -> Candidate:
-    """A decay of unknown amplitude and lag."""
+    """Return a decay of unknown amplitude and lag."""
     x = np.exp(-np.arange(ROWS) / lag)
     return candidate("made", x, point=GridPoint({"lag": (lag, "s")}, decay, cells=(CELL,)))
 
@@ -143,7 +143,7 @@ def fitted(problem: Problem, *model: Candidate) -> Joint:
 
 
 def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Problem) -> None:
-    """Against the inverse of the whole information, with the derivative by the lag as one more column."""
+    """Compare with the inverse of the full information, with the derivative by the lag as a column."""
     one = decay(LAG)
     fit = fitted(problem, one)
     t = np.arange(ROWS)

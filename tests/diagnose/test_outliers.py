@@ -89,7 +89,7 @@ def test_next_to_a_gap_a_sample_has_no_neighbour() -> None:
 
 @pytest.mark.parametrize(("shape", "isolated"), [(SPIKE, True), (PULSE, False)])
 def test_a_diagnosis_names_isolated_samples_only(shape: np.ndarray, isolated: bool) -> None:
-    """Beside others that are off it says that something was there for a moment."""
+    """If other samples are wrong too, the diagnosis reports a passing source."""
     calibration, survey = demo().calibration, demo().survey.copy()
     off = np.zeros(survey.sizes["time"])
     for row in (200, 900):

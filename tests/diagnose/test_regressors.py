@@ -98,7 +98,7 @@ def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(share: float)
 
 
 def test_a_rate_of_change_holds_a_turn_of_a_few_samples() -> None:
-    """Six of them: a difference both ways lacks a sixth."""
+    """The turn has six samples: a central difference would lose a sixth of the rate."""
     whole = right(300)
     phase = 2.0 * np.pi * np.arange(len(whole))[:, None] / 6.0 + np.arange(3.0)
     survey = replace(whole.survey, field=2e4 * np.sin(phase))
@@ -109,7 +109,7 @@ def test_a_rate_of_change_holds_a_turn_of_a_few_samples() -> None:
 
 
 def test_a_second_derivative_is_that_of_a_turn() -> None:
-    """Of 30 samples; in a leg of its own, whose ends have none."""
+    """The turn has 30 samples; in a separate leg, the ends have no second derivative."""
     survey = right(300).survey
     phase = 2.0 * np.pi * np.arange(len(survey)) / 30.0 + np.arange(3.0)[:, None]
     found = rates(survey, 2e4 * np.sin(phase), 2)
@@ -169,7 +169,7 @@ def test_a_mass_that_moves_within_one_interval_is_seen_by_a_shift(problem: Probl
 
 
 def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Problem) -> None:
-    """Between the calibration's own logs and these there has been one, too."""
+    """A power cycle has also occurred between the calibration's logs and these logs."""
     t = problem.survey.time
     learned = replace(problem.survey, learned=np.arange(len(t)) < 100, cycles=t[[300]])
     grid = OffsetStep().candidates(replace(problem, survey=learned))

@@ -102,7 +102,7 @@ def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> 
 
 
 def test_the_command_reports_what_the_improvement_was_measured_on() -> None:
-    """And no improvement where nothing was added: 1.14 -> 1.14 nT would read as one that failed."""
+    """The command reports no improvement if no cause was added: 1.14 -> 1.14 nT would look like a failure."""
     one = {
         "cause": "clock_offset",
         "channel": None,
@@ -147,7 +147,7 @@ def test_a_cause_of_unusual_size_is_questioned() -> None:
 
 
 def test_a_constant_of_the_reference_is_one_at_any_attitude() -> None:
-    """Whatever the sensor's scales, which differ from channel to channel."""
+    """The constant is independent of the scales, which differ between the sensor's channels."""
     problem = replace(right(100), reference_jacobian=np.linspace(0.9, 1.1, 100))
     bias = CAUSES["reference_bias"].candidates(problem)[0]
     named = Hypothesis(bias, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)
@@ -156,7 +156,7 @@ def test_a_constant_of_the_reference_is_one_at_any_attitude() -> None:
 
 
 def test_names_that_gain_nothing_explain_only_in_part() -> None:
-    """As where a survey is diagnosed with the calibration that was fitted to it."""
+    """An example is a survey diagnosed with the calibration that was fitted to it."""
     candidate = CAUSES["reference_bias"].candidates(right(100))[0]
     named = [Hypothesis(candidate, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)]
     improvements = [Improvement(588.1, 587.3, 0.999, (0.863, upper)) for upper in (1.021, 0.999)]
@@ -257,7 +257,7 @@ def test_what_is_not_in_the_schema_is_refused(clear: Diagnosis) -> None:
 
 @pytest.mark.parametrize("name", ["named", "contested", "nothing", "rest"])
 def test_the_report_says_what_the_assessment_holds(clear: Diagnosis, name: str) -> None:
-    """Answer, and each reason and note, word by word; the answer stands before the first section."""
+    """The report holds the summary, each reason and each note; the summary precedes the first section."""
     diagnosis = variants(clear)[name]
     facts = json.loads(findings_json(assess(diagnosis)))["assessment"]
     page = unescape(page_of(diagnosis)).replace("\N{NO-BREAK SPACE}", " ")

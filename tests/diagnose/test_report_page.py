@@ -124,7 +124,7 @@ def test_every_cause_has_a_meaning() -> None:
 
 
 def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
-    """Its sizes would all read as infinite."""
+    """The sizes of an undetectable cause would all be infinite."""
     report = clear.isolability
     gone = report.visible[0]._replace(sizes={"x": (np.inf, "nT")})
     blind = replace(clear, isolability=replace(report, visible=(gone, *report.visible[1:])))
@@ -156,7 +156,7 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
 
 
 def test_wrong_samples_alone_promise_no_gain(clear: Diagnosis) -> None:
-    """They are left out of every RMS, and nothing is added that could gain."""
+    """Every RMS excludes wrong samples, and no effect is added that could improve it."""
     wrong = Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0, lasting=False)
     alone = replace(clear, findings=(), wrong=wrong, verdict="explained")
     page = page_of(alone)

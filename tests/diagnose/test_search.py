@@ -83,7 +83,7 @@ def test_a_further_cause_must_predict_better_than_a_free_description() -> None:
 
 
 def test_what_nature_cannot_do_is_the_vehicles() -> None:
-    """Of two causes of one shape the reference takes no more than a usual error of it."""
+    """Of two causes of one shape, the reference explains at most its usual error."""
     rng = np.random.default_rng(1)
     n = 600
     x = np.linspace(-1.0, 1.0, n)
@@ -152,7 +152,7 @@ def test_a_name_is_asserted_possible_or_ruled_out() -> None:
 
 
 def test_dives_left_out_overrule_a_name_that_fits() -> None:
-    """For any prior: a name that only resembles the truth predicts less than a description."""
+    """For any prior, a name that only resembles the truth predicts less well than a description."""
     problem, rng = right(ROWS), np.random.default_rng(10)
     bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
     problem = replace(problem, residual=bent + rng.normal(size=ROWS))

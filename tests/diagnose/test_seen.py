@@ -155,7 +155,7 @@ TRACKS: dict[str, FloatArray] = {
 
 
 def flown_twice(north: FloatArray) -> Returns:
-    """Return the known positions of a track of four hours along a meridian, m."""
+    """Return the positions (m) of a track along a meridian of four hours, there and back."""
     survey = replace(
         right(ROWS).survey,
         time=T0 + 14400.0 * ALONG,
@@ -187,7 +187,7 @@ def test_only_returns_at_several_times_tell_place_from_time() -> None:
 
 @pytest.mark.parametrize("name", TRACKS)
 def test_the_share_is_what_no_function_of_the_place_imitates(name: str) -> None:
-    """By brute force: of all trends with a bend the one that the cells' means explain best."""
+    """Compare with all trends with a bend: the fraction is that of the trend that cell means explain best."""
     cell = np.floor(TRACKS[name] / 250.0)
     G = (cell[:, None] == np.unique(cell)).astype(float)
     least = np.inf

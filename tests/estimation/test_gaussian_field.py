@@ -1,4 +1,4 @@
-"""The Gaussian field and its normal equations, compared with dense algebra and Laplace's equation."""
+"""Test the Gaussian field and its normal equations against dense algebra and Laplace's equation."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: 
 
 @pytest.mark.parametrize("rho", [0.0, 0.4, 0.99])
 def test_sums_are_those_of_the_whitened_samples_however_they_are_cut(rho: float) -> None:
-    """A gap in the log, one just where a piece ends, and a sample alone."""
+    """The pieces have a gap, a gap at a boundary between pieces, and a single sample."""
     rng = np.random.default_rng(4)
     V, B = rng.normal(size=(12, 3)), rng.normal(size=(12, 5))
     follows = np.ones(12, bool)

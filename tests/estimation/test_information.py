@@ -1,4 +1,4 @@
-"""Gaussian information against naive oracles: dense integrals by scipy, and least squares by numpy."""
+"""Test Gaussian information against dense integrals by scipy and least squares by numpy."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_course_changes_once_it_is_measured() -> None:
 
 
 def test_size_of_a_change_is_that_of_its_effect() -> None:
-    """A change that alternates by 2 about 5."""
+    """The change alternates by 2 about 5."""
     kalman, test = KalmanFilter(np.zeros(1), np.zeros((1, 1))), SequentialTest([False], 1)
     for k in range(200):
         kalman.innovate(5.0 + 2.0 * (-1.0) ** k, np.zeros(1), 0.01)

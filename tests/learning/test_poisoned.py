@@ -59,7 +59,7 @@ def test_another_sheet_for_a_while_is_not_learned() -> None:
 
 
 def test_a_month_without_a_fix_changes_nothing() -> None:
-    """It is reported once, and the published calibration stays."""
+    """The bridge reports the missing fix once and keeps the published calibration."""
     known = calibration()
     learner, world = Learner(known), World(known, 600)
     learn(learner, world)
@@ -89,7 +89,7 @@ def test_a_spoofed_current_is_not_learned_from() -> None:
 
 
 def test_a_map_in_other_units_is_reported() -> None:
-    """Ten times too strong: the map is named, and the first calibration is published."""
+    """The map is ten times too strong: the report names it, and the first calibration is published."""
     known, n = calibration(), 600
     world, learner = World(known, n), Learner(known, grid=grid_of(10.0, 1000.0), spread=20.0)
     doubted = learn(learner, world)

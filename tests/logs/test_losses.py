@@ -1,4 +1,4 @@
-"""Bad rows of a log are dropped, counted and named, and the rest is read as without them."""
+"""Test that bad rows are dropped, counted and named, and the other rows are read as without them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text files of other instruments and loggers: units, sensors, validity and clocks are found and reported."""
+"""Test other instruments' text files: units, sensors, validity and clocks are found and reported."""
 
 from __future__ import annotations
 

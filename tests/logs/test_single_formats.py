@@ -1,4 +1,4 @@
-"""Properties of single formats: their layout, their limits, and files of other programs."""
+"""Test properties of single formats: their layout, their limits, and third-party files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text files of other programs: separators, times, headings, units, and declared columns."""
+"""Test third-party text files: separators, times, headings, units, and declared columns."""
 
 from __future__ import annotations
 

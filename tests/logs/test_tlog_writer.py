@@ -1,4 +1,4 @@
-"""Writing tlogs: rotation, full and stalled disks, loss of power."""
+"""Test the writing of tlogs: rotation, full and stalled disks, loss of power."""
 
 from __future__ import annotations
 

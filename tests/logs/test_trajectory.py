@@ -1,4 +1,4 @@
-"""netCDF by its meaning: each shape as its programs write it, made here, and compared with xarray."""
+"""Test netCDF files with different layouts of third-party programs, compared with xarray."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def flown(along: str, **names: str) -> Variables:
 
 CAPITALS = {name: name.upper() for name in flown("x")}
 DAYS = 7305.0 + (T0 + 10.0 * np.arange(N)) / 86_400.0
-"""Since 1950."""
+"""Times, days since 1950."""
 NANOSECONDS = ((T0 + 10.0 * np.arange(N)) * 1e9).astype("i8")
 NORTH = {"standard_name": "latitude", "units": "degree_north"}
 SHAPES: dict[str, tuple[dict[str, int], Variables]] = {

@@ -1,4 +1,4 @@
-"""The XML, the generated table, and pymavlink's own classes say the same."""
+"""Test that the XML, the generated table and pymavlink's classes agree."""
 
 from __future__ import annotations
 

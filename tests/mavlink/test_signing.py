@@ -1,4 +1,4 @@
-"""Signatures: both ways with pymavlink, and the forged packet from the future."""
+"""Test signatures in both directions with pymavlink, and a forged frame from the future."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ BEAT = Codec(1, 1).pack("HEARTBEAT", type=12)
 
 
 def logged(codec: Codec, *chunks: bytes) -> list[bytes]:
-    """The frames that the log gets."""
+    """Return the frames that the log receives."""
     frame_log, frames = FrameLogWriter(1, 191), []
     for data in chunks:
         frames += frame_log.frames(codec.parse(data), codec.pending)

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this co
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 FLAGS = int(Quality.STALE_TELEMETRY | Quality.GAP)
 PATIENCE = 20_000
-"""ms that a loaded computer may take to show something."""
+"""Time limit for the page on a busy computer, ms."""
 
 
 SPIKES = 150, 200, 250

@@ -27,22 +27,22 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
 PATIENCE = 30_000
-"""ms that a loaded computer may take to show something."""
+"""Time limit for the page on a busy computer, ms."""
 HZ = 20
 LAT, LON, FIELD = 49.52, -57.87, 51_900.0
-"""deg, deg, nT: a place, and how strong the Earth's field is there."""
+"""Latitude and longitude of a place, deg, and strength of the Earth's field there, nT."""
 SHIFT = np.array([14.0, -11.0, 13.0])
-"""nT, by which the offset has changed since the calibration."""
+"""Change of the offset since the calibration, nT."""
 
 
 class Turning:
-    """The field that a vehicle reads which turns and pitches, nT; the Earth's can be made stronger."""
+    """Source of the readings of a turning and pitching vehicle, nT; `level` adds to the Earth's field."""
 
     def __init__(self) -> None:
         self.level, self._samples, self._rng = 0.0, count(), np.random.default_rng(2)
 
     def __call__(self, _: float) -> tuple[float, float, float]:
-        """Read the next sample."""
+        """Return the reading of the next sample."""
         leg = next(self._samples) // 20
         yaw = 0.7 * leg + 0.1 * self._rng.normal()
         pitch = (0.45 if leg % 2 else -0.4) + 0.05 * self._rng.normal()
@@ -55,7 +55,7 @@ class Turning:
 
 @pytest.fixture
 def flying(tmp_path: Path) -> Iterator[tuple[Rig, Turning]]:
-    """Fly a bridge that learns, until the test ends."""
+    """Run a bridge with in-flight calibration until the test ends."""
     more = f"[learning]\nenabled = true\nmax_rate = {HZ}.0\n"
     (folder := tmp_path / "rig").mkdir()
     rig, field, ended = Rig(folder, "udpin", more=more, hz=HZ), Turning(), threading.Event()
@@ -79,7 +79,7 @@ def flying(tmp_path: Path) -> Iterator[tuple[Rig, Turning]]:
 
 
 def press(button: Locator, answer: Locator) -> None:
-    """Press a button until it is answered: on a stalled computer the page may be loading again."""
+    """Press a button repeatedly until the page reacts, because a stalled computer may reload the page."""
     for _ in range(3):
         button.click()
         with suppress(playwright.TimeoutError):

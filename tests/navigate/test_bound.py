@@ -1,4 +1,4 @@
-"""The posterior Cramér-Rao bound, where it is known in closed form."""
+"""Test the posterior Cramér-Rao bound in cases with a closed form."""
 
 from __future__ import annotations
 

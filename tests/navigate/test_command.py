@@ -1,4 +1,4 @@
-"""`magbridge navigate` as a user has it: a log or a plan, maps of every kind, and its output."""
+"""Test `magbridge navigate` with a log or a plan, with maps of every kind, and its output."""
 
 from __future__ import annotations
 

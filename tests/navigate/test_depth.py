@@ -1,4 +1,4 @@
-"""A map flown above a vehicle that dives below."""
+"""Test navigation on a map whose altitude is above a diving vehicle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The estimate's own rules: what a start forgets, when there are many hypotheses, how wide a search is."""
+"""Test the rules of the estimate: what a start resets, the number of hypotheses, the search width."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The navigator as a user has it: it finds the vehicle or reports that it has not; replays are equal."""
+"""Test that the navigator finds the vehicle or reports that it has not, and that replays are equal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Localisation without a map: the track is bent to where the field that it met repeats itself."""
+"""Test localisation without a map, which bends the track to repeat the measured field at crossings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One filter and many: against the equations written out, against each other, against brute force."""
+"""Test one filter and a bank against the written-out equations, each other, and brute force."""
 
 from __future__ import annotations
 

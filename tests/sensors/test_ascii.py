@@ -1,4 +1,4 @@
-"""Line protocols as the configuration describes them."""
+"""Test line protocols that the configuration describes."""
 
 from __future__ import annotations
 

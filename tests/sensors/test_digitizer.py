@@ -1,4 +1,4 @@
-"""The digitizer's frame, byte for byte as its description says."""
+"""Test the digitizer's frame, byte for byte, against its description."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An encoder is the inverse of its driver, within what the instrument resolves."""
+"""Test that an encoder is the inverse of its driver, to the resolution of the instrument."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RANGE = {"hmr2300": 200_000.0, "twinleaf": 100_000.0, "digitizer": 31_000.0, "as
 
 
 def pair(case: str) -> tuple[Driver, Encoder]:
-    """A driver and its instrument, started."""
+    """Return a driver and its emulated instrument, both started."""
     name, options, generation, _ = CASES[case]
     driver, encoder = open_driver(name, options), open_encoder(name, options, rate=20.0)
     if generation:

@@ -30,7 +30,7 @@ SIZE = {
     "eddy_current": 0.005,
     "outliers": 40.0,
 }
-"""Sizes that do about a nanotesla; 5 of its own unit where it is not listed."""
+"""Sizes that change the field by about 1 nT; other effects have the size 5 in their own unit."""
 DRAWN = {
     "temperature_offset": 129.2, "temperature_scale": 175.3, "offset_step": 156.4, "offset_drift": 115.3,
     "current_field": 92.01, "unmodelled_actuator": 141.9, "actuator_order": 41.53, "hysteresis": 46.32,
@@ -75,7 +75,7 @@ def effect(flight: Flight, clean: xr.Dataset, name: str, times: float = 1.0) -> 
 
 
 def imported(path: Path) -> list[str]:
-    """Modules that a file imports."""
+    """Return the modules that a file imports."""
     names = []
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):

@@ -29,7 +29,7 @@ SENSOR = "mag_tail"
 
 
 class Grid(NamedTuple):
-    """A simulated survey."""
+    """Simulated survey of a scalar magnetometer."""
 
     log: xr.Dataset
     truth: FloatArray

@@ -1,4 +1,4 @@
-"""Guihen's trials in Bonne Bay, flown by the twin."""
+"""Test the simulation of Guihen's trials in Bonne Bay."""
 
 from __future__ import annotations
 
