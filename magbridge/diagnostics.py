@@ -1,7 +1,8 @@
-"""Diagnostics: statements with a code for programs, values, and a text for people.
+"""Diagnostics: messages with a code for programs, values, and a text for people.
 
-Calibration, survey, diagnosis and navigation return codes with values; the text of each code stands here.
-The format of a number in a text is its number of significant digits; ``%`` writes a fraction in per cent.
+Calibration, survey, diagnosis and navigation return codes with values. This module has the text of each code.
+In a text, an integer as the format of a number is its count of significant digits; ``%`` writes a fraction in
+per cent.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ TRACK_TEXTS = {
     "own_track.little": "the field adds little to dead reckoning: the track has to come back to places it "
     "has met, before it has drifted by more than the field's length",
 }
-"""Texts of a localisation in the log's own survey."""
+"""Texts of a localisation in a map that is made from the same log."""
 
 SCALAR_TEXTS = {
     "scalar.lag": "{column} is {lag_s:.2f} s late (1-sigma {sigma_s:.1f} s): correct its clock",
@@ -121,7 +122,7 @@ SCALAR_TEXTS = {
     "scalar.heading_error": "{column} has a heading error of {effect_nT:.1f} nT (standard deviation)",
     "scalar.channel": "{channel} disturbs {column} by {effect_nT:.2f} nT (standard deviation)",
 }
-"""Texts of a scalar magnetometer."""
+"""Texts of the check of a scalar magnetometer."""
 
 DIAGNOSIS_TEXTS = {
     # Notes on one finding
@@ -227,7 +228,7 @@ DIAGNOSIS_TEXTS = {
 
 TEXTS = {**FIT_TEXTS, **TRACK_TEXTS, **SCALAR_TEXTS, **DIAGNOSIS_TEXTS}
 CONDITION_CODES = tuple(code.removeprefix("condition.") for code in TEXTS if code.startswith("condition."))
-"""Codes of objections that a condition removes, the weightiest first."""
+"""Codes of the reasons against use that a condition removes, the weightiest first."""
 
 
 ERRORS = {"unsupported_fit"}
@@ -235,12 +236,12 @@ ERRORS = {"unsupported_fit"}
 
 
 class Diagnostic(NamedTuple):
-    """A statement: a code for programs, and the values in its text."""
+    """A message: its code, and the values in its text."""
 
     code: str
     values: Mapping[str, Any] = {}
     about: str = ""
-    """Finding that it is about, where it stands away from that."""
+    """Name of the finding that the message is about, for a message outside of the finding; or empty."""
 
     @property
     def severity(self) -> str:
@@ -255,27 +256,27 @@ class Diagnostic(NamedTuple):
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Values that are numbers."""
+        """Values that are floating-point numbers, by name."""
         return {name: value for name, value in self.values.items() if isinstance(value, float)}
 
 
 class _Numbers(Formatter):
-    """Formatter whose format of a number is its count of significant digits, or ``%``."""
+    """Formatter with two more formats of a number: a count of significant digits, and ``%``."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Return a value as text."""
+        """Return a value as text in the format `format_spec`."""
         if format_spec == "%":
             return f"{100.0 * value:.0f} %"
         return number(value, int(format_spec)) if format_spec.isdigit() else format(value, format_spec)
 
 
 def write_text(code: str, **values: Any) -> str:
-    """Return the text of a code with its values."""
+    """Return the text of a code with its values filled in."""
     return _Numbers().format(TEXTS[code], **values)
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Write a number with significant digits and without an exponent: 1070, not 1.07e+03."""
+    """Return a number with so many significant `digits` and without an exponent: 1070, not 1.07e+03."""
     rounded = float(f"{value:.{digits}g}")
     if not rounded or not isfinite(rounded):
         return f"{rounded:g}"

@@ -1,4 +1,4 @@
-"""The assessment of a diagnosis: quantities, notes, and whether the extended calibration is fit for use."""
+"""The assessment of a diagnosis: quantities, notes, and the usability of the extended calibration."""
 
 from __future__ import annotations
 
@@ -32,30 +32,30 @@ from magbridge.diagnostics import CONDITION_CODES, Diagnostic, number, write_tex
 from magbridge.estimation.residual import residuals, residuals_of, rms
 
 CANCEL = 0.7
-"""Two causes cancel each other where their sum is less than this share of the larger one."""
+"""Ratio of the RMS of two causes' sum to that of the larger cause, below which they cancel each other."""
 IMPLAUSIBLE_MULTIPLE = 5.0
 """Multiple of its plausible size above which a cause is implausible."""
 SLOWLY = 0.9
-"""Fraction of its power that a trend and a curvature over the log explain, for a cause to be called slow."""
+"""Least fraction of a slow cause's power that a parabola over the log explains."""
 DOUBTS = ("contested", "random_walk", "implausible_amplitude", "no_improvement")
-"""Codes of notes that are reasons against the use of an extended calibration."""
+"""Codes of notes on findings that are reasons against the use of the extended calibration."""
 Fitness = Literal["yes", "conditional", "no"]
 Reason = Literal[
     "held_out_and_other_day", "one_condition", "nothing_added", "not_needed", "reference_only", "refused",
     "no_improvement", "refit_as_good",
 ]  # fmt: skip
-"""Code of the reason for the answer."""
+"""Code of the reason for a verdict of :data:`Fitness`."""
 
 
 class Level(NamedTuple):
-    """By how much the whole corrected field is shifted, and its 1-sigma if the names are right, nT."""
+    """Shift of the whole corrected field, nT, and its 1-sigma if the named causes are right, nT."""
 
     shift: float
     sigma: float
 
 
 class Delays(NamedTuple):
-    """By how much y and z were sampled later than x, s, with 1-sigma, and the RMS that this causes, nT."""
+    """Delays (2,) of the axes y and z after x, s, their 1-sigma, s, and the RMS that they cause, nT."""
 
     later: FloatArray
     sigma: FloatArray
@@ -63,7 +63,7 @@ class Delays(NamedTuple):
 
 
 class TelemetryDelay(NamedTuple):
-    """Delay of the telemetry, s, its 1-sigma, and the RMS error as given and with the delay undone, nT."""
+    """Delay of the telemetry, s, its 1-sigma, s, and the RMS errors, nT, without and with its correction."""
 
     delay_s: float
     sigma_s: float
@@ -72,7 +72,7 @@ class TelemetryDelay(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """RMS of measured less simulated, nT: predicted, before, by a refit and after (held out), fitted."""
+    """RMS of the residual, nT: predicted, as given, held out by a refit and by the extension, and fitted."""
 
     predicted: float
     before: float
@@ -82,9 +82,9 @@ class Budget(NamedTuple):
 
 
 def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration) -> Level | None:
-    """Return the shift of the whole corrected field if an error of the reference is among the causes.
+    """Return the shift of the whole corrected field if an error of the reference is a possible cause.
 
-    None where shift and sigma are below the noise.
+    Return None otherwise, and if shift and sigma are below the noise.
     """
     if not any(candidate.about != "vehicle" for candidate in possible):
         return None
@@ -103,7 +103,7 @@ def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration
 
 
 def delays(problem: Problem, fit: Joint) -> Delays | None:
-    """Return the axes' delays where they look interpolated: a noise that no calibration can undo."""
+    """Return the axes' delays, which no calibration can undo; None if they are insignificant."""
     # Delays relative to x: a common delay is invisible in the total field
     places, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
     later = AXIS_DELAY_SIGMA_S * to_x @ fit.z[places]
@@ -115,9 +115,9 @@ def delays(problem: Problem, fit: Joint) -> Delays | None:
 
 
 def motion(problem: Problem, finding: Finding) -> dict[str, float] | None:
-    """Return the fractions of a cause's power and of the samples next to moving masses, and the interval, s.
+    """Return fractions of a cause's power (`share`) and of samples (`usual`) next to moving masses.
 
-    None where the cause acts elsewhere as well.
+    `interval` is the sampling interval, s. Return None if the cause acts at other samples as well.
     """
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
@@ -131,7 +131,7 @@ def motion(problem: Problem, finding: Finding) -> dict[str, float] | None:
 
 
 def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | None:
-    """Return the telemetry delay of a clock offset, with the corrector's errors; None for other causes."""
+    """Return the telemetry delay and its effect on the corrected field; None if the cause is no delay."""
     candidate = finding.candidate
     row = diagnosis.causes.get(candidate.cause)
     if row is None or not row.delays_telemetry:
@@ -151,19 +151,19 @@ def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | 
 
 
 def slow_share(problem: Problem, finding: Finding) -> float:
-    """Return the share of a cause's power, about its mean, that a parabola over the log explains."""
+    """Return the fraction of the variance of a cause's effect that a parabola over the log explains."""
     field = finding.field(problem)
     smooth = np.polynomial.Polynomial.fit(problem.survey.time, field, 2)(problem.survey.time)
     return 1.0 - float(np.var(field - smooth)) / max(float(np.var(field)), 1e-300)
 
 
 def times_usual(candidate: Candidate, b: FloatArray) -> float:
-    """Return the size of a cause b (k,) over its plausible size; 0 where its terms share one size."""
+    """Return the largest coefficient of b (k,) in plausible sizes; 0 for coefficients of one common size."""
     return float(np.abs(b).max()) if candidate.spectra is None else 0.0
 
 
 def cancelling(diagnosis: Diagnosis) -> list[tuple[Finding, Finding, float, float, float]]:
-    """Return pairs of causes that largely cancel each other, with their RMS, and that of their sum, nT."""
+    """Return pairs of findings that largely cancel, each with the RMS of both and of their sum, nT."""
     fields = [(one, one.field(diagnosis.problem)) for one in diagnosis.findings]
     return [
         (one, other, rms(a), rms(b), rms(a + b))
@@ -173,7 +173,7 @@ def cancelling(diagnosis: Diagnosis) -> list[tuple[Finding, Finding, float, floa
 
 
 def budget(diagnosis: Diagnosis) -> Budget:
-    """Compare the residual that the calibration predicts with those that were found."""
+    """Return the RMS of the residual that the calibration predicts and of the residuals found."""
     counts, total = diagnosis.counts, diagnosis.total
     predicted = float(np.sqrt(np.mean(diagnosis.problem.stated[counts])))
     refitted, after = (diagnosis.over_refit.before, total.after) if diagnosis.findings else (None, None)
@@ -181,7 +181,7 @@ def budget(diagnosis: Diagnosis) -> Budget:
 
 
 def notes(diagnosis: Diagnosis, finding: Finding) -> list[Diagnostic]:
-    """List what to know of one finding."""
+    """Return the notes on one finding: on its numbers, its competing hypotheses, and its use."""
     cause = diagnosis.causes[finding.candidate.cause]
     return [
         *_of_numbers(finding),
@@ -191,7 +191,7 @@ def notes(diagnosis: Diagnosis, finding: Finding) -> list[Diagnostic]:
 
 
 def _of_numbers(finding: Finding) -> Iterator[Diagnostic]:
-    """Yield notes on its numbers, on an implausible amplitude, and on whether it may be noise."""
+    """Yield notes on the numbers of a finding, on an implausible amplitude, and on possible noise."""
     candidate = finding.candidate
     if any(name.endswith(")") for name in candidate.names):
         yield Diagnostic("several_terms")
@@ -206,7 +206,7 @@ def _of_numbers(finding: Finding) -> Iterator[Diagnostic]:
 
 
 def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Diagnostic]:
-    """Yield notes on when and where it acts, whether it is corrected, and how much that improves."""
+    """Yield notes on when a cause acts, whether the calibration corrects it, and the improvement."""
     candidate, rest = finding.candidate, diagnosis.unexplained
     found = motion(diagnosis.problem, finding)
     if found is not None:
@@ -228,7 +228,7 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Diagnostic]:
 
 
 def not_separated(candidate: Candidate, cause: Cause, competing: Sequence[CompetingHypothesis]) -> Diagnostic:
-    """Return a note on the causes that could take its place, and on how to distinguish them."""
+    """Return a note on the causes that could take a candidate's place, and on how to distinguish them."""
     others = [hypothesis.candidate for hypothesis in competing]
     if not others:
         return Diagnostic("alone")
@@ -239,7 +239,7 @@ def not_separated(candidate: Candidate, cause: Cause, competing: Sequence[Compet
 
 
 def separation(track: Returns) -> Diagnostic:
-    """Return whether a track distinguishes place from time."""
+    """Return a note on whether the track separates spatial from slow temporal changes of the field."""
     code = "separable" if track.distinguishable else "alike" if track.share else "never"
     values = {"share": track.share, "hours": track.longest / 3600.0, "like": 1.0 - track.separable}
     return Diagnostic(f"track.{code}", values)
@@ -247,7 +247,7 @@ def separation(track: Returns) -> Diagnostic:
 
 @dataclass(frozen=True)
 class Assessment:
-    """Verdict, reasons and quantities that the report shows in addition to the findings."""
+    """Verdict on the extended calibration, with reasons and quantities for the report."""
 
     fit_for_use: Fitness
     """Usability of the written calibration in place of the given one."""
@@ -255,23 +255,23 @@ class Assessment:
     condition: str
     """Condition of a conditional verdict; empty otherwise."""
     summary: str
-    """The answer as a sentence."""
+    """Verdict and reason in words."""
     reasons_for: tuple[Diagnostic, ...]
     reasons_against: tuple[Diagnostic, ...]
     manoeuvres: tuple[str, ...]
     """Manoeuvres that would resolve the open questions."""
     notes: tuple[tuple[Diagnostic, ...], ...]
-    """What to know before believing each finding."""
+    """Notes on each finding, in the order of the findings."""
     reference_shift: Level | None
-    """Shift of the whole corrected field that may be the reference's."""
+    """Shift of the whole corrected field that may be an error of the reference."""
     delays: Delays | None
-    """Delays of the sensor's axes, if they look interpolated."""
+    """Delays of the sensor's axes; None if insignificant."""
     budget: Budget
     residual: Memory
     follows: Seen
     """Series that the residual follows."""
     returns: Returns | None
-    """How well the track separates place from time; None without positions."""
+    """Returns of the track, which separate spatial from temporal changes; None without positions."""
 
 
 class DiagnosisResult(NamedTuple):
@@ -282,7 +282,7 @@ class DiagnosisResult(NamedTuple):
 
 
 def assess(diagnosis: Diagnosis) -> DiagnosisResult:
-    """Weigh a diagnosis; return it with its assessment."""
+    """Return a diagnosis with its assessment."""
     problem, residual = diagnosis.problem, diagnosis.residual / diagnosis.problem.reference_jacobian
     shift = level(problem, diagnosis.possible, diagnosis.calibration)
     track = returns(problem.survey)
@@ -318,7 +318,7 @@ def assess(diagnosis: Diagnosis) -> DiagnosisResult:
 
 
 def _fitness(diagnosis: Diagnosis, use: bool, against: Sequence[Diagnostic]) -> tuple[Fitness, Reason]:
-    """Return whether the written calibration is fit for use, and the code of the reason."""
+    """Return the usability of the written calibration, and the code of the reason."""
     # The first objection decides; without any, another day is needed for an unconditional yes
     objections: dict[Reason, bool] = {
         "nothing_added": not diagnosis.named,
@@ -338,7 +338,7 @@ def _fitness(diagnosis: Diagnosis, use: bool, against: Sequence[Diagnostic]) -> 
 
 
 def _condition(diagnosis: Diagnosis, against: Sequence[Diagnostic], manoeuvres: Sequence[str]) -> str:
-    """Return the condition that removes the weightiest objection, else that of a log of another day."""
+    """Return the condition, in words, that removes the weightiest objection; default: another day's log."""
     codes = [note.code for note in against if note.code in CONDITION_CODES]
     code = min(codes, key=CONDITION_CODES.index, default="same_log")
     warnings = "; ".join(diagnosis.problem.calibration.warnings)
@@ -346,7 +346,7 @@ def _condition(diagnosis: Diagnosis, against: Sequence[Diagnostic], manoeuvres: 
 
 
 def _summary(diagnosis: Diagnosis, reason: Reason, condition: str) -> str:
-    """Return the answer as a sentence."""
+    """Return the verdict for the given `reason` in words."""
     allowed, found = diagnosis.refusal_values
     why = (
         write_text(f"refusal.{diagnosis.refused}", allowed=allowed, found=found) if diagnosis.refused else ""
@@ -356,7 +356,7 @@ def _summary(diagnosis: Diagnosis, reason: Reason, condition: str) -> str:
 
 
 def _domain(diagnosis: Diagnosis) -> list[Diagnostic]:
-    """List the ranges of attitude, depth and telemetry in which the improvement was measured."""
+    """Return a note on the ranges of attitude and channels in which the improvement was measured."""
     survey, known = diagnosis.problem.survey, diagnosis.problem.calibration
     fresh = ~survey.learned
     names = dict.fromkeys([*known.units, *diagnosis.calibration.channels])
@@ -374,7 +374,7 @@ def _domain(diagnosis: Diagnosis) -> list[Diagnostic]:
 
 
 def useful(diagnosis: Diagnosis) -> Diagnostic | None:
-    """Return which causes the extended calibration corrects; None if nothing was added to it."""
+    """Return the note in favour of the extended calibration; None if it corrects no named cause."""
     added = diagnosis.calibration.effects
     if diagnosis.refused:
         return None
@@ -391,7 +391,7 @@ def useful(diagnosis: Diagnosis) -> Diagnostic | None:
 def _against(
     diagnosis: Diagnosis, noted: Sequence[Sequence[Diagnostic]], shift: Level | None, track: Returns | None
 ) -> Iterator[Diagnostic]:
-    """Yield the reasons against use, which a reviewer must resolve; `noted` has the notes of each finding."""
+    """Yield the reasons against the use of the extended calibration; `noted` has each finding's notes."""
     survey, rest = diagnosis.problem.survey, diagnosis.unexplained
     if (survey.fitted & ~survey.learned).any():
         yield Diagnostic("own_log")

@@ -1,4 +1,4 @@
-"""The whole of a diagnosis: compare, search, weigh names against descriptions, extend, measure the gain."""
+"""Entry point of a diagnosis: search for causes, decide on their names, extend, measure the improvement."""
 
 from __future__ import annotations
 
@@ -53,20 +53,23 @@ if TYPE_CHECKING:
 __all__ = ["accept", "diagnose", "odds_over_random_walk", "settle"]
 
 AGAINST = 2.0
-"""Log odds of the held-out dives against the names above which names are rejected: of 14 right names of S/N 8
-one had 1.9, of ten wrong ones four had more."""
+"""Log odds of the held-out dives against the named causes above which the names are rejected. Of 14 right
+names of S/N 8 one had 1.9; of ten wrong names four had more."""
 ABSURD = 0.5
-"""Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
+"""Largest median error of the corrected field, as a fraction of the field, for which a diagnosis is made."""
 MIN_SLOW_FRACTION = 0.5
-"""Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
+"""Fraction of a cause's power that remains in means over up to 64 samples, from which on the cause is
+slow."""
 
 
 def accept(problem: Problem, outcome: SearchOutcome) -> tuple[bool, Leftover | None]:
-    """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
+    """Return True if the causes found are named, and a description of the signal that remains, or None.
 
-    Names and free descriptions pay for the number of alternatives they were chosen from. Names are asserted
-    if, with a description of the remaining signal, they are likelier than every description of the whole
-    signal, and predict every eighth dive as well. They remain possible unless a description beats them 20:1.
+    If the causes are not named, the description is of the whole signal. Causes and free descriptions have a
+    penalty for the number of their alternatives. The causes are named on two conditions, both with a
+    description of the remaining signal: they are likelier than every description of the whole signal, and
+    they predict held-out dives about as well. Otherwise they remain possible unless odds are 20:1 against
+    them.
     """
     model = outcome.model
     # Names: their likelihood ratio with all prices
@@ -103,10 +106,10 @@ def accept(problem: Problem, outcome: SearchOutcome) -> tuple[bool, Leftover | N
 def settle(
     problem: Problem, candidates: Sequence[Candidate], causes: int
 ) -> tuple[SearchOutcome, bool, Leftover | None]:
-    """Search, and return the selected outcome with the result of :func:`accept`.
+    """Search for causes, and return the selected outcome with the result of :func:`accept`.
 
-    Slow noise absorbs part of what descriptions represent. So if the names found without it are not asserted,
-    or something switches, no search with it is made.
+    Slow noise absorbs part of the signal that descriptions represent. Therefore no search with slow noise is
+    made if the causes found without it are not named, or if the signal switches.
     """
 
     def rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> float | None:
@@ -122,7 +125,10 @@ def settle(
 
 
 def _foretold(problem: Problem, model: Sequence[Candidate], fit: Joint, best: Leftover | None) -> float:
-    """Return the log odds by which a model with the best description, if any, predicts every eighth dive."""
+    """Return the log predictive density of interleaved held-out dives: of a model, or with descriptions.
+
+    It is the largest of the model alone and of the model with each fitted description of `best`.
+    """
     columns = [candidate.columns for candidate in model]
     scores = [held_out(problem, columns, fit, interleaved=True).score]
     for one in best.fitted if best else ():
@@ -132,7 +138,7 @@ def _foretold(problem: Problem, model: Sequence[Candidate], fit: Joint, best: Le
 
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
-    """Return True if the rest is a remnant of the idealised regressor of a stronger named cause."""
+    """Return True if the description `rest` contains the regressors of a stronger chosen cause."""
     description = rest.description
     if description is None or description.wider:
         return False
@@ -140,7 +146,7 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
 
 
 def _possible_names(outcome: SearchOutcome, deficit: float) -> tuple[CompetingHypothesis, ...]:
-    """Return the names and competing hypotheses that a description, better by `deficit`, does not exclude."""
+    """Return the causes and competing hypotheses that a description better by `deficit` leaves possible."""
     found: dict[Group, CompetingHypothesis] = {}
     for hypothesis, competing in zip(outcome.chosen, outcome.competing, strict=True):
         limit = bayes_factor_threshold(hypothesis.ratio)
@@ -152,12 +158,13 @@ def _possible_names(outcome: SearchOutcome, deficit: float) -> tuple[CompetingHy
 
 
 def odds_over_random_walk(outcome: SearchOutcome, hypothesis: Hypothesis) -> float:
-    """Return the log odds of one cause that was chosen over offsets that wander in its place.
+    """Return the log odds of a chosen cause over a random walk of the offsets in its place.
 
     Notes
     -----
-    A random walk has a power of 1/f^2: half waves of variance ``g / k^2`` in place of the ``g / k`` of
-    :mod:`.problem`. Both are compared by their evidence, each autoregression at Akaike's price.
+    A random walk has a spectral density of 1/f^2: half waves of variance ``g / k^2`` in place of ``g / k`` in
+    :mod:`.problem`. The two models are compared by their evidence, with Akaike's penalty for each
+    autoregression.
     """
     slots, noise = outcome.problem.survey.slots, outcome.null.noise
     others = [one.candidate for one in outcome.chosen if one is not hypothesis]
@@ -192,27 +199,27 @@ def diagnose(
     datasets : sequence of Dataset
         Deployments that the calibration has not seen.
     calibration : Calibration
-        What the forward model knows.
+        The forward model to test.
     out_dir : path, optional
-        Where ``findings.json``, ``calibration.json`` and ``report.html`` go; nothing is written if not given.
+        Folder for ``findings.json``, ``calibration.json`` and ``report.html``; without it nothing is written.
     training_logs : sequence of Dataset, optional
-        The logs that the calibration was made from: what changed since then is seen against them. One that
-        is diagnosed itself may be among them, lest what the calibration knows from it counts twice.
+        Logs that the calibration was fitted to, which show what changed since. Include a diagnosed log that
+        the calibration was fitted to, so that its information does not count twice.
     grid : AnomalyGrid, optional
-        Added to the main field where a log has no ``reference_field``.
+        Anomaly map that is added to the main field if a log has no ``reference_field``.
     causes : mapping, optional
-        The table of causes; by default :func:`.causes.known`, with those of other packages.
+        Causes to test, by name; default :func:`.causes.known`, which includes causes of other packages.
     progress : callable, optional
-        Told each step's name.
+        Function that is called with the name of each step.
     remarks : sequence of str, optional
-        What the report's reader must know of the logs.
+        Sentences on the logs for the report.
 
     Raises
     ------
     WrongUse
-        There is no dataset.
+        `datasets` is empty.
     DataError
-        The data do not allow it: one line that says which column is missing or too short.
+        A column is missing or has too few values, values are out of range, or no cause can be tested.
     """
     if not datasets:
         raise WrongUse("deployments: expected at least one Dataset, got none")
@@ -306,7 +313,10 @@ def _examine(
 
 
 def _refused(diagnosis: Diagnosis, values: tuple[float, float]) -> Diagnosis:
-    """Return the diagnosis with its extension refused, because the written file corrects the log worse."""
+    """Return the diagnosis with its extension refused because the written file corrects the log worse.
+
+    `values` are the RMS errors, nT, with the given and the written calibration.
+    """
     problem, counts = diagnosis.problem, diagnosis.counts
     unchanged = paired(diagnosis.before, diagnosis.before, problem.survey.dive, counts)
     return replace(
@@ -317,7 +327,10 @@ def _refused(diagnosis: Diagnosis, values: tuple[float, float]) -> Diagnosis:
 
 
 def _posed(survey: Survey, calibration: Calibration) -> Problem:
-    """Pose the problem; refuse another vehicle's data, or data in another unit."""
+    """Return the problem of a survey, linearised about a calibration.
+
+    DataError: the corrected field is so wrong that vehicle or units must differ from the calibration's.
+    """
     problem = pose(survey, calibration)
     off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
     if off > ABSURD * field:
@@ -329,7 +342,10 @@ def _posed(survey: Survey, calibration: Calibration) -> Problem:
 
 
 def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Candidate], dict[str, str]]:
-    """Return all candidates, and the requirements of the causes that have none."""
+    """Return the candidates of all causes, and what a log needs, by name, for the causes without candidates.
+
+    DataError: no cause has a candidate.
+    """
     candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
     untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
     if len(untestable) == len(causes):
@@ -350,7 +366,10 @@ def _extended(
     counts: BoolArray,
     causes: Mapping[str, Cause],
 ) -> tuple[SearchOutcome, Extension, dict[int, Improvement]]:
-    """Extend the calibration by the names that the held-out dives support, with each family's improvement."""
+    """Return the causes that held-out dives support, the extension by them, and each family's improvement.
+
+    The improvements are by index of the first cause of a family.
+    """
     while names.chosen:
         # Extend by all names, then measure each family against an extension by the others
         extension = extension_of(problem, names.model, names.fit, counts)
@@ -386,7 +405,7 @@ def _findings(
     outcome: SearchOutcome,
     causes: Mapping[str, Cause],
 ) -> tuple[Finding, ...]:
-    """Collect the results of each family of causes; the strongest of each has its name."""
+    """Return a finding for each family of named causes, with the name of its strongest cause."""
     found, fit, places = [], extension.fit, slices(names.model)
     for first, *further in _families(names.chosen, causes):
         own, hypothesis = places[first], names.chosen[first]
@@ -402,7 +421,7 @@ def _findings(
 
 
 def _families(named: Sequence[Hypothesis], causes: Mapping[str, Cause]) -> list[list[int]]:
-    """Return the places of the named causes, those of one family together, the strongest of each first."""
+    """Return the indices of the named causes, grouped by family, the strongest of each family first."""
     groups: dict[str, list[int]] = {}
     for k in sorted(range(len(named)), key=lambda n: -named[n].signal_to_noise):
         groups.setdefault(causes[named[k].candidate.cause].family or str(k), []).append(k)
@@ -410,7 +429,7 @@ def _families(named: Sequence[Hypothesis], causes: Mapping[str, Cause]) -> list[
 
 
 def _is_slow(problem: Problem, hypothesis: Hypothesis) -> bool:
-    """Return True for a slow cause: most of its power is left in means over many samples."""
+    """Return True if a cause is slow: half of its power or more remains in means over many samples."""
     candidate = hypothesis.candidate
     b = hypothesis.fit.coefficients[-candidate.size :]
     added = candidate.columns(slice(0, len(problem))) @ b

@@ -1,4 +1,4 @@
 """The report: ``findings.json`` for programs (:mod:`.findings`), ``report.html`` for people (:mod:`.page`).
 
-:mod:`.figures` draws; :mod:`.page` also writes the files.
+:mod:`.figures` draws the plots. :mod:`.page` also writes all files.
 """

@@ -1,4 +1,4 @@
-"""Figures of the report: measured less reference before and after, and what each cause adds."""
+"""Figures of the report: the measured less the reference field, and the contribution of each cause."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from magbridge.diagnose.diagnosis import Diagnosis, label
 from magbridge.pictures import literal
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
-"""Vermilion and blue, which any eye distinguishes; in grey print the second is darker."""
+"""Colours of the plots. Colour-blind readers distinguish the first two; in grey print the second is
+darker."""
 MIN_FONT_PT = 9.0
-"""pt, the smallest letters."""
+"""Smallest size of letters, pt."""
 CURVE_POINTS = 4000
-"""Points drawn per curve; more only make the page heavy."""
+"""Number of points per curve, at which it is thinned to limit the size of the page."""
 PALETTE_SIZE = 256
-"""Colours of a plot: a byte for each pixel."""
+"""Number of colours of a plot, for one byte per pixel."""
 DOT_STYLE: dict[str, Any] = {
     "marker": "s",
     "markersize": 1.6,
@@ -31,15 +32,15 @@ DOT_STYLE: dict[str, Any] = {
     "alpha": 0.5,
     "ls": "none",
 }
-"""Samples as squares of whole pixels: the edges of round dots double the size of the picture."""
+"""Style of samples: squares of whole pixels, because the edges of round dots double the size of the file."""
 LINE_GAP_STEPS = 20.0
-"""Median steps between two points beyond which no line joins them."""
+"""Distance in time between two points, in median steps, beyond which no line joins them."""
 STRETCHES = 150
-"""Stretches of a log whose means make a line through its dots."""
+"""Number of equal parts of a log whose means are drawn as a line."""
 CHANNELS, BINS = 12, 20
-"""Channels drawn, and bins of each."""
+"""Largest number of channels in a plot, and number of bins of each."""
 MAX_SEPARATED_DIVES = 60
-"""Dives from which on no lines separate them."""
+"""Number of dives from which on no lines between dives are drawn."""
 
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more: Any) -> tuple[Figure, Any]:
@@ -55,7 +56,7 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more:
 
 
 def png(figure: Figure, names: Any = None) -> str:
-    """Return the picture as a PNG in base64, its colours those of a palette; `names` are of which axis."""
+    """Return a figure as a palette PNG in base64; `names` is the axes whose legend to draw, or None."""
     if names is not None:
         handles = names.get_legend_handles_labels()
         figure.legend(
@@ -70,12 +71,12 @@ def png(figure: Figure, names: Any = None) -> str:
 
 
 def thin(n: int) -> slice:
-    """Return which of n points to draw."""
+    """Return the slice of n points to draw, about :data:`CURVE_POINTS` of them."""
     return slice(None, None, max(1, n // CURVE_POINTS))
 
 
 def clock(diagnosis: Diagnosis) -> tuple[float, str]:
-    """Return the unit of time that suits the length of the log: its seconds and its name."""
+    """Return the unit of time for the length of the log: its length in s, and its name."""
     return (3600.0, "hours") if np.ptp(diagnosis.problem.survey.time) > 7200.0 else (60.0, "minutes")
 
 
@@ -103,14 +104,14 @@ def unjoined(times: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def ends(*values: FloatArray, margin: float) -> tuple[float, float]:
-    """Return an axis' limits for `values` (n,) without extremes, with a margin, a fraction of their span."""
+    """Return an axis' limits for `values` without extremes, with a `margin` as a fraction of their span."""
     first, last = np.nanquantile(np.concatenate(values), [0.002, 0.998])
     span = max(float(last - first), 1e-9)
     return float(first) - margin * span, float(last) + margin * span
 
 
 def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
-    """Return the two residuals (n,) to compare, each with its colour."""
+    """Return the two residuals (n,), nT, to compare, each with its colour, by name."""
     if not diagnosis.findings:
         return {
             "as calibrated": (diagnosis.before, BEFORE),
@@ -120,7 +121,7 @@ def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
 
 
 def measured(diagnosis: Diagnosis) -> str:
-    """Draw the difference of measured and reference field, before and after, one below the other."""
+    """Return a plot, as base64 PNG, of measured less reference field against time, before and after."""
     survey, both = diagnosis.problem.survey, sides(diagnosis)
     figure, axes = canvas(10, 4.0, 2, 1, sharex=True)
     stated = 2.0 * np.sqrt(diagnosis.problem.stated)[thin(len(survey))]
@@ -147,7 +148,10 @@ def measured(diagnosis: Diagnosis) -> str:
 
 
 def terms(diagnosis: Diagnosis) -> str | None:
-    """Draw the contribution of each cause to the total field, over the residual without it."""
+    """Return a plot of each cause's contribution to the total field over time; None without findings.
+
+    The dots are the contribution plus the residual of the fit.
+    """
     if not diagnosis.findings:
         return None
     count, part = len(diagnosis.findings), thin(len(diagnosis.problem))
@@ -166,7 +170,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
 
 
 def spectrum(diagnosis: Diagnosis) -> str:
-    """Draw the spectral density of the difference, before and after, with the noise model's."""
+    """Return a plot of the spectral density of the residual, before and after, and of the noise model."""
     survey = diagnosis.problem.survey
     interval = float(np.median(np.diff(survey.time)))
     figure, axes = canvas(5.8, 4.0)
@@ -200,7 +204,7 @@ def spectrum(diagnosis: Diagnosis) -> str:
 
 
 def channels(diagnosis: Diagnosis) -> str:
-    """Draw the difference against the channels that it follows most: mean and scatter, all at one scale."""
+    """Return a plot of the residual's mean and scatter against the channels that it follows most."""
     survey, both = diagnosis.problem.survey, sides(diagnosis)
     series = {
         name: (one.values, one.unit) for name, one in survey.channels.items() if name not in survey.still
@@ -239,7 +243,7 @@ def channels(diagnosis: Diagnosis) -> str:
 
 
 def _binned(values: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return count, mean and scatter of `residual` in bins of a channel; NaN in bins with few samples."""
+    """Return count, mean and scatter of `residual` in bins of a channel; NaN in bins of few samples."""
     edges = np.linspace(values.min(), values.max(), BINS + 1)
     bins = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
     number = np.bincount(bins, minlength=BINS)
@@ -249,7 +253,7 @@ def _binned(values: FloatArray, residual: FloatArray) -> tuple[FloatArray, Float
 
 
 def track(diagnosis: Diagnosis) -> str | None:
-    """Draw the difference along the track, before and after."""
+    """Return a plot of the residual along the track, before and after; None without a track."""
     place = diagnosis.problem.survey.place
     if place is None or np.ptp(place[:, :2], axis=0).max() < 1.0:
         return None

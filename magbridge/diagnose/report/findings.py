@@ -1,4 +1,4 @@
-"""``findings.json``: the findings for other programs. Its names are public."""
+"""``findings.json``: the findings for other programs. The names of its keys are public."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.diagnostics import Diagnostic
 
 FINDINGS_FORMAT = 3
-"""Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
+"""Version of the format of ``findings.json`` (``docs/findings.schema.json``); it rises if a key changes."""
 
 
 def findings(result: DiagnosisResult, remarks: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the content of ``findings.json`` as plain Python; `remarks` concern the logs."""
+    """Return the content of ``findings.json`` as plain Python; `remarks` are sentences on the logs."""
     diagnosis, assessment = result
     listed = [_finding(diagnosis, finding) for finding in diagnosis.findings]
     if diagnosis.wrong is not None:
@@ -44,7 +44,7 @@ def findings(result: DiagnosisResult, remarks: Sequence[str] = ()) -> dict[str, 
 
 
 def findings_json(result: DiagnosisResult, remarks: Sequence[str] = ()) -> bytes:
-    """Return ``findings.json``."""
+    """Return ``findings.json`` encoded; `remarks` are sentences on the logs."""
     content = msgspec.json.encode(findings(result, remarks), enc_hook=plain)
     return msgspec.json.format(content, indent=2) + b"\n"
 
@@ -66,7 +66,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
 
 
 def _configuration(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any] | None:
-    """Return the keys of ``bridge.toml`` that correct for a finding; None where no key does."""
+    """Return the keys of ``bridge.toml`` that correct a finding; None if no key corrects it."""
     late = telemetry_delay(diagnosis, finding)
     if late is None or late.delay_s <= 0.0 or late.after_nt >= late.before_nt:
         return None
@@ -75,16 +75,15 @@ def _configuration(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any] | N
 
 
 def _alternatives(competing: Sequence[CompetingHypothesis]) -> list[dict[str, Any]]:
-    """List the others within 20:1, the likeliest first."""
+    """Return cause and channel of each competing hypothesis."""
     return [{"cause": one.candidate.cause, "channel": one.candidate.channel} for one in competing]
 
 
 def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
     """Return value, sigma and unit of every coefficient, and of the nonlinear parameters.
 
-    Where one channel acts with several lags, or an offset jumps more than once, the sum is given and its
-    parts next to it. Coefficients with one common size are summed up as the RMS of their effect over the
-    log's `samples`.
+    If one channel acts with several lags, or an offset jumps more than once, the sum and its parts are
+    returned. Coefficients of one common size are represented by the RMS of their effect over all `samples`.
     """
     candidate = finding.candidate
     if candidate.spectra is not None:
@@ -106,7 +105,7 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
 
 
 def _rms(finding: Finding, samples: int) -> dict[str, Any]:
-    """Return the RMS ``f = sqrt(b^T M b)`` over the log of ``X b``, nT, and its sigma."""
+    """Return the RMS ``f = sqrt(b^T M b)`` of the effect ``X b`` over the log, nT, and its sigma."""
     b = finding.coefficients
     # M = X^T X / n, summed in pieces; df/db = M b / f
     M = normal(finding.candidate.columns, np.zeros(samples))[0] / samples
@@ -116,13 +115,13 @@ def _rms(finding: Finding, samples: int) -> dict[str, Any]:
 
 
 def _adds_up(candidate: Candidate) -> bool:
-    """Return True if coefficients of one name add up: those of one channel at several lags or onsets."""
+    """Return True if coefficients of one name add up, as for one channel with several lags or onsets."""
     channels = {getattr(effect, "channel", None) for effect in candidate.effects}
     return len(channels) == 1 and not candidate.point.shape.keys().isdisjoint(("lag", "onset"))
 
 
 def _unexplained(diagnosis: Diagnosis, assessment: Assessment) -> dict[str, Any] | None:
-    """Return the unnamed part of the residual."""
+    """Return the entry of the unexplained structure; None if there is none."""
     rest = diagnosis.unexplained
     return rest and {
         "kind": rest.kind,
@@ -137,7 +136,7 @@ def _unexplained(diagnosis: Diagnosis, assessment: Assessment) -> dict[str, Any]
 
 
 def _assessment(found: Assessment) -> dict[str, Any]:
-    """Return the parts of the report in addition to the findings."""
+    """Return the entry of the assessment: verdict, reasons and quantities."""
     delays, residual, track, shift = found.delays, found.residual, found.returns, found.reference_shift
     return {
         "fit_for_use": found.fit_for_use,
@@ -170,7 +169,7 @@ def _notes(notes: Sequence[Diagnostic]) -> list[dict[str, Any]]:
 
 
 def _follows(seen: Seen) -> dict[str, Any]:
-    """Return the observed correlate, without its interpretation."""
+    """Return the entry of the series that a signal follows."""
     return dict(zip(("channel", "lag_s", "axis", "amplitude_nT", "fraction"), seen, strict=True))
 
 
@@ -198,7 +197,7 @@ def _improvement(improvement: Improvement, parts: str) -> dict[str, Any]:
 
 
 def _corrected(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the improvement of the corrected field, compared with a refit of the calibration alone."""
+    """Return the entry of the corrected field's improvement over the given calibration and over a refit."""
     found, over, day = diagnosis.improvement, diagnosis.over_refit, diagnosis.other_day
     return _improvement(found, diagnosis.problem.survey.parts) | {
         "before_nT": found.before,

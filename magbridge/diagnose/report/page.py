@@ -1,4 +1,4 @@
-"""``report.html``: the values that its template in this folder shows; and the files of a diagnosis."""
+"""``report.html``, from the template in this folder, and the files of a diagnosis."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from magbridge.files import atomic_path, new_folder
 from magbridge.wording import counted
 
 MARKS: dict[Fitness, str] = {"yes": "good", "conditional": "doubt", "no": "none"}
-"""How an answer is marked."""
+"""CSS class of the verdict's box, by verdict."""
 KIND_SUBJECTS = {
     "switching": "Something that switches or comes and goes",
     "drift": "A slow drift",
@@ -38,14 +38,14 @@ KIND_SUBJECTS = {
     "transient": "A transient",
     "broadband": "Something broadband",
 }
-"""Descriptions of the unexplained part, as the subject of a sentence."""
+"""Kinds of the unexplained structure, in words that begin a sentence."""
 SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 MAX_UNFOLDED_NUMBERS = 12
-"""Numbers that a table shows unfolded."""
+"""Largest number of values that a table shows unfolded."""
 
 
 def report_html(result: DiagnosisResult, remarks: Sequence[str] = ()) -> str:
-    """Return the page; `remarks` are what a reader must know of the logs, each without its full stop."""
+    """Return the report page; `remarks` are sentences on the logs, each without its full stop."""
     diagnosis, assessment = result
     content = _environment().get_template("report.html").render(
         d=diagnosis, a=assessment, remarks=remarks, survey=diagnosis.problem.survey,
@@ -79,18 +79,18 @@ def _names(competing: Sequence[CompetingHypothesis], joint: str = ", ") -> str:
 
 
 def _clock(time: float, form: str) -> str:
-    """Return a time, s since 1970, as a clock shows it."""
+    """Return a time, s since 1970 UTC, in the format `form` of strftime."""
     return datetime.fromtimestamp(float(time), UTC).strftime(form)
 
 
 def _mark(result: DiagnosisResult) -> str:
-    """Return the class of the box with the answer."""
+    """Return the CSS class of the verdict's box."""
     bad = result.assessment.reason in ("refused", "no_improvement", "refit_as_good")
     return "bad" if bad else MARKS[result.assessment.fit_for_use]
 
 
 def _pictures(diagnosis: Diagnosis) -> dict[str, str | None]:
-    """Return each figure of the page as a PNG in base64; None where there is nothing to draw."""
+    """Return each figure of the page by name, as a PNG in base64; None for a figure without data."""
     drawn = figures.measured, figures.terms, figures.channels, figures.spectrum, figures.track
     return {draw.__name__: draw(diagnosis) for draw in drawn}
 
@@ -109,7 +109,7 @@ def _log(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _rows(result: DiagnosisResult) -> list[dict[str, Any]]:
-    """Return the row of each finding on the page."""
+    """Return the template's values for each finding."""
     diagnosis, rows = result.diagnosis, []
     for finding, notes in zip(diagnosis.findings, result.assessment.notes, strict=False):
         numbers = parameters(finding, len(diagnosis.problem))
@@ -126,14 +126,14 @@ def _rows(result: DiagnosisResult) -> list[dict[str, Any]]:
 
 
 def marked_up(line: str) -> Markup:
-    """Return a line of a docstring with its formulas marked up."""
+    """Return a line of a docstring as HTML, with its formulas as code."""
     parts = str(escape(line)).split("``")
     # formulas are escaped above; the only markup is that of the code
     return Markup("".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts)))  # noqa: S704
 
 
 def _rest(result: DiagnosisResult) -> dict[str, Any]:
-    """Return the unexplained part: its place among the findings, the noise, the budget of the RMS."""
+    """Return the template's values of the unexplained structure and of the noise."""
     diagnosis = result.diagnosis
     rest, noise, problem = diagnosis.unexplained, diagnosis.fit.noise, diagnosis.problem
     return {
@@ -149,7 +149,7 @@ def _rest(result: DiagnosisResult) -> dict[str, Any]:
 
 
 def _visible(result: DiagnosisResult) -> dict[str, Any]:
-    """Return which causes such a log can show, and which ones are similar to each."""
+    """Return the causes that the log can show and cannot show, and the causes similar to each."""
     report, track = result.diagnosis.isolability, result.assessment.returns
     hidden = [one for one in report.visible if not any(isfinite(size) for size, _ in one.sizes.values())]
 
@@ -163,7 +163,7 @@ def _visible(result: DiagnosisResult) -> dict[str, Any]:
 
 
 def write(result: DiagnosisResult, out_dir: str | os.PathLike[str], remarks: Sequence[str] = ()) -> None:
-    """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none (WriteError)."""
+    """Write ``findings.json``, ``calibration.json`` and ``report.html``; on a WriteError, none of them."""
     contents = {
         "calibration.json": encode_calibration(result.diagnosis.calibration),
         "findings.json": findings_json(result, remarks),
@@ -175,7 +175,7 @@ def write(result: DiagnosisResult, out_dir: str | os.PathLike[str], remarks: Seq
 
 
 def chance(p_value: float) -> str:
-    """Write a probability to one digit, without a place where a line could break: 0.002, 3·10⁻⁸."""
+    """Return a probability to one digit, without a space: 0.002, 3·10⁻⁸."""
     if p_value > 1e-4:
         return f"{p_value:.1g}"
     digit, power = f"{max(p_value, 1e-99):.0e}".split("e-")
@@ -183,7 +183,7 @@ def chance(p_value: float) -> str:
 
 
 def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
-    """Return sizes in words from values and units by name; an infinite one is left out."""
+    """Return finite sizes in words, from values and units by name."""
     seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
     shown = seen if len(seen) <= MAX_UNFOLDED_NUMBERS else seen[:3]
     texts = [
