@@ -1,4 +1,4 @@
-"""Alignment and calibration together: the sigma includes every uncertainty."""
+"""Test alignment and calibration together: the sigma includes every uncertainty."""
 
 from __future__ import annotations
 

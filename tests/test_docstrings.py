@@ -1,4 +1,4 @@
-"""Docstrings say what a signature cannot: an array's shape, the errors raised, what a constant means."""
+"""Test that docstrings state an array's shape, the errors raised, and the meaning of a constant."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_an_array_has_a_shape() -> None:
 
 
 def test_an_error_that_is_raised_is_named() -> None:
-    """But for commands: their docstrings are what ``--help`` prints, and their errors are exit codes."""
+    """Commands are an exception: ``--help`` prints their docstrings, and their errors are exit codes."""
 
     def raised(function: ast.FunctionDef) -> set[str]:
         thrown = [n.exc for n in ast.walk(function) if isinstance(n, ast.Raise)]

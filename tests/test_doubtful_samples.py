@@ -1,4 +1,4 @@
-"""Each fault of sensor, telemetry and computer in the bytes of a survey: wrong samples have a flag."""
+"""Test that wrong samples have a flag, for each fault of sensor, telemetry and computer in a survey."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def test_interrupted_while_libraries_are_loaded(tmp_path: Path, library: str) ->
 
 @pytest.mark.parametrize("arguments", [["--help"], ["simulate", "--help"], ["--version"]])
 def test_a_reader_who_has_read_enough_is_not_an_error(arguments: list[str]) -> None:
-    """As ``| head -1`` is."""
+    """A reader such as ``| head -1`` closes the pipe early."""
     reading, writing = os.pipe()
     os.close(reading)
     command = [sys.executable, "-m", "magbridge", *arguments]

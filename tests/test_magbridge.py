@@ -1,4 +1,4 @@
-"""What a user imports: the names exist, cost nothing until asked for, and do what the docstring says."""
+"""Test the public names: they exist, are loaded only on use, and do what the docstring states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The service, the adapter's udev rule, the container and the BlueOS extension."""
+"""Test the service, the adapter's udev rule, the container and the BlueOS extension."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Words of messages that depend on a number."""
+"""Test words of messages that depend on a number."""
 
 from magbridge.wording import counted
 

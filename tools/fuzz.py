@@ -1,11 +1,11 @@
-"""Damage inputs of every parser and reader at random; each must give a result or one of our own errors.
+"""Feed randomly damaged inputs to every parser and reader; each must give a result or a magbridge error.
 
     python tools/fuzz.py mavlink digitizer -n 1000000 -o fuzz
     python tools/fuzz.py --kind file --seconds 600 -o fuzz
 
-The seeds are inputs of our own writers and of the emulators. Bits, bytes and numbers of them are changed, and
-pieces are moved, doubled or cut off. Input k of a seed is the same in every run. Inputs that fail are kept in
-the output folder with their traceback.
+The undamaged inputs come from magbridge's writers and the emulators. The tool changes bits, bytes and
+numbers, and moves, doubles or cuts off pieces. Input k of a seed is equal in every run. The output folder
+receives each failing input with its traceback.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from magbridge.sensors import open_driver
 from sitl.fluxgate import open_encoder
 
 MAX_SECONDS = 10.0
-"""Processor time that an input may take, s; all inputs are far smaller than 10 MB."""
+"""Maximum processor time for an input, s; all inputs are far smaller than 10 MB."""
 NUMBERS = [0, 1, 2, 3, 4, 7, 8, 127, 128, 254, 255]
 WORDS = [
     b"nan", b"inf", b"-1", b"1e400", b"-9999", b"0", b",", b"\n", b"\0", b'"', b"\xff\xfe", b"\xef\xbb\xbf",
@@ -58,7 +58,7 @@ Read = Callable[[bytes], object]
 
 
 class Target(NamedTuple):
-    """A parser: its kind, how it reads, and its seeds, both given a folder to write to."""
+    """Parser under test: its kind, and functions that return a reader and the seeds, given a folder."""
 
     kind: str
     open: Callable[[Path], Read]
@@ -69,7 +69,7 @@ class Target(NamedTuple):
 
 
 def _driver(name: str, **options: Any) -> Target:
-    """Return the target of a sensor driver; its bytes come in two chunks."""
+    """Return the target of a sensor driver, which gets the bytes in two chunks."""
 
     def read(data: bytes) -> object:
         driver = open_driver(name, options)
@@ -86,7 +86,7 @@ def _driver(name: str, **options: Any) -> Target:
 
 
 def _mavlink(data: bytes) -> object:
-    """Parse in two chunks; every byte must be in a message, counted as skipped, or pending."""
+    """Parse MAVLink in two chunks; assert that each byte is in a message, counted as skipped, or pending."""
     codec = Codec(1, 191)
     half = len(data) // 2
     messages = [*codec.parse(data[:half]), *codec.parse(data[half:])]
@@ -135,7 +135,7 @@ def _calibration(_: Path) -> list[bytes]:
 
 
 def _file(name: str, function: Callable[[Path], object], *writers: Callable[[Path], object]) -> Target:
-    """Return a target that writes the bytes to a file and reads it; `writers` write the seeds to a path."""
+    """Return a target that reads a file of the damaged bytes; `writers` write the seeds to a path."""
 
     def opened(folder: Path) -> Read:
         path = folder / name
@@ -243,7 +243,7 @@ TARGETS: dict[str, Target] = {
 
 
 def damaged(seeds: Sequence[bytes], rng: random.Random) -> bytes:
-    """Return one of the seeds with one to eight changes."""
+    """Return a random seed with one to eight random changes."""
     data = bytearray(rng.choice(seeds))
     for _ in range(rng.choice((1, 1, 2, 3, 8))):
         at = rng.randrange(len(data) + 1)
@@ -272,7 +272,7 @@ def damaged(seeds: Sequence[bytes], rng: random.Random) -> bytes:
 
 
 class Counts:
-    """Outcomes of the inputs of one target; inputs that fail are kept in its folder."""
+    """Counts of the outcomes of one target; its folder receives the failing inputs."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -280,7 +280,7 @@ class Counts:
         self.slowest = 0.0
 
     def run(self, read: Read, data: bytes) -> None:
-        """Feed one input and count its outcome."""
+        """Feed one input to the reader and count its outcome."""
         began, problem = time.process_time(), ""
         try:
             read(data)
@@ -300,7 +300,7 @@ class Counts:
             self._keep(data, problem)
 
     def _keep(self, data: bytes, problem: str) -> None:
-        """Keep an input whose problem, by the last lines of its traceback, is new."""
+        """Store a failing input if the last lines of its traceback are new."""
         lines = [line for line in problem.splitlines() if line.strip().startswith(("File", "took"))]
         text = "".join(lines[-2:] or [problem[:80]])
         kind = hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()[:10]
@@ -312,7 +312,7 @@ class Counts:
 
 
 def main() -> int:
-    """Fuzz the targets one after the other; print the outcomes."""
+    """Fuzz each target in turn; print the outcomes and return the exit code."""
     parser = command_line(__doc__)
     parser.add_argument("targets", nargs="*", help=f"of {' '.join(TARGETS)}; default all")
     parser.add_argument("--kind", choices=["bytes", "file"], help="all targets of a kind")

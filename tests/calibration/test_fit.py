@@ -162,7 +162,7 @@ def test_the_paper_s_signature(glider: Gliders) -> None:
 
 
 def test_an_order_that_is_too_low_is_reported(glider: Gliders) -> None:
-    """Its sigmas are too small because a term is missing; with the usual order they are not."""
+    """The fit's sigmas are too small because a term is missing; with the usual order they are right."""
     two = glider(0, 2)
     low, usual = fit(two.runs, "auto", 1), fit(two.runs, "auto", 3)
     assert survey_error(low.calibration, two)[1] > 1.25
@@ -298,7 +298,7 @@ def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
 
 
 def test_least_squares_of_the_whitened_is_generalised_least_squares_next_to_gaps_too() -> None:
-    """Against the naive oracle: the covariance of an AR(1) of which some samples are lost, inverted."""
+    """Compare with the dense inverse covariance of an AR(1) process with lost samples."""
     rng = np.random.default_rng(2)
     place = np.flatnonzero(rng.random(120) > 0.2)
     n, run = len(place), np.arange(len(place)) // 40

@@ -142,7 +142,7 @@ def test_true_field_is_fitted_as_before() -> None:
 
 
 def test_straight_line_is_not_supported() -> None:
-    """On one straight line field and heading are not distinguishable: a message, and --strict refuses."""
+    """One straight line cannot separate field and heading: the fit warns, and --strict refuses it."""
     data, true = flown(legs=8, straight=True)
     found = fit(data)
     assert not found.supported

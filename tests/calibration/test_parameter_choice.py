@@ -110,7 +110,7 @@ def test_error_on_later_parts_is_known_with_and_without_a_parameter() -> None:
 @pytest.mark.parametrize("seed", [2, 5])
 @pytest.mark.parametrize("declared", [("battpos",), ("battpos", "ballast")])
 def test_a_mass_that_was_left_out_is_named(declared: tuple[str, ...], seed: int) -> None:
-    """Also one that nearly always moves with the declared one, as a glider's ballast with its battery."""
+    """The message also names a mass that nearly always moves with the declared mass, as ballast does."""
     log = demo_log(seed)
     data = observations(log, declared)
     data = data.part(np.arange(len(data)) % 3 == 0)  # as much to see in a third of the time

@@ -220,7 +220,7 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[byte
 
 
 def test_a_name_that_is_not_of_the_locale(deployment: Path, here: Path) -> None:
-    """As Latin-1 names on a UTF-8 system are: netCDF cannot open them, and JSON cannot hold them."""
+    """Latin-1 names on a UTF-8 system: netCDF cannot open them, and JSON cannot hold them."""
     name = os.fsdecode(b"m\xe4.nc")
     write(read(deployment).isel(time=slice(0, 60)), "log.nc")
     Path("log.nc").rename(name)
@@ -280,7 +280,7 @@ def test_a_file_without_a_value_is_named(
 def test_what_would_be_written_wrong_is_refused(
     arguments: str, code: int, words: str, deployment: Path, here: Path, command: Command
 ) -> None:
-    """Also a simulated log that lacks a channel: its true field must not be taken for one."""
+    """The command also rejects a simulated log without a channel, whose true field is not a reading."""
     write(read(deployment).isel(time=slice(0, 60)).drop_vars("mag_z"), "short.csv")
     save_calibration(identity(), "cal.json")
     assert words in command.refuses(*arguments.split(), code=code)

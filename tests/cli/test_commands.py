@@ -92,7 +92,7 @@ def test_what_headings_are_counted_from_may_be_told(deployment: Path, command: C
 
 
 def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:
-    """Also where the log tells of no attitude, and a parameter has no part in the fit."""
+    """The plot also works for a log without an attitude, and for a parameter outside the fit."""
     write(read(deployment).drop_vars(["roll", "pitch", "heading"]), "bare.csv")
     fitted = "calibrate", "bare.csv", "--method", "nominal", "--parameter", "battpos"
     assert "no heading, which needs roll" in command(*fitted, "-o", "cal.json", "--plot", "fit.png").out
@@ -138,7 +138,7 @@ def test_what_correct_writes_is_netcdf_that_others_read(
 def test_a_field_that_the_earth_does_not_have_is_reported(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
-    """As with another vehicle's calibration: the magnets that it knows of are not those of this one."""
+    """The calibration of another vehicle, with other magnets, gives such a field."""
     own = read(deployment).isel(time=slice(0, 100))
     for name, iron in (("own.nc", 0.0), ("other.nc", 50_000.0)):
         write(own.assign(mag_z=own["mag_z"] + iron), name)
@@ -195,7 +195,7 @@ def test_a_column_that_the_calibration_needs_is_missed_aloud(deployment: Path, c
 
 
 def test_a_grid_that_is_not_used_is_reported(deployment: Path, calibration: Path, command: Command) -> None:
-    """It is added to the IGRF, and a log with a reference of its own does without either."""
+    """A grid is added to the IGRF; a log with its own reference uses neither."""
     command(
         "simulate",
         "demo",
@@ -300,7 +300,7 @@ def test_help_names_every_command(command: Command) -> None:
 
 
 def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a real terminal, a pty: nothing at first, then step and clock; and it leaves the line clean."""
+    """On a terminal (pty), the command prints nothing at first, then step and time, and clears the line."""
     master, slave = pty.openpty()
     os.set_blocking(master, False)
     with os.fdopen(slave, "w") as terminal:
@@ -340,7 +340,7 @@ def test_progress_without_a_terminal_is_lines(
 def test_only_what_the_sensor_measured_is_corrected(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
-    """The vehicle's telemetry in a file of its own, at times of its own, makes no samples and no gaps."""
+    """Telemetry in a separate file with its own times adds neither samples nor gaps."""
     rows = read(deployment).isel(time=slice(0, 300))
     whole = correct_rows(Correction(load_calibration(calibration)), rows)
     masses = rows[["battpos", "ballast"]]

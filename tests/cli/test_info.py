@@ -1,4 +1,4 @@
-"""``magbridge info``, and declarations about a log on the command line."""
+"""Test ``magbridge info``, and declarations about a log on the command line."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_info_counts_gaps_and_rates() -> None:
 
 
 def test_seconds_too_few_to_be_since_1970_count_from_a_start() -> None:
-    """Also under our own name: a log of 1970 is not plausible."""
+    """The rule also holds for magbridge's column names, because a log of 1970 is not plausible."""
     facts = info(made("log", [0.0, 0.5], {"mag_x": [1.0, 2.0]}))
     assert facts["references"]["time_reference"] == "boot"
     assert any("--date says when it was" in hint for hint in facts["hints"])
@@ -174,7 +174,7 @@ def test_what_was_lost_is_named(here: Path, command: Command) -> None:
 
 
 def test_a_log_without_a_date_is_given_one(here: Path, command: Command) -> None:
-    """Also where pydantic is installed, as it is with the page: it would take the day for a moment."""
+    """The date is also accepted if pydantic is installed, which would parse the day as a time."""
     write(made("log", np.arange(9.0), {"mag_x": np.ones(9)}).assign_attrs(time_reference="boot"), "boot.csv")
     assert "times count from a start" in command("info", "boot.csv").err
     facts = json.loads(command("info", "boot.csv", "--json", "--date", "2024-06-01").out)["boot.csv"]
@@ -259,7 +259,7 @@ def test_a_result_is_one_object(
 
 @pytest.mark.parametrize("name", ALL, ids=" ".join)
 def test_a_wrong_option_is_one_object(name: tuple[str, ...], command: Command) -> None:
-    """Also where the command line cannot be parsed."""
+    """The output is one JSON object even if the command line cannot be parsed."""
     output = command(*name, "--no-such-option", "--json", code=2)
     assert only_object(output.out) == {"error": output.err.removeprefix("magbridge: ")[:-1], "exit_code": 2}
 

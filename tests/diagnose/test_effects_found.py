@@ -173,7 +173,7 @@ def test_play_remembers_the_side(
 
 
 def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibration) -> None:
-    """Its branches are polynomials of the degree in the key ``order``."""
+    """The branches of an older backlash effect are polynomials of the degree in the key ``order``."""
     effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.1, scale=0.5, order=3)
     phi = regressors_of(survey, calibration, effect)
     straight = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.0, scale=0.5, order=1)

@@ -25,7 +25,7 @@ TAKEN = np.array([0.0, 0.16, 0.32])
 
 
 def swaying(time: np.ndarray) -> np.ndarray:
-    """(n, 3) nT of 50,000, on a course that turns slowly, with a sway of six samples and one of seventeen."""
+    """Return a field (n, 3) of 50,000 nT that turns slowly, with sways of 6 and 17 samples."""
     t = time - 1.7e9
     heading = 1e-3 * t + 0.02 * np.sin(2.0 * np.pi * t / 24.7)
     pitch = 0.3 + 0.015 * np.sin(2.0 * np.pi * t / 23.1 + 1.0) + 0.05 * np.sin(2.0 * np.pi * t / 68.0)

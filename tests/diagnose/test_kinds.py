@@ -151,7 +151,7 @@ def flown(altitude: float) -> NDArray[np.float64]:
 
 
 def test_what_a_map_as_flown_lacks_grows_with_depth() -> None:
-    """Without the depths, one place has two errors."""
+    """Without the depths, the map would have two errors at one place."""
     missing, residual = flown(90.0), []
     for down in (DOWN, np.zeros(N)):
         problem = drawn(right(N), missing, down)
@@ -226,7 +226,7 @@ def test_a_cause_is_named_in_its_own_room_alone() -> None:
 
 
 def test_a_cause_is_one_short_class() -> None:
-    """Its name stands in one module only, and the class has at most forty lines beside its docstring."""
+    """The cause's name is in one module only, and its class has at most forty lines without docstring."""
     for name, cause in CAUSES.items():
         places = [path for path in ROOM.glob("*.py") if name in strings(path)]
         assert len(places) == 1, (name, places)

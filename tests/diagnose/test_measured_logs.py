@@ -1,4 +1,4 @@
-"""What the simulation gets wrong of real vehicles: measured logs, diagnosed as `magbridge diagnose` does."""
+"""Test the diagnosis on measured logs, which have effects that the simulation lacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noise's autoregressive model, its filter and its level."""
+"""Test the autoregressive noise model, its filter and its standard deviation."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def judged(residual: np.ndarray, order: int) -> Outliers | None:
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_isolated_samples_are_distinguished_from_a_passage(rho: float) -> None:
-    """Also where the noise's correlation spreads a wrong sample over the innovations after it."""
+    """This holds even if the noise's correlation spreads a wrong sample over later innovations."""
     rows = np.arange(400, N, 700)
     for seed in range(5):
         isolated, passing = (found(shape, rows, rho, seed) for shape in (SPIKE, PULSE))
@@ -126,7 +126,7 @@ def test_a_relay_gets_no_name(beside_runs: bool) -> None:
 
 
 def test_a_dipole_that_passes_is_reported_by_three_numbers(problem: Problem) -> None:
-    """Against a dipole's field on a straight course, along the Earth's: Anderson's functions hold it."""
+    """Compare Anderson's functions with a dipole's field on a straight course, along the Earth's field."""
     t = problem.survey.time - problem.survey.time[0]
     speed, nearest = 900.0 / (0.02 * t[-1]), 0.6 * t[-1]
     r = np.column_stack([speed * (t - nearest), np.full(len(t), 900.0), np.full(len(t), -50.0)])

@@ -78,7 +78,7 @@ def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
 
 @pytest.mark.parametrize("share", [0.05, 0.125])
 def test_a_rate_of_change_is_the_whole_logs_where_samples_are_lost(share: float) -> None:
-    """And holds no more of its own noise than by chance, as a one-sided difference would."""
+    """The rate has no more noise than a central difference, unlike a one-sided difference."""
     whole, rng = right(3000), np.random.default_rng(2)
     survey = whole.survey
     turning = 2e4 * np.sin(2.0 * np.pi * survey.time[:, None] / np.array([150.0, 230.0, 700.0]))
@@ -119,7 +119,7 @@ def test_a_second_derivative_is_that_of_a_turn() -> None:
 
 
 def test_a_filter_shortens_a_field_that_turns() -> None:
-    """By an RC filter's steady answer. Without the calibration's own runs no such cause is put forward."""
+    """The loss is an RC filter's in steady turns; without calibration runs this cause is not proposed."""
     whole, tau, period = right(300), 1.5, 240.0
     phase, steepness = 2.0 * np.pi * whole.survey.time / period, np.arctan(2.0 * np.pi * tau / period)
 
@@ -150,7 +150,7 @@ def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> Non
 
 
 def test_a_mass_that_moves_within_one_interval_is_seen_by_a_shift(problem: Problem) -> None:
-    """It has no rate at any sample, but its telemetry has moved after a shift."""
+    """The mass has no rate at any sample, but its telemetry has changed after a shift in time."""
     name = problem.calibration.parameters[0].name
     channel = problem.survey.channels[name]
     low, high = channel.extent

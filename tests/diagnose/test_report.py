@@ -281,7 +281,7 @@ def test_what_is_seen_stands_apart_from_what_it_may_be(clear: Diagnosis) -> None
 
 
 def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
-    """It says how much is left, how long that remembers unless it is white, and what a refit would do."""
+    """The report states how much is left, its correlation time, and what a refit would do."""
     page, last = page_of(clear), assess(clear).assessment.residual
     assert "Nothing else" not in page
     assert re.search(r"The remaining [\d.]+\xa0nT RMS look like noise", page)

@@ -64,7 +64,7 @@ def test_without_an_improvement_of_the_corrected_field_it_is_not_fit_for_use(cle
 
 
 def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
-    """And a calibration whose own data do not support it sets the condition."""
+    """A calibration whose data do not support it sets the condition."""
     small = replace(clear, negligible=True)
     assert answer(small).reason == "not_needed"
     assert "Nothing needs explaining: the causes found make" in page_of(small).partition("<h2")[0]
@@ -211,7 +211,7 @@ def test_the_times_of_wrong_samples_are_all_or_the_first(clear: Diagnosis) -> No
 
 
 def test_a_gain_that_does_not_show_is_reported_as_none(clear: Diagnosis) -> None:
-    """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
+    """An example is a compass in steps of 100 nT: a cause is named, but 588 nT become 587 nT."""
     none = Improvement(588.1, 587.3, 0.999, (0.863, 1.021))
     page = page_of(replace(clear, improvement=none)).replace("\N{NO-BREAK SPACE}", " ")
     assert (

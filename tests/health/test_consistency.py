@@ -121,7 +121,7 @@ def test_plane_over_a_steep_anomaly_is_not_flagged(seed: int) -> None:
 @pytest.mark.parametrize("speed", [0.3, 3.0, 25.0, 60.0])
 @pytest.mark.parametrize("seed", range(2))
 def test_vehicle_that_takes_off_is_not_a_fault(speed: float, seed: int) -> None:
-    """It stands for 30 s, then flies and turns over plane waves of 120 nT RMS that are 1 km long."""
+    """The vehicle stands for 30 s, then flies and turns over waves of 120 nT RMS and 1 km length."""
     rng = np.random.default_rng(seed)
     n, step = 4000, 0.1
     time = step * np.arange(n)

@@ -57,7 +57,7 @@ def along(raw: FloatArray, by: float) -> FloatArray:
 @pytest.mark.parametrize("steps", [1e-3, 0.5, 6.7, 100.0])
 @pytest.mark.parametrize("reference", [FIELD, nan])
 def test_a_healthy_sensor_is_left_alone(steps: float, reference: float) -> None:
-    """Also one that counts in steps far above its noise, as an HMR2300 or an autopilot's compass does."""
+    """This includes a sensor with steps far above its noise, as an HMR2300 or an autopilot's compass."""
     flight = Flight(n=3000, steps=steps)
     if steps > 1.0:
         flight.raw[:, 2] = flight.raw[:, 2] + 0.0

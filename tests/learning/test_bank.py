@@ -197,7 +197,7 @@ def test_a_new_candidate_begins_with_the_level_of_the_last() -> None:
 
 
 def test_a_change_is_significant_only_if_it_is_known_at_all_attitudes() -> None:
-    """Of an offset that is known along two axes, but not along the third."""
+    """An offset that is known along two axes only is not significant."""
     coverage, covariance = Coverage(3), np.diag([1.0, 1.0, 400.0])
     change = np.array([10.0, 10.0, 0.0])
     for direction in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)):

@@ -32,7 +32,7 @@ def test_one_sample_is_the_fits_own_residual() -> None:
 
 
 def test_crustal_field_and_noise_are_stationary_along_the_track() -> None:
-    """Whatever the steps: the covariance stays, and far away nothing is known."""
+    """For any step lengths, the covariance is stationary, and distant fields are independent."""
     nuisance = Nuisance(Noise(2.0, autocorrelation=0.9, interval=4.0, white=0.25), 100.0, 50.0, 800.0)
     F, Q = nuisance.transition(70.0, 12.0)
     np.testing.assert_allclose(F @ nuisance.initial @ F.T + Q, nuisance.initial, atol=1e-9)

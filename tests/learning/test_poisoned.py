@@ -43,7 +43,7 @@ def test_a_map_that_is_wrong_by_no_more_than_the_crustal_field_is_reported() -> 
 
 
 def test_another_sheet_for_a_while_is_not_learned() -> None:
-    """Its level is 80 nT off: nothing is learned from it, and the alarm ends by itself."""
+    """The level of another sheet is 80 nT off: nothing is learned from it, and the alarm ends by itself."""
     known, n = calibration(), 1900
     right, wrong = grid_of(1.0), grid_of(1.0, level=80.0)
     world, learner = World(known, n), Learner(known, grid=right, spread=20.0)
@@ -116,7 +116,7 @@ def test_a_gps_that_jumps_by_a_kilometre_teaches_nothing(*, mapped: bool) -> Non
 
 @pytest.mark.parametrize("lie", ["random", "frozen"])
 def test_a_mass_with_wrong_telemetry_is_one_alarm_until_it_ends(lie: str) -> None:
-    """It is announced once, sigma covers it from the fifth sample on, and then the first one is back."""
+    """The bridge reports one alarm; sigma covers the error from the fifth sample on."""
     known, n = calibration(), 1500
     world, rng = World(known, n), np.random.default_rng(5)
     truth, told = world.mass.copy(), slice(600, 900)
@@ -143,7 +143,7 @@ def test_a_mass_with_wrong_telemetry_is_one_alarm_until_it_ends(lie: str) -> Non
 
 
 def test_telemetry_that_is_late_is_reported() -> None:
-    """By 8 s: before a motion is reported, two samples are outliers that fit the later report."""
+    """Telemetry is 8 s late: two samples before the report of a motion are outliers that fit the report."""
     known, n = calibration(), 400
     world = World(known, n)
     late = np.concatenate([world.mass[:2], world.mass[:-2]])

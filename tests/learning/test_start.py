@@ -26,7 +26,7 @@ def vehicle() -> Calibration:
 
 
 def test_a_vehicle_without_a_calibration_gets_one() -> None:
-    """Its error about the mean comes near the noise, and its sigma includes the unobservable level."""
+    """The error without bias approaches the noise, and sigma includes the unobservable bias."""
     world = World(vehicle(), 2100)
     learner = Learner(class_prior((MASS,), FIELD))
     assert learner.calibration.method == "none"

@@ -134,7 +134,7 @@ def test_the_acknowledgement_is_addressed(link: Line) -> None:
 
 
 def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Line) -> None:
-    """Of metadata, say: the first hundred of a second are answered."""
+    """The flood requests metadata: the bridge replies to the first hundred requests in a second."""
     results = [result(link, link.command(REQUEST, METADATA)) for _ in range(300)]
     assert results == [ACCEPTED] * 100 + [TEMPORARILY_REJECTED] * 200
     others = Codec(255, 191)

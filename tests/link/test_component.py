@@ -172,7 +172,7 @@ COMMANDS = [510, 511, 512, 519, 520, 42424]
 
 @st.composite
 def message(draw: st.DrawFn) -> bytes:
-    """Bytes of a message that the component reacts to, with any values in it."""
+    """Return the bytes of a message to which the component reacts, with any values."""
     layout = spec(draw(st.sampled_from(ANSWERED)))
     fields: dict[str, Any] = {
         name: draw(VALUES[field.code]) for name, field in layout.fields.items() if field.code != "s"

@@ -74,7 +74,7 @@ def test_across_the_antimeridian() -> None:
 @pytest.mark.parametrize("seconds", [0.2, 1.0, 10.0])
 @pytest.mark.parametrize("sigma", [5.0, 20.0, 80.0])
 def test_a_filter_that_fuses_widened_fixes_claims_what_they_are_worth(sigma: float, seconds: float) -> None:
-    """Its steady state, by the Riccati equation, has the fix's own variance."""
+    """The filter's steady-state variance (Riccati equation) equals the variance of the original fix."""
     fix = replace(FIX, covariance_nn=sigma**2, covariance_ne=0.0, covariance_ee=sigma**2)
     sent = widened(fix, seconds)
     density = sent.covariance_nn * seconds

@@ -383,7 +383,7 @@ def test_files_that_once_failed(cases: Path, name: str, monkeypatch: pytest.Monk
 
 
 def test_a_quotation_mark_that_is_never_closed_costs_its_row(tmp_path: Path) -> None:
-    """It once took all that follows for one cell: pandas' ParserError."""
+    """An unclosed quotation mark once made the rest of the file one cell: pandas' ParserError."""
     path = tmp_path / "log.csv"
     rows = [f"{1_700_000_000 + 4 * k},20000.0,{k}.0,40000.0\n" for k in range(20)]
     rows[7] = '1700000028,20000.0,"7.0,40000.0\n'

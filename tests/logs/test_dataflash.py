@@ -1,4 +1,4 @@
-"""ArduPilot's records: every field equals pymavlink's, and damage costs only the damaged records."""
+"""Test ArduPilot's records: every field equals pymavlink's, and damage costs only the damaged records."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_log_in_which_no_record_joins_another_holds_none(records: int, tmp_pat
 
 
 def test_of_a_record_with_a_field_of_unknown_length_what_stands_before_it_is_read(tmp_path: Path) -> None:
-    """And nothing beyond the record's end, whatever a damaged description says."""
+    """The reader reads nothing beyond the record's end, even with a damaged description."""
     log = Log({"MAG": (14, "Qhh", "TimeUS,MagX,MagY")})
     odd = described(14, 15, "MAG", "Qh?nZ", "TimeUS,MagX,Odd,MagY,MagZ")
     rows = b"".join(log.record("MAG", 1000 * k, k, -k) for k in range(5))
@@ -117,7 +117,7 @@ def test_text_and_bytes_are_the_same_log(tmp_path: Path) -> None:
 @given(at=st.integers(0, 319), junk=st.binary(min_size=1, max_size=300))
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_junk_between_records_costs_no_record(at: int, junk: bytes, tmp_path: Path) -> None:
-    """Its bytes are counted, unless they are records themselves."""
+    """The reader counts the junk bytes, unless they are themselves records."""
     log, path = flight(), tmp_path / "log.bin"
     starts = [place for place in range(len(log.data)) if log.data[place : place + 2] == b"\xa3\x95"]
     heads = [a for a, b in pairwise([*starts, len(log.data)]) if b > a and log.data[a + 2] in range(10, 18)]
@@ -134,7 +134,7 @@ def test_junk_between_records_costs_no_record(at: int, junk: bytes, tmp_path: Pa
 
 
 def test_a_record_that_was_cut_short_is_not_read(tmp_path: Path) -> None:
-    """Its last fields would be bytes of the next record, which are not measurements."""
+    """The last fields of a truncated record would be bytes of the next record, not measurements."""
     log, path = Log(), tmp_path / "log.bin"
     for k in range(20):
         log.mag(k * 100_000, 0, (k, 20, -300))
@@ -147,7 +147,7 @@ def test_a_record_that_was_cut_short_is_not_read(tmp_path: Path) -> None:
 
 
 def test_a_kind_that_is_described_again(tmp_path: Path) -> None:
-    """As after a boot with other firmware: each record is read as the description before it says."""
+    """After a boot with other firmware, each record is read by the description that precedes it."""
     first, second = Log(), Log({**KINDS, "BARO": (16, "QBffH", "TimeUS,I,Alt,Press,More")})
     for log, alt in ((first, 1.0), (second, 2.0)):
         for k in range(5):

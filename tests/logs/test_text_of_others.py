@@ -106,7 +106,7 @@ def test_counts_of_time(heading: str, tmp_path: Path) -> None:
 
 
 def test_nanoseconds_under_our_own_name_are_known_by_their_size(tmp_path: Path) -> None:
-    """As a telephone's recorder writes them; where seconds are declared they are none."""
+    """Telephone recorders write nanoseconds; the rule does not apply if seconds are declared."""
     rows = f"{NOON * 1e9:.0f},1\n{NOON * 1e9 + 1e9:.0f},2\n"
     log = read(tmp_path, f"time,mag_x\n{rows}")
     np.testing.assert_allclose(log["time"], [NOON, NOON + 1], atol=1e-6)
@@ -125,7 +125,7 @@ def test_times_of_day_are_of_a_day_that_is_given(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("heading", ["time", "UTC", "time [%H%M%S.%f]"])
 def test_six_digits_that_step_over_sixty_are_times_of_day(heading: str, tmp_path: Path) -> None:
-    """As proton magnetometers and NMEA write them; the minute has 60 s, a count would go on to 99."""
+    """Proton magnetometers and NMEA write such times; a minute has 60 s, but a count would reach 99."""
     column = ["time=time [%H%M%S.%f]"] if "%" in heading else []
     heading = heading.partition(" ")[0]
     log = read(tmp_path, f"{heading},nT\n120058.0,48120\n120059.0,48121\n120100.0,48122\n", column=column)

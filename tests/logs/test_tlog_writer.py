@@ -52,7 +52,7 @@ def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
 
 
 def test_two_runs_in_one_folder_keep_apart(tmp_path: Path) -> None:
-    """By name, so that each replays although both began in the same second."""
+    """The names of the two runs differ, so that each can be replayed although both began in one second."""
     frames = FRAME, FRAME[::-1]
     with (
         closing(TlogWriter(tmp_path, max_size=1e-3)) as one,
@@ -83,7 +83,7 @@ def test_new_file_by_size_and_by_age_loses_nothing(tmp_path: Path) -> None:
 
 
 def test_directory_that_cannot_be_made_is_reported_and_tried_again(tmp_path: Path) -> None:
-    """As where a disk is there only some seconds after the bridge."""
+    """An example is a disk that is mounted some seconds after the start of the bridge."""
     directory = tmp_path / "disk" / "logs"
     directory.parent.write_text("")
     with closing(TlogWriter(directory)) as log:
@@ -135,7 +135,7 @@ print(full[0])
 
 @pytest.mark.parametrize("removed", ["file", "folder"])
 def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
-    """It can still be written to, as any open file; later its name does not exist."""
+    """A removed log can still be written as an open file, but its name no longer exists."""
 
     def write(time_us: int) -> tuple[int, int, str]:
         before = log.records + log.lost

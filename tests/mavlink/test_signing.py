@@ -150,7 +150,7 @@ def restarted(one: Codec, *, clean: bool) -> Codec:
 
 @pytest.mark.parametrize("clean", [True, False])
 def test_restarts_within_seconds_lock_out_no_peer(clean: bool) -> None:
-    """Nor do our own stamps run ahead of the clock, restart by restart."""
+    """The bridge's own time stamps do not run ahead of the clock from restart to restart."""
     bridge, autopilot = codec(), codec(component=1)
     for k in range(20):
         now = NOW + k * 500_000
@@ -188,7 +188,7 @@ def test_a_liar_with_the_key_harms_only_its_own_stream() -> None:
 
 
 def test_our_stamps_follow_the_autopilot_s_but_not_for_years() -> None:
-    """A computer that was off for a day, without a clock of its own, is believed by a vehicle that knows."""
+    """A computer without a clock, off for a day, takes the time from a vehicle that knows it."""
     day = 24 * HOUR
     for ahead, follows in ((day, True), (30 * day, True), (11 * YEAR, False)):
         bridge, autopilot = Codec(1, 191, Signing(KEY, follow=(1, 1))), codec(component=1)

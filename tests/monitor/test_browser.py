@@ -1,4 +1,4 @@
-"""The page in a real browser: its view, its keyboard control, and its text for a screen reader."""
+"""Test the page in a real browser: its view, its keyboard control, and its text for a screen reader."""
 
 from __future__ import annotations
 

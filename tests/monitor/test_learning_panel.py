@@ -1,4 +1,4 @@
-"""The panel of in-flight calibration in a browser, of a real bridge over a real socket, and its buttons."""
+"""Test the panel of in-flight calibration and its buttons in a browser, with a real bridge."""
 
 from __future__ import annotations
 

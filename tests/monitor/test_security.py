@@ -33,7 +33,7 @@ def status(url: str, path: str = "/", method: str = "GET", **headers: str) -> ht
 
 
 def websocket(url: str, *, host: str = "", **headers: str) -> int:
-    """Ask for a websocket, and return the status of the answer: 101 is one."""
+    """Request a websocket; return the status of the reply, 101 if it is accepted."""
     parts = urlsplit(url)
     with socket.create_connection((parts.hostname, parts.port), timeout=20) as connection:
         lines = [

@@ -30,7 +30,7 @@ CALIBRATED = ("--calibration", "cal.json")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options: NavigationOptions) -> Path:
-    """A log of two hours whose channels are the field itself, its map, a calibration that changes nothing."""
+    """Return a folder with a log of two hours without disturbance, its map, and a neutral calibration."""
     path = tmp_path_factory.mktemp("navigate")
     ds = track_over(grid, options, 6, hours=2.0)
     field = ds["total_field"].to_numpy()

@@ -1,4 +1,4 @@
-"""The odds of a receiver's position by the field, at right and at false positions."""
+"""Test the odds of a receiver's position by the field, at right and at false positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The likelihood of a track in an unmapped field, its bound, and the sampler that uses both."""
+"""Test the likelihood of a track in an unmapped field, its bound, and the sampler that uses both."""
 
 from __future__ import annotations
 

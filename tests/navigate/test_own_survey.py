@@ -20,7 +20,7 @@ OPTIONS = NavigationOptions(start_sigma=1.0, current_sigma=0.03, drift=0.05, bia
 
 
 def flown(*, straight: bool) -> xr.Dataset:
-    """A current of 3 cm/s displaces a glider over a field of 40 nT and 700 m: back and forth, or ahead."""
+    """Return a glider's log in a current of 3 cm/s over a field of 40 nT and 700 m: to and fro, or ahead."""
     rng = np.random.default_rng(4)
     time = np.arange(0.0, HOURS * 3600.0, DT)
     leg = (time // 1800.0).astype(int)

@@ -1,4 +1,4 @@
-"""The RM3100 by its registers: traps of the part, and faults of the bus."""
+"""Test the RM3100 driver on its registers, with the part's pitfalls and faults of the bus."""
 
 from __future__ import annotations
 

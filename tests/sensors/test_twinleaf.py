@@ -1,4 +1,4 @@
-"""TIO packets, built here by hand from the public descriptions of the protocol."""
+"""Test TIO packets that the tests build from the public description of the protocol."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def on_the_line(kind: int, payload: bytes, routing: bytes = b"") -> bytes:
 
 
 def generation_2(columns: list[tuple[int, str, str]], stream: int = 1, segment: int = 5) -> bytes:
-    """Descriptors of a stream of 200 Hz / 4."""
+    """Return the descriptors of a stream of 200 Hz / 4."""
     size = sum(kind >> 4 for kind, _, _ in columns)
     records = [
         (1, pack("<BBIBBB", 9, 3, 0xABCD, 0, 0, 1) + b"VMR"),

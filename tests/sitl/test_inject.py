@@ -1,4 +1,4 @@
-"""The physics of each injected effect, independent of the detector's model of it."""
+"""Test the physics of each injected effect, independently of the detector's model."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_it_shows_in_its_segment_alone(name: str) -> None:
 
 
 def test_an_unknown_effect_is_one_line(tmp_path: Path) -> None:
-    """It names the key and what there is."""
+    """The error message names the key and the known effects."""
     text = (SCENARIOS / "bolt.toml").read_text(encoding="utf-8").replace("offset_step", "gremlin")
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"hidden.effect: expected one of temperature_offset.* not gremlin"):

@@ -1,4 +1,4 @@
-"""The simulated fluxgate: axes, filter, converter, temperature and noise."""
+"""Test the simulated fluxgate: axes, filter, converter, temperature and noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Replays: real bytes through a real pty and a real socket, into the real bridge."""
+"""Test replays, which send real bytes through a pty and a socket to the real bridge."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def survey(flown: xr.Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The configuration of a bridge that replayed them, and its log."""
+    """Return the configuration of a bridge that replayed the ten minutes, and its log."""
     folder = tmp_path_factory.mktemp("recorded")
     path = config(folder)
     replay([survey], path, log=folder / "logs")

@@ -1,4 +1,4 @@
-"""Deployments of the digital twin: scenarios, seeds, missions and logs that drive it."""
+"""Test deployments of the digital twin: scenarios, seeds, missions and logs that drive it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated Earth field, crustal field and water."""
+"""Test the simulated Earth field, crustal field and water."""
 
 from __future__ import annotations
 

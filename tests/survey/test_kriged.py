@@ -1,4 +1,4 @@
-"""Kriging from the nearest samples, over an area that is too large for nodes as fine as its field."""
+"""Test kriging from the nearest samples, for an area too large for nodes as fine as its field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scalar magnetometer on lines and ties: lag, lever arm and heading error, from the survey alone."""
+"""Test a scalar magnetometer on lines and ties: lag, lever arm and heading error from the survey only."""
 
 from __future__ import annotations
 

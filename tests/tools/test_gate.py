@@ -1,4 +1,4 @@
-"""The gate's own programs: wording, names, commit messages, size."""
+"""Test the programs of the gate: wording, names, commit messages, size."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ def test_px4_locks_gps_out_while_another_position_aids() -> None:
 
 
 def test_the_filter_is_kalmans() -> None:
-    """Against matrices: predicted, updated, and forced with a position gain of 1."""
+    """Compare prediction, update and forced position with matrix equations."""
     q, R, dt = 1e-3, 9.0, 2.0
     made = PositionFilter(q)
     P, x = np.diag([1e6, 1.0]), np.zeros(2)
@@ -246,7 +246,7 @@ def test_an_autopilot_that_uses_fixes_does_not_mislead_the_bridge(kind: str, sta
 
 
 def test_ardupilot_is_not_made_to_believe_odometry_too_much() -> None:
-    """Its EKF would claim 1 m where the field gives 100: none is sent, and the reason is reported."""
+    """ArduPilot would claim 1 m where the field gives 100 m: the bridge reports this and sends no fix."""
     run, autopilot = sailed("ODOMETRY", "ArduPilot", "ODOMETRY")
     assert not autopilot.taken
     assert any("ArduPilot would claim to know it better" in text for _, text in run.texts)

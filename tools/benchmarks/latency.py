@@ -1,4 +1,4 @@
-"""The real programs as processes: latency and start of ``magbridge run``, processor time of commands.
+"""Measure the real programs as processes: latency and start of ``magbridge run``, time of commands.
 
 Latency is the time from writing the last byte of a frame to the pty until the datagram arrives.
 

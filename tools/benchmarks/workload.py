@@ -1,4 +1,4 @@
-"""The bridge's input in every benchmark: one configuration, one calibration, one stream of events.
+"""Make the bridge's input for every benchmark: one configuration, one calibration, one stream of events.
 
 The corrected field is the Earth's at the vehicle's position, plus noise. Another field would make the bridge
 treat the sensor as faulty.
