@@ -259,7 +259,7 @@ class Assessment:
     reasons_for: tuple[Diagnostic, ...]
     reasons_against: tuple[Diagnostic, ...]
     manoeuvres: tuple[str, ...]
-    """Manoeuvres that would resolve the open questions."""
+    """Manoeuvres that would distinguish the possible causes."""
     notes: tuple[tuple[Diagnostic, ...], ...]
     """Notes on each finding, in the order of the findings."""
     reference_shift: Level | None
@@ -269,7 +269,7 @@ class Assessment:
     budget: Budget
     residual: Memory
     follows: Seen
-    """Series that the residual follows."""
+    """Series that the residual of the fit follows."""
     returns: Returns | None
     """Returns of the track, which separate spatial from temporal changes; None without positions."""
 

@@ -47,7 +47,7 @@ from magbridge.diagnose.problem import Problem, side_by_side
 FALSE_ALARM_RATE = 0.01
 """Probability of any false finding in a log without faults (family-wise)."""
 ODDS = float(np.log(20.0))
-"""Log evidence by which a cause with an exact regressor must win to be named alone."""
+"""Log odds of 20:1, by which a cause with an exact regressor excludes a competing one."""
 IDEAL = 0.2
 """Assumed error of an idealised regressor, as a fraction of its norm."""
 REMNANT = 0.3
@@ -61,7 +61,7 @@ cases."""
 MAX_PLAUSIBLE_MULTIPLE = 50.0
 """Multiple of its plausible size from which on an effect is impossible."""
 FREE = 1e-3
-"""Prior precision of free coefficients, in units of a plausible size's; 1 for those of one common size."""
+"""Prior precision of free coefficients in :func:`likeness`, in units of their widths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,7 +356,7 @@ def most_visible(candidates: Sequence[Candidate], info: Information, places: Seq
 
 
 def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: float) -> Visible:
-    """Return the sizes at which a candidate is found, if it is chosen from so many `hypotheses`."""
+    """Return the sizes at which a candidate is found that is chosen from a number of `hypotheses`."""
     # Noncentrality at which a noncentral chi-square passes the threshold in 95 %
     freedom = max(score(info, place, candidate).freedom, 1)
     sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))

@@ -86,9 +86,9 @@ class Extension:
     sigma: FloatArray
     """Stated sigma (n,) of the corrected field, nT."""
     score: float
-    """Log predictive density of the folds."""
+    """Log predictive density, summed over the folds."""
     day_error: FloatArray | None = None
-    """Like `error`, with whole days left out; None for a log of one day."""
+    """Held-out error (n,), nT, with whole days left out; None for a log of one day."""
     refused: str = ""
     """Code of the reason for a refusal; empty if the extension is accepted."""
     details: tuple[float, float] = (0.0, 0.0)

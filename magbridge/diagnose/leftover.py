@@ -40,8 +40,8 @@ CALM = 2
 LOUD = 2.0
 """Ratio of a residual to the calibration's stated sigma above which a structureless residual is reported."""
 SLOW, SMOOTH, NEGLIGIBLE = 0.4, 5.0, 1e-5
-"""Limits of a residual that is far from white: fraction of its power in means over 64 samples, ratio of its
-RMS to that of its differences; and the RMS, as a fraction of the field, below which it is negligible."""
+"""Limits above which a residual is far from white: fraction of its power in means over up to 64 samples;
+ratio of its RMS to that of white noise with equal steps. Third: least RMS, as a fraction of the field."""
 
 
 def varying(
@@ -113,7 +113,7 @@ class Leftover(NamedTuple):
     signal_to_noise: float
     p_value: float
     evidence: float
-    """Log Bayes factor of the description against the model."""
+    """Log Bayes factor of the description against the model without it."""
     period_s: float | None
     """Period of a tone, s."""
     best_channel: str | None

@@ -192,7 +192,7 @@ def diagnose(
     progress: Callable[[str], object] = str,
     remarks: Sequence[str] = (),
 ) -> DiagnosisResult:
-    """Find what the forward model gets wrong in these deployments.
+    """Find the causes of a forward model's errors in deployments, and extend the calibration by them.
 
     Parameters
     ----------

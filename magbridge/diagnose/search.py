@@ -59,8 +59,7 @@ Rival = Callable[[Problem, Sequence[Candidate], Joint, Candidate], float | None]
 """Function of problem, model, fit and further cause: held-out score of the best free description in place of
 the further cause, or None."""
 LOST, PLACES = 2, 6
-"""Numbers at which a signal is called switching: at least so many regressors, more than so many level
-shifts."""
+"""Least number of regressors in the model, and number of level shifts to exceed, for a switching signal."""
 AFTERWARDS = 16
 """Samples beyond the noise's order over which a shift of the level is tested."""
 MAX_REGRESSORS = 6

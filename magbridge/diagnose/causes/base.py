@@ -23,7 +23,7 @@ class Cause(ABC):
     """A fault that a diagnosis tests; the report prints the first docstring line of each subclass."""
 
     name: ClassVar[str]
-    """Name in ``findings.json``."""
+    """Name of the cause in ``findings.json``."""
     meaning: ClassVar[str]
     """Meaning of the cause for a reader of the report, as a clause without its full stop."""
     needs: ClassVar[str]

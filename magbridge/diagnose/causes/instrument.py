@@ -24,7 +24,7 @@ MAX_BEND_NT = 50.0
 
 
 class OffsetStep(Cause):
-    """The offset jumps, by a power cycle, a shock or a magnet: ``T += b`` from its onset on.
+    """The offset jumps after a power cycle, a shock or a magnet: ``T += b`` after an onset.
 
     All power cycles together are as likely beforehand as all other times together. One power cycle is
     assumed between the calibration's own logs and the diagnosed ones.
@@ -58,7 +58,7 @@ class OffsetStep(Cause):
 
 
 class OffsetDrift(Cause):
-    """The offset creeps (ageing, relaxing stress): ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / period``."""
+    """The offset drifts (ageing, relaxing stress): ``T += b_1 x + b_2 x^2``, ``x = (t - t_0) / period``."""
 
     name = "offset_drift"
     meaning = "the sensor's zero creeps with time"

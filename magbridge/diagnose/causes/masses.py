@@ -114,7 +114,7 @@ def _sources(problem: Problem, cause: str, name: str, distance: float) -> Candid
 
 
 class Hysteresis(Cause):
-    """Backlash of a drive, or moving steel remagnetised: ``T += b (S(y) - S(p)) / width``, y the play of p.
+    """Backlash of a drive, or remagnetised steel: ``T += b (S(y) - S(p)) / width``, y the play operator of p.
 
     S is linear for the backlash of a drive. For steel S is steep only near the steel: see
     :class:`~magbridge.calibration.effects.PlayEffect`.

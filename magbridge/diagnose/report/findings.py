@@ -80,7 +80,7 @@ def _alternatives(competing: Sequence[CompetingHypothesis]) -> list[dict[str, An
 
 
 def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
-    """Return value, sigma and unit of every coefficient, and of the nonlinear parameters.
+    """Return value, sigma and unit of each coefficient and nonlinear parameter of a finding, by name.
 
     If one channel acts with several lags, or an offset jumps more than once, the sum and its parts are
     returned. Coefficients of one common size are represented by the RMS of their effect over all `samples`.

@@ -96,7 +96,7 @@ def _pictures(diagnosis: Diagnosis) -> dict[str, str | None]:
 
 
 def _log(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return times and counts of the compared log, and whether the calibration was fitted to it."""
+    """Return the template's values of the log: its times and counts, and its use by the calibration."""
     survey = diagnosis.problem.survey
     new = ~survey.learned
     time = survey.time[new]
