@@ -280,7 +280,7 @@ def test_a_file_without_a_value_is_named(
 def test_what_would_be_written_wrong_is_refused(
     arguments: str, code: int, words: str, deployment: Path, here: Path, command: Command
 ) -> None:
-    """The command also rejects a simulated log without a channel, whose true field is not a reading."""
+    """The commands also reject a simulated log that lacks a channel of the magnetometer."""
     write(read(deployment).isel(time=slice(0, 60)).drop_vars("mag_z"), "short.csv")
     save_calibration(identity(), "cal.json")
     assert words in command.refuses(*arguments.split(), code=code)

@@ -92,7 +92,7 @@ def test_what_headings_are_counted_from_may_be_told(deployment: Path, command: C
 
 
 def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:
-    """The plot also works for a log without an attitude, and for a parameter outside the fit."""
+    """The plot works for a log without attitude, and with a parameter that the method does not use."""
     write(read(deployment).drop_vars(["roll", "pitch", "heading"]), "bare.csv")
     fitted = "calibrate", "bare.csv", "--method", "nominal", "--parameter", "battpos"
     assert "no heading, which needs roll" in command(*fitted, "-o", "cal.json", "--plot", "fit.png").out

@@ -35,7 +35,7 @@ def test_evidence_asks_its_price() -> None:
 
 
 def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
-    """Compare with the integral over half a Gaussian of the size that the data prefer."""
+    """Compare with the integral over half a Gaussian prior of the likeliest size."""
     estimate = 1.8
     size = np.sqrt(estimate**2 - 1.0)
     b = np.linspace(0.0, 12.0, 20_001)

@@ -117,7 +117,7 @@ def test_what_a_calibration_learned_from_a_log_does_not_count_twice() -> None:
 
 
 def test_a_report_names_and_counts_the_dives_of_what_is_diagnosed_alone() -> None:
-    """The report does so even if only the log of the calibration numbers its runs."""
+    """The survey's dives have equal numbers and source, with and without the log of the calibration."""
     parts = segments(simulate(load("survey"), 2))
     survey = parts["survey"].drop_vars("run").assign_attrs(source="survey.nc")
     learned = parts["calibration"].assign_attrs(source="runs.nc")

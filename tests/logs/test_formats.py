@@ -105,7 +105,7 @@ TOLERANCES = {"latitude": 0.6e-7, "longitude": 0.6e-7, "depth": 0.6e-3, "heading
 
 
 def assert_close(back: xr.Dataset, dataset: xr.Dataset) -> None:
-    """As :func:`assert_same`, to the precision of the messages: float32, 1e-7 deg, mm, µs."""
+    """Assert equality as :func:`assert_same`, to the precision of the messages: float32, 1e-7 deg, mm, µs."""
     assert set(back.data_vars) == set(dataset.data_vars)
     for name, column in dataset.variables.items():
         atol = TOLERANCES.get(str(name), 0.6e-6 if "time" in str(name) else 1e-30)
@@ -267,7 +267,7 @@ def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
 
 
 def test_streams_in_bounded_memory(tmp_path: Path) -> None:
-    """Eight times the rows, as much memory: pieces of one size, none kept."""
+    """Eight times the rows need as much memory: the reader keeps only one piece of constant size."""
     import tracemalloc  # noqa: PLC0415 - slows everything down while it is loaded
 
     peaks = []
@@ -285,7 +285,7 @@ def test_streams_in_bounded_memory(tmp_path: Path) -> None:
 
 
 def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
-    """By the reader of its makers: topics, schemas and messages."""
+    """Foxglove's own reader finds the topics, schemas and messages."""
     reader = pytest.importorskip("mcap.reader")
     whole = example(50).fillna(2.0)
     whole["latitude"][7] = np.nan

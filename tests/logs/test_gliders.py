@@ -42,7 +42,7 @@ def dive(path: Path, **changed: tuple[str, np.ndarray]) -> xr.Dataset:
 
 
 def test_a_dive_across_the_date_line(tmp_path: Path) -> None:
-    """Its positions are at the times of its CTD, and rows between two of them are interpolated."""
+    """The dive's positions are at the times of its CTD, and rows between them are interpolated."""
     read = dive(tmp_path / "p1670001.nc")
     east = np.array([-3, -2, -1, 0, 1, 2, 3]) * 0.01
     np.testing.assert_allclose((read["longitude"] + 360.0) % 360.0, 180.0 + east, atol=1e-9)
@@ -55,7 +55,7 @@ def test_a_motor_s_current_is_that_of_its_manoeuvre(tmp_path: Path) -> None:
 
 
 def test_variables_of_another_length_than_their_times_are_left_out(tmp_path: Path) -> None:
-    """As in a file that somebody has cut: a channel of the magnetometer is missed aloud."""
+    """A truncated file has such variables; the reader reports a missing channel of the magnetometer."""
     path, short = tmp_path / "p1670001.nc", ("gc_event", np.zeros(2))
     whole = set(dive(path))
     for name, column in (("latitude", "latitude"), ("eng_head", "heading")):
@@ -219,7 +219,7 @@ def test_navigation_of_a_seaexplorer(packed: bool, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["sea035.12.pld1.sub.36", "sea035.12.pld1.raw.36"])
 def test_the_payload_s_rows_know_where_the_masses_were(name: str, tmp_path: Path) -> None:
-    """Between the navigation's samples of the same dive, not of another."""
+    """The mass positions are interpolated between the navigation's samples of one dive only."""
     (tmp_path / "sea035.12.gli.sub.36.gz").write_bytes(gzip.compress(GLI.encode()))
     (tmp_path / "sea035.12.gli.sub.3").write_text(GLI.replace("20.1", "99.9"))
     (tmp_path / name).write_text(PLD)

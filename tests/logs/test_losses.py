@@ -121,7 +121,7 @@ def test_no_good_file_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
-    """Its end is not text: the rows before it are kept, and the file is counted and named."""
+    """The file's end is not text: the rows before it are kept, and the file is counted and named."""
     paths = made(tmp_path, 3, ())
     long = deployment("made", T0 + 10.0 + np.arange(0.0, 10.0, 0.001), {"mag_x": np.ones(10_000)})
     logs.write(long, paths[1])

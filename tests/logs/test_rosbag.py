@@ -106,7 +106,7 @@ def test_a_bag_in_our_frames(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
 def test_one_file_of_a_bag(kind: str, tmp_path: Path) -> None:
-    """Without the folder's metadata, as Foxglove has them."""
+    """Foxglove's bags are single files without the metadata of a folder."""
     folder = bag(tmp_path / "log", kind)
     (file,) = folder.glob("*.db3" if kind == "sqlite3" else "*.mcap")
     whole = logs.read(folder)
@@ -128,7 +128,7 @@ def test_a_driver_that_does_not_publish_tesla_is_reported(
 
 
 def test_no_unit_fits(tmp_path: Path) -> None:
-    """A field that would be the Earth's in no unit stays what the message says."""
+    """A field that no unit makes as strong as the Earth's keeps the message's unit."""
     back = logs.read(bag(tmp_path / "log", scale=1e12))
     np.testing.assert_allclose(back["mag_x"], 1e21 * FIELD[:, 0], rtol=1e-9)
     assert not noted(back.attrs)
@@ -227,7 +227,7 @@ def test_whatever_a_robot_says_is_as_rosbags_reads_it(kind: str, tmp_path: Path)
 
 
 def test_an_imu_that_knows_no_orientation_gives_none(tmp_path: Path) -> None:
-    """Its first covariance is -1; the quaternion says nothing."""
+    """The first covariance of -1 means that the quaternion is invalid."""
 
     def other(write_message: Any, types: Any, header: Any, k: int, _: str) -> None:
         vector, nine = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 9.8), np.zeros(9)

@@ -1,4 +1,4 @@
-"""A sensor's own log is combined with a vehicle's logs: telemetry at the sensor's times, gaps counted."""
+"""Test that a sensor's log gets a vehicle's telemetry at the sensor's times, with gaps counted."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fluxgate(path: Path, time: np.ndarray) -> Path:
 
 @pytest.fixture
 def both(tmp_path: Path) -> tuple[Path, Path]:
-    """A fluxgate's log at 1 Hz, from 10 s before the vehicle's log to 10 s after it; and that log."""
+    """Return a fluxgate's log at 1 Hz, 10 s longer at both ends than the vehicle's log, and that log."""
     time = START + np.arange(-10.0, 211.0) + 0.5
     return fluxgate(tmp_path / "fluxgate.csv", time), vehicle(tmp_path / "vehicle.nc")
 

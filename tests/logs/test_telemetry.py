@@ -217,7 +217,7 @@ def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path)
 
 
 def test_the_log_says_what_its_parameters_are(tmp_path: Path) -> None:
-    """As a bridge does of its ``[telemetry]``: any field of any message, scaled, under its own name."""
+    """Like a bridge's ``[telemetry]``, the log declares any field of any message, scaled and named."""
     log = Log()
     name: dict[str, Any] = {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=batt"}
     array: dict[str, Any] = {

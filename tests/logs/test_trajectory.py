@@ -36,7 +36,7 @@ def made(path: Path, dimensions: dict[str, int], variables: Variables) -> Path:
 
 
 def flown(along: str, **names: str) -> Variables:
-    """Return the variables of a flight along a dimension, with some `names` replaced."""
+    """Return the variables of a flight along a dimension, with other `names` for some."""
     k = np.arange(float(N))
     columns: Variables = {
         "time": (along, T0 + 10.0 * k, dict(TIME)),
@@ -206,7 +206,7 @@ VARIABLES = {
 
 @pytest.fixture
 def metadata(here: Path) -> Path:
-    """Return the metadata that the page demands."""
+    """Write the metadata.toml that the documentation shows; return its path."""
     (text,) = (one.text for one in blocks("toml") if "[platform]" in one.text)
     (here / "metadata.toml").write_text(text)
     return here / "metadata.toml"

@@ -119,7 +119,7 @@ def test_key_file(tmp_path: Path) -> None:
 
 
 def test_signatures_follow_the_host_s_clock(peer: ModuleType) -> None:
-    """A computer without a real-time clock starts in 1970, until it receives the time."""
+    """The bridge's stamps follow an autopilot that is a day or a month ahead, but not eleven years."""
     ours, theirs = codec(now=5_000_000), station(peer)
     (refused,) = theirs.parse_buffer(text(codec(now=5_000_000)))
     assert refused.get_type() == "BAD_DATA"

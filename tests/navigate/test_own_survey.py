@@ -20,7 +20,7 @@ OPTIONS = NavigationOptions(start_sigma=1.0, current_sigma=0.03, drift=0.05, bia
 
 
 def flown(*, straight: bool) -> xr.Dataset:
-    """Return a glider's log in a current of 3 cm/s over a field of 40 nT and 700 m: to and fro, or ahead."""
+    """Return a glider's log with a drift of 3 cm/s, on triangles or straight, over a field of 40 nT."""
     rng = np.random.default_rng(4)
     time = np.arange(0.0, HOURS * 3600.0, DT)
     leg = (time // 1800.0).astype(int)

@@ -32,7 +32,7 @@ class Rock:
 
 
 def surveyed(rock: Rock) -> Samples:
-    """Fly 24 lines of 12 km, a sample every 100 m."""
+    """Return samples every 100 m on 24 lines of 12 km, one of which is off its stated place."""
     rng = np.random.default_rng(1)
     line, along = np.repeat(np.arange(24), 120), np.tile(100.0 * np.arange(120), 24)
     place = np.stack([along, APART * line], axis=1)
