@@ -14,8 +14,7 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Problem
 
 Columns = Callable[[slice], FloatArray]
-"""Function of a slice of m rows: (m, k) change of the residual per unit of each of k coefficients, stored
-column by column."""
+"""Function of m rows: (m, k) change of the residual per unit of k coefficients, stored column by column."""
 AXIS_NAMES = ("x", "y", "z")
 About = Literal["vehicle", "constant", "place", "time"]
 Group = tuple[str, str | None]
@@ -173,8 +172,7 @@ class Candidate:
     regressors: Callable[[slice], FloatArray] | None = None
     """Function of m rows: regressors (r, m) of the effect with less noise than the live ones; or None."""
     about: About = "vehicle"
-    """``vehicle`` for vehicle and sensor; else how the reference errs: ``constant``, by ``place``,
-    ``time``."""
+    """``vehicle`` (with sensor), or an error of the reference: ``constant``, by ``place`` or ``time``."""
 
     @property
     def group(self) -> Group:

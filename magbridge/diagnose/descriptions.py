@@ -1,7 +1,6 @@
 """Free descriptions: columns that model structure of any kind in a residual, without a physical cause.
 
-Functions here have histories of the log's n samples as arguments, (n,) or (n, 3), and return
-:mod:`.columns`: (m, k) for m rows.
+Arguments are series of the log's n samples, (n,) or (n, 3). Results are :mod:`.columns`, (m, k) for m rows.
 """
 
 from __future__ import annotations
@@ -63,10 +62,7 @@ def spectra(count: int, axes: int) -> tuple[tuple[str, FloatArray], ...]:
 
 
 def direction(body: Columns) -> Columns:
-    """Return the monomials of order 1 to 4 of the field's direction in the body.
-
-    `body` returns (m, 3) vectors in that direction.
-    """
+    """Return monomials of order 1 to 4 of the field's direction in the body, that of `body` (m, 3)."""
     exponents = [(i, j, d - i - j) for d in (1, 2, 3, 4) for i in range(d + 1) for j in range(d + 1 - i)]
 
     def columns(rows: slice) -> FloatArray:

@@ -27,10 +27,7 @@ MIN_RMS_REDUCTION = 0.01
 
 
 def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
-    """Return the samples (n,) by which an improvement is measured.
-
-    Samples of the calibration's own logs and outliers are excluded, unless no other sample is left.
-    """
+    """Return the samples (n,) that count: outside the calibration's logs, and no outliers."""
     # Where every sample was learned from, all of them count
     counts = ~problem.survey.learned
     if wrong is not None:
@@ -53,8 +50,7 @@ class Finding:
     covariance: FloatArray
     """(k, k) covariance of the coefficients, in the same units."""
     over_random_walk: float = np.inf
-    """Log odds over random-walk offsets (:func:`.odds_over_random_walk`); infinite if the cause is not
-    slow."""
+    """Log odds over random-walk offsets (:mod:`.run`); infinite for a cause that is not slow."""
     further: tuple[Candidate, ...] = ()
     """Further causes of the same family in the fit: competing hypotheses, not findings of their own."""
 
@@ -84,10 +80,7 @@ class Finding:
         return np.asarray(columns @ self.coefficients / problem.reference_jacobian)
 
     def follows(self, problem: Problem, fit: Joint) -> Seen:
-        """Return the series that the residual without the other causes follows, and the RMS of this cause.
-
-        The series is None if noise hides it.
-        """
+        """Return the series that the residual of all other causes follows; None if noise hides it."""
         field = self.field(problem)
         found = seen(problem, field + fit.residual / problem.reference_jacobian, field)
         return found._replace(size=rms(field))
@@ -165,10 +158,7 @@ def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool
 def verdict_of(
     named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Improvement
 ) -> str:
-    """Return the verdict of ``findings.json``.
-
-    It is ``explained`` only if nothing unnamed remains and the named causes improve held-out dives.
-    """
+    """Return the verdict of ``findings.json``; causes without held-out improvement explain only in part."""
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"

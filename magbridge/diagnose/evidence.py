@@ -56,8 +56,7 @@ SMOOTH, MOST_REMAINING = 0.1, 8.0
 """Replacement of :data:`REMNANT` for a Gaussian process, and largest signal-to-noise of its remnant."""
 SIMULATIONS = 400
 CONFOUNDED = 0.85
-"""Correlation above which two causes are listed as a pair. At this value S/N 6 distinguishes them in 95 % of
-cases."""
+"""Correlation above which two causes are listed as a pair; at S/N 6 it leaves 5 % of cases confused."""
 MAX_PLAUSIBLE_MULTIPLE = 50.0
 """Multiple of its plausible size from which on an effect is impossible."""
 FREE = 1e-3
@@ -91,10 +90,7 @@ class Information:
         )
 
     def released(self, base: Joint, *places: slice) -> Information:
-        """Return the information without the coefficients at `places` of the model of `base`.
-
-        The other coefficients of the model are projected out.
-        """
+        """Return the information without these coefficients of `base`, the others projected out."""
         first, own = len(self.score) - base.coefficients.size, np.r_[*places]
         others = np.setdiff1d(np.arange(first, len(self.score)), own)
         S = self.matrix[np.ix_(others, others)] + np.diag(base.prior[len(base.z) + others - first])

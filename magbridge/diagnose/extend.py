@@ -38,8 +38,7 @@ MAX_STEPS = 12
 MAX_HALVINGS = 6
 """Largest number of halvings of one step."""
 MAX_MISMATCH = 0.1
-"""Largest RMS difference of linear prediction and nonlinear residual at convergence, as a fraction of the
-noise."""
+"""Convergence: RMS difference of linear prediction and nonlinear residual, as a fraction of the noise."""
 MODES = 64
 """Number of directions over which the misfit of an idealised regressor is spread, from the blind study."""
 
@@ -50,10 +49,7 @@ def loosened(
     columns: Sequence[Columns],
     fit: Joint,
 ) -> Joint:
-    """Return the fit with its covariance widened for free nonlinear parameters.
-
-    `columns` are the columns of the model's pieces.
-    """
+    """Return the fit with its covariance widened for nonlinear parameters; `columns` are of `model`."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if not any(piece.point.rebuild and piece.point.cells for piece in pieces):
         return fit

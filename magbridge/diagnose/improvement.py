@@ -310,8 +310,7 @@ def _excess_variance(
 ) -> float:
     """Return the largest excess, nT², of the mean square held-out error over the stated variance.
 
-    The excess is computed for each set of samples (n,) in `parts`; 0 is the smallest result. The covariance
-    of a fit contains noise alone, not the error of its model.
+    The largest is over the sets of samples in `parts`. A fit's covariance lacks the error of its model.
     """
     sigma = corrected(problem.survey, calibration).sigma
     return max(0.0, *(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any()))

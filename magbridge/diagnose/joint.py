@@ -334,10 +334,7 @@ def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
 
 
 def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, place: slice, spectra: FloatArray) -> FloatArray:
-    """Return the prior precision of the coefficients at `place` for their likeliest size and spectrum.
-
-    P and h are the information and the score at zero of all coefficients.
-    """
+    """Return the prior precision of the coefficients at `place` for their likeliest size and spectrum."""
     # Schur complement: information and score of the block, all other coefficients projected out
     others = np.delete(np.arange(len(h)), place)
     K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, place])
@@ -436,10 +433,7 @@ class Improvement(NamedTuple):
 def paired(
     error_before: FloatArray, error_after: FloatArray, dive: IntArray, counts: BoolArray
 ) -> Improvement:
-    """Return the improvement between two errors (n,), nT, over the samples where `counts` (n,) is true.
-
-    Its interval is a bootstrap over whole dives.
-    """
+    """Return the improvement between two errors (n,), nT, where `counts` (n,), by a bootstrap of dives."""
     # Sums of squares of each dive: the bootstrap then draws dives, not samples
     number = np.unique(dive[counts], return_inverse=True)[1]
     b, a = np.bincount(number, error_before[counts] ** 2), np.bincount(number, error_after[counts] ** 2)

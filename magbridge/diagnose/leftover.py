@@ -29,8 +29,8 @@ from magbridge.diagnose.state import CompetingHypothesis
 from magbridge.estimation.residual import rms, robust_scale
 
 MAX_TESTED_COEFFICIENTS = 6
-"""Largest number of coefficients of a cause whose amplitude is tested for variation: with more, a cause can
-have almost any shape."""
+"""Most coefficients of a cause that is tested for a varying amplitude; with more, it fits almost any
+shape."""
 COMPARED_DESCRIPTIONS = 3
 """Number of descriptions, the best under each noise, that are compared by the full likelihood."""
 TURNS = 6
@@ -168,8 +168,7 @@ def leftover(
 ) -> Leftover | None:
     """Return the best significant description of the residual of `model`, or None.
 
-    Descriptions that only repeat the regressors of the causes in `but` are not tried. Those in `also` are
-    tried in addition.
+    Descriptions that only repeat the regressors of the causes in `but` are not tried; those in `also` are.
     """
     # Descriptions that only repeat an excluded cause's own regressors are no alternatives
     listed = [one for one in (*descriptions(problem, fit), *also) if not one.covers(but)]

@@ -162,10 +162,7 @@ class ResidualNoise:
         return out
 
     def response(self, residual: FloatArray) -> FloatArray:
-        """Return the response y (n,) of the module notes for a residual (n,), nT.
-
-        The weights in psi come from the fitted residual.
-        """
+        """Return y (n,) of the module notes for a residual (n,), nT, with the fitted weights of psi."""
         weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
         return np.asarray(weight * self.whiten(residual) / self.kappa)
 

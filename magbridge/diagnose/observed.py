@@ -37,8 +37,7 @@ CORRELATION_LAGS_S = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 7
 MIN_EXPLAINED_FRACTION = 0.1
 """Least fraction of a signal's power that a series must explain to be reported."""
 MIN_AXIS_FRACTION = 0.8
-"""Least ratio of the power that one axis explains to the power that all axes explain, for a report of the
-axis."""
+"""Least ratio of the power explained by one axis to that by all axes, for a report of the axis."""
 MIN_LAG_GAIN = 0.02
 """Fraction of the signal's power that a series with a lag must explain in addition to one without."""
 CLEARLY = 0.1
@@ -64,8 +63,7 @@ class Seen(NamedTuple):
     """The series that a signal follows, and how well."""
 
     channel: str | None
-    """Series that explains most: a channel, ``time``, ``roll``, ``pitch`` or ``heading``; None if none
-    does."""
+    """Channel that explains most, or ``time``, ``roll``, ``pitch``, ``heading``; None if none does."""
     lag: float
     """Lag of the signal behind the series, s."""
     axis: str | None
@@ -98,10 +96,7 @@ class Memory(NamedTuple):
 
 
 def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = None) -> Seen:
-    """Return the series that a signal (n,), nT of the total field, follows.
-
-    If a `component` (n,) of the signal is given, it must follow the series as well.
-    """
+    """Return the series that a signal (n,), nT of total field, and its part `component` (n,) follow."""
     part = slice(None, None, -(-len(signal) // CORRELATION_ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
     axes = np.column_stack([np.ones(len(u)), u])

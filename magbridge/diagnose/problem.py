@@ -59,8 +59,7 @@ BROADEST = 1e-3
 FALL = 0.3
 """Ratio of a coefficient's plausible size to that of the next lower power of a mass' position."""
 MIN_PRECISION = 0.1
-"""Remaining precision, in units of the posterior's, above which logs other than the repeated ones determined
-a direction."""
+"""Remaining precision, as a fraction of the posterior's, above which other logs determined a direction."""
 STABLE = 2e-5
 """Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better
 than 20 ppm."""
@@ -79,10 +78,7 @@ def waves() -> FloatArray:
 
 
 def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
-    """Return the change of m rows of a residual per nT of each slow-noise coefficient, (m, k).
-
-    `slopes` (n, 3) are the derivatives of the residual by the offsets of the axes.
-    """
+    """Return the change (m, k) of m rows of a residual per nT of each slow-noise coefficient."""
     # cos(pi k t / T) at the middle of each sample's interval
     n, part = len(slopes), slopes.T[:, rows]
     phase = np.pi * (np.arange(n)[rows] + 0.5) / n
@@ -111,8 +107,7 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
 def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
     """Return the error (3, n), nT per s of delay, of axes sampled late and interpolated to their row.
 
-    The readings `H` (3, n), nT, must be free of noise, because the one-sided difference would correlate with
-    it.
+    `H` (3, n), nT, must be free of the readings' noise, with which a one-sided difference would correlate.
     """
     # Linear interpolation between t - h + tau and t + tau: H + tau (dH/dt - (H_0 - H_-) / h), per unit of tau
     rate, follows = rates(survey, H), survey.follows()
@@ -136,10 +131,7 @@ def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
 def derivatives(
     calibration: Calibration, samples: ResidualSamples, g: FloatArray, L: FloatArray, dtype: type = float
 ) -> FloatArray:
-    """Return the derivatives of the residual by all K coefficients times L (K, q): (n, q).
-
-    `g` (n, 9) are the derivatives by the nine coefficients of each sample.
-    """
+    """Return (n, q) derivatives of the residual by all coefficients, times L (K, q); g is (n, 9)."""
     # Sum over r, s of phi_r C_krs g_s, by one product of matrices for each block of rows
     tensor, _ = coefficient_tensor(calibration)  # C_krs of :mod:`.problem`
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], tensor[0].size).T

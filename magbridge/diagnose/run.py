@@ -58,8 +58,7 @@ names of S/N 8 one had 1.9; of ten wrong names four had more."""
 ABSURD = 0.5
 """Largest median error of the corrected field, as a fraction of the field, for which a diagnosis is made."""
 MIN_SLOW_FRACTION = 0.5
-"""Fraction of a cause's power that remains in means over up to 64 samples, from which on the cause is
-slow."""
+"""Least fraction of a slow cause's power that remains in means over up to 64 samples."""
 
 
 def accept(problem: Problem, outcome: SearchOutcome) -> tuple[bool, Leftover | None]:
@@ -125,10 +124,7 @@ def settle(
 
 
 def _foretold(problem: Problem, model: Sequence[Candidate], fit: Joint, best: Leftover | None) -> float:
-    """Return the log predictive density of interleaved held-out dives: of a model, or with descriptions.
-
-    It is the largest of the model alone and of the model with each fitted description of `best`.
-    """
+    """Return the held-out score of a model with the best of the descriptions in `best`, if any helps."""
     columns = [candidate.columns for candidate in model]
     scores = [held_out(problem, columns, fit, interleaved=True).score]
     for one in best.fitted if best else ():
@@ -313,10 +309,7 @@ def _examine(
 
 
 def _refused(diagnosis: Diagnosis, values: tuple[float, float]) -> Diagnosis:
-    """Return the diagnosis with its extension refused because the written file corrects the log worse.
-
-    `values` are the RMS errors, nT, with the given and the written calibration.
-    """
+    """Return the diagnosis with a refused extension; `values` are RMS errors, nT, as given and written."""
     problem, counts = diagnosis.problem, diagnosis.counts
     unchanged = paired(diagnosis.before, diagnosis.before, problem.survey.dive, counts)
     return replace(
@@ -327,10 +320,7 @@ def _refused(diagnosis: Diagnosis, values: tuple[float, float]) -> Diagnosis:
 
 
 def _posed(survey: Survey, calibration: Calibration) -> Problem:
-    """Return the problem of a survey, linearised about a calibration.
-
-    DataError: the corrected field is so wrong that vehicle or units must differ from the calibration's.
-    """
+    """Return the linearised problem; DataError: the data are of another vehicle or in another unit."""
     problem = pose(survey, calibration)
     off, field = float(np.median(np.abs(problem.residual))), float(np.median(survey.reference))
     if off > ABSURD * field:
@@ -342,10 +332,7 @@ def _posed(survey: Survey, calibration: Calibration) -> Problem:
 
 
 def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Candidate], dict[str, str]]:
-    """Return the candidates of all causes, and what a log needs, by name, for the causes without candidates.
-
-    DataError: no cause has a candidate.
-    """
+    """Return all candidates, and the needs of causes without any; DataError: no candidate at all."""
     candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
     untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
     if len(untestable) == len(causes):
@@ -366,10 +353,7 @@ def _extended(
     counts: BoolArray,
     causes: Mapping[str, Cause],
 ) -> tuple[SearchOutcome, Extension, dict[int, Improvement]]:
-    """Return the causes that held-out dives support, the extension by them, and each family's improvement.
-
-    The improvements are by index of the first cause of a family.
-    """
+    """Return the causes that held-out dives support, their extension, and each family's improvement."""
     while names.chosen:
         # Extend by all names, then measure each family against an extension by the others
         extension = extension_of(problem, names.model, names.fit, counts)

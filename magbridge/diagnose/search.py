@@ -56,8 +56,7 @@ from magbridge.diagnose.state import (
 from magbridge.estimation.residual import robust_scale
 
 Rival = Callable[[Problem, Sequence[Candidate], Joint, Candidate], float | None]
-"""Function of problem, model, fit and further cause: held-out score of the best free description in place of
-the further cause, or None."""
+"""Function of problem, model, fit, further cause: held-out score of a free description instead, or None."""
 LOST, PLACES = 2, 6
 """Least number of regressors in the model, and number of level shifts to exceed, for a switching signal."""
 AFTERWARDS = 16
@@ -86,10 +85,7 @@ class Outliers(NamedTuple):
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
-    """Return the significant outliers of a fit, or None.
-
-    The mixture ``(1 - eps) t_nu + eps N(0, S^2)`` is tested against the best ``t_nu``.
-    """
+    """Return the outliers if ``(1 - eps) t_nu + eps N(0, S^2)`` beats the best ``t_nu``, else None."""
     v = fit.noise.innovations
     n = len(v)
     if np.abs(v).max() < 5.0:

@@ -220,10 +220,7 @@ def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 
 def _ridge(model: Sequence[Candidate]) -> FloatArray:
-    """Return the prior precision (k,) of a model's coefficients, in units of their widths.
-
-    It is 1 for errors of the reference and coefficients of one common size, else :data:`.RIDGE`.
-    """
+    """Return the initial prior precision (k,): :data:`.RIDGE`, or 1 for reference errors and common sizes."""
     natural = [not c.effects or c.spectra is not None for c in model]
     return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
 
@@ -256,10 +253,7 @@ def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, 
 def _profiled(
     state: SearchState, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
 ) -> tuple[Candidate, FloatArray, float]:
-    """Return the candidate at the best value of parameter `name`, its start coefficients, and a log ratio.
-
-    The ratio is the width of a grid cell over the width of the likelihood in the parameter.
-    """
+    """Return the best value's candidate, start coefficients, and log ratio of cell to likelihood width."""
     rebuild = best.candidate.point.rebuild
     assert rebuild is not None
     columns = [candidate.columns for candidate in model]
@@ -306,10 +300,7 @@ def _bracket(state: SearchState, candidate: Candidate, name: str) -> tuple[float
 def refined(
     state: SearchState, model: list[Candidate], base: Joint, members: int | None = None
 ) -> tuple[list[Candidate], Joint]:
-    """Return the model, and its fit, with the nonlinear parameters of its first `members` profiled.
-
-    Each is profiled given the others, and then moves to the end of the model.
-    """
+    """Return model and fit after its first `members` were profiled in turn and moved to the end."""
     for _ in range(len(model) if members is None else members):
         own, others = model[0], model[1:]
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
@@ -377,10 +368,7 @@ def exchanged(state: SearchState, model: list[Candidate], base: Joint) -> tuple[
 
 
 def _changes(state: SearchState, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], int]]:
-    """Return the changes of the model to try: the new candidates, and the index of the piece they replace.
-
-    The first changes drop each piece; the likeliest replacements follow.
-    """
+    """Return the exchanges to try: new candidates (none for a drop), and the index of the replaced piece."""
     info = state.conditional_on(pieces, base)
     found = [
         (one.behind, [one.candidate], place)

@@ -61,8 +61,7 @@ MAX_LAG = 1000
 MIN_SURVEY_SAMPLES = 60
 """Least number of samples from which noise and an effect can both be estimated."""
 SHORT = 0.25
-"""Quantile of the time steps that is taken as the sampling interval: some gliders sample faster near the
-surface."""
+"""Quantile of time steps taken as the sampling interval: some gliders sample faster near the surface."""
 INTERNAL_PREFIXES = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of a magnetic field. A second magnetometer repeats all effects and so cannot explain any."""
@@ -74,8 +73,7 @@ NOT_TELEMETRY = {
 TRUSTED = 0.5
 """Largest cubic term in the interpolation of an axis to its row's time, as a multiple of the noise."""
 MAX_HALF_RANGES = 10.0
-"""Distance of a parameter from the middle of its calibrated range, in half ranges, beyond which it is no
-valid position."""
+"""Distance from the middle of a parameter's range, in half ranges, beyond which a value is invalid."""
 
 
 def kinds_of(name: str, unit: str) -> tuple[str, ...]:
@@ -393,10 +391,7 @@ def _sources(logs: Sequence[xr.Dataset]) -> str:
 
 
 def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
-    """Return the rows with field, reference and all parameters, one row for each time.
-
-    DataError: fewer than :data:`MIN_SURVEY_SAMPLES` samples, or complete rows.
-    """
+    """Return the rows with field, reference and all parameters; DataError: too few rows."""
     needed = [*CHANNELS, "reference_field", *calibration.units]
     size = table["time"].size
     if size < MIN_SURVEY_SAMPLES:
@@ -419,10 +414,7 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
 def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
 ) -> dict[str, FloatArray]:
-    """Return the numeric columns of a log, with axes interpolated to the rows' times, and its reference.
-
-    DataError: the log is of another sensor, or lacks a column.
-    """
+    """Return a log's numeric columns and reference; its axes are interpolated to the rows' times."""
     source = str(ds.attrs.get("source", "deployment"))
     sensor = str(ds.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):

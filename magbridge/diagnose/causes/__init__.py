@@ -1,7 +1,6 @@
 """The causes of error that a diagnosis tests: one class for each, with its equation in the docstring.
 
-Start with :mod:`.base`, the interface. Another package adds a cause by an entry point of the group
-:data:`GROUP`.
+Start with :mod:`.base`, the interface. A package adds a cause by an entry point of :data:`GROUP`.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ from magbridge.plugins import load, plugins
 __all__ = ["CAUSES", "Cause", "known"]
 
 GROUP = "magbridge.causes"
-"""Group of entry points: each loads a :class:`Cause`, and its name is the name of the cause in
-``findings.json``."""
+"""Group of entry points that add a :class:`Cause`, under the cause's name in ``findings.json``."""
 
 CAUSES: dict[str, Cause] = {
     cause.name: cause

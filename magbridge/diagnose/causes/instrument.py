@@ -15,7 +15,7 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import Problem
 
 ONSETS = 40
-"""Number of onsets of a step that are tried, evenly over the samples. Four times as many gain only 0.6 in log
+"""Number of onsets tried for a step, evenly over the samples. Four times as many gain only 0.6 in log
 odds."""
 TONES = 5
 """Number of peaks of the spectrum that are tried as tones."""

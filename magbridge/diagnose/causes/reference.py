@@ -46,10 +46,7 @@ class MapError(Cause):
     family = "reference"
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return two Gaussian processes: a map for another height, and a map with errors.
-
-        Return none for a log without positions, or with a track of less than 200 m.
-        """
+        """Return two Gaussian processes: a map for another height, and a map with errors."""
         place = problem.survey.place
         if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
             return []

@@ -16,8 +16,7 @@ from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effe
 from magbridge.diagnose.problem import Problem, cached_per_problem
 
 TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
-"""Lags of a temperature effect that are tried, s. The nearest one imitates any lag between to within a fifth
-(RMS)."""
+"""Lags of a temperature effect that are tried, s; any lag between is imitated to within a fifth (RMS)."""
 STAGES = 2
 """Number of equal lags in series, for hull and core: one lag is wrong by 10 to 30 % of a slab's temperature,
 two lags by 4 to 9 %."""
@@ -27,10 +26,7 @@ MAX_JOINT_CURRENTS = 12
 
 @cached_per_problem
 def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatArray]]:
-    """Return a function of channel and lag, s, that returns a cached lagged temperature by rows, (1, m).
-
-    Origins and causes share a temperature, of 3 MB for a month.
-    """
+    """Return a function of channel and lag, s, that returns a lagged temperature by rows, (1, m)."""
     survey = problem.survey  # a cache that referred to the problem would keep it alive
 
     @lru_cache(len(TELEMETRY_LAGS_S) * len(problem.channels_of("temperature")))

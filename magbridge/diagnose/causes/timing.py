@@ -62,10 +62,7 @@ class _Rate(Cause):
     """Names of the coefficients."""
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the single candidate, whose rates come from a spline.
-
-        The live correction takes backward differences, which contain the noise of their own sample.
-        """
+        """Return the single candidate; its rates are less noisy than the live backward differences."""
         effect, phi = RateEffect(cause=self.name, on=self.on), field_rates(problem)
         return [
             of_effect(

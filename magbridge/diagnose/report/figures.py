@@ -17,8 +17,7 @@ from magbridge.diagnose.diagnosis import Diagnosis, label
 from magbridge.pictures import literal
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
-"""Colours of the plots. Colour-blind readers distinguish the first two; in grey print the second is
-darker."""
+"""Colours of plots. Colour-blind readers distinguish the first two; in grey print the second is darker."""
 MIN_FONT_PT = 9.0
 """Smallest size of letters, pt."""
 CURVE_POINTS = 4000
@@ -148,10 +147,7 @@ def measured(diagnosis: Diagnosis) -> str:
 
 
 def terms(diagnosis: Diagnosis) -> str | None:
-    """Return a plot of each cause's contribution to the total field over time; None without findings.
-
-    The dots are the contribution plus the residual of the fit.
-    """
+    """Return a plot of each cause's effect, over the residual without it; None without findings."""
     if not diagnosis.findings:
         return None
     count, part = len(diagnosis.findings), thin(len(diagnosis.problem))
