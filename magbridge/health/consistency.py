@@ -63,7 +63,8 @@ NOISE_DOF: Final = 8.0
 MIN_ERROR_SIGMA: Final = 1.0
 """Smallest RMS effect of an error that raises an alarm, in sigmas of the total field."""
 REPORTED_ERROR_SIGMA: Final = 3.0
-"""RMS effect from which an alarm is reported in text, in sigmas; a smaller one widens sigma only."""
+REPORTED_LOG_RATIO: Final = 25.0
+"""RMS effect, in sigmas, and L from which an alarm is reported in text; below either, only sigma widens."""
 CLEAR_LOG_RATIO: Final = 4.0
 """Log-likelihood ratio L below which an alarm ends."""
 COMPETING_LOG_RATIO: Final = 5.0
@@ -269,7 +270,7 @@ class ConsistencyCheck:
             f = test.signature[row]
             error = float(f @ test.amplitude[row])
             self._variance += weight * (error * error + float(f @ test.covariance(row) @ f))
-        if size <= REPORTED_ERROR_SIGMA * sigma:
+        if size <= REPORTED_ERROR_SIGMA * sigma or largest < REPORTED_LOG_RATIO:
             return
         kind = ERROR_KINDS[min(int(test.kind[rows[0]]), len(ERROR_KINDS) - 1)]
         text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind} wrong"
