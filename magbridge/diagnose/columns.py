@@ -288,9 +288,6 @@ def of_reference(
     names: tuple[str, ...],
     kind: About,
 ) -> Candidate:
-    """Return the candidate of an error of the reference, ``sum_k b_k basis_k(t)``, nT.
-
-    `basis` returns (m, k) for m rows. `width` (k,) is the plausible size of each b_k, nT.
-    """
+    """Return the candidate of an error of the reference, ``sum_k b_k basis_k(t)``, nT."""
     columns = lambda rows: problem.reference_jacobian[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
     return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=kind)

@@ -350,10 +350,7 @@ def _of_attitude(problem: Problem) -> list[Description]:
 def _in_body(
     problem: Problem, basis: Columns, *, scales: bool = False, kind: str = "broadband", **more: Any
 ) -> Description:
-    """Return a description with each function of `basis` along each body axis.
-
-    With `scales`, each function is multiplied by the axis' reading in units of the usual field.
-    """
+    """Return a description by `basis` along each body axis, times the axis' reading with `scales`."""
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)

@@ -6,11 +6,9 @@ The log is divided into folds of whole dives, runs or eighths. Each fold is corr
 :func:`magbridge.calibration.correct.correct` with a calibration that is fitted to the other folds. For
 comparison, the calibration as given is refitted in the same way without any cause.
 
-An extension is refused for one of three reasons:
-
-- the linear model's held-out prediction and the corrected field differ by more than the noise;
-- the corrected field moves further than the given covariance allows, where the log does not determine it;
-- the held-out field becomes worse.
+An extension is refused for one of three reasons. The linear model's held-out prediction and the corrected
+field differ by more than the noise. The corrected field moves further than the given covariance allows, where
+the log does not determine it. Or the held-out field becomes worse.
 """
 
 from __future__ import annotations
@@ -310,7 +308,7 @@ def _excess_variance(
 ) -> float:
     """Return the largest excess, nT², of the mean square held-out error over the stated variance.
 
-    The largest is over the sets of samples in `parts`. A fit's covariance lacks the error of its model.
+    `parts` are sets of samples, the largest of whose excesses counts. A covariance lacks the model's error.
     """
     sigma = corrected(problem.survey, calibration).sigma
     return max(0.0, *(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any()))

@@ -113,10 +113,7 @@ class ResidualNoise:
         return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
 
     def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
-        """Return the whitened columns (m, k) of `values`, whose first row is row `start` of the log.
-
-        The first `skip` rows of `values` only serve as the past, and are not returned.
-        """
+        """Return the whitened rows of `values` from log row `start` + `skip` on; earlier rows are a past."""
         # Band matrix of f (1, -a) in blocks of BAND rows: one dense product for each block
         p, k, own = len(self.ar), values.shape[1], len(values) - skip
         count = -(-own // BAND)
@@ -222,10 +219,7 @@ def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
 
 
 def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
-    """Return the order p of the autoregression by Akaike's criterion, with the residual's outliers clipped.
-
-    `slots` (n,) are the times of the samples, in sampling intervals.
-    """
+    """Return the autoregression's order by Akaike's criterion; `slots` (n,) are times in intervals."""
     n = len(residual)
     scale = robust_scale(residual) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
@@ -333,10 +327,7 @@ def _sums(values: FloatArray, count: IntArray) -> FloatArray:
 
 
 def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray, float]:
-    """Return the likeliest of :data:`TAILS`, the level of each sample (n,), nT, and the log likelihood.
-
-    The search starts from `nu`. `v` (n,) are the innovations, nT, and `count` the blocks' lengths.
-    """
+    """Return the likeliest of :data:`TAILS`, the level of each sample (n,), nT, and the log likelihood."""
     # Hill climbing over the list of tails, which has one peak
     at = TAILS.index(nu)
     square = v * v
@@ -353,10 +344,7 @@ def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray
 
 
 def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -> tuple[float, FloatArray]:
-    """Return the log likelihood and the likeliest level (b,), nT, of each block under tails `nu`.
-
-    `square` (n,) are squared innovations, nT², `count` (b,) the blocks' lengths, and `level` a first guess.
-    """
+    """Return the log likelihood and the likeliest level (b,), nT, of each block under tails `nu`."""
     n = len(square)
     power = level**2
     # Expectation maximisation of a Student scale, all blocks at once

@@ -110,10 +110,7 @@ def _columns(
 
 
 def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
-    """Return the places of one `length`, in intervals, with a ratio above :data:`LEAST_RATIO`, (5, m).
-
-    The rows are length, frequency (per interval), moment (intervals), likelihood ratio and log prior.
-    """
+    """Return (5, m) length, frequency, moment (intervals), ratio and log prior of notable places."""
     noise, slots, slope = fit.noise, problem.survey.slots, problem.reference_jacobian
     wide, every = WINDOW * length, length // 2
     window = np.exp(-0.5 * ((np.arange(wide) - wide // 2) / length) ** 2)

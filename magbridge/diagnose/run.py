@@ -64,11 +64,9 @@ MIN_SLOW_FRACTION = 0.5
 def accept(problem: Problem, outcome: SearchOutcome) -> tuple[bool, Leftover | None]:
     """Return True if the causes found are named, and a description of the signal that remains, or None.
 
-    If the causes are not named, the description is of the whole signal. Causes and free descriptions have a
-    penalty for the number of their alternatives. The causes are named on two conditions, both with a
-    description of the remaining signal: they are likelier than every description of the whole signal, and
-    they predict held-out dives about as well. Otherwise they remain possible unless odds are 20:1 against
-    them.
+    If the causes are not named, the description is of the whole signal. Causes and descriptions have a
+    penalty for their alternatives. The causes are named if, with a description of the remaining signal, they
+    are likelier than every description of the whole signal and predict held-out dives about as well.
     """
     model = outcome.model
     # Names: their likelihood ratio with all prices

@@ -1,7 +1,6 @@
 """The steps of a search: score all causes given a model, fit the likeliest, profile and exchange causes.
 
-A model is a list of candidates. It is not part of the state: each step has a model as argument and returns
-another.
+A model is a list of candidates, not part of the state: each step has one as argument and returns another.
 """
 
 from __future__ import annotations

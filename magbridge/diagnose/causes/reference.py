@@ -90,10 +90,7 @@ def _expanded(
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:
-    """Return the mean position (c, 3), m, in each cell of the track, and the side of the cells, m.
-
-    The side is the smallest, from :data:`FINEST` on, that gives at most :data:`MAX_MAP_ERROR_CELLS` cells.
-    """
+    """Return the mean position (c, 3), m, in each of at most 300 cells of the track, and their side, m."""
     # Coarser cells until there are few enough
     side = FINEST
     while (found := _each(np.floor(place / side)))[1].max() >= MAX_MAP_ERROR_CELLS:
@@ -111,10 +108,7 @@ def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
 
 
 def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
-    """Return (n, c) weights that interpolate linearly between the corners of visited cells, and the corners.
-
-    `place` (n, d) and the corners (c, d) are in m, as is the `side` of a cell.
-    """
+    """Return (n, c) weights of linear interpolation between corners of visited cells, and these (c, d), m."""
     low = np.floor(place / side)
     high = place / side - low
     # Trilinear weights of the corners of each sample's cell
@@ -184,8 +178,7 @@ class DiurnalVariation(Cause):
 class ReferenceBias(Cause):
     """The reference is off by a constant: a main-field model lacks the crustal field.
 
-    Main-field models are within 73 to 114 nT in each component at 68 % of sites (Beggan 2022, Earth Planets
-    Space 74:17).
+    At 68 % of sites a model errs by at most 73 to 114 nT (Beggan 2022, Earth Planets Space 74:17).
     """
 
     name = "reference_bias"
