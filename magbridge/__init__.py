@@ -8,33 +8,33 @@ From logs of calibration runs to corrected samples::
     mb.save(found.calibration, "cal.json")
     mb.write(mb.correct_rows(mb.Correction(found.calibration), mb.read("survey.nc")), "corrected.nc")
 
-What there is:
+Functions and classes:
 
-- ``read``: a log, or several, of any format, as an ``xarray.Dataset`` on ``time``
-- ``write``: a Dataset as a file, in the format of its suffix
-- ``from_frame``: a Dataset from a pandas data frame
-- ``to_frame``: a data frame from a Dataset, indexed by moments in UTC
-- ``read_grid``: an anomaly grid, of any format
-- ``reference_field``: what the total field should be at the places of a log
-- ``observations``: what a fit needs of a log, and which of its columns move masses
-- ``calibrate``: a calibration of a log, with its scalar magnetometer
-- ``fit``: a calibration of these observations, with its covariance, warnings and residual
-- ``Calibration``: what a fit found: the model, its coefficients and how sure they are
-- ``save``, ``load``: a calibration to and from ``cal.json``
-- ``correct``: the field of one reading, of arrays of them, or of a log with its scalar magnetometer
-- ``Corrector``: the same for many readings, one by one
-- ``Correction``: readings and telemetry, aligned and corrected as the bridge does it
-- ``correct_rows``: a log, corrected: total field, vector, anomaly, sigmas and flags
-- ``heading``: the heading of corrected vectors, with its standard deviation
-- ``plan``: the calibration runs to run next
-- ``diagnose``: the errors of the model in logs, their causes, and an extended calibration
-- ``survey``: an anomaly map from corrected logs
-- ``navigate``: the track that the field and a map give
-- ``plot``: plots: ``corrected``, ``residuals``, ``grid``; each returns matplotlib's axes
-- ``MagbridgeError``: what every error is that magbridge raises; its text is one line
+- ``read``: read one or several logs of any format as an ``xarray.Dataset`` on ``time``
+- ``write``: write a Dataset to a file, in the format of the file's suffix
+- ``from_frame``: convert a pandas data frame to a Dataset
+- ``to_frame``: convert a Dataset to a data frame, indexed by UTC times
+- ``read_grid``: read an anomaly grid of any format
+- ``reference_field``: compute the expected total field at the positions of a log
+- ``observations``: select the data of a log that a fit needs, given the columns that move masses
+- ``calibrate``: fit a calibration to a log, including its scalar magnetometer
+- ``fit``: fit a calibration to observations, with covariance, warnings and residual
+- ``Calibration``: model with its coefficients and their covariance
+- ``save``, ``load``: write and read a calibration (``cal.json``)
+- ``correct``: correct one reading, arrays of readings, or a log with its scalar magnetometer
+- ``Corrector``: correct many readings, one by one
+- ``Correction``: align and correct readings and telemetry as the bridge does
+- ``correct_rows``: correct a log: total field, vector, anomaly, sigmas and flags
+- ``heading``: compute the heading of corrected vectors, with its standard deviation
+- ``plan``: choose the next calibration runs
+- ``diagnose``: find the errors of the model in logs and their causes, and extend the calibration
+- ``survey``: make an anomaly map from corrected logs
+- ``navigate``: estimate the track from the field and a map
+- ``plot``: draw ``corrected``, ``residuals`` or ``grid``; each returns matplotlib axes
+- ``MagbridgeError``: base class of all errors of magbridge; its text is one line
 
 Functions that take a Dataset accept ``time`` in seconds since 1970 UTC or as ``datetime64``. Each name is
-imported when it is first used, because the bridge itself needs few of them.
+imported at its first use, because the bridge itself needs few of them.
 """
 
 import sys
@@ -86,7 +86,7 @@ _HOMES = {
     "read_grid": "field.read",
     "reference_field": "field.reference",
 }
-"""Name to the module that has it."""
+"""Public name -> module that defines it, relative to ``magbridge``."""
 
 
 def __getattr__(name: str) -> object:
@@ -105,9 +105,9 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """Keeps ``survey``, ``navigate`` and ``diagnose`` functions, although packages have the same names.
+    """Module type that keeps ``survey``, ``navigate`` and ``diagnose`` bound to functions.
 
-    The import system binds a package that is imported to its name in the parent.
+    Subpackages have the same names, and the import system would bind these names to the subpackages.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -1,4 +1,4 @@
-"""The program: ``magbridge``, or ``python -m magbridge``."""
+"""Start the program, as ``magbridge`` or ``python -m magbridge``."""
 
 import gc
 import os
@@ -9,16 +9,16 @@ from pathlib import Path
 __all__ = ["main"]
 
 LIVE = ("run", "replay", "correct")
-"""Commands through which a sample takes the live path, and may be learned from."""
+"""Commands that process samples as the live bridge does, possibly with online calibration."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; return its exit code. Ctrl-C prints one line, even while libraries are being loaded."""
+    """Run a command and return its exit code; Ctrl-C prints one line, even while libraries are loaded."""
     given = sys.argv[1:] if arguments is None else arguments
     _open_streams()
     if given[:1] in [[name] for name in LIVE]:
-        # read as numpy is loaded. Two threads round otherwise, which no replay on one core would repeat;
-        # and on a busy computer they wait for each other for up to 0.4 s, where one alone takes 1 ms
+        # numpy reads this when it is loaded. Results of two threads differ in rounding, so a replay on one
+        # core would not repeat them. On a busy computer, threads also wait up to 0.4 s for each other.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         if len(given) == 3 and given[:2] == ["run", "--config"] and not given[2].startswith("-"):
@@ -29,14 +29,14 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("magbridge: interrupted", file=sys.stderr)
         return 130
-    except OSError as error:  # a part of the program cannot be loaded: no file handle is left, a damaged disk
+    except OSError as error:  # a module cannot be loaded: no file handle is left, or a damaged disk
         print(f"magbridge: {error.strerror or error} (magbridge itself cannot be loaded)", file=sys.stderr)
         return 1
 
 
 def _run_bridge(config: Path) -> int:
     """Run a bridge without loading the command line, which would delay its first heartbeat."""
-    gc.disable()  # until the bridge runs: what is loaded stays, and the collector would only scan it
+    gc.disable()  # until the bridge runs: loaded modules stay, so the collector would only scan them
     from magbridge.bridge.run import run  # noqa: PLC0415 - as above
     from magbridge.errors import MagbridgeError  # noqa: PLC0415
 
@@ -50,7 +50,7 @@ def _run_bridge(config: Path) -> int:
 
 
 def _open_streams() -> None:
-    """Open missing output streams, and make every character printable in any locale."""
+    """Open missing standard streams, and make every character printable in any locale."""
     # closed by the parent process; opened in this order, each gets its own descriptor
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:

@@ -1,13 +1,13 @@
-"""Put the three channels and the telemetry on one time base, from past data alone.
+"""Resample the three channels and the telemetry to one common time, using past data only.
 
-A multiplexed converter samples one channel after the other: all are brought to the time of the earliest
-(:mod:`magbridge.one_time`). The anti-alias filter delays the field by ``filter_delay``; the sample's time is
-corrected for that, and the telemetry is looked up at the corrected time.
+A multiplexed converter samples one channel after the other; the aligner interpolates all channels to the time
+of the earliest (:mod:`magbridge.one_time`). The anti-alias filter delays the field by ``filter_delay``. The
+aligner subtracts this delay from the sample's time, and evaluates the telemetry at the corrected time.
 
-If the process stalls, readings and telemetry wait in buffers. An input with its own time stamp (of the
-instrument, or of the autopilot by TIMESYNC) keeps it; any other input may have been measured at any time of
-the stall. A sample with such an input is flagged ``late_join``, and its sigma covers all values that the
-parameters had during the stall.
+If the process stalls, readings and telemetry wait in buffers. An input with a time stamp (of the instrument,
+or of the autopilot by TIMESYNC) keeps its time. Any other input may have been measured at any time during the
+stall. A sample with an input of unknown time is flagged ``late_join``, and its sigma covers all values that
+the parameters had during the stall.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ __all__ = ["NEVER", "Aligner", "Input", "Sample", "Track"]
 
 NEVER: Final = -(1 << 62)
 TRACK_LENGTH: Final = 1024
-"""Telemetry values kept for each parameter: enough for 20 s at 50 Hz."""
+"""Number of telemetry values that are stored for each parameter: enough for 20 s at 50 Hz."""
 
 
 class Input(NamedTuple):
-    """A parameter that the calibration needs: name, calibrated range, and age (s) from which it is stale.
+    """Parameter that the calibration needs: name, calibrated range, and age (s) from which it is stale.
 
-    `is_mass` is False where a change is not a motion: a current, a temperature.
+    `is_mass` is False for a parameter that is not the position of a mass, such as a current or temperature.
     """
 
     name: str
@@ -45,12 +45,12 @@ class Input(NamedTuple):
 
 
 class Track:
-    """The recent telemetry of one parameter.
+    """Recent telemetry of one parameter.
 
-    The parameter is moving when it differs from an anchor, an earlier value, by more than ``moving_rate``
-    (fraction of its calibrated range per second) times the time elapsed, which counts as at least 1 s: over
-    shorter times the noise of the telemetry would look like motion. The first value that comes 1 s or more
-    after the anchor becomes the next anchor.
+    The parameter is moving if it differs from an earlier value, the anchor, by more than ``moving_rate``
+    times the elapsed time. ``moving_rate`` is a fraction of the calibrated range per second. The elapsed time
+    counts as at least 1 s, because the noise of the telemetry would look like motion over shorter times. The
+    first value 1 s or more after the anchor becomes the next anchor.
     """
 
     __slots__ = (
@@ -63,14 +63,16 @@ class Track:
         self.history: deque[tuple[int, float]] = deque(maxlen=TRACK_LENGTH)
         self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
         self.first_us = NEVER
-        # between these times its values are guessed, and lie between these
+        # interval of times (µs) with values of unknown time, and interval of these values
         self.guess_us, self.guess = (NEVER, NEVER), (nan, nan)
         self.lacking = True
         self.anchor: tuple[int, float] | None = None
         self.moved_us = NEVER
 
     def update(self, time_us: int, value: float, moving_rate: float, since_us: int = 0) -> None:
-        """Add a value measured at `time_us`, µs; NaN: unknown from now on. Values out of order are ignored.
+        """Add a value measured at `time_us`, µs; ignore a value that is older than the last one.
+
+        NaN means that the value is unknown from now on.
 
         If `since_us` is not 0, the value was measured at an unknown time between `since_us` and `time_us`.
         """
@@ -83,7 +85,7 @@ class Track:
             low, high = self.guess if self.guess_us[0] == since_us else (self.last, self.last)
             self.guess_us = since_us, time_us
             self.guess = (min(low, value), max(high, value)) if isfinite(low) else (value, value)
-        if time_us == self.last_us:  # of several that came at once, the newest
+        if time_us == self.last_us:  # of several values at one time, keep the newest
             self.history.pop()
         else:
             self.before = self.last if self.history else value
@@ -109,7 +111,7 @@ class Track:
         return self.history[-2][0] if len(self.history) > 1 else self.last_us
 
     def extremes_since(self, begin_us: int) -> tuple[float, float]:
-        """Return the least and the greatest value since `begin_us`, including the value held then."""
+        """Return smallest and largest value since `begin_us` (µs), including the value at that time."""
         low = high = self.last
         for then_us, value in reversed(self.history):
             low, high = min(low, value), max(high, value)
@@ -118,10 +120,10 @@ class Track:
         return low, high
 
     def value_at(self, time_us: int) -> tuple[float, float, float, float]:
-        """Return the value at `time_us`, its age in s, and two values between which a moving mass is.
+        """Return the value at `time_us` (µs), its age (s), and two values that bound it during a motion.
 
-        Between two values it is interpolated (age 0); after the last it is held; before the first, the first
-        is taken, and the age is the time until then.
+        Between two values the result is interpolated (age 0). After the last value, the last value is used.
+        Before the first value, the first value is used, and the age is the time until it was measured.
         """
         after_us, after = self.last_us, self.last
         if after_us <= time_us:
@@ -143,36 +145,35 @@ LATE_JOIN: Final = int(Quality.LATE_JOIN)
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False):
-    """Three channels and the telemetry at one time."""
+    """Three channels and the telemetry at one common time."""
 
     reading: Reading
-    """The reading that the instrument sent."""
+    """Reading as the instrument sent it."""
     reading_us: int
-    """Our time at the reading's ``device_time``, µs."""
+    """Time of the host's clock at the reading's ``device_time``, µs."""
     time_us: int
-    """Time that is common to all channels, µs."""
+    """Common time of all channels, corrected for the filter's delay, µs."""
     field: Vector
-    """Raw field, sensor axes, nT."""
+    """Raw field in sensor axes at `time_us`, nT."""
     values: tuple[float, ...]
-    """The parameters at `time_us`, in the order of the calibration."""
+    """Values of the parameters at `time_us`, in the order of the calibration."""
     age: float
-    """Age of the oldest telemetry used, s."""
+    """Age of the oldest telemetry value in the sample, s."""
     quality: int
     """:class:`~magbridge.records.Quality` bits."""
     sigma: float
-    """1-sigma that the flags add in quadrature to the uncertainty of the corrected field, nT."""
+    """1-sigma to add in quadrature to that of the corrected field because of flagged conditions, nT."""
     spans: tuple[tuple[int, float, float], ...]
-    """Parameters that are not known exactly: index in `values`, and the two ends of the interval in which the
-    value lies."""
+    """Parameters with an uncertain value: index in `values`, and lower and upper bound of the value."""
 
 
 class Aligner:
     """Join readings and telemetry into samples.
 
-    `inputs` are the parameters of the calibration in its order; `tracks` holds their telemetry and `by_name`
-    also all other telemetry that is watched. `power_cycle` is the instrument's power-on counter at its
-    calibration (None: unknown). `late_since_us` is the time when a stall began, µs (0: no stall), and
-    `motion_since_us` the time of the last report before the motion of the last sample.
+    `inputs` are the parameters of the calibration in its order. `tracks` holds their telemetry, and `by_name`
+    also other telemetry that is watched. `power_cycle` is the instrument's power-on counter at its
+    calibration (None if unknown). `late_since_us` is the start of a stall, µs (0 without a stall).
+    `motion_since_us` (µs) is the time of the last report before a motion that affects the last sample.
     """
 
     def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
@@ -187,22 +188,22 @@ class Aligner:
         self._period_us, self._step_us = 0.0, 0
 
     def watch(self, name: str, max_age: float) -> None:
-        """Follow a telemetry series that the calibration does not use yet; its gaps flag no sample."""
+        """Record a telemetry series that the calibration does not use yet; its gaps do not set flags."""
         if name not in self.by_name:
             self.by_name[name] = Track(Input(name, nan, nan, max_age))
 
     def follow(self, names: tuple[str, ...]) -> None:
-        """Set the inputs to `names`, in the order of another calibration; each is an input or watched."""
+        """Set the inputs to `names`, the order of another calibration; each must be an input or watched."""
         self.tracks = tuple([self.by_name[name] for name in names])
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
-        """Replace the settings, and the ages (s) after which the parameters named in `ages` are stale."""
+        """Replace the settings, and for the parameters in `ages` the age (s) from which they are stale."""
         self.settings = settings
         for name, track in self.by_name.items():
             track.max_age = ages.get(name, track.max_age)
 
     def telemetry(self, name: str, time_us: int, value: float, *, guessed: bool = False) -> None:
-        """Add a telemetry value of `time_us` (µs); NaN: unknown. A name that is not an input is ignored.
+        """Add a telemetry value measured at `time_us` (µs); NaN means unknown. Ignore names without a track.
 
         If `guessed`, `time_us` is the time of arrival after a stall.
         """
@@ -212,7 +213,7 @@ class Aligner:
             track.update(time_us, value, self.settings.moving_rate, since_us)
 
     def reading(self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0) -> Sample:
-        """Turn a reading into a sample.
+        """Return the sample that results from a reading and the telemetry.
 
         `time_us` (µs) is the host's time of ``reading.device_time``. If `restarted`, the instrument was
         powered on again. `missing` is the number of readings lost just before this one.
@@ -278,7 +279,7 @@ class Aligner:
             if track.moved_us == track.last_us or sample_us - track.moved_us <= settle_us:
                 spans.append((index, low, high))
                 if track.input.is_mass:
-                    quality |= MOVING  # or it stopped not long ago
+                    quality |= MOVING  # or stopped less than settle_time ago
                     self.motion_since_us = min(self.motion_since_us, track.reported_before_us)
             if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
                 quality |= LATE_JOIN
@@ -292,8 +293,8 @@ class Aligner:
     def _is_gap(self, time_us: int) -> bool:
         """Return True if samples are missing before `time_us`.
 
-        The time since the last reading is a gap when it exceeds ``gap_factor`` times both the mean period and
-        the interval before it: an instrument that is set to sample less often is flagged once, not for ever.
+        The time since the last reading is a gap if it exceeds ``gap_factor`` times both the mean period and
+        the previous interval. So an instrument that changes to a lower rate is flagged only once.
         """
         if self._before_us == NEVER:
             return False

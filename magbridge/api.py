@@ -1,4 +1,4 @@
-"""Functions of ``import magbridge`` that combine several packages."""
+"""Define the functions of ``import magbridge`` that combine several packages."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def calibrate(
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **options: Any,
 ) -> Calibration:
-    """Fit the calibration of a log's vector magnetometer, and of its scalar magnetometer if one is named.
+    """Fit the calibration of a log's vector magnetometer, and of a scalar magnetometer if `scalar` is given.
 
     Parameters
     ----------
     deployment : Dataset
-        On ``time``, with ``mag_x mag_y mag_z`` (nT), and ``reference_field`` or positions.
+        Log on ``time``, with ``mag_x mag_y mag_z`` (nT), and ``reference_field`` or positions.
     parameters : str or sequence of str
-        Columns that move masses, for the vector magnetometer.
+        Columns with the positions of moving masses, for the vector magnetometer.
     scalar : str
         Column of a scalar magnetometer's reading, nT; its compensation is in ``sensors`` of the result.
     channels : sequence of str, optional
@@ -55,16 +55,16 @@ def calibrate(
         Crustal field to add to the main field. Without it and without ``reference_field``, the crustal
         field along the track is estimated together with the scalar's compensation.
     lag : float, optional
-        Time by which the scalar is late, s; estimated if not given.
+        Delay of the scalar's readings, s; estimated if not given.
     lever : tuple of 3 float
         Position of the scalar relative to the logged positions, m forward, starboard and down.
     **options
-        Of :func:`magbridge.fit`: ``method``, ``order``.
+        Options of :func:`magbridge.fit`: ``method``, ``order``.
 
     Returns
     -------
     Calibration
-        Of the vector magnetometer, with the scalar's compensation.
+        Calibration of the vector magnetometer, with the scalar's compensation.
 
     Raises
     ------
@@ -105,27 +105,27 @@ def correct(
     Parameters
     ----------
     calibration : Calibration
-        Of the sensor that took the samples.
+        Calibration of the sensor that took the samples.
     field : (3,) or (n, 3) array, or Dataset
-        nT, raw, sensor axes. A log is corrected as the bridge does it, with its scalar magnetometer where the
-        calibration has one.
+        Raw field in sensor axes, nT, or a log. A log is corrected as by the bridge, and with its scalar
+        magnetometer if the calibration has one.
     channels : (k,) or (n, k) array
-        ``calibration.channels``, in that order; NaN where unknown.
+        Values of ``calibration.channels``, in that order; NaN if unknown.
     time : float or (n,) array
-        s since 1970 UTC or ``datetime64``, ascending; only effects with a state use it.
+        Ascending times, s since 1970 UTC or ``datetime64``; only effects with a state use the times.
 
     Returns
     -------
     Corrected, CorrectedArrays or Dataset
-        Of one reading, of the n, or of a log: the columns of :func:`magbridge.correct_rows`, and with a
-        scalar magnetometer ``scalar_field``, its sigma and flags.
+        Result for one reading, for n readings, or for a log. The latter has the columns of
+        :func:`magbridge.correct_rows`, and with a scalar magnetometer ``scalar_field``, its sigma and flags.
 
     Raises
     ------
     CalibrationError
-        Another shape, or another number of channels than the calibration's.
+        The field has another shape, or the number of channels differs from the calibration's.
     FormatError
-        A log lacks a column.
+        The log lacks a column.
     """
     if hasattr(field, "data_vars"):
         return _corrected_log(calibration, cast("xr.Dataset", field))
@@ -144,7 +144,7 @@ def correct(
 
 
 def _corrected_log(calibration: Calibration, deployment: xr.Dataset) -> xr.Dataset:
-    """Return a corrected log, with its scalar magnetometer."""
+    """Return the corrected log, with its scalar magnetometer if the calibration has one."""
     from magbridge.calibration.fitting.scalar_log import with_scalar  # noqa: PLC0415 - scipy only where it is used
     from magbridge.correction import Correction  # noqa: PLC0415 - as the other imports of this function
 
@@ -159,9 +159,9 @@ def navigate(
     options: NavigationOptions | None = None,
     **more: Any,
 ) -> xr.Dataset:
-    """Return the track that the field and a map give; :func:`magbridge.navigate.batch.navigate`.
+    """Estimate the track from the field and a map, as :func:`magbridge.navigate.batch.navigate`.
 
-    Without a map: where the track crosses itself in the field,
+    Without a map, estimate the track from the places at which it crosses itself, as
     :func:`magbridge.navigate.own_survey.localise`.
     """
     from magbridge.navigate import NavigationOptions, batch, own_survey  # noqa: PLC0415 - filterpy only where it is used
@@ -179,18 +179,18 @@ def survey(
     Parameters
     ----------
     deployments : sequence of Dataset
-        Logs with a vector, which are corrected first, or with ``total_field`` or ``anomaly``.
+        Logs with ``total_field`` or ``anomaly``, or with a raw vector, which is corrected first.
     *calibrations : Calibration
-        One for all logs with a vector, or one for each of them.
+        One calibration for all logs with a raw vector, or one for each of these logs.
     scalar : str
-        Column of a scalar magnetometer to survey with instead.
+        Column of a scalar magnetometer to use instead of the vector.
     **options
-        Of a scalar's survey: ``names``, ``lag``, ``lever``; :func:`magbridge.survey.run.scalar_survey`.
+        Options of :func:`magbridge.survey.run.scalar_survey`: ``names``, ``lag``, ``lever``.
 
     Raises
     ------
     WrongUse
-        The sequence is empty.
+        `deployments` is empty.
     """
     from magbridge.survey import run  # noqa: PLC0415 - scipy only where it is used
 

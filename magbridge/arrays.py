@@ -1,4 +1,4 @@
-"""Array types, for annotations; docstrings give the shapes and units."""
+"""Define array types for annotations; docstrings state the shapes and units."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["BoolArray", "FloatArray", "IndexArray", "IntArray", "RealArray", "pl
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 RealArray = NDArray[np.floating[Any]]
-"""Array of numbers of either precision, as files hold them."""
+"""Array of floating-point numbers of any precision, as read from files."""
 IndexArray = NDArray[np.intp]
 IntArray = NDArray[np.int64]
 
 
 def plain(value: object) -> object:
-    """Return a numpy number as Python's, for msgspec, which encodes only those.
+    """Convert a numpy number to a Python number, because msgspec encodes only Python numbers.
 
-    NotImplementedError: it is not a numpy number.
+    NotImplementedError: `value` is not a numpy number.
     """
     if isinstance(value, np.generic):
         return value.item()

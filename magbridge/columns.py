@@ -1,6 +1,7 @@
-"""The columns of a deployment: name, unit, meaning.
+"""Define the columns of a deployment: names, units and meanings.
 
-These names are public (files, command line, the link). Any other name is telemetry in the unit it declares.
+The names are public: files, the command line and the link use them. A column of any other name is telemetry
+in the unit that it declares.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ __all__ = [
 
 
 class Column(NamedTuple):
-    """Unit and meaning of a column, by the names of the variable's attributes."""
+    """Unit and meaning of a column; the fields have the names of the variable's attributes."""
 
     units: str
     long_name: str
@@ -32,14 +33,14 @@ class Column(NamedTuple):
 CHANNELS = ("mag_x", "mag_y", "mag_z")
 """The raw, uncorrected channels in sensor axes (x forward, y starboard, z down)."""
 CHANNEL_TIMES = ("mag_time_x", "mag_time_y", "mag_time_z")
-"""Times of the samples of each channel, if not all are at ``time``."""
+"""Columns with the sampling time of each channel, for logs in which they differ from ``time``."""
 FURTHER_AXIS = re.compile(r"mag[1-9]\d*_[xyz]")
-"""Name of an axis of a further vector sensor, in nT as those of the first."""
+"""Pattern of the names of further vector sensors' channels, which are in nT like the first sensor's."""
 AGE = "age_"
-"""Before the name of a parameter: how old its value was, in s, in the log of a bridge."""
+"""Prefix of a parameter's name for the column with the age of its value, s, in a bridge's log."""
 
 TEMPERATURE = "sensor_temperature"
-"""Column of the temperature at the fluxgate, the only channel of a calibration that is part of a reading."""
+"""Column of the temperature at the fluxgate: the only calibration channel that comes with a reading."""
 COLUMNS: dict[str, Column] = {
     "time": Column("s", "seconds since 1970-01-01 UTC"),
     "mag_x": Column("nT", "raw magnetic field, sensor x (forward)"),
@@ -86,7 +87,7 @@ CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z"
 """Columns that ``magbridge correct`` writes in addition to ``time``."""
 
 HEADINGS = ("magnetic_heading", "heading", "heading_sigma", "declination", "declination_sigma")
-"""Written by ``magbridge correct`` if the log has roll and pitch, and the calibration a boresight."""
+"""Columns that ``magbridge correct`` adds if the log has roll and pitch and the calibration a boresight."""
 
 NT_PER_UNIT = {
     "fT": 1e-6, "pT": 1e-3, "nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9,
@@ -126,20 +127,20 @@ _SPELLINGS = {
     "in": ("inch", "inches"),
     "cm3": ("cc", "cm^3", "cm³"),
 }
-"""A unit of ours, and how others spell it."""
+"""Unit of magbridge -> spellings of it in other programs' files."""
 _SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
 
 
 MAX_NAMES = 60
-"""Largest number of columns that a message names."""
+"""Largest number of columns that a message lists."""
 YEAR_1980 = 315_532_800.0
-"""Start of 1980, s since 1970: only a clock that was never set shows an earlier time."""
+"""Start of 1980, s since 1970: an earlier time means that the clock was never set."""
 
 
 def counts_from_boot(deployment: xr.Dataset) -> bool:
-    """Return True if a deployment's times count from a boot, on an unknown day.
+    """Return True if the times of a deployment count from a boot and their date is unknown.
 
-    The log states it (``time_reference = boot``), or the times are before 1980.
+    This is so if the log states ``time_reference = boot``, or states no reference and ends before 1980.
     """
     time = deployment["time"].values
     reference = deployment.attrs.get("time_reference")
@@ -147,9 +148,9 @@ def counts_from_boot(deployment: xr.Dataset) -> bool:
 
 
 def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
-    """Return a deployment with its times in s since 1970-01-01 UTC, which may be datetime64.
+    """Return a deployment with its times, numbers or datetime64, converted to s since 1970-01-01 UTC.
 
-    Times that are neither numbers nor datetime64 are a :class:`~magbridge.errors.FormatError`.
+    FormatError: the times are missing, or are neither numbers nor datetime64.
     """
     import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
 
@@ -171,14 +172,14 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
 
 
 def _times(deployment: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return the columns of a deployment that hold times."""
+    """Return the columns of a deployment that contain times, by name."""
     return {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
 
 
 def decoded(deployment: xr.Dataset) -> xr.Dataset:
-    """Return a deployment with datetime64 times (UTC, ns), as xarray decodes them.
+    """Return a deployment with its times converted to datetime64 (UTC, ns).
 
-    Times that count from a boot are counted from 1970.
+    Times that count from a boot are converted as if they counted from 1970.
     """
     import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
 
@@ -196,10 +197,10 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
 
 
 def factor(unit: str, column: str) -> float | None:
-    """Return the factor from `unit` to the unit of `column`; None without a conversion.
+    """Return the factor that converts `unit` to the unit of `column`; None if there is no conversion.
 
-    A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1. The factor of an
-    undeclared unit is 1, too (empty, or then written as 1).
+    The factor is 1 for a column that is not in :data:`COLUMNS`, which keeps its declared unit. It is also 1
+    for an undeclared unit (an empty text or "1").
     """
     if unit in ("", "1"):
         return 1.0
@@ -212,19 +213,19 @@ def factor(unit: str, column: str) -> float | None:
 
 
 def usual(unit: str) -> str:
-    """Return a unit in the spelling of :data:`COLUMNS`: ``degC`` for ``Celsius``."""
+    """Return a unit in the spelling of :data:`COLUMNS`, such as ``degC`` for ``Celsius``."""
     unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     written_out = unit.lower().replace("-", "").replace(" ", "").replace("teslas", "tesla")
     return _SAME.get(unit) or (_SAME.get(written_out, unit) if len(written_out) > 4 else unit)
 
 
 def may_be(unit: str, other_unit: str) -> bool:
-    """Return True if two units can be equal; either may be undeclared (empty, or then written as 1)."""
+    """Return True if two units are equal, or at least one is undeclared (an empty text or "1")."""
     return {unit, other_unit} & {"", "1"} != set() or usual(unit) == usual(other_unit)
 
 
 def absent(name: str, present: Iterable[str]) -> str:
-    """Return the message that a column is missing, which there are, and how to declare it."""
+    """Return the message that the column `name` is missing, with the present columns and a remedy."""
     names = [repr(one) if " " in one else one for one in present]
     headings = " ".join(names[:MAX_NAMES]) + f" and {len(names) - MAX_NAMES} more" * (len(names) > MAX_NAMES)
     near = suggestion(name, names)
@@ -232,9 +233,9 @@ def absent(name: str, present: Iterable[str]) -> str:
 
 
 def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
-    """Check that a deployment has these columns.
+    """Check that a deployment has all columns in `names`.
 
-    FormatError: it lacks one: names the file, the column, and the columns that are there.
+    FormatError: a column is missing; the message names the file, the column, and the present columns.
     """
     for name in names:
         if name not in deployment:
@@ -245,9 +246,9 @@ def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
 
 
 def require_units(deployment: xr.Dataset, units: Mapping[str, str]) -> None:
-    """Check that the columns of a deployment are in these units, where a column declares one.
+    """Check that columns of a deployment have the units in `units` (column -> unit), if they declare one.
 
-    FormatError: one is in another unit: names the file, the column, and both units.
+    FormatError: a column has another unit; the message names the file, the column, and both units.
     """
     for name, unit in units.items():
         given = str(deployment[name].attrs.get("units", "")) if name in deployment else ""

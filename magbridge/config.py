@@ -1,6 +1,7 @@
-"""``bridge.toml`` as frozen settings; an unknown key or a wrong type is one clear line.
+"""Read a ``bridge.toml`` as immutable settings.
 
-Everything is checked before anything is opened. Paths in the file are relative to the file.
+All keys and types are checked before a port is opened; an error is one line. Paths in the file are relative
+to the file.
 """
 
 from __future__ import annotations
@@ -23,47 +24,48 @@ __all__ = [
 
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]
-"""Bounded, because TOML allows ``inf``, but deadlines and sizes are converted to integers."""
+"""`Positive`, `NotNegative`: Numbers with an upper bound, because deadlines and sizes become integers."""
 Rate = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Name = Annotated[str, Meta(min_length=1)]
 SystemId = Annotated[int, Meta(ge=1, le=255)]
 Baudrate = Annotated[int, Meta(gt=0, le=20_000_000)]
-"""Bounded: what does not fit 32 bits is refused only when the port is opened."""
+"""Baud rate, bounded because larger values would only be rejected when the port is opened."""
 
 
 MAX_BRIDGE_SENSORS = 4
-"""Sensors of a bridge at most: the log numbers their ports."""
+"""Largest number of sensors of a bridge; the log can number only as many ports."""
 
 
 class Sensor(Table, frozen=True):
-    """``[sensor]``, or ``[sensor.NAME]`` for each of several sensors: which instrument, on which port."""
+    """``[sensor]``, or ``[sensor.NAME]`` for each of several sensors: instrument and port."""
 
     driver: str
-    """A name from the driver table (:data:`magbridge.sensors.DRIVERS`)."""
+    """Name of the driver, a key of :data:`magbridge.sensors.DRIVERS`."""
     port: Name
-    """A device, a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``), an RM3100 on a bus
-    (``i2c:1:0x20``, ``spi:0.0``), or a pattern such as ``/dev/ttyUSB*``: the first device that sends a
-    reading within `timeout`. A device that sends NMEA 0183 instead gets no start-up commands."""
+    """Port: a device, a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``), an RM3100 on a bus
+    (``i2c:1:0x20``, ``spi:0.0``), or a pattern such as ``/dev/ttyUSB*``. A pattern selects the first device
+    that sends a reading within `timeout`. The bridge does not send start-up commands to a device that sends
+    NMEA 0183."""
     baudrate: Baudrate = 9600
     """Baud rate, bit/s."""
     timeout: Positive = 10.0
     """Time without a reading after which the sensor counts as silent, s."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
-    """The driver's own settings."""
+    """Settings of the driver."""
     name: Annotated[str, Meta(max_length=16, pattern=r"^\w*$")] = ""
-    """NAME of ``[sensor.NAME]``: what messages and the log call the sensor; not a key of the file."""
+    """NAME of ``[sensor.NAME]``, by which messages and the log identify the sensor; not a key of the file."""
     id: Annotated[int, Meta(ge=0, lt=MAX_BRIDGE_SENSORS)] | None = None
     """``sensor_id`` in all messages; by default the sensors are numbered from 0 in the order of the file.
     Sensor 0 is the main sensor: heading, learning and navigation use it."""
     calibration: Name | None = None
-    """The ``cal.json`` of this sensor; for sensor 0 this may be ``calibration.file``, too. A scalar sensor's
-    default is the calibration of sensor 0, if that has an entry for it."""
+    """The ``cal.json`` of this sensor; for sensor 0, ``calibration.file`` may give it instead. The default of
+    a scalar sensor is the calibration of sensor 0, if that calibration has an entry for the scalar sensor."""
     sigma: Positive | None = None
-    """Scalar sensors only: nT, 1-sigma of the reading where the instrument is mounted. With it the reading
-    needs no calibration."""
+    """1-sigma of a scalar sensor's reading at its mounting position, nT. With this key the scalar sensor does
+    not need a calibration."""
     filter_delay: NotNegative | None = None
-    """Delay of the sensor's own filter, s, instead of ``align.filter_delay``. Default for a scalar sensor: 0,
-    because its calibration includes the lag."""
+    """Delay of the sensor's filter, s, instead of ``align.filter_delay``. The default for a scalar sensor is
+    0, because its calibration includes the lag."""
 
     @property
     def label(self) -> str:
@@ -77,27 +79,27 @@ class Sensor(Table, frozen=True):
 
 
 class Link(Table, frozen=True):
-    """``[link]``: the MAVLink side."""
+    """``[link]``: the MAVLink connection."""
 
     url: Name
     """MAVLink URL: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and ``HOST:PORT`` or
     ``[IPV6]:PORT``, or a serial device."""
     system: SystemId = 1
-    """The vehicle's system id: ours, and the only one we listen to."""
+    """System id of the vehicle, which the bridge uses, and from which alone it accepts messages."""
     component: SystemId = 191
-    """Our own component id; 191 is an onboard computer."""
+    """Component id of the bridge; 191 is an onboard computer."""
     autopilot: SystemId = 1
-    """The autopilot's component id."""
+    """Component id of the autopilot."""
     baudrate: Baudrate = 57600
     """Baud rate of a serial link, bit/s."""
     signing_key: Name | None = None
-    """File of 32 bytes; packets are signed and unsigned ones refused."""
+    """File of 32 bytes, with which packets are signed; the bridge rejects unsigned packets."""
     max_other_peers_rate: NotNegative = 1000.0
-    """Largest rate to all peers except the autopilot's together, kB/s, on ``udpin`` and ``tcpin``."""
+    """Largest total data rate to all peers except the autopilot, kB/s, on ``udpin`` and ``tcpin``."""
     request_streams: bool = True
     """Request from the autopilot the messages that the bridge needs, if they arrive too rarely."""
     parameters: Name | None = None
-    """File that keeps parameters changed over the link; by default ``bridge.parameters.json`` next to a
+    """File that stores parameters changed over the link; by default ``bridge.parameters.json`` next to a
     configuration called ``bridge.toml``."""
 
     def __post_init__(self) -> None:
@@ -106,7 +108,7 @@ class Link(Table, frozen=True):
 
     @property
     def shared(self) -> bool:
-        """Return True if the link has many possible peers: it then reads whole frames of each."""
+        """Return True if the link can have several peers, so that the frames of each are read separately."""
         return self.url.startswith(("udpin:", "tcpin:"))
 
 
@@ -115,28 +117,28 @@ MAX_DELAY_S = 600.0
 
 
 class Telemetry(Table, frozen=True):
-    """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.
+    """``[telemetry.NAME]``: a field of a MAVLink message that becomes the parameter NAME.
 
     ``value = scale * message.field + offset``.
     """
 
     message: str
-    """The MAVLink message, ``NAMED_VALUE_FLOAT``."""
+    """Name of the MAVLink message, such as ``NAMED_VALUE_FLOAT``."""
     field: str
-    """One of its fields, also with an index: ``actuator[2]``."""
+    """Name of a field of the message, with an index if it is an array: ``actuator[2]``."""
     match: dict[str, str | int | float] = msgspec.field(default_factory=dict)
     """Values that other fields of the message must have."""
     scale: float = 1.0
     offset: float = 0.0
-    """`scale`, `offset`: As above."""
+    """`scale`, `offset`: Conversion, ``value = scale * message.field + offset``."""
     unit: str = ""
     """Unit of the parameter, as in the calibration."""
     max_age: Positive = 30.0
-    """Age from which on a value is stale, s."""
+    """Age from which a value is stale, s."""
     delay: float = 0.0
-    """Time by which the telemetry is late, s: a value stamped t was true at t - delay."""
+    """Delay of the telemetry, s: a value with the time stamp t was measured at t - delay."""
     component: SystemId | None = None
-    """Component whose messages count; by default the autopilot, or else the first component that sends."""
+    """Id of the component whose messages are used; by default the autopilot, else the first that sends."""
 
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.scale) < inf:
@@ -148,45 +150,45 @@ class Telemetry(Table, frozen=True):
 
 
 class CalibrationFile(Table, frozen=True):
-    """``[calibration]``: what to correct with."""
+    """``[calibration]``: the calibration to correct with."""
 
     file: Name
-    """The ``cal.json``."""
+    """Path of the calibration (``cal.json``)."""
 
 
 class Align(Table, frozen=True):
-    """``[align]``: one time base for channels and telemetry; each key is also a MAVLink parameter."""
+    """``[align]``: time alignment of channels and telemetry; each key is also a MAVLink parameter."""
 
     filter_delay: NotNegative = 0.0
-    """Delay of the channels by the anti-alias filter, s."""
+    """Delay of the channels in the anti-alias filter, s."""
     gap_factor: Annotated[float, Meta(gt=1, le=1e9)] = 2.5
-    """A pause longer than this many sample periods is a gap."""
+    """Number of sample periods without a sample from which a pause is a gap."""
     moving_rate: Positive = 0.005
-    """A parameter that changes faster than this fraction of its calibrated range per second is moving."""
+    """Rate from which a parameter is moving, as a fraction of its calibrated range per second."""
     settle_time: NotNegative = 0.0
-    """Time after a movement during which samples stay flagged, s."""
+    """Time after a motion during which samples stay flagged ``moving``, s."""
     stale_growth: NotNegative = 1.0
     """Growth of the sigma with the age of stale telemetry, nT/s."""
     turn_on_sigma: NotNegative = 20.0
-    """1-sigma, by which the sensor's offset changes at every power-on, nT."""
+    """1-sigma of the change of the sensor's offset at a power-on, nT."""
     reference_sigma: Positive = 145.0
-    """1-sigma of the Earth's total field about the main field, nT: a corrected field beyond five of them is
-    ``implausible``."""
+    """1-sigma of the Earth's total field about the main-field model, nT. A corrected field that differs by
+    more than five sigma is flagged ``implausible``."""
 
 
 class Navigation(Table, frozen=True):
-    """``[navigation]``: the corrected field against an anomaly map."""
+    """``[navigation]``: position by matching the corrected field to an anomaly map."""
 
     map: Name
-    """The anomaly grid."""
+    """File of the anomaly grid."""
     fix: str = "EXTERNAL_POSITION_ESTIMATE"
     """Message that sends a fix to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4, the
     default), ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4)."""
     rate: NotNegative | None = None
-    """Rate of the fixes, Hz, dead-reckoned between updates; 0 is with each update. Default 5 for
-    ``ODOMETRY``, else 0."""
+    """Rate of the fixes, Hz; fixes between updates of the filter are dead-reckoned. 0 sends a fix with each
+    update. Default 5 for ``ODOMETRY``, else 0."""
     depth: NotNegative = 0.0
-    """Depth of the deepest dives, m; a map whose altitude is known is continued to half this depth."""
+    """Depth of the deepest dive, m; a map of known altitude is continued to half this depth."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     """Prior uncertainties and settings of the position filter: the fields of
     :class:`magbridge.navigate.NavigationOptions`."""
@@ -196,38 +198,40 @@ class HeadingOutput(Table, frozen=True):
     """``[heading]``: heading from the corrected field and the autopilot's roll and pitch."""
 
     send: Literal["odometry", "vision_position_estimate"] | None = None
-    """Message in which the heading goes to the autopilot as a yaw: ``odometry`` or
-    ``vision_position_estimate``; not sent by default."""
+    """Message that sends the heading to the autopilot as a yaw: ``odometry`` or ``vision_position_estimate``.
+    By default the heading is not sent."""
     rate: NotNegative = 10.0
-    """Rate of that message, Hz; 0 is with every sample. ArduPilot needs 4 Hz at least, PX4 10 Hz."""
+    """Rate of the message `send`, Hz; 0 sends it with every sample. ArduPilot needs 4 Hz at least, PX4
+    10 Hz."""
     tilt_sigma: Positive | None = None
-    """1-sigma of the autopilot's roll and pitch, deg; by default that of the calibration's runs."""
+    """1-sigma of the autopilot's roll and pitch, deg; by default the value from the calibration runs."""
     nmea: Name | None = None
     """Port for the NMEA 0183 sentences HDG, HDT and PASHR: ``udp:HOST:PORT`` or a serial device."""
     nmea_baudrate: Baudrate = 4800
     """Baud rate, bit/s, if `nmea` is a serial device."""
     nmea_rate: Positive = 1.0
-    """Rate of the sentences, Hz."""
+    """Rate of the NMEA sentences, Hz."""
 
 
 class Learning(Table, frozen=True):
-    """``[learning]``: the calibration's coefficients are learned in flight."""
+    """``[learning]``: recursive estimation of the calibration's coefficients in flight."""
 
     enabled: bool = False
-    """True to learn from the start; ``MB_LEARN`` changes that over the link."""
+    """True to learn from the start of the bridge; the parameter ``MB_LEARN`` changes this over the link."""
     reference: Name = "igrf"
-    """Reference of the corrected field: ``igrf``, or the file of an anomaly grid to add to the IGRF."""
+    """Reference field: ``igrf``, or the file of an anomaly grid to add to the IGRF."""
     map_sigma: NotNegative = 20.0
     position_sigma: NotNegative = 100.0
-    """`map_sigma`, `position_sigma`: 1-sigma of that grid, nT, and of the vehicle's position on it, m."""
+    """`map_sigma`, `position_sigma`: 1-sigma of the anomaly grid, nT, and of the vehicle's position, m."""
     prior: Name | None = None
-    """Without ``[calibration]``: a calibration file with the prior of a vehicle of this class."""
+    """Calibration file with the prior for vehicles of this class; used without ``[calibration]``."""
     ranges: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
-    """Without both: lowest and highest value of each moving mass; the prior is that of any vehicle."""
+    """Lowest and highest value of each moving mass; used without ``[calibration]`` and `prior`, with a prior
+    for any vehicle."""
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
-    """Largest rate of the samples that are learned from, Hz."""
+    """Largest rate of the samples used for learning, Hz."""
     directory: Name | None = None
-    """Folder for the calibrations that were learned; by default that of the calibration's file."""
+    """Folder for the learned calibrations; by default the folder of the calibration's file."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges.items():
@@ -238,10 +242,10 @@ class Learning(Table, frozen=True):
 
 
 class Log(Table, frozen=True):
-    """``[log]``: where the telemetry log goes, and when a new file begins."""
+    """``[log]``: folder and file sizes of the telemetry log."""
 
     directory: str
-    """The folder."""
+    """Folder of the log's files."""
     max_size: Positive = 64.0
     """Largest size of a file, MB."""
     max_age: Positive = 24.0
@@ -249,11 +253,11 @@ class Log(Table, frozen=True):
 
 
 class Config(Table, frozen=True):
-    """A whole ``bridge.toml``.
+    """Settings of a bridge: the contents of a ``bridge.toml``.
 
-    `publish` holds Hz of each message: 0 is with every sample, a negative rate never. `path` is the file
-    itself, `digest` the first 8 bytes of its SHA-256 in hex. With several ``[sensor.NAME]`` tables, `sensor`
-    is the one with the id 0, and `more_sensors` are the others.
+    `publish` is the rate of each message, Hz: 0 sends it with every sample, a negative rate never. `path` is
+    the file itself, `digest` the first 8 bytes of its SHA-256 in hex. With several ``[sensor.NAME]`` tables,
+    `sensor` is the sensor with the id 0, and `more_sensors` are the others.
     """
 
     sensor: Sensor
@@ -272,12 +276,12 @@ class Config(Table, frozen=True):
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
-        """All sensors: `sensor`, with the id 0, and the others by id."""
+        """All sensors in the order of their ids: `sensor`, then `more_sensors`."""
         return self.sensor, *self.more_sensors
 
     @property
     def files(self) -> dict[str, str | None]:
-        """The files that must exist, by their keys; None where a key is not given."""
+        """Dotted key -> name of a file that must exist; None if the key is not given."""
         learning = self.learning or Learning()
         return {
             "calibration.file": self.calibration.file if self.calibration else None,
@@ -289,7 +293,7 @@ class Config(Table, frozen=True):
         }
 
     def resolve(self, name: str) -> Path:
-        """Return the path that `name` means in this file: relative to the file itself."""
+        """Return the path of a file named in the configuration, relative to the configuration's folder."""
         return self.path.parent / Path(name).expanduser()
 
 
@@ -310,7 +314,7 @@ def load(path: str | Path) -> Config:
 
 
 def parse(table: dict[str, Any], path: Path) -> Config:
-    """Return the configuration in the table of a ``bridge.toml``, without its digest.
+    """Convert the table of a ``bridge.toml`` to a configuration, without its digest.
 
     ConfigError: a key is unknown or missing, or a value has the wrong type or range.
     """
@@ -351,7 +355,7 @@ def parse(table: dict[str, Any], path: Path) -> Config:
 
 
 def _named_sensors(sensor: Any) -> dict[str, Any]:
-    """Return the tables ``[sensor.NAME]`` by name; empty for a plain ``[sensor]``."""
+    """Return the tables ``[sensor.NAME]`` by name; empty for a single table ``[sensor]``."""
     if not isinstance(sensor, dict) or sensor.keys() & {"driver", "port"}:
         return {}
     tables = {name: one for name, one in sensor.items() if isinstance(one, dict)}
@@ -359,7 +363,10 @@ def _named_sensors(sensor: Any) -> dict[str, Any]:
 
 
 def _numbered(sensors: list[Sensor], path: Path) -> list[Sensor]:
-    """Return the sensors by id, each with its own; ConfigError: too many, or ids or names that clash."""
+    """Assign missing ids and return the sensors in the order of their ids.
+
+    ConfigError: there are too many sensors, ids or names are repeated, or no sensor has the id 0.
+    """
     if len(sensors) > MAX_BRIDGE_SENSORS:
         raise ConfigError(
             path, "sensor", f"expected at most {MAX_BRIDGE_SENSORS} sensors, got {len(sensors)}"

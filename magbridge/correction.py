@@ -1,8 +1,8 @@
-"""Correct readings with telemetry, for the live bridge and ``magbridge correct`` alike.
+"""Correct readings with telemetry, for the live bridge and for ``magbridge correct``.
 
-Alignment gives the channels and the parameters at the sample's time; the calibration turns them into the
-corrected field. A parameter that is not known exactly (a mass in motion, telemetry that never came) widens
-the sigma: the correction is evaluated at both ends of the interval in which the parameter lies.
+The aligner returns the channels and the parameters at the sample's time, and the calibration converts them to
+the corrected field. An uncertain parameter (a mass in motion, missing telemetry) increases the sigma: the
+correction is evaluated at the lower and upper bound of the parameter.
 """
 
 from __future__ import annotations
@@ -32,31 +32,32 @@ __all__ = ["Correction"]
 EXTRAPOLATED = int(Quality.EXTRAPOLATED)
 MOVING = int(Quality.MOVING)
 NOT_MASS_UNITS = frozenset({"A", "mA", "V", "W", "degC", "K", "bar", "dbar", "Pa", "kPa"})
-"""Units of parameters that are not the position of a mass: a sample while they change is not `moving`."""
+"""Units of parameters that are not positions of masses: their changes do not set the flag ``moving``."""
 MAX_AGE = 30.0
-"""Age from which telemetry is stale, s, unless :meth:`magbridge.align.Aligner.tune` sets another."""
+"""Default age from which telemetry is stale, s; :meth:`magbridge.align.Aligner.tune` replaces it."""
 
 
 class Correction:
-    """Correct readings one after the other.
+    """Corrector for a sequence of readings, with alignment, plausibility checks and online calibration.
 
     Parameters
     ----------
     calibration : Calibration or None
-        Without one every sample passes unchanged, flagged ``uncalibrated``.
+        Calibration to apply; without one, samples are unchanged and flagged ``uncalibrated``.
     settings : Align, optional
-        If not given, and :func:`~magbridge.rows.correct_rows` corrects a bridge's own log: that bridge's.
+        Settings of the alignment. By default, :func:`~magbridge.rows.correct_rows` uses the settings that a
+        bridge's own log declares.
     learner : Learner, optional
-        Learns from the samples; its published calibration is used from the next sample on.
+        Estimator that updates the calibration; a published calibration is used from the next sample on.
 
     Attributes
     ----------
     notices : list of str
         Messages about flagged samples since the caller last emptied the list, each once.
     corrector : Corrector
-        Applies the calibration.
+        Object that applies the calibration in use to a sample.
     is_contradicted : bool
-        Whether another sensor contradicts the last sample: the learner then does not use the next one.
+        True if another sensor contradicts the last sample; the learner then does not use the next sample.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class Correction:
         self._wants_temperature = TEMPERATURE in self.aligner.by_name
         self.corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
-        # a field without a calibration is not expected to be the Earth's
+        # without a calibration, the field need not resemble the Earth's
         self._messages = Messages()
         self.notices = self._messages.lines
         self.parts = OptionalParts(self.notices.append)
@@ -95,13 +96,13 @@ class Correction:
 
     @property
     def calibration(self) -> Calibration:
-        """The calibration that is in use."""
+        """Calibration that is in use."""
         return self.corrector.calibration
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
-        """Align as the bridge did whose log declares its settings among its attributes.
+        """Apply the alignment settings that a bridge's log declares in its attributes `attrs`.
 
-        ConfigError: a number out of range.
+        ConfigError: a setting is out of range.
         """
         declared = {key: float(value) for key, value in attrs.items() if isinstance(value, (int, float))}
         names = [key for key in Align.__struct_fields__ if f"align.{key}" in declared]
@@ -112,7 +113,7 @@ class Correction:
         self.aligner.tune(self.aligner.settings, {name: age for name, age in ages.items() if age})
 
     def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
-        """Add a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
+        """Add a telemetry value; see :meth:`magbridge.align.Aligner.telemetry` for the arguments."""
         self.aligner.telemetry(name, time_us, value, guessed=guessed)
         if name in self._conditions:
             self._hold(name, value)
@@ -128,15 +129,15 @@ class Correction:
         position: tuple[float, float] | None = None,
         depth: float = nan,
     ) -> tuple[Sample, Corrected]:
-        """Align and correct one reading, and check the result.
+        """Align and correct one reading, and check the result; return the aligned and the corrected sample.
 
-        Arguments are those of :meth:`magbridge.align.Aligner.reading`; `main_field` is the main field's total
-        (nT) where the sample was taken, `position` the latitude and longitude (deg), `depth` in m; NaN or
-        None where not known.
+        For `reading` to `missing` see :meth:`magbridge.align.Aligner.reading`. `main_field` is the total main
+        field (nT) at the sample, `position` its latitude and longitude (deg), `depth` is in m; NaN or None if
+        unknown.
         """
         if self.learner is not None and self.learner.calibration is not self.corrector.calibration:
             self._use(self.learner.calibration)
-        if self._wants_temperature and isfinite(reading.temperature):  # not every reading need have one
+        if self._wants_temperature and isfinite(reading.temperature):  # a reading may lack it
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
         (F, sigma, x, y, z, sx, sy, sz), quality = self.corrector.numbers(
@@ -191,7 +192,7 @@ class Correction:
         main_field: float,
         position: tuple[float, float] | None,
     ) -> tuple[float, int]:
-        """Return the variance (nT^2) and the flags that the checks of the corrected field add."""
+        """Check the corrected field; return the variance (nT^2) and the flags that the checks add."""
         if position is not None:
             health.set_position(sample.time_us, *position)
         is_moving = bool(sample.quality & MOVING)
@@ -213,7 +214,7 @@ class Correction:
         return variance, health.flags
 
     def _mass_changes(self, sample: Sample) -> list[float]:
-        """Return by how much the total field changes where each mass moves by a fraction of its range, nT."""
+        """Return the change of the total field, nT, if each mass moves by `MASS_FRACTION` of its range."""
         spans = []
         for index in self._masses:
             one, value = self.aligner.tracks[index].input, sample.values[index]
@@ -222,26 +223,26 @@ class Correction:
         return list(self.corrector.changes(sample.field, sample.values, spans))
 
     def _hold(self, name: str, value: float) -> None:
-        """Hold the last known value of a condition."""
+        """Store the value of a condition if it is finite and the calibration does not model the condition."""
         if name in self._conditions and isfinite(value):
             self._conditions[name] = self._conditions[name][0], value
 
     def _extrapolation(self, sigma: float) -> tuple[float, int]:
-        """Return the variance (nT^2) and the flag where depth or temperature is beyond the fit's.
+        """Return the variance (nT^2) and the flag for a depth or temperature outside the range of the fit.
 
-        An effect that the fit could not see over half the range is as large as the sample's own `sigma`, nT,
-        without the level of the reference. It grows in proportion to the distance.
+        An undetected effect over half the fitted range is assumed to be as large as the sample's `sigma`, nT,
+        without the constant error of the reference. It grows in proportion to the distance from the range.
         """
         calibration = self.corrector.calibration
         own = max(sigma * sigma - calibration.reference.level_sigma**2, calibration.noise.sensor**2)
         variance = 0.0
         for condition, value in self._conditions.values():
-            if excess := condition.excess(value):  # an infinite sigma stays one
+            if excess := condition.excess(value):  # never inf * 0, which is NaN
                 variance += own * excess * excess
         return (variance, EXTRAPOLATED) if variance > sigma * sigma else (variance, 0)
 
     def _check_direction(self, sample: Sample, vector: Vector) -> tuple[float, int]:
-        """Return the variance (nT^2) of each component and the flags that the direction's check adds."""
+        """Check the direction; return the variance (nT^2) of each component and the flags that this adds."""
         assert self.direction is not None
         variance = self.direction.check(sample.time_us, *vector)
         return variance, self.direction.flags
@@ -254,7 +255,7 @@ class Correction:
         position: tuple[float, float] | None,
         restarted: bool,
     ) -> tuple[int, float]:
-        """Update the learner with the sample; return its flags and its variance, nT^2."""
+        """Update the learner with the sample; return the flags and the variance (nT^2) that it adds."""
         assert self.learner is not None
         if restarted:
             self.learner.restarted()
@@ -274,9 +275,9 @@ class Correction:
         return self.learner.flags, self.learner.variance
 
     def _use(self, calibration: Calibration) -> None:
-        """Correct from now on with another calibration, of the same terms or with effects more or fewer."""
+        """Replace the calibration by one of the same terms, possibly with other effects."""
         self.aligner.follow(calibration.channels)
-        self._conditions = {}  # a learned calibration holds under the conditions that it was learned in
+        self._conditions = {}  # a learned calibration is valid under the present conditions
         values = [track.last for track in self.aligner.tracks]
         by = self.corrector.replace(calibration, values)
         if not calibration.level:
@@ -295,25 +296,28 @@ class Correction:
         return HealthMonitor(calibration.noise, self._messages, level, len(self._masses))
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
-        """Return the part of a corrected sample's sigma that all samples share, nT; NaN without a level."""
+        """Return the part of the total field's sigma that all samples share, nT; NaN if not modelled."""
         if self._raised is None:
             return nan
         raised = self._raised.numbers(sample.time_us, sample.field, sample.values, sample.quality)[0][0]
         return abs(raised - corrected.total_field) / LEVEL_STEP_SIGMA
 
     def _more(self, sample: Sample) -> float:
-        """Return the variance to add: ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
+        """Return the variance of alignment, ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, nT^2.
+
+        s is the `sigma` of the sample, lo and hi are the bounds of its uncertain parameters.
+        """
         more = sample.sigma * sample.sigma
         for change in self.corrector.changes(sample.field, sample.values, sample.spans):
             more += 0.25 * change * change
         if (
             not more < MAX_MEASURED_NT * MAX_MEASURED_NT
-        ):  # also NaN, as where a parameter has neither value nor range
+        ):  # also NaN, if a parameter has neither value nor range
             more = inf
         return more
 
 
 def _unmodelled_conditions(calibration: Calibration) -> dict[str, tuple[CalibratedRange, float]]:
-    """Return the conditions that no parameter and no effect follows, each with its value: not known yet."""
+    """Return the conditions without a parameter or effect in the calibration, with an unknown value (NaN)."""
     modelled = calibration.channels
     return {one.name: (one, nan) for one in calibration.conditions if one.name not in modelled}
