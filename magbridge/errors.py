@@ -39,7 +39,7 @@ class MagbridgeError(Exception):
 def _rebuilt(
     kind: type[MagbridgeError], args: tuple[object, ...], values: dict[str, object]
 ) -> MagbridgeError:
-    """Return a pickled error as it was."""
+    """Rebuild an error from its pickled values."""
     error = kind.__new__(kind, *args)
     error.args = args
     error.__dict__.update(values)

@@ -1,4 +1,4 @@
-"""Files that are never half-written."""
+"""Write files and folders completely or not at all."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _sync(path: Path) -> None:
 
 
 def existing(path: Path) -> Path:
-    """Return a path that is a file to read; FormatError: it is none."""
+    """Return `path` if it is a regular file; FormatError: it is not."""
     if path.is_dir():
         raise FormatError(path, "expected a file, not a directory")
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""Optional parts of the live path, each of which may fail without ending the bridge."""
+"""Run optional parts of the live path so that an error in one does not end the bridge."""
 
 from __future__ import annotations
 
