@@ -109,8 +109,8 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def systems_reason(path: Path) -> Iterator[None]:
     """Raise the operating system's reason where a library that writes to `path` fails.
 
-    netCDF hides that reason: it reports a full disk as 'HDF error' or 'Permission denied'. So `ROOM` bytes
-    are appended to the file, which is spoilt already, and the system raises its own error.
+    netCDF hides that reason: it reports a full disk as 'HDF error' or 'Permission denied'. So `PROBE_BYTES`
+    bytes are appended to the file, which is spoilt already, and the system raises its own error.
 
     OSError: the file cannot be written, and why.
     """
