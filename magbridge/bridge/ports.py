@@ -1,4 +1,4 @@
-"""Recognition of the device on a serial line: a magnetometer, an autopilot, a GPS, or unknown."""
+"""Recognise the device on a serial line: a fluxgate, an autopilot, a GPS, or an unknown one."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from magbridge.sensors.framing import nmea_checksum
 __all__ = ["BAUDRATES", "Recognised", "SerialDevice", "listen", "ports", "recognise"]
 
 BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
-"""Baud rates at which the device is searched, the most common first, bit/s."""
+"""Bit/s at which a line is listened to, the most usual first."""
 NMEA_0183 = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
 TEXT_LINE = re.compile(rb"[^\r\n]+[\r\n]")
 TEXT_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
 SHOWN = 60
-"""Most characters of an unrecognised line that are printed."""
+"""Characters shown of a line that is not understood."""
 BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
-"""Error numbers of a port that another program has opened exclusively."""
+"""Error numbers of a port that another program has opened for itself."""
 MIN_RECOGNISED = 3
-"""Smallest number of readings or frames by which a sender is recognised."""
+"""Readings or frames by which a sender is known."""
 
 
 class Recognised(NamedTuple):
-    """Sender that was recognised on a line."""
+    """Sender recognised on a line."""
 
     who: str
-    """Kind: ``mavlink``, ``nmea``, the name of a driver, ``text`` or ``bytes``; empty without any bytes."""
+    """``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came."""
     text: str
-    """Description for the user: rate, systems, or a line that cannot be parsed."""
+    """More of it, for people: rates, systems, the first line that cannot be parsed."""
 
 
 class SerialDevice(NamedTuple):
-    """Serial port of this computer."""
+    """A serial port of this computer."""
 
     device: str
     description: str
-    """Manufacturer, product and serial number, as the USB device states them."""
+    """What the USB says of it."""
 
 
 def ports() -> list[SerialDevice]:
-    """Return the serial ports of this computer to which hardware is attached."""
+    """Return the serial ports with hardware."""
     found = [one for one in list_ports.comports() if one.hwid != "n/a" or one.vid is not None]
     return [SerialDevice(one.device, _described(one)) for one in sorted(found)]
 
@@ -68,11 +68,11 @@ def _described(device: Any) -> str:
 def listen(
     device: str, baudrates: Sequence[int] = BAUDRATES, seconds: float = 1.5
 ) -> tuple[Recognised, int | None, bytes]:
-    """Return the sender on a device, its baud rate (None if unknown), and the received bytes; send nothing.
+    """Recognise the sender on a device, its baud rate, and the bytes received; nothing is sent.
 
     `device`: a device or a pyserial URL.
-    `baudrates`: baud rates to try in this order, until the sender is recognised.
-    `seconds`: time for each baud rate, s.
+    `baudrates`: tried in turn, until one is understood.
+    `seconds`: for each.
     PortError: the device cannot be opened.
     """
     best, at, came = Recognised("", "silent"), None, b""
@@ -86,13 +86,13 @@ def listen(
             return recognised, baudrate, data
         if (recognised.who == "text") > (best.who == "text") or (recognised.who and not best.who):
             best, at, came = recognised, baudrate, data
-        if "://" in device:  # the baud rate has no effect on a line over the network
+        if "://" in device:  # a network's line has no baud rate of ours
             break
     return best, at, came
 
 
 def _refusal(device: str, error: Exception) -> str:
-    """Return why a port cannot be opened, and the remedy."""
+    """Return why a port cannot be opened, and what to do."""
     if getattr(error, "errno", None) in BUSY:
         users = _users(device)
         return f"busy: {users or 'another program'} has opened it; stop that program, then repeat"
@@ -106,7 +106,7 @@ def _users(device: str) -> str:
     """Return the programs that hold a device open, as far as this user may see them; empty if unknown."""
     found, real = set(), Path(device).resolve()
     for link in Path("/proc").glob("[0-9]*/fd/*"):
-        with suppress(OSError):  # another user's process, or a process that has ended
+        with suppress(OSError):  # another user's process, or one that has ended
             process = link.parts[2]
             if link.readlink() == real and int(process) != os.getpid():
                 found.add(f"{Path('/proc', process, 'comm').read_text().strip()} (process {process})")
@@ -126,7 +126,7 @@ def _read(device: str, baudrate: int, seconds: float) -> bytes:
 
 
 def recognise(data: bytes, seconds: float) -> Recognised:
-    """Return the sender of `data`, which were received within `seconds`."""
+    """Return the sender of these bytes, received within `seconds`."""
     if not data:
         return Recognised("", "silent")
     for known in (_mavlink(data), _nmea(data), *_drivers(data, seconds)):
@@ -164,7 +164,7 @@ def _nmea(data: bytes) -> Recognised | None:
 
 
 def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
-    """Yield each built-in driver that finds readings in `data`, received within `seconds`."""
+    """Yield the built-in drivers that recognise the bytes without a request."""
     for name in DRIVERS:
         for options in OPTIONS.get(name, ({},)):
             kind = driver_class(name, "ports")
@@ -181,8 +181,8 @@ def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
 
 
 OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
-    "ascii": (),  # not tried, because any line of numbers would match
+    "ascii": (),  # any line of numbers would do: it has to be described
     "digitizer": ({"sensitivity": 1e-5},),
     "hmr2300": ({"output": "ascii"}, {"output": "binary"}),
 }
-"""Driver -> sets of options to try; the sensitivity has no effect on the recognition."""
+"""Driver -> the options to try; the sensitivity says nothing about the line."""

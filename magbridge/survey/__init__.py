@@ -2,9 +2,9 @@
 
 ::
 
-    logs, tables --> read (corrected with a calibration, or with one found from the same logs)
+    logs, tables --> read (corrected with a given calibration, or with one fitted to the same logs)
                        |
-                    samples --> gridding (field in place, levels, slow changes) --> maps, predictions
+                    samples --> gridding (crustal field, levels, slow changes) --> maps, predictions
                        |                        |
                   crossovers (before)      crossovers (after)
 

@@ -2,13 +2,13 @@ r"""Lag, lever arm and heading error of a survey's scalar magnetometer, from the
 
 .. math:: s_i = f(x_i - \tau v_i + R(\psi_i) a) + h(\psi_i) + \sum_k c_k \cdot z_k + l_{line} + e_i
 
-f is the crustal field in place, :math:`\tau` the lag of the reading after the position, v the velocity, a the
+f is the crustal field, :math:`\tau` the lag of the reading after the position, v the velocity, a the
 lever arm (forward, starboard) from the positions to the sensor, h the heading error with two harmonics, z_k
 the telemetry channels or the uncertain combinations of a compensation, and l the level of the line.
 
-Lag and forward lever arm move the samples along the track. The likelihood of that shift has several maxima:
-the shift is scanned on a grid first. Then Gauss-Newton steps refine all terms, with the field's gradient as
-the derivative by the shift. At one speed only ``lever - v * lag`` is determined.
+Lag and forward lever arm shift the samples along the track. The likelihood of this shift has several maxima,
+so a scan on a grid comes first. Gauss-Newton steps then refine all terms; the field's gradient gives the
+derivative by the shift. At constant speed the samples determine only ``lever - v * lag``.
 """
 
 from __future__ import annotations
@@ -52,56 +52,56 @@ LAG_SIGMA_S, LEVER_SIGMA_M = 0.5, 2.0
 SCANNED_LAG_S, SCANNED_LEVER_M = 1.0, 5.0
 """Largest lag, s, and forward lever arm, m, of the scan."""
 SCAN_STEP_LENGTHS, MIN_SCAN_STEPS, MAX_SCAN_STEPS = 1.0 / 8.0, 9, 41
-"""Step of the scan in lengths of the field, and fewest and most steps."""
+"""Step of the scan in correlation lengths of the field, and fewest and most steps."""
 HEADING_WIDTH_NT, LOG_HEADING_SPREAD = 2.0, float(np.log(5.0))
-"""Width of a harmonic of the heading error, nT, and the 1-sigma of its logarithm."""
+"""Prior 1-sigma of a harmonic of the heading error, nT, and the 1-sigma of its logarithm."""
 CHANNEL_WIDTH_NT, LOG_CHANNEL_SPREAD = 10.0, 1.5
-"""Width of a channel's effect for one swing, nT, and the 1-sigma of its logarithm."""
+"""Prior 1-sigma of a channel's effect for one swing, nT, and the 1-sigma of its logarithm."""
 FITTED_SAMPLES, FITTED_NODES = 8_000, 8_000
-"""Samples and nodes of the joint fit, at most."""
+"""Largest numbers of samples and nodes of the joint fit."""
 SCANNED_SAMPLES, SCANNED_NODES = 4_000, 3_000
-"""Samples and nodes of the scan, at most."""
+"""Largest numbers of samples and nodes of the scan."""
 MAX_SPACING_FRACTION = 1.0 / 240.0
-"""Largest distance of fitted samples, as a fraction of the survey's extent."""
+"""Largest spacing of fitted samples, as a fraction of the survey's extent."""
 GAUSS_NEWTON_STEPS, SEARCH_EFFORT, CLIMB_STEPS = 4, 0.3, 14
 SEPARABLE_FRACTION = 0.5
-"""Posterior over prior 1-sigma of lag or lever arm, above which the two are not separable."""
+"""Largest posterior over prior 1-sigma of lag and of lever arm with which the two count as separable."""
 SHIFT_NAMES = ("lag", "forward", "starboard")
 HARMONICS = ("cos", "sin", "cos2", "sin2")
-"""Functions of the heading in the heading error."""
+"""Names of the harmonics of the heading in the heading error."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScalarTerms:
-    """What the joint fit found about a scalar magnetometer."""
+    """Terms of a scalar magnetometer that the joint fit has estimated, and their effects."""
 
     column: str
     shift: FloatArray
-    """(3,), lag (s), forward and starboard lever arm (m)."""
+    """Lag (s), forward and starboard lever arm (m), (3,)."""
     shift_sigma: FloatArray
-    """(3,), 1-sigma of each."""
+    """1-sigma (3,) of each component of `shift`."""
     along_m: float
     along_sigma_m: float
-    """`along_m`, `along_sigma_m`: m, forward lever arm minus speed times lag, and its 1-sigma."""
+    """`along_m`, `along_sigma_m`: forward lever arm minus speed times lag, and its 1-sigma, m."""
     speed: float
     """Median speed, m/s."""
     separable: bool
-    """True if lag and forward lever arm are known each by itself."""
+    """True if the samples determine lag and forward lever arm separately."""
     heading_error: FloatArray
-    """(4,), nT, of cos, sin of the heading and cos, sin of twice the heading."""
+    """Amplitudes (4,), nT, of cos and sin of the heading, and of cos and sin of twice the heading."""
     contribution: dict[str, float]
-    """Standard deviation, nT, of each term over the survey."""
+    """Standard deviation of each term's effect over the survey, nT."""
     misties_raw: float
-    """RMS, nT, of the crossings as read."""
+    """RMS mis-tie at the crossovers before correction, nT."""
     field: Choice
     """Crustal field and noise of the joint fit, for the map."""
     merit: dict[str, Any] | None
-    """Figure of merit of a box that was not fitted; None without one."""
+    """Figure of merit of a box flight, which was not fitted; None without a box flight."""
     findings: tuple[Diagnostic, ...] = ()
-    """Statistically significant terms (:data:`.CHANCE`): shift along the track, heading error, channels."""
+    """Statistically significant terms (:func:`.is_significant`): shift along the track, heading, channels."""
 
     def facts(self) -> dict[str, Any]:
-        """Return the numbers to print as JSON."""
+        """Return the estimated terms as plain values, to print as JSON."""
         named = zip(SHIFT_NAMES, self.shift.tolist(), self.shift_sigma.tolist(), strict=True)
         shift = {
             f"{name}_{'s' if name == 'lag' else 'm'}": {"value": value, "sigma": sigma}
@@ -121,7 +121,7 @@ class ScalarTerms:
         }
 
     def summary(self) -> str:
-        """Return the numbers as text."""
+        """Return the estimated terms as text."""
         lag, forward, starboard = self.shift
         sigma = self.shift_sigma
         if self.separable:
@@ -144,9 +144,9 @@ def align(
 ) -> tuple[Samples, ScalarTerms]:
     """Fit lag, lever arm, heading error and channels together with the crustal field and the lines' levels.
 
-    The `lag` of the reading after the position, s, is estimated if not given. With `lever_known` the
-    positions are those of the sensor already. The samples that are returned are at the sensor's places,
-    without heading error and channels; their uncertainty is in `modes`.
+    `lag`, s, is that of the reading after the position; it is estimated if not given. With `lever_known` the
+    positions are the sensor's already. The returned samples are at the sensor's places, corrected for heading
+    error and channels; the uncertainty of the corrections is in `modes`.
 
     CalibrationError: the samples do not determine a field.
     """
@@ -162,20 +162,24 @@ def align(
 
 
 class _Solution(NamedTuple):
-    """Unknowns of the joint fit."""
+    """Solution of the joint fit."""
 
     effects: FloatArray
-    """Heading error, then each term's unknowns, then the free components of the shift's last step."""
+    """Estimates (m,): heading error, coefficients of each term, last step of the k free shift components."""
     covariance: FloatArray
-    """Covariance of `effects`."""
+    """Covariance (m, m) of `effects`."""
     slopes: FloatArray
-    """Change of each fitted sample with each free component of the shift, nT/s and nT/m, (n, k)."""
+    """Change (n, k) of each fitted sample with each free component of the shift, nT/s and nT/m."""
     field: FloatArray
-    """Coefficients of the crustal field."""
+    """Coefficients (nodes,) of the crustal field."""
 
 
 class _JointFit:
-    """Scan, then Gauss-Newton, on some of the samples."""
+    """Joint fit on a part of the samples: a scan of the shift, then Gauss-Newton steps.
+
+    `shift` (3,) is the initial lag (s) and lever arm (m), of which the components with `free` (3,) are
+    estimated.
+    """
 
     def __init__(self, rows: ScalarRows, shift: FloatArray, free: FloatArray) -> None:
         self.rows, self.shift, self.free = rows, shift, np.flatnonzero(free)
@@ -200,11 +204,11 @@ class _JointFit:
         self.solution = self._gauss_newton()
 
     def place(self, shift: FloatArray) -> FloatArray:
-        """Return the sensor's place (n, 2), m, with a lag (s), forward and starboard lever arm (m)."""
+        """Return the sensor's places (n, 2), m, for a `shift` (3,): lag (s) and lever arm (m)."""
         return np.asarray(self.rows.samples.place + np.tensordot(shift, self.directions, 1))
 
     def _blocks(self, chosen: IndexArray) -> tuple[ParameterBlock, ...]:
-        """Return levels, slow changes, heading error and terms of some samples."""
+        """Return the blocks of levels, slow changes, heading error and terms for the samples `chosen`."""
         blocks = list(level_blocks(self.rows.samples.part(chosen)))
         # Heading error: first and second harmonic of the heading, with one width for all four.
         harmonics = _harmonics(self.rows.heading[chosen])
@@ -226,7 +230,7 @@ class _JointFit:
         return Weighed(family, family.centre, FINE_NOISE_NT, length)
 
     def _search(self, chosen: IndexArray) -> Choice:
-        """Return a field for the samples as they are, on coarse nodes."""
+        """Return the likeliest field on coarse nodes for the samples `chosen`, at the initial shift."""
         blocks, every = self._blocks(chosen), np.arange(len(chosen))
         problem = self._problem(chosen, self.shift, blocks)
         place = problem.samples.place
@@ -240,7 +244,7 @@ class _JointFit:
         )  # fmt: skip
 
     def _scan(self, chosen: IndexArray, choice: Choice) -> Choice:
-        """Set the shift along the track to the likeliest one of a grid; return the field of that shift."""
+        """Set the shift along the track to the likeliest value on a grid; return the field for this shift."""
         if not len(self.free):
             return choice
         component = int(self.free[0])  # lag, else forward lever arm
@@ -267,7 +271,7 @@ class _JointFit:
         return climb(sums, choice, weighed, steps=CLIMB_STEPS)
 
     def _refine_field(self, choice: Choice) -> Choice:
-        """Return the likelier one of a field with white noise and one whose noise is correlated in time."""
+        """Return the field and noise on finer nodes, with white or correlated noise as is likelier."""
         blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
         problem = self._problem(self.chosen, self.shift, blocks)
         field = choice.field
@@ -275,11 +279,11 @@ class _JointFit:
             length = field.length * ((field.alpha - 1) / (SMOOTH - 1)) ** BENDS
             field = replace(field, alpha=SMOOTH, length=length)
         nodes = nodes_for(problem.samples.place, field.length, field.alpha, FITTED_NODES, FINER_NODES)
-        # Finer nodes resolve what the scan left to the noise.
+        # Finer nodes resolve parts of the field that counted as noise in the scan.
         field = replace(field, nodes=nodes)
         weighed, sums = self._weighed(blocks, field.length), problem.sums(field, every)
         start = replace(choice, field=field)
-        # White noise of the innovations' size; the size of the correlated noise is larger.
+        # White noise has the amplitude of the innovations; the correlated noise is larger.
         ratio = choice.ratio / np.sqrt(1.0 - choice.rho**2)
         white = climb(sums, replace(start, rho=0.0, ratio=ratio), weighed, move_rho=False, steps=CLIMB_STEPS)
         if choice.rho == 0.0:
@@ -287,7 +291,7 @@ class _JointFit:
         return max(white, climb(sums, start, weighed, steps=CLIMB_STEPS), key=lambda found: found.score)
 
     def _gauss_newton(self) -> _Solution:
-        """Refine the shift together with all other terms."""
+        """Refine the shift together with all other terms by Gauss-Newton steps; return the last solution."""
         blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
         effects = sum(len(block.shape) for block in blocks if _is_effect(block))
         slopes: FloatArray | None = None
@@ -303,7 +307,7 @@ class _JointFit:
             sigma = self._weighed(joint, self.choice.field.length).sigma
             widths = maximise_evidence(reduced.quadratic, family, family.centre, sigma)
             prior = family.prior(widths.eta).precision
-            # The prior of the shift is about zero, and the step's about minus the shift so far.
+            # The prior mean of the shift is zero, so that of the step is minus the shift so far.
             mean = np.zeros(len(prior))
             moved = len(self.free) if slopes is not None else 0
             if moved:
@@ -325,7 +329,7 @@ class _JointFit:
         return solution
 
     def _slopes(self, chosen: IndexArray, w: FloatArray) -> FloatArray:
-        """Return the change of samples with the free components of the shift, (n, k), nT/s and nT/m."""
+        """Return the change (n, k) of the samples with each free component of the shift, nT/s and nT/m."""
         place, field = self.place(self.shift)[chosen], self.choice.field
         # Slope of the field north and east, times the change of place with each component of the shift.
         inside = field.nodes.covers(place)
@@ -334,7 +338,7 @@ class _JointFit:
         return np.asarray(np.einsum("knj,nj->nk", self.directions[self.free][:, chosen], gradient))
 
     def result(self) -> tuple[Samples, ScalarTerms]:
-        """Return the aligned samples and the report."""
+        """Return all samples, aligned and corrected, and the estimated terms."""
         rows, found = self.rows, self.solution
         every = np.arange(len(rows.raw))
         slopes = self._slopes(every, found.field)
@@ -361,12 +365,12 @@ class _JointFit:
         return samples, self._terms(parts, contribution, rms(raw) if len(raw) else 0.0)
 
     def _every_sample(self) -> Choice:
-        """Return the field with the noise's autocorrelation between all samples, not only the fitted ones."""
+        """Return the field and noise with the autocorrelation of the noise between successive samples."""
         step = int(np.median(np.diff(self.chosen)))
         return replace(self.choice, rho=self.choice.rho ** (1.0 / step))
 
     def _terms(self, parts: list[FloatArray], contribution: dict[str, float], misties: float) -> ScalarTerms:
-        """Return the report."""
+        """Return the estimated terms with their uncertainties and effects."""
         many = len(self.free)
         covariance = np.zeros((3, 3))
         if many:
@@ -416,23 +420,23 @@ class _JointFit:
 
 
 def _is_effect(block: ParameterBlock) -> bool:
-    """Return whether a block is a heading error or a term, not a level of a line or a slow change."""
+    """Return True if a block is the heading error or a term, not line levels or slow changes."""
     return block.name == "heading error" or block.name.startswith("effect of ")
 
 
 def _harmonics(heading: FloatArray) -> FloatArray:
-    """Return cosine and sine of headings (n,), rad, and of twice them, (n, 4)."""
+    """Return cosine and sine of the heading (n,), rad, and of twice the heading, as columns (n, 4)."""
     return np.stack([np.cos(heading), np.sin(heading), np.cos(2 * heading), np.sin(2 * heading)], axis=1)
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """Return a root R (r, r) of a covariance, ``R R^T``."""
+    """Return a matrix root R (r, r) of a covariance (r, r), which is ``R R^T``."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _fitted_rows(samples: Samples, most: int) -> IndexArray:
-    """Return at most `most` samples: evenly thinned where they are dense, then about the middle."""
+    """Return indices of about `most` samples: thin dense samples evenly, then keep those about the middle."""
     place = samples.place
     spacing = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
     extent = float(np.hypot(*np.ptp(place, axis=0)))

@@ -1,4 +1,4 @@
-"""A picture of a survey: its map and sigma, the track, residuals and crossovers."""
+"""Figure of a survey: its map and sigma, the track, residuals and crossovers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from magbridge.survey.samples import Crossovers, Samples
 __all__ = ["draw_survey"]
 
 MAX_DOTS = 20_000
-"""Samples drawn, at most."""
+"""Largest number of samples that are drawn."""
 
 
 def draw_survey(

@@ -1,13 +1,12 @@
-r"""The map from corrected samples: a Gaussian field in place, with each line's own level.
+r"""The map from corrected samples: a spatial Gaussian field, and a level for each line.
 
 .. math:: y_i = f(x_i) + l_{line(i)} + s(t_i) + e_i
 
-f is the field of :mod:`magbridge.estimation.gaussian_field`. The evidence selects its size, length and
-smoothness, as in a survey that calibrates itself. It also selects the widths of the levels l and of the
-slow changes s.
-Map and sigma are the posterior's mean and standard deviation. The uncertainty of the calibration (its
-`modes`) is not fitted again to the same data: it is added to the sigma unchanged (a *considered*
-uncertainty: Schmidt 1966).
+f is the field of :mod:`magbridge.estimation.gaussian_field`, l the level of a line, s slow changes with time.
+Maximum evidence determines the amplitude, correlation length and smoothness of f, and the prior widths of l
+and s. Map and sigma are the posterior's mean and standard deviation. The uncertainty of the calibration (its
+`modes`) is not estimated from the same data, but added to the sigma (a *considered* uncertainty: Schmidt
+1966).
 """
 
 from __future__ import annotations
@@ -53,30 +52,30 @@ __all__ = ["FINER_NODES", "FINE_NOISE_NT", "Gridded", "Posterior", "gridded", "l
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The field given its size and length."""
+    """Posterior of the field for one pair of amplitude and correlation length."""
 
     weight: float
-    """Posterior probability of `size` and the field's length."""
+    """Posterior probability of this amplitude and correlation length."""
     field: GaussianField
     size: float
     sigma: float
-    """`size`, `sigma`: nT, the field's standard deviation where the roughness is 1, and the noise's."""
+    """`size`, `sigma`: standard deviation of the field where the roughness is 1, and of the noise, nT."""
     w: FloatArray
-    """(nodes,): The field's coefficients."""
+    """Coefficients of the field (nodes,)."""
     follow: FloatArray
-    """(nodes, r): Change of the nodes with 1-sigma of each other uncertainty: levels, slow changes, the
+    """Change (nodes, r) of the coefficients with 1-sigma of each other uncertainty: levels, slow changes,
     calibration."""
     precision: csr_array
-    """(nodes, nodes), in units of the noise's."""
+    """Precision of the coefficients (nodes, nodes), in units of the noise's precision."""
     inverse: InverseBlocks
     """Blocks of the inverse of `precision`."""
     levels: FloatArray
-    """(n,), nT, subtracted from each sample: its line's level and the slow part, about their mean."""
+    """Line level plus slow change (n,), nT, about their mean, to be subtracted from each sample."""
     mean: float
-    """Mean of the field over the samples, nT: a level, which no survey determines and the sigma excludes."""
+    """Mean of the field over the samples, nT, which a survey does not determine and the sigma excludes."""
 
     def evaluate(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
-        """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
+        """Return the field (n,), nT, and its variance (n,), nT², at places with spline rows B (n, nodes)."""
         return B @ self.w, self.sigma**2 * self.inverse.variances(B) + ((B @ self.follow) ** 2).sum(axis=1)
 
     def draw(self, rng: np.random.Generator, number: int) -> FloatArray:
@@ -90,51 +89,51 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Gridded:
-    """A gridded survey; :meth:`evaluate` returns the field and its sigma at any place."""
+    """Gridded survey, whose :meth:`evaluate` returns the anomaly and its sigma at any place."""
 
     posteriors: tuple[Posterior, ...]
-    """Posterior of the likeliest size and length first, then further ones that the data allow."""
+    """Posteriors for the plausible pairs of amplitude and correlation length, the likeliest first."""
     roughness: Roughness
-    """How the field's size varies from place to place."""
+    """Variation of the field's amplitude from place to place."""
     rho: float
-    """The noise's autocorrelation."""
+    """Autocorrelation of the noise of successive samples."""
     middle: float
     """Depth at which the map holds, m."""
     mean: float
-    """Mean of all samples, and of the map over them, nT."""
+    """Mean of the kept samples, and of the map over them, nT."""
     kept: BoolArray
-    """(n,): True for samples that are not outliers."""
+    """True (n,) for samples that are not outliers."""
     widths: Hyperparameters
-    """As the evidence chose them."""
+    """Prior widths and noise that maximise the evidence."""
     kriged: Kriged | None = None
     """Predictor to use instead of the nodes if these are coarser than the crustal field."""
 
     @property
     def field(self) -> GaussianField:
-        """The likeliest field."""
+        """Gaussian field of the likeliest posterior."""
         return self.posteriors[0].field
 
     @property
     def size(self) -> float:
-        """The field's standard deviation where the roughness is 1, nT."""
+        """Standard deviation of the field where the roughness is 1, nT."""
         return float(np.sqrt(sum(one.weight * one.size**2 for one in self.posteriors)))
 
     @property
     def sigma(self) -> float:
-        """The noise's, nT."""
+        """Standard deviation of the samples' noise, nT."""
         return self.posteriors[0].sigma if self.kriged is None else self.kriged.noise
 
     @property
     def levels(self) -> FloatArray:
-        """(n,), nT, subtracted from each sample: its line's level and the slow part."""
+        """Line level plus slow change (n,), nT, to be subtracted from each sample."""
         return np.asarray(sum(one.weight * one.levels for one in self.posteriors))
 
     def evaluate(
         self, place: FloatArray, depth: FloatArray | float | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the anomaly and its 1-sigma (n,) each, nT, at places (n, 2), m, and depths (n,), m.
+        """Return the anomaly and its 1-sigma, (n,) each, nT, at places (n, 2), m, and depths (n,), m.
 
-        The depth is the map's own if not given; where the samples are kriged it is that of those around.
+        The default depth is the map's. Kriging ignores `depth`: its anomaly is at the samples' depth.
         """
         if self.kriged is not None:
             return self._beside_samples(place)
@@ -161,7 +160,7 @@ class Gridded:
         return mean, np.sqrt(variance + ((B @ self.posteriors[0].follow) ** 2).sum(axis=1))
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
-        """Yield about `number` equally probable anomalies (n,), nT, at places (n, 2), m."""
+        """Yield about `number` random anomalies (n,), nT, from the posterior at places (n, 2), m."""
         rng, rough = np.random.default_rng(0), self.roughness.evaluate(place)
         for one in self.posteriors:
             B = one.field.basis(place)
@@ -169,7 +168,7 @@ class Gridded:
                 yield self.mean - one.mean + rough * (B @ w)
 
     def at_samples(self, samples: Samples) -> FloatArray:
-        """Return the anomaly (n,), nT, at the samples' own places and depths."""
+        """Return the gridded anomaly (n,), nT, at the places and depths of the samples."""
         # Chunks bound the memory of the splines.
         deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.evaluate(samples.place)
 
@@ -185,35 +184,36 @@ class Gridded:
 
 
 LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
-"""nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
+"""Prior 1-sigma of the levels of lines, nT, and the 1-sigma of its logarithm."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
-"""Width of slow changes, nT, and the 1-sigma of its logarithm, as in a survey that calibrates itself."""
+"""Prior 1-sigma of slow changes, nT, and the 1-sigma of its logarithm."""
 UNOBSERVED_CHANGE_NT = 0.25
-"""nT of slow changes where the samples show none. On a track that never crosses itself a slow change is as
-likely as a crustal anomaly: with a free width, slow changes absorbed up to 6 nT of it."""
+"""Prior 1-sigma of slow changes, nT, if the evidence does not require larger ones. On a track that never
+crosses itself, slow changes look like crustal anomalies: with a free width they absorbed 6 nT of these."""
 SEARCHED, SEARCHED_NODES = 4_000, 12_000
-"""Samples about the middle with which the field is searched, and nodes at most."""
+"""Largest numbers of samples and of nodes in the search for the field's parameters."""
 VARIATION_BOX_M = 5_000.0
-"""North and east of it, m: where there are more samples within, every second or tenth of these."""
+"""Smallest half width of the square about the middle from which the search takes (thinned) samples, m."""
 GRID_OUTLIER_SIGMA = 6.0
-"""Sigmas beyond which a sample is left out."""
+"""Residual in sigmas beyond which a sample is an outlier."""
 FINER_NODES = 2.5
-"""Factor of the nodes per length where a joint fit has found the field, for noise of a thousandth of it."""
+"""Factor of the nodes per correlation length if a joint fit has found the field and its small noise."""
 FINE_NOISE_NT = 0.05
-"""Noise from which the likeliest one of a scalar's survey is sought; its search is fast upwards only."""
+"""Initial noise of a scalar survey's search, nT; it is below the true noise, because only that is fast."""
 LARGE, LIKELIER = 100.0, 5.0
-"""Areas of a length's square, and log-likelihood gain, from which on the field's size may vary with place."""
+"""Smallest area, in squared correlation lengths, and smallest gain of log likelihood with which the field's
+amplitude varies from place to place."""
 MAX_GRID_NODES = 40_000
-"""Nodes at most; their variances take 0.5 GB."""
+"""Largest number of nodes; their variances take 0.5 GB of memory."""
 
 
 def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None) -> Gridded:
-    """Grid the corrected samples of a survey.
+    """Return the gridded field of the corrected samples of a survey.
 
-    With `local` the field's size may vary from place to place. `start` is field and noise where a joint fit
-    has found them; they are searched if not given.
+    With `local`, the field's amplitude may vary from place to place. `start` is the field and noise that a
+    joint fit has found; without it, a search over part of the samples determines them.
     """
-    # 1. Field and noise by a part of the samples, or as a joint fit has found them.
+    # 1. Field and noise from a part of the samples, or from a joint fit.
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1) if start is None else FINE_NOISE_NT
     choice, roughness = _searched(samples, sigma, local=local, start=start)
     finer = 1.0 if start is None else FINER_NODES
@@ -262,7 +262,7 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
 
 
 def _left_open(choice: Choice, sums: SampleSums, weighed: Weighed) -> list[tuple[float, Choice]]:
-    """Return the plausible sizes and lengths of the field, with their weights."""
+    """Return the plausible amplitudes and correlation lengths of the field, each with its weight."""
 
     def score(choice: Choice) -> float:
         reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
@@ -280,7 +280,10 @@ def _posterior(
     widths: Hyperparameters,
     shaken: FloatArray,
 ) -> Posterior:
-    """Return the field given its size and length; `shaken` (nodes, r): what the calibration does to it."""
+    """Return the posterior of the field for the amplitude and length of `choice`, with a given `weight`.
+
+    `shaken` (nodes, r) is the change of the coefficients with 1-sigma of each of the calibration's modes.
+    """
     reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
     z, covariance = _solved(reduced, widths, family)
     # Shift of the nodes with 1-sigma of each other unknown: dw/dz times a root of its covariance.
@@ -295,13 +298,13 @@ def _posterior(
 
 
 def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
-    """Return the levels, one a line (or log), and what changes slowly within a log."""
+    """Return the parameter blocks of the lines' levels and, if the time is known, of slow changes."""
     # One column for each line: 1 at its samples.
     of = np.unique(samples.line, return_inverse=True)[1].ravel()
     levels = np.zeros((len(of), int(of.max()) + 1))
     levels[np.arange(len(of)), of] = 1.0
     groups = [ParameterBlock("levels of lines", levels, np.ones(levels.shape[1]), LEVEL, LEVEL_SPREAD)]
-    if levels.shape[1] == 1:  # the crustal field of its size may have one sign along a single line
+    if levels.shape[1] == 1:  # along a single line, the crustal field may have one sign: a wide prior
         groups = [ParameterBlock("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
         # Slow changes are offered: the evidence decides whether they are needed.
@@ -316,7 +319,7 @@ def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
 def _needed(
     groups: tuple[ParameterBlock, ...], sums: SampleSums, choice: Choice, sigma: float
 ) -> tuple[ParameterBlock, ...]:
-    """Return levels and slow changes; these are small unless larger ones make the samples likelier."""
+    """Return the blocks with a small width for slow changes, unless the evidence requires a larger one."""
     if not any(one.offered for one in groups):
         return groups
     reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
@@ -331,8 +334,8 @@ def _needed(
 def _searched(
     samples: Samples, sigma: float, *, local: bool, start: Choice | None = None
 ) -> tuple[Choice, Roughness]:
-    """Return the field that a part of the samples determines, with noise of about `sigma` nT."""
-    # The densest part, thinned to so many samples.
+    """Return field and roughness from a part of the samples, whose noise is about `sigma` nT."""
+    # The part about the middle, thinned to SEARCHED samples.
     part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, VARIATION_BOX_M))
     step = max(len(part) // SEARCHED, 1)
     few = samples.part(part[::step])
@@ -359,7 +362,7 @@ def _searched(
         rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho
     if uniform or _few_lengths(samples, best):
         return replace(best, rho=rho), even
-    # Compare a field of one size with one whose size follows the roughness.
+    # Compare a field of one amplitude with a field whose amplitude is proportional to the roughness.
     uneven = Roughness.from_samples(samples, best.field.length)
     problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
@@ -368,7 +371,7 @@ def _searched(
 
 
 def _few_lengths(samples: Samples, choice: Choice | None) -> bool:
-    """Return whether a survey is too small for a field whose size varies; False without a field."""
+    """Return True if a survey is too small for a field of varying amplitude; False without a field."""
     # Number of independent cells: area over length squared.
     area = float(np.prod(np.ptp(samples.place, axis=0)))
     return choice is not None and area < LARGE * choice.field.length**2
@@ -377,7 +380,7 @@ def _few_lengths(samples: Samples, choice: Choice | None) -> bool:
 def _solved(
     reduced: FieldEliminated, widths: Hyperparameters, family: PriorFamily
 ) -> tuple[FloatArray, FloatArray]:
-    """Return z (q,) and its covariance (q, q)."""
+    """Return the posterior mean (q,) and covariance (q, q) of all unknowns but the field."""
     # Posterior of z with the field eliminated.
     precision = reduced.quadratic.precision / widths.sigma**2 + family.prior(widths.eta).precision
     z = np.linalg.solve(precision, reduced.quadratic.vector / widths.sigma**2)
@@ -392,7 +395,7 @@ def _considered(
     family: PriorFamily,
     rows: IndexArray,
 ) -> FloatArray:
-    """Return the change of the field with each of the calibration's modes, (nodes, r), for 1-sigma."""
+    """Return the change (nodes, r) of the field's coefficients with 1-sigma of each calibration mode."""
     q = len(problem.D)
     sums = problem.sums(choice.field, rows, modes=True)
     # Eliminate the field with the modes as further unknowns; then let levels follow the modes.
@@ -403,5 +406,8 @@ def _considered(
 
 
 def _without_level(follow: FloatArray, mean: FloatArray) -> FloatArray:
-    """Subtract from the uncertain shifts of the field (nodes, r) their mean over the samples: the level."""
+    """Return the uncertain shifts of the coefficients (nodes, r) without their mean over the samples.
+
+    `mean` (nodes,) is the row from the coefficients to the field's mean over the samples.
+    """
     return np.asarray(follow - (mean @ follow)[None, :] / max(mean.sum(), 1e-9))

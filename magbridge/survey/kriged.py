@@ -1,14 +1,14 @@
 r"""Kriging from the nearest samples, for areas where nodes as fine as the crustal field are too many.
 
-Sources that are distributed at random at a depth d have the spectrum :math:`e^{-2 k d}` (Spector & Grant
-1970), and so, as :math:`\int e^{-k h} J_0(k r)\, k\, dk = h / (r^2 + h^2)^{3/2}`, the covariance
+Random sources at a depth d have the spectrum :math:`e^{-2 k d}` (Spector & Grant 1970). With
+:math:`\int e^{-k h} J_0(k r)\, k\, dk = h / (r^2 + h^2)^{3/2}` the covariance of their field is
 
 .. math:: C(r) = s^2 h^3 / (r^2 + h^2)^{3/2}, \quad h = 2 d.
 
-The estimate of depth, size s and noise maximises the likelihood of some samples, each given the nearest of
-those that precede it in a random order (Vecchia 1988). A line with wrong positions reads a crustal field of
-the same kind, which no other line crosses: its samples have :math:`(1 + g^2) C` in common, with g from the
-predictions of the other lines.
+Depth, amplitude s and noise maximise the likelihood of some samples. Each is predicted from its nearest
+samples among those that precede it in a random order (Vecchia 1988). A line with wrong positions reads an
+additional field of the same covariance, which no other line shares. The covariance between two samples of one
+line is therefore :math:`(1 + g^2) C`. The predictions from the other lines determine g.
 """
 
 from __future__ import annotations
@@ -26,42 +26,42 @@ from magbridge.survey.samples import Roughness, Samples
 __all__ = ["Kriged", "kriged"]
 
 NEAREST, GIVEN = 100, 40
-"""Samples from which a place is predicted, and from which each of :data:`CHOOSING` samples is."""
+"""Number of samples that predict a place, and number that predict each of the :data:`CHOOSING` samples."""
 AMONG = 400
-"""Nearest samples among which are the GIVEN."""
+"""Number of nearest samples from which the :data:`GIVEN` are selected."""
 CHOOSING = 600
-"""Samples whose predictions choose the depth of the sources."""
+"""Number of samples whose predictions determine depth, amplitude and noise."""
 MAX_SEARCH_STEPS = 50
-"""Steps of the maximisation over depth, size and noise."""
+"""Largest number of evaluations in the search for depth, amplitude and noise."""
 SHARE, SPREAD = 0.1, np.log(5.0)
-"""Centre of the prior of g, and the 1-sigma of its logarithm."""
+"""Median of the prior of g, and the 1-sigma of its logarithm."""
 SHARES = np.geomspace(0.02, 5.0, 60)
-"""Values of g that are tried."""
+"""Values of g that the estimate tries."""
 SAMPLE_SPACING_DEPTHS = 2.0
-"""Distance, in depths of the sources, between the samples of a line that determine its g."""
+"""Distance between the samples of a line that determine its g, in depths of the sources."""
 VARYING_LOG_RATIO = 5.0
-"""Nats from which on the field's size may vary from place to place."""
+"""Smallest gain of log likelihood with which the field's amplitude varies from place to place."""
 KRIGED_PLACES = 256
-"""Places at a time."""
+"""Number of places that are kriged at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kriged:
-    """Samples and the covariance of their field, for kriging at the height of the samples."""
+    """Kriging predictor at the height of the samples: the samples, and the covariance of their field."""
 
     place: FloatArray
     value: FloatArray
     line: IndexArray
-    """`place`, `value`, `line`: (n, 2) m, (n,) nT and the number of each's line."""
+    """`place`, `value`, `line`: samples' positions (n, 2), m, anomalies (n,), nT, and line numbers (n,)."""
     roughness: Roughness
     tree: cKDTree
     below: float
     """Depth of the sources below the samples, m."""
     size: float
     noise: float
-    """`size`, `noise`: nT, standard deviation of the field where the roughness is 1, and of the noise."""
+    """`size`, `noise`: standard deviation of the field where the roughness is 1, and of the noise, nT."""
     share: FloatArray
-    """(lines,): g, what each alone reads, over the field."""
+    """g (lines,): amplitude of the field that only this line reads, over that of the crustal field."""
 
     def evaluate(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance (n,) each, nT and nT², at places (n, 2), m."""
@@ -72,14 +72,14 @@ class Kriged:
         return out[:, 0], out[:, 1]
 
     def of_a_line(self, place: FloatArray) -> FloatArray:
-        """Return 1-sigma (n,), nT, of a line's own part, which is not the field, at places (n, 2), m."""
+        """Return the 1-sigma (n,), nT, of a line's reading about the true field at places (n, 2), m."""
         return np.asarray(np.hypot(rms(self.share) * self.size * self.roughness.evaluate(place), self.noise))
 
     def given(self, place: FloatArray, neighbours: IndexArray, line: IndexArray | None = None) -> FloatArray:
-        """Return the field and its variance (n, 2) at places (n, 2) given the samples `neighbours` (n, k).
+        """Return the field (nT) and its variance (nT²), (n, 2), at places (n, 2), m, from samples (n, k).
 
-        The mean about a place is known only to the spread of all samples. With `line` (n,) it is the
-        field as that line reads it.
+        `neighbours` are the samples' indices. The prior of the mean around a place is as wide as the spread
+        of all samples. With `line` (n,) the field includes the additional field that this line reads.
         """
         x, lines, here = self.place[neighbours], self.line[neighbours], self.roughness.evaluate(place)
         there = self.roughness.evaluate(x.reshape(-1, 2)).reshape(neighbours.shape)
@@ -108,10 +108,10 @@ class Kriged:
 
 
 def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
-    """Return the predictor from the nearest samples; its size varies with the place if that is likelier.
+    """Return the kriging predictor; its amplitude varies with the place if that is clearly likelier.
 
-    There are at least :data:`AMONG` samples; `value` (n,), nT, is without the lines' levels, and the field
-    has about the `length`, m.
+    `value` (n,), nT, is the anomaly without the lines' levels. `length`, m, is about the field's correlation
+    length. At least :data:`AMONG` samples are needed.
     """
     tree, size = cKDTree(samples.place), float(np.std(value))
     share = np.zeros(int(samples.line.max()) + 1)
@@ -127,7 +127,7 @@ def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
 
 
 def _likeliest(start: Kriged) -> tuple[Kriged, float]:
-    """Return the likeliest depth, size and noise, and the log likelihood."""
+    """Return `start` with the likeliest depth, amplitude and noise, and their log likelihood."""
     rng = np.random.default_rng(0)
     rank, some = rng.permutation(len(start.value)), rng.choice(len(start.value), CHOOSING)
     near = start.tree.query(start.place[some], AMONG)[1]
@@ -153,7 +153,7 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
 
 
 def _share(kriged: Kriged, line: int) -> float:
-    """Return the likeliest g of a line by the prediction of the others; its prior where there are none."""
+    """Return the likeliest g of a line from predictions by other lines; the prior's median without those."""
     rows = np.flatnonzero(kriged.line == line)
     steps = np.linalg.norm(np.diff(kriged.place[rows], axis=0), axis=1)
     step = float(np.median(steps)) if len(steps) else 1.0
@@ -175,7 +175,10 @@ def _share(kriged: Kriged, line: int) -> float:
 
 
 def _first(neighbours: IndexArray, earlier: BoolArray) -> tuple[IndexArray, BoolArray]:
-    """Return the first :data:`GIVEN` of the `earlier` `neighbours` (n, k), and whether as many exist (n,)."""
+    """Return the first :data:`GIVEN` of the `neighbours` (n, k) that are True in `earlier` (n, k).
+
+    Rows with fewer are left out; the mask (n,) that is returned too is True for the other rows.
+    """
     whole = np.asarray(earlier.sum(axis=1) >= GIVEN)
     order = np.argsort(~earlier[whole], axis=1, kind="stable")[:, :GIVEN]
     return np.take_along_axis(neighbours[whole], order, axis=1), whole

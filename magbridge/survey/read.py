@@ -1,6 +1,6 @@
-"""Logs and tables to the samples of a survey, corrected here or elsewhere.
+"""Readers of a survey's samples from logs and tables, corrected here or by other software.
 
-Those of a scalar magnetometer keep what its alignment needs: heading, velocity and the terms that are fitted.
+Samples of a scalar magnetometer also hold the heading, velocity and terms that its alignment needs.
 """
 
 from __future__ import annotations
@@ -48,15 +48,15 @@ ANOMALY_COLUMNS = (
 HEIGHT = ("height", "altitude", "height_m", "height_ell_m", "altitude_m", "elevation")
 TABLE_SUFFIXES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
 MODES, FAINT = 24, 0.05
-"""Uncertain combinations of a calibration at most, and nT below which one does not matter."""
+"""Largest number of a calibration's modes, and smallest RMS effect of a mode that is used, nT."""
 MIN_LOCATED_SAMPLES = 10
-"""Samples of a table or a log, at least."""
+"""Smallest number of usable samples of a table or a log."""
 THINNED = 2_000
-"""Samples by which they are found."""
+"""Approximate number of samples from which the modes are determined."""
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a file is a table of lines: positions and an anomaly, without a vector or a time."""
+    """Return True if a file is a CSV table with an anomaly or total field, but without vector and time."""
     if not path.name.lower().endswith(TABLE_SUFFIXES):
         return False
     names = set(_table(path, rows=0).columns)
@@ -66,9 +66,10 @@ def is_table(path: Path) -> bool:
 
 
 def read_table(path: Path) -> Samples:
-    """Read a table: longitude, latitude, anomaly (nT), and where there are any height, line, line_type.
+    """Read the samples of a table: longitude, latitude (deg), anomaly (nT).
 
-    FormatError: a column is missing or holds something else than numbers.
+    The columns height (m), line and line_type are optional. FormatError: a column is missing or is not
+    numeric, or there are too few rows.
     """
     table = _table(path)
     value = _numbers(path, table, _first(path, table, ANOMALY_COLUMNS))
@@ -94,9 +95,10 @@ def read_table(path: Path) -> Samples:
 def read_points(
     path: Path, origin: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray]:
-    """Read points: longitude and latitude (n,), deg, depth (n,), m, if known, and m north and east (n, 2).
+    """Read points of a table: longitude, latitude (n,), deg, depth (n,), m, or None, and place (n, 2).
 
-    FormatError: a column is missing or holds something else than numbers, or a place is not known.
+    The place is in m north and east of `origin`. FormatError: a column is missing or is not numeric, or a row
+    has no position.
     """
     table = _table(path)
     longitude, latitude, depth = _places(path, table)
@@ -106,9 +108,9 @@ def read_points(
 
 
 def corrected_by_others(ds: xr.Dataset) -> Samples:
-    """Return the samples of a log with ``total_field`` or ``anomaly``, nT, and positions.
+    """Return the samples of a log with positions and a corrected ``total_field`` or ``anomaly``, nT.
 
-    FormatError: it has neither, or no position.
+    FormatError: the log has neither, or no position.
     """
     require(ds, ("latitude", "longitude"))
     if "anomaly" in ds:
@@ -124,9 +126,9 @@ def corrected_by_others(ds: xr.Dataset) -> Samples:
 
 
 def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
-    """Correct a log with its calibration; flagged samples are left out, the calibration's sigma is kept.
+    """Return the unflagged samples of a log, corrected with a calibration, whose uncertainty is in `modes`.
 
-    FormatError: it has no position.
+    FormatError: the log has no position.
     """
     require(ds, ("latitude", "longitude"))
     ds = at_one_time(ds)
@@ -149,10 +151,10 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
 def located(
     ds: xr.Dataset, value: FloatArray, name: str = "a field", *, by_line: bool = True
 ) -> tuple[Samples, BoolArray]:
-    """Return all rows of a log with anomalies (n,), nT, and which of them can be used, (n,).
+    """Return all rows of a log as samples, and a mask (n,) of the rows with a value and a position.
 
-    `value` is NaN where it is not known; `name` is its name in the error. With `by_line` the log's ``line``
-    and ``line_type`` divide it into lines. FormatError: fewer than ten rows have a value and a position.
+    `value` (n,) is the anomaly, nT, NaN where unknown; `name` is its name in the error. With `by_line` the
+    log's ``line`` and ``line_type`` divide it into lines. FormatError: fewer than ten usable rows.
     """
     longitude, latitude, depth = positions(ds)
     known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
@@ -173,7 +175,7 @@ def located(
 
 
 def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
-    """Return a log without the creep of its sensor's offset that was found together with the calibration."""
+    """Return a log minus the slow drift of the sensor's offset that was fitted with the calibration."""
     if creep is None or not set(CHANNELS) <= set(ds):
         return ds
     offset = creep.offset_at(ds["time"].to_numpy().astype(float))
@@ -181,7 +183,7 @@ def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
-    """Join the samples of several logs about one origin: lines and modes stay each log's own."""
+    """Return the samples of several logs as one, about the first origin; lines and modes stay separate."""
     origin = parts[0].origin
     places, lines, first = [], [], 0
     for one in parts:
@@ -192,7 +194,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     many = sum(one.modes.shape[1] for one in parts)
     modes = np.zeros((sum(len(one.value) for one in parts), many))
     row = column = 0
-    # Block diagonal: the uncertain combinations of one log do not touch another log.
+    # Block diagonal: the modes of one log do not affect another log.
     for one in parts:
         n, r = one.modes.shape
         modes[row : row + n, column : column + r] = one.modes
@@ -219,12 +221,12 @@ def _doubtful(corrected: xr.Dataset) -> BoolArray:
 
 
 def _daily(ds: xr.Dataset) -> FloatArray | float:
-    """Return a base station's variation (n,), nT; 0 without one."""
+    """Return the daily variation (n,), nT, from a base station; 0 without a base station."""
     return ds["daily_variation"].to_numpy() if "daily_variation" in ds else 0.0
 
 
 def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the change of the samples with 1-sigma of each uncertain combination of coefficients, (n, r)."""
+    """Return the change (n, r), nT, of the samples with 1-sigma of each uncertain coefficient combination."""
 
     def total(calibration: Calibration, rows: slice) -> FloatArray:
         return correct(calibration, field[rows], channels[rows], time[rows]).total
@@ -291,47 +293,47 @@ COMPENSATION = "compensation"
 SPEED_SMOOTHING_S = 2.0
 """Time over which the velocity is averaged, s."""
 MAX_SPEED_GAP_INTERVALS = 3.0
-"""Intervals without a sample after which the velocity starts again."""
+"""Longest gap between samples across which a velocity is computed, in median intervals."""
 
 
 class AlignmentTerm(NamedTuple):
-    """A disturbance whose effect is fitted."""
+    """Disturbance of the scalar whose r unknown coefficients are fitted with the survey."""
 
     name: str
     columns: FloatArray
-    """Effect of each unknown on each sample, nT, (n, r)."""
+    """Effect (n, r), nT, on each sample of a unit of each coefficient."""
 
 
 class BoxRows(NamedTuple):
-    """A box flight within a survey, which is not fitted."""
+    """Box flight within a survey, which is left out of the fit and tests its result."""
 
     box: BoxFlight
     heading: FloatArray
-    """Heading of each of the log's samples, rad."""
+    """Heading (n,) of each of the log's samples, rad."""
     raw: FloatArray
-    """Anomaly as read, nT."""
+    """Anomaly (n,) as read, nT."""
     value: FloatArray
-    """Anomaly after compensation by the calibration, nT."""
+    """Anomaly (n,) after compensation by the calibration, nT."""
     terms: tuple[AlignmentTerm, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class ScalarRows:
-    """The samples of one or several logs with a scalar magnetometer, before alignment."""
+    """Samples of a scalar magnetometer from one or several logs, before alignment."""
 
     column: str
     samples: Samples
-    """At the places of the positions; `value` is compensated where the calibration has the sensor."""
+    """Samples at the logged positions; `value` is compensated if a calibration has the sensor."""
     raw: FloatArray
-    """Anomaly as read, nT, (n,)."""
+    """Anomaly (n,) as read, nT."""
     heading: FloatArray
-    """Heading, or course where no heading is known, rad, (n,)."""
+    """Heading (n,), or course where the heading is unknown, rad."""
     velocity: FloatArray
-    """North and east, m/s, (n, 2)."""
+    """Velocity (n, 2), north and east, m/s."""
     terms: tuple[AlignmentTerm, ...]
-    """Channels, or uncertain combinations of the compensation's coefficients."""
+    """Terms of the telemetry channels, or of the compensation's uncertain coefficient combinations."""
     compensated: dict[str, float]
-    """Standard deviation of each part of the calibration's compensation, nT."""
+    """Standard deviation of each term of the calibration's compensation, nT."""
     boxes: tuple[BoxRows, ...] = ()
 
 
@@ -342,10 +344,10 @@ def scalar_rows(
     calibrations: Sequence[Calibration] = (),
     lever: tuple[float, float, float] | None = None,
 ) -> ScalarRows:
-    """Return the samples of logs with a scalar magnetometer; arguments as of :func:`.run.scalar_survey`.
+    """Return a scalar magnetometer's samples from logs; arguments are those of :func:`.run.scalar_survey`.
 
     FormatError: a column is missing, or fewer than ten samples have a reading and a position. DataError: the
-    reading is not nT, or the number of calibrations is neither one nor that of the logs.
+    reading is not in nT, or the number of calibrations is neither one nor that of the logs.
     """
     known: list[Calibration | None] = list(calibrations) or [None]
     if len(known) not in (1, len(logs)):
@@ -359,7 +361,7 @@ def scalar_rows(
 
 
 def _joined(parts: Sequence[ScalarRows]) -> ScalarRows:
-    """Join the samples of several logs; a term of the same name and size is one term."""
+    """Return the samples of several logs as one; terms of equal name and size become one term."""
     # Terms of one name share their coefficients across logs; rows of other logs are zero.
     edges = np.cumsum([0, *(len(part.raw) for part in parts)])
     blocks: dict[tuple[str, int], FloatArray] = {}
@@ -387,7 +389,7 @@ def _log_rows(
     calibration: Calibration | None,
     lever: tuple[float, float, float] | None,
 ) -> ScalarRows:
-    """Return the samples of one log."""
+    """Return a scalar magnetometer's samples from one log."""
     require(log, ("latitude", "longitude", column, *names))
     require_date(log)
     # A calibration of the sensor compensates it and leaves its uncertain combinations as terms; without one,
@@ -430,7 +432,7 @@ def _log_rows(
 
 
 def _velocity(time: FloatArray, place: FloatArray) -> FloatArray:
-    """Return the velocity north and east (n, 2), m/s, over some seconds, never across a gap of the log."""
+    """Return the velocity (n, 2), north and east, m/s, averaged over seconds but not across a gap."""
     interval = max(float(np.median(np.diff(time))), 1e-3)
     half = max(1, round(0.5 * SPEED_SMOOTHING_S / interval))
     # Central difference over the smoothing time, cut at the ends of a stretch without gaps.
@@ -450,7 +452,7 @@ def _boxes(
     value: FloatArray,
     terms: tuple[AlignmentTerm, ...],
 ) -> tuple[BoxRows, ...]:
-    """Return the log's box flight, if it holds one."""
+    """Return the log's box flight as a tuple of one, or () if the log has none."""
     if not {"roll", "pitch", "heading"} <= set(log.variables):
         return ()
     roll, pitch = (log[name].to_numpy().astype(float) for name in ("roll", "pitch"))
@@ -459,9 +461,9 @@ def _boxes(
 
 
 def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[AlignmentTerm, ...]:
-    """Return each channel's columns: its value, and times cosine and sine of the heading where that is known.
+    """Return a term for each channel: its value, and with a heading also times cosine and sine of it.
 
-    A channel is centred and divided by its swing (2 to 98 %).
+    The value is centred and divided by the channel's swing (2 to 98 % quantile).
     """
     terms = []
     for name in names:

@@ -1,4 +1,4 @@
-"""A survey from its logs to its map: calibrate if need be, correct, level, grid."""
+"""Processing of a survey from its logs to its map: correct, align a scalar sensor, level, grid."""
 
 from __future__ import annotations
 
@@ -36,32 +36,32 @@ if TYPE_CHECKING:
 __all__ = ["Result", "facts", "samples_of", "scalar_survey", "summary", "survey"]
 
 DRAWN_TRACKS = 16
-"""Fields and places that are drawn where a track jumps."""
+"""Number of random fields and position errors that estimate the effect of a track's jumps."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Samples, map and crossovers of a survey."""
+    """Result of a survey: samples, gridded field, crossovers and warnings."""
 
     samples: Samples
-    """Corrected."""
+    """Corrected samples, without those far from all others."""
     gridded: Gridded
     found: Crossovers
     before: FloatArray
     after: FloatArray
-    """`before`, `after`, (m,), nT, mis-ties before levelling and after."""
+    """`before`, `after`: mis-ties (m,), nT, before and after levelling."""
     residual: FloatArray
-    """(n,), nT, of every sample."""
+    """Residual (n,), nT, of every sample: its anomaly minus level and map."""
     warnings: tuple[Diagnostic, ...]
     scalar: ScalarTerms | None = None
-    """Lag, lever arm and heading error of a scalar magnetometer, where the survey is its."""
+    """Lag, lever arm and heading error of a scalar magnetometer; None for other surveys."""
 
 
 def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) -> Samples:
-    """Return the samples of several logs, corrected where they have a vector.
+    """Return the samples of several logs; logs with a raw vector are corrected with a calibration.
 
-    There is one calibration for all logs with a vector, or one for each of them in order. DataError: another
-    number of calibrations. FormatError: a log without positions.
+    `calibrations` has one for all logs with a vector, or one for each in order. DataError: another number of
+    calibrations. FormatError: a log without positions.
     """
     parts: list[Samples] = []
     with_vector = [log for log in logs if _has_vector(log)]
@@ -82,9 +82,9 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
 
 
 def survey(samples: Samples, start: Choice | None = None) -> Result:
-    """Level and grid corrected samples, from the `start` that a joint fit has found, if any.
+    """Level and grid corrected samples; `start` is the field that a joint fit has found, if any.
 
-    CalibrationError: the samples cannot be gridded.
+    CalibrationError: the samples do not determine a map.
     """
     warnings: list[Diagnostic] = []
     # 1. Leave out samples far from all others. 2. Grid. 3. Compare lines at their crossings before and after.
@@ -129,13 +129,13 @@ def scalar_survey(
 ) -> Result:
     """Align, level and grid the samples of a scalar magnetometer, the `column` (nT) of logs with positions.
 
-    The effect of the telemetry channels `names` is fitted where no calibration has the sensor. There are no
-    `calibrations`, one for all logs, or one for each; one whose ``sensors`` hold `column` compensates it.
-    `lag` is the time of the reading after the position, s, and `lever` the sensor's place relative to the
-    logged positions, m forward, starboard and down; lag and horizontal lever are estimated if not given.
+    `calibrations` has none, one for all logs, or one for each. A calibration whose ``sensors`` hold `column`
+    compensates the sensor; otherwise the effects of the telemetry channels `names` are fitted. `lag` is the
+    delay of the reading after the position, s. `lever` is the sensor's place relative to the logged
+    positions, m forward, starboard and down. Lag and horizontal lever arm are estimated if not given.
 
-    FormatError: a column is missing. DataError: the reading is not nT, or the number of calibrations does not
-    fit. CalibrationError: the samples cannot be aligned or gridded.
+    FormatError: a column is missing. DataError: the reading is not in nT, or the number of calibrations is
+    wrong. CalibrationError: the samples cannot be aligned or gridded.
     """
     rows = scalar_rows(logs, column, names, calibrations, lever)
     samples, terms = align(rows, lag=lag, lever_known=lever is not None)
@@ -143,10 +143,10 @@ def scalar_survey(
 
 
 def _gridded(samples: Samples, start: Choice | None) -> Gridded:
-    """Grid samples; where the track jumps, they are as uncertain as their places.
+    """Grid samples; if the track jumps, the sigma includes the effect of wrong positions.
 
-    Where stretches that are out of place cross, they contradict each other: each has a level of its own, and
-    the rest is not a change with time.
+    Misplaced stretches contradict each other where they cross. Each stretch between jumps is therefore a line
+    with its own level, and without time, so that the contradictions do not count as slow changes.
     """
     # A jump of the track cuts a line: places before and after it are wrong by different amounts.
     at = jumps(samples.place, samples.time)
@@ -162,12 +162,12 @@ def _gridded(samples: Samples, start: Choice | None) -> Gridded:
 
 
 def _misplaced(samples: Samples, line_ends: IndexArray, found: Gridded) -> FloatArray:
-    """Return the errors (n, r), nT, in the samples that jumps of the track at `line_ends` (m,) may cause.
+    """Return r random errors (n, r), nT, of the samples, as jumps of the track at `line_ends` (m,) may cause.
 
-    After a jump by d, either the stretch before or the one after is wrong by d: each has an error of
-    N(0, d²/2). Places and fields are drawn; their mean square is the variance.
+    At a jump by d, the stretch before and the stretch after each have an error of position N(0, d²/2).
+    Position errors and fields are drawn at random; the sum of the r squared errors is the variance.
     """
-    # Monte Carlo: draw fields and errors of place, and take the difference of the field as the error.
+    # Monte Carlo: draw fields and position errors; the difference of the field is the error of a sample.
     rng, field = np.random.default_rng(0), found.posteriors[0].field
     stretch, steps = samples.line, samples.place[line_ends + 1] - samples.place[line_ends]
     here, drawn = field.basis(samples.place), []
@@ -186,7 +186,7 @@ def _has_vector(log: xr.Dataset) -> bool:
 
 
 def facts(result: Result, path: Path) -> dict[str, Any]:
-    """Return the numbers to print as JSON."""
+    """Return the survey's results as plain values, to print as JSON."""
     found = result.gridded
     return {
         "file": str(path),
@@ -210,7 +210,7 @@ def facts(result: Result, path: Path) -> dict[str, Any]:
 
 
 def summary(result: Result) -> str:
-    """Return the numbers in a sentence."""
+    """Return the survey's main results as a sentence."""
     known = facts(result, Path())
     ties = (
         f"{counted(known['crossovers'], 'crossover')} {known['misties_before_nT']:.1f} nT RMS before "

@@ -1,8 +1,8 @@
 """Corrected samples of a survey: roughness of their field, rows in a linear model, crossovers of lines.
 
-A single amplitude for a whole survey is too small over an intrusion that crops out, and too large elsewhere.
-The field's second differences along the lines, smoothed over some of its lengths, show where it is rougher:
-the field's amplitude is made proportional to their root mean square.
+A single amplitude for a whole survey is too small over an outcropping intrusion, and too large elsewhere.
+Where the field is rougher, its second differences along the lines are larger. The field's amplitude is
+therefore proportional to their root mean square, smoothed over some correlation lengths.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ class Samples:
     """Corrected samples of a survey, from which a map is computed."""
 
     place: FloatArray
-    """(n, 2), m north and east of `origin`."""
+    """Positions (n, 2), m north and east of `origin`."""
     depth: FloatArray
-    """(n,), m below the ellipsoid (negative: above)."""
+    """Depth (n,) below the ellipsoid, m; negative is above."""
     time: FloatArray
-    """(n,), s since 1970 UTC; NaN where not known."""
+    """Time (n,), s since 1970 UTC; NaN where unknown."""
     value: FloatArray
-    """(n,), nT, anomaly."""
+    """Anomaly (n,), nT."""
     line: IndexArray
-    """(n,): Label of the line, or of the log if it is not divided into lines."""
+    """Label (n,) of the sample's line, or of its log if the log is not divided into lines."""
     tie: BoolArray
-    """(n,): Whether the line is a tie line."""
+    """True (n,) for samples of a tie line."""
     origin: tuple[float, float]
     """Latitude and longitude of the origin, deg."""
     weight: FloatArray = field(default_factory=lambda: np.empty(0))
-    """(n,): Noise of a sample over the typical one's."""
+    """Noise (n,) of each sample, as a multiple of the typical sample's."""
     rho: float | None = 0.0
-    """Autocorrelation of successive samples' noise; None: not known."""
+    """Autocorrelation of the noise of successive samples; None if unknown."""
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    """(n, r), nT, change of every sample by 1-sigma of each uncertain combination of coefficients."""
+    """Change (n, r), nT, of every sample with 1-sigma of each uncertain combination of coefficients."""
     level_sigma: float = 0.0
-    """1-sigma of the error that all samples share, the reference's level, nT."""
+    """1-sigma of the constant error of all samples (the reference bias), nT."""
 
     def __post_init__(self) -> None:
         n = len(self.value)
@@ -59,7 +59,7 @@ class Samples:
             object.__setattr__(self, "modes", np.empty((n, 0)))
 
     def part(self, rows: BoolArray | IndexArray) -> Samples:
-        """Return the samples `rows`: an (n,) mask, or indices."""
+        """Return the samples that `rows` selects, an (n,) mask or indices."""
         arrays: dict[str, Any] = {
             name: value[rows] for name, value in vars(self).items() if isinstance(value, np.ndarray)
         }
@@ -67,25 +67,25 @@ class Samples:
 
 
 LAG, REACH = 0.5, 2.0
-"""Lengths between the samples of a second difference, and of the smoothing's sigma."""
+"""Lag of the second differences, and sigma of the smoothing, in correlation lengths."""
 LEAST, LARGEST = 0.2, 6.0
-"""Limits of a roughness, relative to the typical one."""
+"""Smallest and largest roughness, relative to the typical one."""
 MAX_CELLS_PER_SIDE = 400
-"""Most cells a side."""
+"""Largest number of cells along a side of the survey."""
 PRIOR = 0.1
-"""Weight of the typical roughness, over that of the average cell's samples."""
+"""Weight of the typical roughness in a cell, relative to the samples of an average cell."""
 
 
 @dataclass(frozen=True, eq=False)
 class Roughness:
-    """The size of the field over the typical one, on a grid of cells."""
+    """Local amplitude of the field, relative to its typical amplitude, on a grid of cells."""
 
     low: FloatArray
-    """(2,), m north and east."""
+    """South-western corner (2,) of the grid, m north and east."""
     cell: float
     """Side of a cell, m."""
     scale: FloatArray
-    """(a, b)."""
+    """Relative amplitude (a, b) in each cell."""
 
     @classmethod
     def uniform(cls) -> Roughness:
@@ -99,7 +99,7 @@ class Roughness:
         low, extent = place.min(axis=0), np.ptp(place, axis=0)
         # Cells of a fraction of the smoothing length, limited in number.
         cell = max(float(extent.max()) / MAX_CELLS_PER_SIDE, REACH * length / 4.0)
-        # Second differences are free of levels and slow changes; their mean square follows the roughness.
+        # Levels and slow changes cancel in second differences, whose mean square is that of the roughness.
         bent = _bends(samples, LAG * length)
         known = np.isfinite(bent)
         if known.sum() < 50:
@@ -128,7 +128,10 @@ class Roughness:
 
 
 def _bends(samples: Samples, lag: float) -> FloatArray:
-    """Return the second difference (n,) of the field over `lag` m along the line, nT; NaN at its ends."""
+    """Return the second difference (n,), nT, of the anomaly at a lag of `lag` m along each line.
+
+    It is NaN at the ends of a line.
+    """
     y, line, place = samples.value, samples.line, samples.place
     # y(s + lag) - 2 y(s) + y(s - lag) along one line.
     step = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
@@ -141,7 +144,10 @@ def _bends(samples: Samples, lag: float) -> FloatArray:
 
 
 class Rows:
-    """The samples of a survey as rows of a linear model."""
+    """Samples of a survey as rows of a linear model: field, blocks of parameters `groups`, and noise.
+
+    Samples that are False in `kept` (n,) are left out of the sums.
+    """
 
     def __init__(self, samples: Samples, groups: tuple[ParameterBlock, ...], roughness: Roughness) -> None:
         self.samples, self.groups = samples, groups
@@ -153,24 +159,27 @@ class Rows:
         self.kept = np.ones(len(samples.value), bool)
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
-        """Return the contribution of the field's coefficients to the samples `rows`, (m, nodes)."""
+        """Return the matrix (m, nodes) from the field's coefficients to the anomaly at the samples `rows`."""
         # Splines at the samples, times the roughness there.
         known = field.basis(self.samples.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.scale[rows]) @ known)
 
     def mean_over_samples(self, field: GaussianField) -> FloatArray:
-        """Return the contribution of each of the field's coefficients to the samples' mean, (nodes,)."""
+        """Return the row (nodes,) from the field's coefficients to the mean anomaly of the kept samples."""
         kept, total = np.flatnonzero(self.kept), np.zeros(field.nodes.size)
         for start in range(0, len(kept), BLOCK_ROWS):
             total += self.basis(field, kept[start : start + BLOCK_ROWS]).sum(axis=0)
         return total / len(kept)
 
     def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
-        """Return the field of coefficients w (nodes,) at every sample, (n,), nT."""
+        """Return the crustal field (n,), nT, at every sample, given its coefficients w (nodes,)."""
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def sums(self, field: GaussianField, rows: IndexArray, modes: bool = False) -> SampleSums:
-        """Return the sums of the samples `rows` (m,), of them the kept; with the calibration's modes."""
+        """Return the sums of the model's rows over the kept ones of the samples `rows` (m,).
+
+        With `modes`, the calibration's modes are further columns.
+        """
         return sum_rows(self._pieces(field, rows, modes))
 
     def _pieces(self, field: GaussianField, rows: IndexArray, modes: bool) -> Iterator[LinearisedRows]:
@@ -180,7 +189,7 @@ class Rows:
         follows = np.zeros(len(rows), bool)
         follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
         for start in range(0, len(rows), BLOCK_ROWS):
-            # One row of overlap: the noise is correlated with that of the row before.
+            # One row of overlap: a row's noise is correlated with the noise of the row before.
             first = max(start - 1, 0)
             mine = rows[first : start + BLOCK_ROWS]
             weight = -1.0 / s.weight[mine]
@@ -195,29 +204,29 @@ class Rows:
 
 
 SEGMENTS = 60_000
-"""Largest number of segments of all lines: a longer track is processed in longer steps."""
+"""Largest number of segments of all lines; longer tracks are divided into longer segments."""
 LONGEST_SEGMENT_QUANTILE = 0.99
-"""Quantile of the segments' lengths up to which crossovers are sought."""
+"""Quantile of the segments' lengths that limits the search for crossovers; longer segments are gaps."""
 MIN_SEGMENTS_BETWEEN = 20
-"""Segments of one line between two that can be a crossover."""
+"""Smallest number of segments along one line between two segments that may be a crossover."""
 
 
 @dataclass(frozen=True, eq=False)
 class Crossovers:
-    """Places where two lines cross."""
+    """The m places where two lines cross, each on two segments of several samples."""
 
     place: FloatArray
-    """(m, 2), m north and east."""
+    """Positions (m, 2), m north and east."""
     first: IndexArray
     second: IndexArray
-    """`first`, `second`, (m,): Samples that begin the two segments."""
+    """`first`, `second`: indices (m,) of the samples at which the two segments begin."""
     share: FloatArray
-    """(m, 2): How far along each segment, 0 to 1."""
+    """Position (m, 2) of the crossover along each of the two segments, 0 to 1."""
     step: int
-    """Samples of a segment."""
+    """Number of samples from the beginning of a segment to its end."""
 
     def misties(self, value: FloatArray) -> FloatArray:
-        """Return the difference (m,) of `value` (n,) between the lines, the first minus the second."""
+        """Return the mis-ties (m,): `value` (n,) of the first line minus that of the second, interpolated."""
 
         def interpolate(start: IndexArray, share: FloatArray) -> FloatArray:
             end = np.minimum(start + self.step, len(value) - 1)
@@ -227,8 +236,8 @@ class Crossovers:
 
 
 def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
-    """Return where lines cross, by the samples' `place` (n, 2), m north and east, and label `line` (n,)."""
-    # Segments of several samples: their number bounds the work.
+    """Return the crossovers of lines, from the samples' `place` (n, 2), m north and east, and `line` (n,)."""
+    # Segments of several samples: their number limits the computing time.
     step = max(len(place) // SEGMENTS, 1)
     start = np.arange(0, len(place) - step, step)
     start = start[line[start] == line[start + step]]
@@ -247,10 +256,13 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
 
 
 def _nearby_pairs(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return pairs of segments that may meet, from `a` (m, 2) along `way` (m, 2), not adjacent on a line."""
+    """Return index pairs of segments that may cross; each begins at `a` (m, 2) and extends by `way` (m, 2).
+
+    Segments close to each other on one `line` (m,) are left out.
+    """
     if len(a) < 2:
         return np.empty(0, np.intp), np.empty(0, np.intp)
-    # Segments that meet have their middles within the mean of their lengths; longer ones are gaps of a track.
+    # The middles of segments that meet are within the mean of their lengths.
     longest = max(float(np.quantile(np.linalg.norm(way, axis=1), LONGEST_SEGMENT_QUANTILE)), 1.0)
     pairs = cKDTree(a + 0.5 * way).query_pairs(longest, output_type="ndarray")
     i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
