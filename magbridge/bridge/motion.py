@@ -1,9 +1,9 @@
-"""Select the telemetry for dead reckoning, without telemetry that contains the bridge's own fixes.
+"""Selection of the telemetry for dead reckoning, without telemetry that contains the bridge's own fixes.
 
-An autopilot that takes our fixes sends them back in LOCAL_POSITION_NED, GLOBAL_POSITION_INT and ODOMETRY.
-Taken for the vehicle's motion, they move the track that the next fix is computed from, which moves the
-autopilot, and so on: 60 m become a kilometre. So its own position counts as motion only until a fix has been
-sent to it, and again once GPS has put it right.
+An autopilot that uses our fixes sends them back in LOCAL_POSITION_NED, GLOBAL_POSITION_INT and ODOMETRY. If
+the bridge used these positions as the vehicle's motion, each fix would shift the track of the next fix, and
+an error of 60 m would grow to a kilometre. So the autopilot's position counts as motion only until the first
+fix is sent, and again after GPS has corrected it.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from magbridge.navigate.deadreckoning import GLIDE
 __all__ = ["FIX_3D", "Frame", "Motion", "MotionSource"]
 
 MAX_STATE_AGE_US = 10_000_000
-"""Time for which a height or an attitude is the present one, µs."""
+"""Longest time for which a received height or attitude is used, µs."""
 UNSET = (0, 0)
-"""GPS_GLOBAL_ORIGIN's latitude and longitude of an autopilot without an origin."""
+"""Latitude and longitude in GPS_GLOBAL_ORIGIN of an autopilot without an origin."""
 
 
 class Frame:
-    """Track the origin of the autopilot's local frame, and the vehicle's height and attitude.
+    """Latest origin of the autopilot's local frame, and height and attitude of the vehicle.
 
-    `origin`: deg, deg, m above the sea.
-    `attitude`: quaternion w, x, y, z from body to north-east-down, as last heard.
+    `origin`: latitude (deg), longitude (deg) and altitude (m above the sea); None if unknown.
+    `attitude`: last received attitude, as the quaternion w, x, y, z from body to north-east-down.
     """
 
     def __init__(self) -> None:
@@ -48,12 +48,12 @@ class Frame:
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Process a message of the autopilot."""
+        """Process a message of the autopilot, received at `time_us` (µs)."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
     def altitude(self, time_us: int) -> float:
-        """Return the altitude (m above the sea); NaN if unknown."""
+        """Return the altitude (m above the sea) at `time_us` (µs); NaN if unknown."""
         if time_us - self._altitude_us < MAX_STATE_AGE_US:
             return self._altitude
         if self.origin is not None and time_us - self._down_us < MAX_STATE_AGE_US:
@@ -61,12 +61,15 @@ class Frame:
         return nan
 
     def depth(self, time_us: int) -> float:
-        """Return the depth (m below the sea); without an origin, the local height counts from the start."""
+        """Return the depth (m below the sea) at `time_us` (µs); NaN if unknown.
+
+        Without an altitude, the depth is relative to the origin of the local frame.
+        """
         altitude = self.altitude(time_us)
         return self._down if isnan(altitude) and time_us - self._down_us < MAX_STATE_AGE_US else -altitude
 
     def pose(self, time_us: int, latitude: float, longitude: float) -> Pose | str:
-        """Return the pose of a vehicle at a position (deg), or the reason why there is none."""
+        """Return the vehicle's pose at a position (deg) and a time, or the reason why it is unknown."""
         if self.origin is None:
             return "no origin of the autopilot's frame"
         if time_us - self._attitude_us >= MAX_STATE_AGE_US:
@@ -97,54 +100,58 @@ class Frame:
 
 
 MAX_SOURCE_AGE_US = 30_000_000
-"""µs without it, after which the next best source is used."""
+"""Time without data from a source of motion after which the next best source is used, µs."""
 GLIDING_US = 600_000_000
-"""µs since the vehicle was last steep, for which it counts as a glider."""
+"""Time after the last steep pitch for which the vehicle counts as a glider, µs."""
 SPEED_WEIGHT = 0.1
-"""Share of each new speed in the mean that is kept for when nothing else is known."""
+"""Weight of each new speed in the running mean, which is used if no source of motion is left."""
 EQUAL_M_S = 0.011
-"""m/s: an airspeed this near to the speed over ground is that speed (``GCS_Common.cpp``, vfr_hud_airspeed, of
-a vehicle without an airspeed sensor). GPS_RAW_INT has steps of 0.01 m/s."""
+"""Largest difference from the ground speed at which an airspeed counts as ground speed, m/s. ArduPilot
+without an airspeed sensor sends ground speed (``GCS_Common.cpp``, vfr_hud_airspeed), GPS_RAW_INT in 0.01
+m/s steps."""
 MIN_EQUAL = 5
-"""Number of such speeds in a row until that is reported."""
+"""Number of airspeeds in a row equal to the ground speed after which the bridge reports them."""
 VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
-"""Flags of EKF_STATUS_REPORT, and of ESTIMATOR_STATUS: the velocity holds; the position is only held."""
+"""Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS: horizontal velocity is valid; position is held
+constant."""
 HEADING_STEP_RAD, HEADING_STEP_US = 0.15, 10_000_000
-"""rad by which the heading of an autopilot whose filter contradicts its sensors may change in these µs."""
+"""Heading uncertainty (rad) added for each interval (µs) in which the autopilot's filter contradicts a
+sensor."""
 FIX_3D = 3
-"""Lowest GPS_RAW_INT.fix_type whose position is used."""
+"""Smallest GPS_RAW_INT.fix_type whose position is used."""
 ARMED = 128
 """Flag of HEARTBEAT.base_mode: the vehicle is armed."""
 STATE_UNKNOWN, ON_GROUND = 0, 1
 """Values of EXTENDED_SYS_STATE.landed_state (MAV_LANDED_STATE)."""
 JUMP = 10.0
-"""Step of a position beyond its own velocity that is a reset, m."""
+"""Step of a position, in excess of the motion by its velocity, that counts as a reset, m."""
 
 
 class MotionSource(IntEnum):
-    """Source of dead reckoning; earlier ones are preferred."""
+    """Source of the motion for dead reckoning; a smaller value is preferred."""
 
     OTHER = 0
-    """The position that another component of the vehicle measures, as a Doppler log's does."""
+    """Position from another component of the vehicle, such as a Doppler log."""
     SPEED = 1
     """Heading and speed through the water or air."""
     TRACK = 2
-    """The autopilot's own estimate, as long as none of our fixes is in it."""
+    """The autopilot's position or velocity, while it does not contain the bridge's fixes."""
     GLIDE = 3
-    """Heading, and the speed by pitch and depth."""
+    """Heading, and the speed computed from pitch and depth."""
     LAST = 4
-    """Heading, and the last speed that was known."""
+    """Heading, and the last known speed."""
     NONE = 5
 
 
 class Motion:
-    """Pass the vehicle's motion to the navigator, from the best available source.
+    """Selector that passes the vehicle's motion from the best available source to the navigator.
 
-    `frame`: has received each message before.
-    `velocity_stays`: whether a fix leaves the autopilot's velocity as it was, so that this remains a
-        measurement.
-    `fed_back`: our fixes are in the autopilot's position.
-    `gps_trusted`: no GPS position that was rejected is in the autopilot's position.
+    `frame`: local frame; the caller has passed each message to it before.
+    `velocity_stays`: returns True if a fix does not change the autopilot's velocity, so that the velocity
+        remains an independent measurement.
+    `source`: present source of the motion.
+    `fed_back`: True if the autopilot's position contains the bridge's fixes.
+    `gps_trusted`: False if the autopilot's position may contain GPS positions that the bridge rejected.
     """
 
     def __init__(
@@ -175,14 +182,14 @@ class Motion:
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Process a message of the vehicle."""
+        """Process a message of the vehicle, received at `time_us` (µs)."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
     def fixes_sent(self) -> None:
         """Record that the autopilot's position contains the bridge's fixes from now on."""
         if not self.fed_back and self.source is MotionSource.TRACK and not self._velocity_stays():
-            self.source = MotionSource.NONE  # the next best is used at once
+            self.source = MotionSource.NONE  # the next best source is used at once
         self.fed_back = True
 
     def gps_held(self) -> None:
@@ -214,9 +221,10 @@ class Motion:
             self._take_off_or_land(time_us)
 
     def _take_off_or_land(self, time_us: int) -> None:
-        """Notice whether an aircraft stands on the ground, where the wind does not move it.
+        """Update whether an aircraft is on the ground; restart the estimate of the wind at take-off.
 
-        What dead reckoning by airspeed has learned there is not the wind, so it is forgotten at the take-off.
+        On the ground, dead reckoning by airspeed does not estimate the wind, because the wind does not move
+        the aircraft.
         """
         known = self._landed_state != STATE_UNKNOWN
         resting = self._landed_state == ON_GROUND if known else not self._armed
@@ -236,7 +244,7 @@ class Motion:
         elif speed > 0.0 and isfinite(self._heading):
             self._equal = 0
             self._last = speed
-            # a source that is followed already has the heading, from the time of its report
+            # if speed is the source already, the navigator has the heading since its own message
             heading = nan if self.source is MotionSource.SPEED else self._heading
             if self._use(MotionSource.SPEED, time_us, "heading and speed through the water or air"):
                 speed = message["groundspeed"] if self._grounded else speed
@@ -248,13 +256,13 @@ class Motion:
             self._gps_us = time_us
 
     def _vouch(self, message: Message, time_us: int) -> None:
-        """Use the autopilot's report on whether its velocity holds."""
+        """Process the autopilot's report of the validity of its velocity and attitude."""
         if message.component == self._component.peer[1]:
             flags = message["flags"]
             holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
             self._unvouched_us = -MAX_SOURCE_AGE_US if holds else time_us
-            # Without a good heading, dead reckoning is wrong by a part of the speed. While GPS is used, the
-            # autopilot rather contradicts GPS, and dead reckoning has to test that.
+            # A wrong heading makes dead reckoning wrong by a fraction of the speed. While GPS is used, GPS is
+            # the more likely fault, and dead reckoning has to test GPS.
             uses_gps = self.gps_trusted and time_us - self._gps_us < HEADING_STEP_US
             is_due = time_us - self._contradicted_us >= HEADING_STEP_US
             if is_due and not uses_gps and is_contradicted(message):
@@ -284,7 +292,10 @@ class Motion:
         velocity: tuple[float, float],
         resets: int = 0,
     ) -> None:
-        """Process an estimate of position (m, north and east) and velocity (m/s)."""
+        """Process an estimate of position (north, east, m; None without one) and velocity (north, east, m/s).
+
+        `resets`: reset counter of the message, which changes when the position jumps.
+        """
         stream, own = (message.component, message.id), message.component == self._component.peer[1]
         if own and (not self.gps_trusted or time_us - self._unvouched_us < MAX_SOURCE_AGE_US):
             return
@@ -307,7 +318,10 @@ class Motion:
     def _move(
         self, time_us: int, place: tuple[float, float], velocity: tuple[float, float] | None, resets: int
     ) -> None:
-        """Follow a position without the jumps of its estimator."""
+        """Pass a position (north, east, m) to the navigator, without jumps from resets of its estimator.
+
+        `velocity`: velocity (north, east, m/s) with which jumps are detected; None if unknown.
+        """
         if self._step is not None:
             then_us, *before, count = self._step
             seconds = (time_us - then_us) * 1e-6
@@ -323,7 +337,10 @@ class Motion:
     def _use(
         self, source: MotionSource, time_us: int, words: str, stream: tuple[int, int] | None = None
     ) -> bool:
-        """Return True if dead reckoning uses a source, because no better one is recent."""
+        """Return True if `source` is now the source of motion, because no better source is recent.
+
+        `words`: description of the source for a STATUSTEXT. `stream`: its component and message id.
+        """
         same = (source, stream) == (self.source, self._stream)
         if not same and source >= self.source and time_us - self._received_us < MAX_SOURCE_AGE_US:
             return False
@@ -340,7 +357,7 @@ class Motion:
 
 
 def rotate(q: tuple[float, float, float, float], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return a vector turned by a quaternion w, x, y, z: v + 2 u × (u × v + w v)."""
+    """Return the vector `v` rotated by the quaternion w, x, y, z: v + 2 u × (u × v + w v), u = (x, y, z)."""
     w, x, y, z = q
     a, b, c = (y * v[2] - z * v[1] + w * v[0], z * v[0] - x * v[2] + w * v[1], x * v[1] - y * v[0] + w * v[2])
     return (v[0] + 2.0 * (y * c - z * b), v[1] + 2.0 * (z * a - x * c), v[2] + 2.0 * (x * b - y * a))

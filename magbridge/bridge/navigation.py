@@ -1,4 +1,4 @@
-"""The navigator on the link: dead reckoning from the vehicle's telemetry in, fixes to the autopilot out."""
+"""Navigation in the bridge: telemetry and samples for the navigator, and its fixes for the autopilot."""
 
 from __future__ import annotations
 
@@ -32,42 +32,45 @@ from magbridge.wording import one_of
 __all__ = ["NavigationService", "open_navigation"]
 
 SHORTEST_US, LONGEST_US = 5_000_000, 60_000_000
-"""µs without a GPS position after which GPS is lost: three times its period, within these."""
+"""Limits of the time without a position after which GPS counts as lost, which is three GPS periods, µs."""
 HELD_US = 60_000_000
-"""µs of good GPS, after which the autopilot's position is that of the GPS."""
+"""Time of good GPS after which the autopilot's position is equal to the GPS position, µs."""
 ASK_US = 5_000_000
-"""µs between two requests for the origin of the local frame."""
+"""Time between two requests for the origin of the local frame, µs."""
 OVERRATED = "ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
 ANSWER_PAUSE_US = 20_000_000
-"""µs between two reports that the autopilot begins or ceases to accept fixes."""
+"""Shortest time between two reports that the autopilot starts or stops to accept fixes, µs."""
 UNUSED_US = 45_000_000
-"""µs for which the autopilot's position must differ from the fixes until that is reported."""
+"""Time for which the autopilot's position must differ from the fixes before the bridge reports it, µs."""
 MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
-"""Differences from the autopilot's position that count as none: m, and 1-sigmas of the fix."""
+"""Tolerated difference of the autopilot's position from a fix: m, plus a multiple of the fix's sigma."""
 PX4_KEEPS_CLAIM = 1, 16
-"""Version of PX4 up to which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's own uncertainty; a later one
-fuses it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
+"""Last version of PX4 in which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's uncertainty. Later
+versions fuse it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
 ARDUPILOT_FUSES: tuple[int, int] | None = None
-"""Version from which ArduPilot fuses EXTERNAL_POSITION_ESTIMATE and accepts GLOBAL_POSITION_SENSOR; None as
-long as no release does (pull request 31738)."""
+"""First version of ArduPilot that fuses EXTERNAL_POSITION_ESTIMATE and accepts GLOBAL_POSITION_SENSOR; None,
+because no release does so yet (pull request 31738)."""
 UNANSWERED = 3
-"""Commands in a row without an answer before that is reported."""
+"""Number of commands in a row without a reply after which the bridge reports it."""
 HINTS = {
     MAV_RESULT.FAILED: " (it still uses GPS, has no origin, or nothing measures its speed)",
     MAV_RESULT.TEMPORARILY_REJECTED: " (it does not dead-reckon)",
 }
-"""What the answers of ArduPilot (setLatLng) and PX4 (EKF2.cpp) mean."""
+"""Result of a fix -> its meaning in the replies of ArduPilot (setLatLng) and PX4 (EKF2.cpp)."""
 
 
 class Gps:
-    """Track whether the autopilot's GPS has a position."""
+    """State of the autopilot's GPS: has it a recent position, and for how long."""
 
     def __init__(self) -> None:
         self._last_us = self._since_us = -LONGEST_US
         self._allowed_us = 0
 
     def receive(self, message: Message, time_us: int, *, used: bool = True) -> bool:
-        """Process a GPS_RAW_INT; return True if its position is used."""
+        """Process a GPS_RAW_INT received at `time_us` (µs); return True if it has a usable position.
+
+        `used`: False if the bridge rejects or suspects the position.
+        """
         good: bool = message["fix_type"] >= FIX_3D and used
         if not good:
             self._allowed_us = 0
@@ -80,22 +83,22 @@ class Gps:
         return True
 
     def good(self, time_us: int) -> bool:
-        """Return True if there is a recent position."""
+        """Return True if the GPS has a recent position at `time_us` (µs)."""
         return time_us - self._last_us < self._allowed_us
 
     def held(self, time_us: int) -> bool:
-        """Return True if there has been a position long enough for the autopilot to adopt it."""
+        """Return True if GPS has been good for `HELD_US`, so that the autopilot has adopted its position."""
         return self.good(time_us) and time_us - self._since_us > HELD_US
 
 
 class Fixing:
-    """Send fixes while the autopilot has no GPS, and process its answers.
+    """Sender of fixes while the autopilot has no good GPS, and handler of the autopilot's replies.
 
-    `kind`: of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
-    `frame`: has received each message before.
-    `gnss`: has tested each GPS position before.
+    `kind`: message of the fixes, a value of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
+    `frame`: local frame; the caller has passed each message to it before.
+    `gnss`: monitor of GPS; the caller has passed each GPS position to it before.
     `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
-    `sent`, `accepted`, `refused`: number of fixes, and of answers.
+    `sent`, `accepted`, `refused`: number of sent fixes, and of fixes accepted and rejected by the autopilot.
     """
 
     def __init__(self, kind: Kind, component: Component, frame: Frame, gnss: GnssMonitor) -> None:
@@ -121,30 +124,34 @@ class Fixing:
 
     @property
     def velocity_stays(self) -> bool:
-        """Whether a fix leaves the autopilot's velocity alone: ArduPilot's setLatLng does, PX4 does not."""
+        """True if a fix does not change the autopilot's velocity, as ArduPilot's setLatLng."""
         return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4 and not self._ardupilot_fuses
 
     @property
     def is_fused(self) -> bool:
-        """Return True if the autopilot fuses a fix with its own position, so that it must be widened."""
+        """True if the autopilot fuses fixes with its own position: their covariance is then inflated."""
         replaced = self._version is not None and self._version <= PX4_KEEPS_CLAIM
         fused_by_px4 = self.stack == MAV_AUTOPILOT.PX4 and not replaced
         return self._kind.fused or fused_by_px4 or self._ardupilot_fuses
 
     @property
     def _ardupilot_fuses(self) -> bool:
-        """Return True if the autopilot is an ArduPilot of :data:`ARDUPILOT_FUSES` or later."""
+        """True if the autopilot is an ArduPilot of version :data:`ARDUPILOT_FUSES` or later."""
         if ARDUPILOT_FUSES is None or self._version is None:
             return False
         return self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._version >= ARDUPILOT_FUSES
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Process a message of the autopilot."""
+        """Process a message of the autopilot, received at `time_us` (µs)."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
     def send(self, reckoned: Reckoned | None, resets: int) -> bool:
-        """Send the present position as a fix if the autopilot needs it; return True if it was sent."""
+        """Send a dead-reckoned position as a fix if the autopilot needs it; return True if a fix was sent.
+
+        `reckoned`: the present position, or None if it is unknown.
+        `resets`: number of jumps of the navigator's estimate.
+        """
         now_us = self._component.codec.now_us
         fix = self._fix(reckoned, resets, now_us)
         if isinstance(fix, str):
@@ -167,7 +174,7 @@ class Fixing:
         return True
 
     def _fix(self, reckoned: Reckoned | None, resets: int, now_us: int) -> Fix | str:
-        """Return the fix, or the reason why there is none."""
+        """Return the fix for the position `reckoned`, or the reason why no fix shall be sent."""
         unwanted = self._unwanted(now_us)
         if unwanted or reckoned is None:
             return unwanted or "no valid position"
@@ -190,7 +197,7 @@ class Fixing:
         return fix
 
     def _unwanted(self, now_us: int) -> str:
-        """Return the reason why the autopilot needs or accepts no fix; empty without one."""
+        """Return the reason why the autopilot does not need or accept a fix; empty if it needs a fix."""
         accepted = self._ardupilot_fuses and not self._kind.local
         if self.stack in self._kind.refused_by and not accepted:
             return self._kind.refused_by[self.stack]
@@ -200,7 +207,7 @@ class Fixing:
         return "GPS is suspect" if suspect else ""
 
     def _await_answer(self) -> None:
-        """Count a fix that the autopilot has not yet answered; report if it answers none."""
+        """Count a fix without a reply; report more than `UNANSWERED` of them in a row."""
         self._waiting += 1
         if self._waiting > UNANSWERED:
             text = "the autopilot does not answer fixes"
@@ -226,7 +233,7 @@ class Fixing:
         self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
 
     def _compare(self, message: Message, time_us: int) -> None:
-        """Compare the autopilot's position with the last fix, and report if they differ for long."""
+        """Compare the autopilot's position with the last fix; report a difference that lasts `UNUSED_US`."""
         if self._last is None or self._before_us is None:
             return
         own = message["lat"] * 1e-7, message["lon"] * 1e-7
@@ -236,7 +243,7 @@ class Fixing:
             self._component.announcer.forget("use")
         elif time_us - self._agreed_us > UNUSED_US:
             text = f"the autopilot does not use the fixes: its position is {distance:.0f} m off"
-            # one text for one state, whatever the distance is
+            # report only once, although the distance in the text changes
             if not self._reported_unused:
                 self._component.announcer.state("use", text, MAV_SEVERITY.WARNING)
         self._reported_unused = distance >= MIN_DIFFERENCE_M and time_us - self._agreed_us > UNUSED_US
@@ -247,7 +254,7 @@ class Fixing:
             self._version = version >> 24, version >> 16 & 0xFF
 
     def _has_gps(self, time_us: int) -> bool:
-        """Return True if the receiver sends positions, even unused ones."""
+        """Return True if the GPS receiver has recently sent positions, even if the bridge rejects them."""
         return time_us - self._position_us < LONGEST_US
 
     def _gps(self, message: Message, time_us: int) -> None:
@@ -271,7 +278,7 @@ class Fixing:
             self._request("GPS_GLOBAL_ORIGIN")
 
     def _request(self, name: str) -> None:
-        """Ask the autopilot for one message."""
+        """Request one message `name` from the autopilot."""
         system, autopilot = self._component.peer
         self._component.outbox.send(
             "COMMAND_LONG",
@@ -293,8 +300,9 @@ class Fixing:
 
 GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
 GPS_AGE_S, GPS_AGE_SIGMA_S = 0.15, 0.1
-"""s between a receiver's measurement and the arrival of GPS_RAW_INT, and its 1-sigma: 0.1 to 0.2 s in the
-receiver (ArduPilot's and PX4's defaults for its delay), and up to 0.2 s until the autopilot sends it."""
+"""Delay from the GPS measurement to the arrival of GPS_RAW_INT and its standard deviation, s. It is 0.1 to
+0.2 s in the receiver (ArduPilot's and PX4's defaults), and up to 0.2 s until the autopilot sends the
+message."""
 UNKNOWN_MOTION = 65535
 """Value of GPS_RAW_INT.vel and .cog that means 'unknown'."""
 STATE_TEXTS = {
@@ -318,13 +326,16 @@ COPIED_FIELDS = (
     *("covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate"),
     *("bias", "bias_sigma", "current_north", "current_east"),
 )
-"""Fields of MAG_NAVIGATION that a record has under the same name."""
+"""Fields of MAG_NAVIGATION with the same name as an attribute of :class:`Record`."""
 
 
 class NavigationService:
-    """Feed the navigator, and send its updates and fixes.
+    """Connection of a navigator to the link: passes inputs to it, and sends its updates and fixes.
 
-    `fix`: of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
+    `grid`: map of the crustal anomaly.
+    `options`: options of the navigator.
+    `fix`: message of the fixes, a value of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
+    `component`: the MAVLink component that sends the messages.
     """
 
     def __init__(
@@ -344,7 +355,7 @@ class NavigationService:
         self._state = NavigationState.OFF
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Pass the vehicle's motion or surface position in a message to the navigator."""
+        """Pass the motion or GPS position in a message, received at `time_us` (µs), to the navigator."""
         if message.id == INTEGRITY:
             states = message["jamming_state"], message["spoofing_state"]
             self.navigator.gnss.receive_integrity(time_us, *states)
@@ -358,7 +369,7 @@ class NavigationService:
             self._send()  # the first fix does not wait for the next update
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
-        """Process a corrected sample."""
+        """Pass a corrected sample at `time_us` (µs) to the navigator, and send the resulting update."""
         self.navigator.utc_offset_us = self._component.codec.utc_offset_us
         self._notify(self.navigator.sample(time_us, corrected))
 
@@ -388,7 +399,7 @@ class NavigationService:
             self._component.announcer.state("gps", text, severity)
 
     def _notify(self, record: Record | None) -> None:
-        """Send an update; and a fix, if fixes have no rate of their own."""
+        """Send an update of the navigator, if any; also send a fix if fixes have no rate of their own."""
         if record is None:
             return
         component = self._component
@@ -425,11 +436,12 @@ class NavigationService:
 def open_navigation(
     config: Config, wanted: Wanted, calibration: Calibration | None
 ) -> Callable[[Component], NavigationService]:
-    """Return a function that makes the navigation of a configuration for a component.
+    """Return a function that creates the navigation service for a MAVLink component.
 
-    Where the configuration sets neither ``noise`` nor ``bias_sigma``, both are taken from the calibration.
+    If `wanted`, the section ``[navigation]``, sets neither ``noise`` nor ``bias_sigma``, the calibration
+    determines both.
 
-    ConfigError: a fix message or an option that does not exist, or a rate too low for the receiver.
+    ConfigError: a fix message or an option does not exist, or the rate is too low for the receiver.
     FormatError, OutOfRange: the map cannot be read.
     """
     if wanted.fix not in FIX_MESSAGES:

@@ -1,12 +1,12 @@
-"""Ports: read bytes and write messages without blocking; and the peers of a port that anyone can come to.
+"""Ports that read and write without blocking, and the network peers of a port.
 
-A port that is gone raises :class:`PortError` once and is closed; :meth:`Port.open` may then be tried again.
-Writing never blocks: what a slow reader does not take waits while it is new, then is dropped and counted.
+A lost port raises :class:`PortError` once and is closed; :meth:`Port.open` may then be tried again. Writing
+never blocks. Messages for a slow reader wait for a short time; then they are dropped and counted.
 
-Each peer of ``udpin`` or ``tcpin`` has a parser of its own, so that what one sends never swallows what
-another does: the bridge gets whole frames, and after them the bytes that belong to none. A peer is answered
-once it has sent something valid, signed where the link is signed; a peer with the autopilot's id is answered
-first and is never left out for the others.
+Each peer of ``udpin`` or ``tcpin`` has its own parser, so that bytes of one peer never damage frames of
+another. The bridge gets complete frames, followed by bytes that belong to no frame. The bridge sends to a
+peer after the peer has sent a valid frame, which must be signed on a signed link. A peer with the autopilot's
+id comes first.
 """
 
 from __future__ import annotations
@@ -27,24 +27,27 @@ from magbridge.mavlink.messages import SIGNATURE, V2, is_signed
 __all__ = ["PEER_READ_BYTES", "READ_BYTES", "PacedPort", "Peer", "Peers", "Port", "cut"]
 
 TIMEOUT = 30.0
-"""s after its last valid frame at which a peer is no longer answered."""
+"""Time after its last valid frame for which the bridge sends to a peer, s."""
 ANSWERED = 8
-"""Most peers that are answered; of more, the autopilot's and then those that came first."""
+"""Most peers to which the bridge sends: the autopilot's peer, then the peers that came first."""
 MAX_PARSED_PEERS = 64
-"""Most peers of which there is a parser."""
+"""Most peers that have a parser."""
 PEER_READ_BYTES = 8192
-"""Bytes of one peer that are looked at before the sensor's turn; the autopilot's are looked at whole."""
+"""Most bytes of one peer, except the autopilot's, that are parsed before the sensors are read."""
 STRANGERS = 8192
-"""Bytes, likewise, of all peers together that have not yet sent anything valid."""
+"""Most bytes of all peers without a valid frame together that are parsed before the sensors are read."""
 LOOK = 1.0
-"""s between two looks at who has fallen silent."""
+"""Time between two updates of the list of peers to which the bridge sends, s."""
 
 
 class Peer:
-    """A network peer of a port.
+    """Network peer of a port.
 
-    `address`: as the port knows it.
-    `genuine`, `pilot`: when it last sent something valid, and something of the autopilot's; s, monotonic.
+    `address`: address or descriptor by which the port identifies the peer.
+    `codec`: parser of the peer's bytes.
+    `genuine`, `pilot`: times of its last valid frame, and of its last frame of the autopilot; s, monotonic.
+    `since`: time of its first valid frame, without a later silence of `TIMEOUT`; s, monotonic.
+    `share`: number of bytes received since the bytes of all peers were last drained.
     """
 
     __slots__ = ("address", "codec", "genuine", "pilot", "share", "since")
@@ -56,14 +59,15 @@ class Peer:
 
 
 class Peers:
-    """The peers of one port.
+    """All network peers of one port, with the selection of the peers to which the bridge sends.
 
-    `autopilot`: system and component whose peer goes before all others.
-    `budget`: bytes/s that all but the autopilot's get together.
-    `signed`: a frame is valid once :meth:`credit` has named it; else if it is a known message.
-    `ignored`, `withheld`: bytes that were not parsed, because their sender had used up its share; and that
-        others than the autopilot did not get, because the budget was used up.
-    `notices`: texts about the peers to announce, each once.
+    `autopilot`: system and component whose peer comes first.
+    `budget`: bytes/s that all other peers get together.
+    `signed`: True if a frame is valid only after :meth:`credit` confirms it; else each known message is
+    valid.
+    `ignored`: number of bytes that were not parsed, because their sender exceeded its limit.
+    `withheld`: number of bytes that were not sent to other peers, because the budget was used up.
+    `notices`: texts about the peers that the bridge shall send as STATUSTEXT.
     """
 
     def __init__(
@@ -85,7 +89,7 @@ class Peers:
         self.notices: deque[str] = deque(maxlen=8)
 
     def receive(self, address: Hashable, data: bytes) -> None:
-        """Process the bytes that a peer sent."""
+        """Process bytes from the peer at `address`."""
         peer, now = self._peers.get(address), time.monotonic()
         if peer is None:
             peer = self._meet(address)
@@ -116,7 +120,7 @@ class Peers:
         return data
 
     def credit(self, frames: Iterable[bytes]) -> None:
-        """Learn which frames of the last :meth:`drain` were signed by someone who has the key."""
+        """Count `frames` of the last :meth:`drain` as valid for their senders: the key signed them."""
         now = time.monotonic()
         for frame in frames:
             if peer := self._authors.get(frame):
@@ -129,12 +133,12 @@ class Peers:
         self._look = 0.0
 
     def is_known(self, address: Hashable) -> bool:
-        """Return True if a peer has lately sent something valid."""
+        """Return True if the peer at `address` has sent a valid frame within `TIMEOUT`."""
         peer = self._peers.get(address)
         return peer is not None and time.monotonic() - peer.genuine < TIMEOUT
 
     def answered(self) -> list[Peer]:
-        """Return the receivers in the order of sending."""
+        """Return the peers to which the bridge sends, in the order of sending."""
         now = time.monotonic()
         if now < self._look:
             return self._answered
@@ -148,7 +152,10 @@ class Peers:
         return self._answered
 
     def affords(self, peer: Peer | None, size: int) -> bool:
-        """Return True if `size` bytes may go to a peer (None: one that has sent nothing), and count them."""
+        """Return True if the budget allows to send `size` bytes to a peer, and subtract them from the budget.
+
+        `peer`: the peer, or None for a peer that has sent nothing.
+        """
         now = time.monotonic()
         if self._budget == inf or (peer is not None and now - peer.pilot < TIMEOUT):
             return True
@@ -162,7 +169,7 @@ class Peers:
         return True
 
     def route(self, sender: tuple[int, int]) -> Peer | None:
-        """Return the peer from which a system and component was last heard, if it is answered."""
+        """Return the peer that last sent frames of a system and component; None if it gets none."""
         peer = self._routes.get(sender)
         return peer if peer in self.answered() else None
 
@@ -185,31 +192,31 @@ class Peers:
             peer.pilot = now_s
 
     def _notify(self, text: str, holds: bool) -> None:
-        """Note a text once, when it begins to hold."""
+        """Add `text` to the notices once, when the condition `holds` becomes true."""
         if holds and text not in self._reported:
             self.notices.append(text)
         (self._reported.add if holds else self._reported.discard)(text)
 
 
 READ_BYTES = 65536
-"""Bytes read at once."""
+"""Most bytes that are read at once."""
 MAX_WAIT_S = 0.1
-"""s after which a message that waits is dropped, if a newer one of its kind waits as well."""
+"""Time after which a waiting message is dropped if a newer message of its kind waits, s."""
 MAX_WAITING_MESSAGES = 512
-"""Messages that may wait."""
+"""Most messages that wait."""
 RENEWED = {spec(name).id for name in LIMITS}
-"""Messages that are sent again and again: a newer one makes an older one worthless."""
+"""Ids of periodic messages, of which only the newest matters."""
 NAMED, NAME = spec("NAMED_VALUE_FLOAT").id, 8
-"""Message in which each name is a kind of its own, and the offset of the name in its payload."""
+"""Id of the message in which each name is a kind of its own, and the offset of the name in its payload."""
 HEADER, CHECKSUM = 10, 2
-"""Bytes of a frame before its payload, and after it."""
+"""Bytes of a frame before its payload, and of its checksum after the payload."""
 
 
 class Port(ABC):
-    """A port with one descriptor, that of a file, a terminal, a socket or a pipe.
+    """Port with one file descriptor: of a file, a terminal, a socket or a pipe.
 
-    `peers`: those of a port that anyone can come to.
-    `read_bytes`: bytes that are read at once.
+    `peers`: the peers of a port with any number of peers; None for a port with one peer.
+    `read_bytes`: most bytes that are read at once.
     `ended`: reason of the :class:`PortError` at an end of file.
     """
 
@@ -220,18 +227,18 @@ class Port(ABC):
         self._peers, self._read_bytes, self._ended = peers, read_bytes, ended
         self._fd = -1  # set last when the port opens, which another thread may do
         self.dropped = 0
-        """Bytes that could not be written."""
+        """Number of bytes that could not be written."""
         self.overrun = 0
         """Number of the `dropped` bytes that an open port could not buffer, because it is too slow."""
 
     @property
     def is_open(self) -> bool:
-        """Return True if bytes can be read and written."""
+        """True if bytes can be read and written."""
         return self._fd >= 0
 
     @abstractmethod
     def open(self) -> None:
-        """Open it; raises :class:`PortError`."""
+        """Open the port; raise :class:`PortError` if this fails."""
 
     def tend(self) -> None:  # noqa: B027 - most ports need nothing
         """Do periodic slow work while the port is open; called by the thread that opens it."""
@@ -241,9 +248,9 @@ class Port(ABC):
         return [self._fd] if self._fd >= 0 else []
 
     def read(self) -> bytes:
-        """Return the received bytes, when a descriptor is ready; raises :class:`PortError` for a lost port.
+        """Return the received bytes; raise :class:`PortError` if the port is lost.
 
-        A serial line that is ready and yet has nothing is one that hung up, so do not ask when none is ready.
+        Call this method only if a descriptor is ready, because a serial line without bytes counts as lost.
         """
         received = self._receive()
         if self._peers is None:
@@ -253,7 +260,7 @@ class Port(ABC):
         return self._peers.drain()
 
     def _receive(self) -> list[tuple[Any, bytes]]:
-        """Return the pieces of bytes that have come, each with the address of its sender."""
+        """Return the received pieces of data, each with the address of its sender."""
         try:
             data = os.read(self._fd, self._read_bytes)
         except BlockingIOError:
@@ -265,7 +272,7 @@ class Port(ABC):
         return [(None, data)]
 
     def write(self, data: bytes) -> None:
-        """Send each message in `data` whole or drop it; raises :class:`PortError` when the port is gone."""
+        """Send or drop each message in `data` as a whole; raise :class:`PortError` if the port is lost."""
         if self._peers is None:
             self._send(data, None)
             return
@@ -274,49 +281,49 @@ class Port(ABC):
                 self._send(data, address)
 
     def write_to(self, sender: tuple[int, int], data: bytes) -> None:
-        """Send as :meth:`write` does, only to the peer from which a system and component was last heard."""
+        """Send as :meth:`write`, but only to the peer that last sent frames of a system and component."""
         if self._peers is None:
             self._send(data, None)
         elif (peer := self._peers.route(sender)) is not None and self._peers.affords(peer, len(data)):
             self._send(data, peer.address)
 
     def _receivers(self) -> list[tuple[Any, Peer | None]]:
-        """Return addresses and peers of those to send to, in the order in which to send."""
+        """Return address and peer of each receiver, in the order of sending."""
         assert self._peers is not None
         return [(peer.address, peer) for peer in self._peers.answered()]
 
     @abstractmethod
     def _send(self, data: bytes, address: Any) -> None:
-        """Send to an address, or to the only peer."""
+        """Send `data` to the peer at `address`, or, if `address` is None, to the port's only peer."""
 
     @property
     def waiting(self) -> bool:
-        """Return True if bytes wait that a slow line could not buffer."""
+        """True if bytes wait because the line is slow."""
         return False
 
     def flush(self) -> None:  # noqa: B027 - most ports keep nothing
-        """Continue to send the waiting bytes; raises :class:`PortError` when the port is gone."""
+        """Send more of the waiting bytes; raise :class:`PortError` if the port is lost."""
 
     def blocked(self) -> list[int]:
-        """Return the file descriptors that accept more of the waiting bytes once they are writable."""
+        """Return the file descriptors for which bytes wait until the descriptor is writable."""
         return []
 
     def credit(self, frames: Iterable[bytes]) -> None:
-        """Accept the peers that sent these frames as receivers: the frames are signed with the key."""
+        """Accept the senders of `frames`, which were signed with the key, as receivers."""
         if self._peers is not None:
             self._peers.credit(frames)
 
     def notice(self) -> str:
-        """Return a new notice about the peers; empty without one."""
+        """Remove and return the oldest notice about the peers; empty if none waits."""
         return self._peers.notices.popleft() if self._peers is not None and self._peers.notices else ""
 
     def write_all(self, data: bytes) -> None:
-        """Send `data` whole, waiting for a slow reader; for a replay, which has no deadline."""
+        """Send all of `data` and wait for a slow reader; for a replay, which has no deadline."""
         self.write(data)
 
     @abstractmethod
     def close(self) -> None:
-        """Close the port; no effect on a closed port."""
+        """Close the port, if it is open."""
 
     def overran(self, data: bytes) -> None:
         """Count `data` as dropped because the line is too slow."""
@@ -324,18 +331,19 @@ class Port(ABC):
         self.overrun += len(data)
 
     def lost(self, reason: object) -> PortError:
-        """Close the port and return the error to raise."""
+        """Close the port because of `reason`, and return the error for the caller to raise."""
         self.close()
         return PortError(self.name, str(reason))
 
 
 class PacedPort(Port):
-    """A port whose line may be slower than the data to send.
+    """Port whose line may be slower than the data to send.
 
-    What the line has no room for waits here, where it can still be dropped, and not in the system's buffers,
-    which would send it seconds late. The order is kept, since signatures and sequence numbers depend on it.
+    Excess messages wait in the port, which can still drop them, and not in the system's buffers, which would
+    send them seconds late. The order of messages never changes, because signatures and sequence numbers
+    depend on it.
 
-    `piece`: bytes that are handed to the system at once, and what completes a message.
+    `piece`: number of bytes that are written to the system at once, before a message is completed.
     """
 
     def __init__(
@@ -347,9 +355,12 @@ class PacedPort(Port):
         self._begun = bytearray()
 
     def _send(self, data: bytes, address: Any) -> None:  # noqa: ARG002 - a line has one peer
-        """Send messages, each whole or not at all; the others wait until the line takes them."""
+        """Send the messages in `data`, or queue them until the line accepts more bytes.
+
+        If too many messages wait, drop the older ones as a whole.
+        """
         free = not self.waiting and len(data) <= self._piece
-        if free and self._room():  # as on most lines at most times: nothing need be cut into messages
+        if free and self._room():  # the usual case, in which data need not be split into messages
             self._begun += data[self._put(data) :]
             return
         now = time.monotonic()
@@ -362,7 +373,7 @@ class PacedPort(Port):
 
     @property
     def waiting(self) -> bool:
-        """Return True if a message, or the rest of one, waits."""
+        """True if a message, or the rest of a message, waits."""
         return bool(self._begun or self._waiting)
 
     def flush(self) -> None:
@@ -373,15 +384,15 @@ class PacedPort(Port):
             del self._begun[: self._put(self._begun)]
 
     def blocked(self) -> list[int]:
-        """Return the descriptor that takes more once it is writable."""
+        """Return the port's descriptor, for which bytes may wait."""
         return self.fds()
 
     @abstractmethod
     def _room(self) -> bool:
-        """Return True if bytes handed to the system now leave soon."""
+        """Return True if the system would transmit further bytes without a long delay."""
 
     def _put(self, data: bytes | bytearray) -> int:
-        """Write `data`; return the number of bytes written. Raises :class:`PortError`."""
+        """Write `data`; return the number of bytes written. PortError: the port is lost."""
         try:
             return os.write(self._fd, data)
         except BlockingIOError:
@@ -403,7 +414,7 @@ class PacedPort(Port):
             self._begun += self._waiting.popleft().frame
 
     def _thin(self, late: float) -> None:
-        """Drop the messages from before `late` of which a newer one waits."""
+        """Drop messages that wait since before `late` (s, monotonic) if a newer message of the kind waits."""
         newer: set[bytes] = set()
         kept: deque[_Waiting] = deque()
         for one in reversed(self._waiting):
@@ -417,7 +428,7 @@ class PacedPort(Port):
 
 
 class _Waiting(NamedTuple):
-    """A message: since when it waits (s, monotonic), the kind of which only the newest counts, its bytes."""
+    """Waiting message: begin of the wait (s, monotonic), kind by :func:`_kind`, and bytes."""
 
     since: float
     kind: bytes | None
@@ -425,7 +436,7 @@ class _Waiting(NamedTuple):
 
 
 def cut(data: bytes) -> Iterator[bytes]:
-    """Cut `data` into MAVLink frames; a command to a sensor stays in one piece."""
+    """Yield the MAVLink frames in `data`; yield other data, such as a sensor command, whole."""
     while data:
         size = len(data)
         if data[0] == V2 and size > HEADER:
@@ -435,7 +446,7 @@ def cut(data: bytes) -> Iterator[bytes]:
 
 
 def _kind(frame: bytes) -> bytes | None:
-    """Return the key of messages that supersede each other; None for a message that must be sent."""
+    """Return a key equal for all messages that replace each other; None for a message that must be sent."""
     number = int.from_bytes(frame[7:10], "little")
     if frame[0] != V2 or number not in RENEWED:
         return None

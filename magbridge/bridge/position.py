@@ -1,4 +1,4 @@
-"""Position and heading of the vehicle, the main field at the position, and NMEA sentences."""
+"""Position of the vehicle with the main field there, and heading of the vehicle for autopilot and NMEA."""
 
 from __future__ import annotations
 
@@ -35,35 +35,36 @@ __all__ = [
 
 POSITION = spec("GLOBAL_POSITION_INT")
 MAX_POSITION_AGE_US: Final = 60_000_000
-"""Age of a position, µs: a glider makes 20 m in a minute, over which the main field changes by less than
-0.1 nT."""
+"""Longest time for which a position is used, µs. In a minute a glider moves by 20 m, and the main field
+changes by less than 0.1 nT."""
 CLOCK_SET_US: Final = 10**15
-"""µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
+"""Time in 2001, µs since 1970; if the host's clock is earlier, it was never set, and the date is unknown."""
 FIELD_INTERVAL_US: Final = 1_000_000
-"""µs after which the bridge computes the main field again."""
+"""Time after which the bridge computes the main field again, µs."""
 MAX_VECTOR_AGE_US: Final = 3_600_000_000
 MAX_VECTOR_DISTANCE_DEG: Final = 0.01
-"""Time, and difference of latitude or longitude, from which on the bridge computes the main field's vector
-again: over 1 km its direction changes by 0.01 deg."""
+"""Time (µs) and difference of latitude or longitude (deg) after which the bridge computes the main field's
+vector again; over 1 km its direction changes by 0.01 deg."""
 MAX_VEHICLE_SPEED_M_S: Final = 350.0
 """Speed that no vehicle with a fluxgate exceeds, m/s."""
 MAX_JUMP_M: Final = 10_000.0
-"""m beyond what MAX_SPEED_M_S allows: the main field changes by 50 nT at most over that, so that a correction
-of a long dead reckoning is not a jump."""
+"""Step of the position, in excess of `MAX_VEHICLE_SPEED_M_S`, that is not a jump, m. A correction after long
+dead reckoning is within it; over this distance the main field changes by at most 50 nT."""
 SUSPECT_US: Final = 900_000_000
-"""µs for which the vehicle must stay at a position beyond a jump until the bridge uses that position."""
+"""Time for which the vehicle must stay at a position beyond a jump before the bridge uses the position,
+µs."""
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """Largest magnitudes of GLOBAL_POSITION_INT's lat and lon, 1e-7 deg."""
 ALTITUDE_M: Final = -15_000.0, 100_000.0
-"""Heights at which the main-field model is defined for vehicles, m."""
+"""Lowest and highest altitude for which the main field is computed, m; other altitudes count as 0."""
 
 UNKNOWN_VECTOR: Final = (nan, nan, nan)
 
 
 class Position:
-    """Last position of the vehicle; the first one loads the field model.
+    """Last position of the vehicle, and the main field at this position.
 
-    `notify`: receives the reason why the main field is unknown at a known position.
+    `notify`: called with the reason if the main field is unknown at a known position.
     """
 
     MESSAGE: ClassVar[int] = POSITION.id
@@ -92,10 +93,11 @@ class Position:
         return nan if self.last_position is None else self._depth
 
     def update(self, message: Message, time_us: int) -> None:
-        """Use a GLOBAL_POSITION_INT; ignore one that states an unknown or impossible position.
+        """Update the position with a GLOBAL_POSITION_INT received at `time_us` (µs).
 
-        After a jump that speed and time do not allow, main field and anomaly are unknown until the
-        vehicle is near the former track again or has stayed beyond the jump for :data:`SUSPECT_US`.
+        An unknown or impossible position is ignored. After a jump that no vehicle's speed explains, main
+        field and anomaly are unknown. They are known again when the vehicle is near the former track, or
+        has stayed beyond the jump for :data:`SUSPECT_US`.
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
         # an autopilot that does not know its position sends 0, 0 or INT32_MAX
@@ -110,7 +112,7 @@ class Position:
         self._watch_for_jumps(time_us)
 
     def _watch_for_jumps(self, time_us: int) -> None:
-        """Compare the last position with the last one that was trusted."""
+        """Compare the last position with the last trusted position, and detect or end a jump."""
         assert self._where is not None
         if self._trusted is not None and not self._within_reach(
             self._trusted, (self._jumped_us or time_us) - self._trusted_us
@@ -123,15 +125,17 @@ class Position:
         self._trusted, self._trusted_us, self._jumped_us = self._where, time_us, 0
 
     def _within_reach(self, trusted: tuple[float, float], elapsed_us: int) -> bool:
-        """Return True if the vehicle can have come from a position (deg) to the present one."""
+        """Return True if a vehicle can reach its position from `trusted` (deg) in `elapsed_us` (µs)."""
         assert self._where is not None
         north, east = separation(*trusted, *self._where)
         return hypot(north, east) < MAX_JUMP_M + MAX_VEHICLE_SPEED_M_S * abs(elapsed_us) * 1e-6
 
     def main_field(self, time_us: int, utc_us: int) -> float:
-        """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.
+        """Return the IGRF's total field at the position, nT.
 
-        `time_us`, `utc_us`: µs of event time, and of UNIX time by the host's clock as it is set now.
+        It is NaN if position or date are unknown, or the model is not valid for them.
+
+        `time_us`, `utc_us`: present event time, and UNIX time of the host's clock, µs.
         """
         if (
             self._where is None
@@ -146,9 +150,10 @@ class Position:
         return self._field
 
     def direction(self, main_field: float, utc_us: int) -> tuple[float, float, float]:
-        """Return the IGRF's vector near the position, nT, north-east-down.
+        """Return the IGRF's field vector near the position, nT, north-east-down.
 
-        `main_field`: what :meth:`main_field` has returned; the vector is NaN where that is.
+        `main_field`: result of :meth:`main_field`; if it is NaN, the vector is NaN, too.
+        `utc_us`: UNIX time, µs.
         """
         if isnan(main_field):
             return UNKNOWN_VECTOR
@@ -157,7 +162,7 @@ class Position:
         return self._vector
 
     def _evaluate_vector(self, utc_us: int) -> None:
-        """Compute the vector at the position, unless the vehicle is still near the last place of that."""
+        """Compute the vector at the position, unless the position and time of the last vector are near."""
         assert self._where is not None
         self._vector_where = self._where
         (latitude, longitude), (last_latitude, last_longitude) = self._where, self._vector_at
@@ -184,17 +189,18 @@ class Position:
 
 ATTITUDE, HEARTBEAT = spec("ATTITUDE"), spec("HEARTBEAT").id
 MAX_ATTITUDE_AGE_US: Final = 1_000_000
-"""µs between a sample and the ATTITUDE that levels it; beyond, the heading is unknown."""
+"""Longest time between a sample and the ATTITUDE for its heading, µs; beyond, the heading is unknown."""
 COVARIANCE_INTERVAL_US: Final = 200_000
-"""µs for which the covariance of the vector is used again: it changes with attitude and masses, slowly."""
+"""Time for which a covariance of the vector is used, µs; it changes slowly with attitude and moving
+masses."""
 MAX_PITCH_RAD: Final = radians(89.0)
-"""Largest pitch at which roll and heading are distinguished, rad."""
+"""Largest pitch at which roll and heading are separable, rad."""
 CONTRADICTED_TILT_RAD: Final = radians(10.0)
-"""1-sigma of roll and pitch of an autopilot whose filter contradicts its sensors, rad."""
+"""Standard deviation of roll and pitch from an autopilot whose filter contradicts its sensors, rad."""
 MAX_SENT_SIGMA_DEG: Final = 30.0
-"""Largest sigma of a heading that is sent to the autopilot, deg."""
+"""Largest standard deviation of a heading that is sent to the autopilot or to NMEA receivers, deg."""
 MAX_WAITING: Final = 8
-"""Sentences that wait at most."""
+"""Most sets of NMEA sentences that wait for the bridge to send them."""
 NO_HEADING_FLAGS: Final = int(
     Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT
 )
@@ -202,13 +208,13 @@ NO_HEADING_FLAGS: Final = int(
 
 
 class LiveHeading:
-    """Compute the heading of each sample; send it to the autopilot and to NMEA receivers.
+    """Computation of the heading of each sample, and sender of headings to autopilot and NMEA receivers.
 
-    `wanted`: ``[heading]`` of the configuration.
-    `component`: the MAVLink side.
-    `nmea`: sentences that are due; the bridge takes them out. A replay does not: the oldest are dropped.
+    `wanted`: section ``[heading]`` of the configuration.
+    `component`: the MAVLink component.
+    `nmea`: NMEA sentences to send, which the bridge takes out; the oldest are dropped in a replay.
     `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
-    `is_sending`: the configuration names a receiver of headings.
+    `is_sending`: True if the configuration names a receiver of headings.
     """
 
     def __init__(self, wanted: HeadingOutput, component: Component) -> None:
@@ -234,7 +240,7 @@ class LiveHeading:
         self._declination = self._declination_sigma = nan
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Process an ATTITUDE, HEARTBEAT or report of the filter of the autopilot, received at `time_us`."""
+        """Process an ATTITUDE, HEARTBEAT or filter report of the autopilot, received at `time_us` (µs)."""
         if message.id == HEARTBEAT:
             self.stack = message["autopilot"]
             return
@@ -249,12 +255,12 @@ class LiveHeading:
     def compute(
         self, sample: Sample, corrected: Corrected, corrector: Corrector, main: Vector, crustal: float
     ) -> Attitude:
-        """Return the attitude at a sample, with its heading; unknown without a recent ATTITUDE.
+        """Return the attitude at a sample, with its heading; `NO_ATTITUDE` without a recent ATTITUDE.
 
-        `sample`, `corrected`: as aligned, and as corrected.
-        `corrector`: has just corrected the sample.
-        `main`: nT, main field, north-east-down; NaN where unknown.
-        `crustal`: nT, 1-sigma of the crustal field that the main-field model lacks.
+        `sample`, `corrected`: the sample, and its corrected field.
+        `corrector`: the corrector, whose last sample is `sample`.
+        `main`: main field, north-east-down, nT; NaN if unknown.
+        `crustal`: standard deviation of the crustal field, which the main-field model lacks, nT.
         """
         boresight = corrector.calibration.boresight
         since_us = sample.time_us - self._attitude_us
@@ -284,7 +290,7 @@ class LiveHeading:
     def _tilt(self, elapsed: float, stated: float) -> tuple[float, float, float]:
         """Return roll, pitch and their standard deviation (rad), `elapsed` s after the last ATTITUDE.
 
-        `stated`: rad, that of the ATTITUDE itself.
+        `stated`: standard deviation of roll and pitch at the ATTITUDE itself, rad.
 
         The body rates p, q, r give ``droll/dt = p + tan(pitch) (q sin(roll) + r cos(roll))`` and
         ``dpitch/dt = q cos(roll) - r sin(roll)``.
@@ -300,7 +306,7 @@ class LiveHeading:
         return roll + roll_change, pitch + pitch_change, sigma
 
     def _decline(self, main: Vector, crustal: float) -> None:
-        """Compute the declination (deg) and its standard deviation when the main field has changed."""
+        """Compute declination and its standard deviation (deg) again if the main field (nT) has changed."""
         if self._main is main and self._crustal == crustal:
             return
         north, east, _ = main
@@ -310,7 +316,10 @@ class LiveHeading:
         self._declination_sigma = sigma.item()
 
     def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
-        """Send the heading of a sample if it is due and accurate; `time_us` is the sample's time."""
+        """Send the heading of a sample at `time_us` (µs) if it is due and accurate enough.
+
+        `quality`: quality flags of the sample.
+        """
         if quality & NO_HEADING_FLAGS or attitude.sigma > MAX_SENT_SIGMA_DEG:
             return
         utc_us = time_us + self._component.codec.utc_offset_us

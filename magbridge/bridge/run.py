@@ -1,8 +1,9 @@
-"""Run a bridge on its ports until it is stopped; keep its state for the next run, and serve files.
+"""Live run of a bridge on its ports, with storage of its state for the next run and a file server.
 
-A thread reads the files that stations ask for; the live thread hands on requests and takes replies, a few
-messages at a time, and never waits for the disk. Replies are not in the log, which would grow by everything
-that is read of it. The log has their number, so that a replay counts on as the bridge did.
+A thread reads the files that stations request. The live thread passes requests to it and takes a few replies
+at a time, so that the live thread never waits for the disk. Replies with files are not logged, because each
+download of a log would make the log grow. The log has the number of replies, from which a replay continues
+the sequence numbers.
 """
 
 from __future__ import annotations
@@ -51,20 +52,20 @@ Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
 class StoredState(msgspec.Struct, frozen=True):
-    """The contents of the file."""
+    """State of the bridge that is stored in a file for the next run."""
 
     parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
-    """Values that differ from the configuration's."""
+    """Values of parameters that differ from the configuration, by name."""
     signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
-    """The last that may have been used (10 µs since 2015-01-01); 48 bits on the link."""
+    """Last signing time stamp that may have been used (10 µs since 2015-01-01); 48 bits on the link."""
     signing_streams: list[tuple[Byte, Byte, Byte, bool, Annotated[int, Meta(ge=0, lt=1 << 48)]]] = []
-    """The last time stamp accepted of each stream."""
+    """Last accepted time stamp of each signed stream."""
 
 
 def load_state(path: str | Path) -> StoredState:
-    """Read the file; return an empty state if it does not exist.
+    """Return the state in the file at `path`; an empty state if the file does not exist.
 
-    FormatError: it is not what :func:`save_state` wrote.
+    FormatError: the file does not have the format of :func:`save_state`.
     """
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=StoredState)
@@ -75,38 +76,38 @@ def load_state(path: str | Path) -> StoredState:
 
 
 def save_state(path: str | Path, kept: StoredState) -> None:
-    """Write the file, whole or not at all, and sync it to the disk: power may be cut at any moment."""
+    """Write the state to the file at `path`, atomically and synchronised to the disk."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))
 
 
 STAMP_INTERVAL_US = 60_000_000
-"""µs between two savings of the signing time stamps."""
+"""Time between two savings of the signing time stamps, µs."""
 SAVE_US = 1_000_000
-"""µs between two savings of parameters: each waits for the disk, and the sensor for it."""
+"""Shortest time between two savings of parameters, µs, because a saving delays the sensors."""
 
 
 class Keeper:
-    """Save the state while the bridge runs and when it ends."""
+    """Storage of the bridge's state, while the bridge runs and when it ends."""
 
     AHEAD = 2 * STAMP_INTERVAL_US // 10
-    """Units of 10 µs for which stamps are reserved at each saving, lest the next run use them again."""
+    """Time for which each saving reserves stamps, units of 10 µs: the next run does not reuse them."""
 
     def __init__(self, config: Config) -> None:
         self._notify: Callable[[bytes], None] = lambda _: None
-        # named after the configuration: the folder may hold another bridge's file
+        # named after the configuration, because the folder may contain another bridge's file
         self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
         self._spoilt = False
         try:
             self._kept = load_state(self._path)
-        except (FormatError, OSError):  # no reason to keep a vehicle ashore
+        except (FormatError, OSError):  # the bridge starts without the stored state
             self._kept, self._spoilt = StoredState(), True
         self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
         self._saved_us = self._retry_us = self._revision = 0
         self._learned = kept_path(config)
 
     def attach(self, edge: LiveEdge) -> None:
-        """Attach `edge`, to notify it when the state cannot be stored or read; then the file is set aside."""
+        """Send later errors of storage as events to `edge`; rename and report a file that cannot be read."""
         self._notify = edge.notify
         if self._spoilt:
             name = self._path.name
@@ -118,12 +119,12 @@ class Keeper:
             self._notify(events.notice(f"{self._key.name[-20:]}: every user can read this key"))
 
     def start(self, time_us: int) -> StartEvent:
-        """Return the start of a run at `time_us`."""
+        """Return the start event of a run at `time_us` (µs), with the stored state."""
         kept = self._kept
         return StartEvent(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save the learned calibration, changed parameters within `SAVE_US`, time stamps every `KEEP_US`."""
+        """Save a new learned calibration, changed parameters, and, every `STAMP_INTERVAL_US`, time stamps."""
         learning, path = pipeline.learning, self._learned
         if learning is not None and path is not None and (why := keep(learning, path)):
             self._notify(events.notice(why))
@@ -136,9 +137,9 @@ class Keeper:
             self._revision, self._retry_us = -1, time_us + STAMP_INTERVAL_US
 
     def save(self, pipeline: Pipeline, *, last: bool = False) -> bool:
-        """Write the file if its content has changed; return False, the old file kept, where that fails.
+        """Write the state if it has changed; return False if this fails, so that the old file remains.
 
-        At the `last` saving of a run, no stamp is reserved for frames still to be sent.
+        `last`: True at the end of a run, when no time stamps need be reserved for later frames.
         """
         kept = StoredState(pipeline.component.parameters.changed())
         if signing := pipeline.signing:
@@ -156,20 +157,21 @@ class Keeper:
 
 
 SWITCH = 0.0005
-"""s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
+"""Python's switch interval, s: the time that another thread can delay the bridge. The default is 5 ms."""
 NOTICE_PAUSE = 0.2
-"""s between two checks for texts to print."""
+"""Time between two checks for texts to print, s."""
 LOG_LOOK_US = 1_000_000
-"""µs between two checks of the log."""
+"""Time between two checks of the log, µs."""
 
 
 def run(path: Path) -> None:
-    """Attach to the sensor and the link that a ``bridge.toml`` names, until stopped by a signal.
+    """Run the bridge of a ``bridge.toml`` on its ports until a signal stops it.
 
-    Announcements over the link are printed on stderr, too.
+    STATUSTEXTs are also printed to stderr.
 
-    `path`: the ``bridge.toml``.
-    ConfigError, FormatError, CalibrationError: as :func:`set_up`; nothing was opened then.
+    `path`: path of the ``bridge.toml``.
+    ConfigError, FormatError, CalibrationError: the configuration, or a file that it names, is not valid; no
+        port was opened.
     """
     if sys.stderr.isatty():
         print(f"{path}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
@@ -178,13 +180,13 @@ def run(path: Path) -> None:
     pipeline = set_up(config, keeper.start(clock.now_us()))
     link, sensors = ports(config)
     nmea = nmea_port(config)
-    # the link first, so that a sensor's port that does not open can be reported over it
+    # the link first, so that the bridge can report a sensor's port that does not open
     edge = LiveEdge({Channel.LINK: link, **sensors}, clock)
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
     _stop_on_signals(edge)
-    # not before a signal would end the bridge in good order: a program that reads the first text may send one
+    # after the signal handlers are set, because a program may send a signal when it reads the first text
     texts = pipeline.component.announcer.texts
     Thread(target=_print_statustexts, args=(texts,), name="voice", daemon=True).start()
     sys.setswitchinterval(SWITCH)
@@ -211,7 +213,7 @@ def run(path: Path) -> None:
 
 
 def leave_wrong_devices(pipeline: Pipeline, sensors: Mapping[int, SerialPort | BusPort]) -> None:
-    """Try the next device for each sensor on whose port another instrument is."""
+    """For each sensor on whose port another instrument seems to send, switch to the next matching device."""
     for stream in pipeline.streams:
         if stream.line.wrong_device:
             stream.line.wrong_device = False
@@ -219,9 +221,9 @@ def leave_wrong_devices(pipeline: Pipeline, sensors: Mapping[int, SerialPort | B
 
 
 def ports(config: Config) -> tuple[Port, dict[int, SerialPort | BusPort]]:
-    """Return the (unopened) ports of the link and of the sensors, these by MAG_PORT_NAME.
+    """Return the (unopened) port of the link, and the ports of the sensors by MAG_PORT_NAME.
 
-    ConfigError: a name that no port can have.
+    ConfigError: a port's name is not valid.
     """
     own = config.link
     link = open_link(
@@ -243,10 +245,10 @@ def _stop_on_signals(edge: LiveEdge) -> None:
 
 
 def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
-    """Print texts on stderr in a thread, because a blocked terminal must not stop the bridge.
+    """Print `texts` (severity and text) to stderr, in a thread: a blocked terminal then stops nothing.
 
-    Nor may it hold up the exit, where Python waits for a file object that is in use: hence ``os.write``.
-    The journal takes a syslog level, which a MAVLink severity is, from ``<N>`` before a line (sd-daemon(3)).
+    ``os.write`` is used, because Python waits at exit for a file object that is in use. In the journal, the
+    prefix ``<N>`` sets the syslog level, which is equal to the MAVLink severity (sd-daemon(3)).
     """
     stderr = sys.stderr.fileno()
     status = os.fstat(stderr)
@@ -272,7 +274,7 @@ def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter 
 
 
 class Upkeep:
-    """Work between two events: files for stations, saved state, changes of the log, NMEA sentences."""
+    """Tasks between two events: serve files, save the state, report on the log, send NMEA sentences."""
 
     def __init__(
         self,
@@ -297,7 +299,7 @@ class Upkeep:
         self._look_us = 0
 
     def finish_event(self, time_us: int) -> None:
-        """Run the tasks that are due after an event at `time_us`."""
+        """Run the tasks that are due after an event at `time_us` (µs)."""
         while self._requests:
             self.files.ask(self._requests.popleft())
         if not self._link.waiting:
@@ -312,7 +314,7 @@ class Upkeep:
             self._sentences.send(self._pipeline.heading.nmea, time_us)
 
     def _look_at_log(self, log: TlogWriter) -> None:
-        """Report failures, recoveries and losses of the log; keep the `beginning` of its next file."""
+        """Report failures, recoveries and losses of the log; update the first records of its next file."""
         if self._parameters.revision != self._revision:
             self._revision = self._parameters.revision
             log.beginning = self._pipeline.beginning(self._parameters.changed())
@@ -325,29 +327,29 @@ class Upkeep:
 FTP = spec("FILE_TRANSFER_PROTOCOL")
 LIST, DATA, END = (spec(f"LOG_REQUEST_{name}").id for name in ("LIST", "DATA", "END"))
 REQUESTS = 64
-"""Requests that may wait; more are dropped, and stations ask again."""
+"""Most requests that wait; further requests are dropped, and stations repeat them."""
 UNDER_WAY = 32
-"""Replies of one station that may be under way."""
+"""Most requests of one station that are processed at a time."""
 BATCH = 4
-"""Messages that are sent at once: some 0.1 ms of the live thread."""
+"""Most messages that are sent at once, which takes about 0.1 ms of the live thread."""
 READY = 8
-"""Messages that may wait to be sent; then nothing more is read."""
+"""Most messages that wait to be sent; then no file is read."""
 POLL_INTERVAL_S = 0.01
-"""s between two looks at whether the link takes more."""
+"""Time between two checks if the link accepts more messages, s."""
 IDLE = 1.0
-"""s between two looks for requests while nothing is under way."""
+"""Longest wait for a request while no request is in process, s."""
 
 Reply = tuple[Spec, bytes]
 Sender = tuple[int, int]
 
 
 class FileServer:
-    """Serve the metadata of the parameters, and the logs.
+    """Thread that serves the metadata of the parameters, and the logs, to stations.
 
-    `texts`: the metadata's files, by path.
-    `logs`: the folder of the logs.
-    `rate`: returns bytes/s at which files are sent; 0 refuses every request by silence.
-    `notify`: wakes the live thread with a state frame, or with none.
+    `texts`: contents of the metadata files, by path.
+    `logs`: the folder of the logs; None without a log.
+    `rate`: returns the rate at which files are sent, bytes/s; at 0, requests get no reply.
+    `notify`: wakes the live thread; called with a state frame or with empty bytes.
     """
 
     def __init__(
@@ -369,12 +371,12 @@ class FileServer:
         self._thread.start()
 
     def ask(self, request: Message) -> None:
-        """Queue a request; return at once."""
+        """Queue a request without blocking."""
         if self._asked.qsize() < REQUESTS:
             self._asked.put(request)
 
     def drain(self) -> tuple[Sender, list[Reply]]:
-        """Return the pending replies and their receiver, at once."""
+        """Return up to `BATCH` ready replies and their receiver (system, component), without blocking."""
         sender, replies = (0, 0), list[Reply]()
         while self._ready and len(replies) < BATCH and (not replies or self._ready[0][0] == sender):
             sender, reply = self._ready.popleft()
@@ -382,7 +384,7 @@ class FileServer:
         return sender, replies
 
     def close(self) -> None:
-        """End the thread, and close its files."""
+        """End the thread, which closes its files."""
         self._ending = True
         self._asked.put(None)
         self._thread.join(IDLE)
@@ -401,7 +403,7 @@ class FileServer:
             self._ftp.close()
 
     def _waiting(self, timeout: float) -> Iterator[Message | None]:
-        """Yield the pending requests, or wait for the first one."""
+        """Yield the pending requests; if none is pending, wait up to `timeout` (s) for a request."""
         try:
             yield self._asked.get(timeout=timeout) if timeout else self._asked.get_nowait()
             for _ in range(self._asked.qsize()):
@@ -424,7 +426,7 @@ class FileServer:
             waiting.clear()
 
     def _reported_once(self, sender: Sender, replies: Iterator[bytes]) -> Iterator[bytes]:
-        """Yield replies; report the first refusal to a station, other than the end of a file."""
+        """Yield the replies; report each kind of rejection once per station, except the end of a file."""
         for payload in replies:
             yield payload
             if why := FtpServer.refusal(payload):
@@ -434,7 +436,7 @@ class FileServer:
                     self._notify(events.notice(text[:50]))
 
     def _turn(self) -> None:
-        """Prepare a batch for each station in turn, and pause as long as sending takes."""
+        """Prepare a batch of replies, one per station in turn, and pause for the time that sending takes."""
         rate, size = self._rate(), 0
         if rate <= 0:
             self._under_way.clear()

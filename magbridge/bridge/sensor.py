@@ -1,4 +1,4 @@
-"""One sensor of the bridge: its driver, its line, its correction and its publisher."""
+"""Processing of one sensor of the bridge: its serial line, its driver, its correction and its messages."""
 
 from __future__ import annotations
 
@@ -38,38 +38,40 @@ __all__ = [
 
 OK: Final = MAG_PORT_STATE.OK
 COMMAND_GAP_US = 100_000
-"""µs between two commands to a sensor."""
+"""Time between two commands to a sensor, µs."""
 LISTEN_US = 1_200_000
-"""µs for which a line that may be another instrument's is listened to: a GPS sends every second."""
+"""Time without commands on a line that may be another instrument's, µs; a GPS sends within this time."""
 NMEA_SENTENCE = re.compile(rb"[$!][A-OQ-Z][A-Z]{4},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
-"""A sentence of NMEA 0183, but none that a maker has defined (``$P...``)."""
+"""Pattern of a standard sentence of NMEA 0183, which does not match proprietary sentences (``$P...``)."""
 MAX_SENTENCE_BYTES = 128
-"""Bytes, the longest sentence and a margin."""
+"""Length of the longest NMEA sentence plus a margin, bytes."""
 TEXT_BYTES = re.compile(rb"[\t\r\n -~]+")
 NOT_A_NUMBER = re.compile(rb"\bnan\b", re.IGNORECASE)
 SAME_US: Final = 60_000_000
 MIN_REPEATED_READINGS: Final = 10
-"""µs, and number of readings, after which one that repeats is announced: the sensor may hang. It has no flag,
-because one that counts in steps of 100 nT may as well be at rest."""
+"""Time (µs) and number of equal readings after which a STATUSTEXT reports that the sensor may hang. Samples
+get no flag, because a sensor with steps of 100 nT may send equal readings at rest."""
 LINE_CHECK_INTERVAL_US = 1_000_000
-"""µs between two checks that readings still come."""
+"""Time between two checks that readings arrive, µs."""
 
 
 class SensorLine:
-    """Watch the line; send the start-up commands whenever the sensor may have lost them.
+    """Monitor of a sensor's line, which sends the start-up commands whenever the sensor may have lost them.
 
-    `name`: what the sensor is called in messages about its state.
-    `start`: to be called whenever the line was opened; returns the commands that start the sensor.
-    `timeout_us`: µs without a reading after which it counts as silent.
-    `searching`: the line may be another instrument's: it is listened to before it gets commands, and it gets
-        none if it sends NMEA 0183 and no readings.
-    `announcer`, `timers`: the link's.
-    `start_us`: µs since 1970 UTC.
-    `sensor_id`: which sensor.
-    `timer`: name of the timer that fires if the sensor is silent.
-    `to_send`: commands that are due; the caller of the pipeline sends them and empties the list.
-    `wrong_device`: no reading has come since the line was opened, but a timeout or NMEA 0183 has: it may be
-        another instrument's. The owner of the line tries another one, if there is one, and resets this.
+    `name`: name of the sensor in STATUSTEXTs.
+    `start`: function that is called when the line is opened; returns the commands that start the sensor.
+    `timeout_us`: time without a reading after which the sensor counts as silent, µs.
+    `searching`: True if the line may be another instrument's. The sensor then gets commands after a pause,
+    and
+        none if the line carries NMEA 0183 and no readings.
+    `announcer`, `timers`: services of the link.
+    `start_us`: start of the run, µs since 1970 UTC.
+    `sensor_id`: number of the sensor.
+    `timer`: name of the timer that checks if the sensor is silent.
+    `state`: state of the line (MAG_PORT_STATE).
+    `to_send`: commands to send; the caller of the pipeline sends them and empties the list.
+    `wrong_device`: True if a timeout or NMEA 0183 suggests another instrument, and no reading has arrived
+        since the line was opened. The owner of the line then tries another device and resets this attribute.
     """
 
     def __init__(
@@ -93,7 +95,7 @@ class SensorLine:
         self.to_send: list[bytes] = []
         self.wrong_device = self._known = False
         self._received_us = start_us
-        # no longer than until the line counts as silent, so that the message does not depend on it
+        # shorter than the timeout, so that the pause does not change the message about a silent line
         self._listen_us = min(LISTEN_US, timeout_us // 2) if searching else 0
         self._commands: tuple[bytes, ...] = ()
         self._tail = b""
@@ -104,14 +106,14 @@ class SensorLine:
         timers.every(self.timer, LINE_CHECK_INTERVAL_US, self._look, start_us + LINE_CHECK_INTERVAL_US)
 
     def on_reading(self, time_us: int) -> None:
-        """Record a reading."""
+        """Record the arrival of a reading at `time_us` (µs)."""
         self._received_us, self._known = time_us, True
         if self.state != OK:
             self.state = OK
             self._announcer.state(self.timer, f"{self._name} sends readings")
 
     def read(self, field: Vector, time_us: int) -> None:
-        """Check the values of a reading (nT); announce one that stays the same for long."""
+        """Compare a reading (nT) with earlier ones; report one that does not change for `SAME_US`."""
         if field != self._field:
             self._field, self._repeats, self._since_us = field, 0, time_us
             if self._hangs:
@@ -125,7 +127,7 @@ class SensorLine:
             self._announcer.state(self._reading_key, text, MAV_SEVERITY.WARNING)
 
     def on_unparsed(self, data: bytes, time_us: int) -> None:
-        """Record bytes that complete no reading."""
+        """Record the arrival of bytes that complete no reading, and detect NMEA 0183 in them."""
         self._unparsed_us = time_us
         received = self._tail + data
         self._tail = received[-MAX_SENTENCE_BYTES:]
@@ -134,12 +136,12 @@ class SensorLine:
             self._timers.cancel(self._command_timer)
 
     def opened(self, time_us: int) -> None:
-        """Send the start-up commands, because the sensor may have lost power; SILENT until it sends."""
+        """Handle an opened port: send the start-up commands, and set the state to SILENT until a reading."""
         self._commands, self._known, self._tail = self._start(), False, b""
         self._wake(time_us, self._listen_us)
 
     def lost(self, reason: str) -> None:
-        """Record that the port is lost."""
+        """Record and report that the port was lost because of `reason`."""
         self.state = MAG_PORT_STATE.LOST
         self._timers.cancel(self._command_timer)
         self._announcer.state(self.timer, f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
@@ -154,7 +156,7 @@ class SensorLine:
         self._wake(time_us)
 
     def _unparsed(self) -> str:
-        """Return a description of the bytes without readings: at a wrong baud rate, they are not text."""
+        """Return a description of received bytes that are not readings, with the likely cause."""
         if not TEXT_BYTES.fullmatch(self._tail):
             return "sends, but no readings: baud rate?"
         if NOT_A_NUMBER.search(self._tail):
@@ -179,7 +181,7 @@ class SensorLine:
 
 
 def needed_units(calibration: Calibration) -> dict[str, str]:
-    """Return the telemetry that a calibration needs, by name, with the unit of each."""
+    """Return the units of the telemetry values that a calibration needs, by name."""
     units = calibration.units
     return {name: units.get(name, "") for name in calibration.channels if name != TEMPERATURE}
 
@@ -200,17 +202,21 @@ def unmet(units: Mapping[str, str], config: Config) -> list[ConfigError]:
 
 
 def check(units: Mapping[str, str], config: Config) -> None:
-    """Check that the link will provide telemetry in these units; ConfigError: as :func:`unmet`."""
+    """Check that ``[telemetry]`` has every channel of `units`; ConfigError: a channel or unit is missing."""
     for error in unmet(units, config):
         raise error
 
 
 RATE_SAMPLES = 64
-"""Samples over which the sample rate is computed."""
+"""Number of latest samples over which the sample rate is computed."""
 
 
 def open_drivers(config: Config) -> list[Driver]:
-    """Return the driver of each sensor; ConfigError: one does not exist, or sensor 0 is not a vector."""
+    """Return the driver of each sensor.
+
+    ConfigError: a driver does not exist, sensor 0 is a scalar although a vector sensor exists, or a setting
+    does not fit the sensor.
+    """
     drivers = [open_driver(one.driver, one.options, config.path, one.key) for one in config.sensors]
     vectors = [one for one, driver in zip(config.sensors, drivers, strict=True) if not is_scalar(driver)]
     if vectors and is_scalar(drivers[0]):
@@ -243,11 +249,11 @@ def other_calibrations(config: Config) -> dict[int, Calibration]:
 def scalar_entry(
     sensor: Sensor, config: Config, own_calibration: Calibration | None, main: Calibration | None
 ) -> ScalarSensor | None:
-    """Return the compensation of a scalar sensor; None if no calibration has one.
+    """Return the compensation of a scalar sensor; None if no calibration contains it.
 
-    `sensor`: its name is the column of the compensation.
-    `config`: for its path and its telemetry.
-    `own_calibration`, `main`: that of the sensor itself, and that of sensor 0.
+    `sensor`: the sensor, whose name is the column of its compensation.
+    `config`: configuration with the telemetry.
+    `own_calibration`, `main`: calibrations of the sensor itself and of sensor 0, or None.
     ConfigError: `own_calibration` has no entry for the sensor, or a channel is not in ``[telemetry]``.
     """
     entries = (own_calibration or main).sensors if own_calibration is not None or main is not None else ()  # type: ignore[union-attr]
@@ -264,14 +270,15 @@ def scalar_entry(
 
 
 class SensorStream:
-    """One sensor.
+    """Processing of one sensor, from received bytes to corrected samples.
 
-    `component`: the MAVLink side.
-    `start_us`: µs, when the bridge started.
-    `publisher`: sends its samples.
-    `line`: holds the commands that are to be sent to the sensor.
-    `samples`, `lost`: readings received, and those missing by the instrument's own numbering.
-    `quality`: the flags that were announced last.
+    `correction`: correction of the sensor's readings.
+    `component`: the MAVLink component.
+    `start_us`: start of the bridge, µs since 1970 UTC.
+    `publisher`: sender of the sensor's samples.
+    `line`: monitor of the line, with the commands to send to the sensor.
+    `samples`, `lost`: number of readings received, and of readings missing in the instrument's numbering.
+    `quality`: quality flags that were last sent as STATUSTEXT.
     """
 
     def __init__(
@@ -295,7 +302,7 @@ class SensorStream:
         self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
 
     def receive(self, data: bytes, time_us: int) -> Iterable[tuple[Reading, Stamp]]:
-        """Parse bytes; return the readings that they complete, each with its time."""
+        """Parse bytes received at `time_us` (µs); return the completed readings with their times."""
         readings = self.driver.feed(data)
         if not readings:
             self.line.on_unparsed(data, time_us)
@@ -311,12 +318,12 @@ class SensorStream:
         position: tuple[float, float] | None,
         depth: float,
     ) -> list[tuple[Sample, Corrected]]:
-        """Correct a reading; return the samples that are complete now.
+        """Correct a reading; return the completed samples, each with its corrected field.
 
-        `reading`, `stamp`: as :meth:`receive` returns them.
-        `main_field`: nT, the main field's total; NaN where unknown.
-        `position`: deg, latitude and longitude; None where not known.
-        `depth`: m; NaN where not known.
+        `reading`, `stamp`: reading and its time from :meth:`receive`.
+        `main_field`: magnitude of the main field, nT; NaN if unknown.
+        `position`: latitude and longitude, deg; None if unknown.
+        `depth`: depth below the sea, m; NaN if unknown.
         """
         correction, time_us = self.correction, stamp.time_us
         restarted, missing = stamp.restarted, stamp.missing
@@ -337,29 +344,29 @@ class SensorStream:
         return self.complete()
 
     def complete(self) -> list[tuple[Sample, Corrected]]:
-        """Return the waiting samples of a scalar that the vector of the same time completes."""
+        """Return the waiting scalar samples for whose time the vector is known."""
         if not isinstance(self.correction, ScalarCorrection):
             return []
         return self.correction.samples(self._component.codec.now_us)
 
     def use_vector(self, time_us: int, field: Vector) -> None:
-        """Use the corrected vector (nT) of sensor 0 at `time_us` (µs) to compensate a scalar."""
+        """Pass sensor 0's corrected vector (nT) at `time_us` (µs) to the compensation of a scalar."""
         if isinstance(self.correction, ScalarCorrection):
             self.correction.vector(time_us, field)
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
-        """Apply the settings of the alignment, and the ages (s) from which telemetry is stale."""
+        """Apply the settings of the alignment, and the age (s) beyond which each telemetry value is stale."""
         self.correction.aligner.tune(own_settings(self.sensor, self.driver, settings), ages)
 
     @property
     def sample_rate(self) -> float:
-        """Rate of the last readings, Hz; NaN while the sensor is silent."""
+        """Rate of the latest readings, Hz; NaN while the sensor is silent."""
         times = self._times
         span_us = times[-1] - times[0] if times and self.line.state == MAG_PORT_STATE.OK else 0
         return (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan
 
     def report(self) -> None:
-        """Send MAG_SENSOR."""
+        """Send MAG_SENSOR with the state and the counts of the sensor."""
         component = self._component
         component.outbox.send(
             "MAG_SENSOR",
@@ -392,12 +399,12 @@ def open_correction(
     main: Calibration | None,
     learner: Learner | None = None,
 ) -> tuple[Correction | ScalarCorrection, Calibration | None]:
-    """Return the correction of a sensor, and the calibration that it uses.
+    """Return the correction of a sensor, and the calibration that it uses, or None.
 
     `sensor`, `driver`, `config`: the sensor, its driver, and the configuration.
-    `own_calibration`, `main`: that of the sensor itself, and that of sensor 0.
-    `learner`: of sensor 0.
-    ConfigError: the link does not provide what the calibration needs.
+    `own_calibration`, `main`: calibrations of the sensor itself and of sensor 0, or None.
+    `learner`: online estimator of sensor 0, or None.
+    ConfigError: ``[telemetry]`` lacks a channel of the calibration, or has it in another unit.
     """
     settings = own_settings(sensor, driver, config.align)
     if is_scalar(driver):

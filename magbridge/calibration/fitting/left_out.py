@@ -1,20 +1,20 @@
-"""What a fit is worth on parts that it has not seen.
+"""Errors of a fit on held-out parts of the data.
 
 Notes
 -----
-At the fit, ``g / sigma^2 + L z = 0`` (g: half the gradient of the cost, L: precision of the prior). Without
-part k its Hessian and gradient are missing, so to first order::
+At the fit, ``g / sigma^2 + L z = 0`` (g: half the gradient of the cost, H: half its Hessian, L: precision of
+the prior). A fit without part k lacks the part's Hessian and gradient, so to first order::
 
     P_k = ((H - H_k) / sigma^2 + L)^-1,   z_k - z = P_k g_k / sigma^2
     e_i(z_k) = e_i + J_i (z_k - z),   s_i^2 = sigma^2 + J_i P_k J_i^T     for i in part k
 
-If the model is right, ``e_i / s_i`` has the variance 1, whichever parts are left out: runs, or the samples of
-like attitude, which tell how far the fit can be carried to attitudes that it has not seen. Its root mean
-square is Birge's ratio R (Birge 1932, Phys. Rev. 40:207): where it is larger than chance allows, the model
-lacks something of that size, and all sigmas are too small by R.
+If the model is right, ``e_i / s_i`` has the variance 1 for any held-out part. The parts are runs, or groups
+of samples with similar attitude, which test the fit at attitudes outside its data. The root mean square of
+``e_i / s_i`` is Birge's ratio R (Birge 1932, Phys. Rev. 40:207). If R exceeds 1 by more than chance allows,
+the model is incomplete, and all sigmas are too small by the factor R.
 
-This check needs the normal equations only. To first order two different fits can agree, so to prefer one to
-another each is fitted again without the part (:func:`error_between`).
+This check needs the normal equations only. Two different fits may agree to first order, so a comparison of
+fits repeats each fit without the part (:func:`error_between`).
 """
 
 from __future__ import annotations
@@ -33,42 +33,44 @@ from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
 PARTS, BLOCKS = 10, 4
-"""Number of parts of a log with runs, at most, and of blocks where it has fewer than three runs."""
+"""Largest number of parts of a log with runs, and number of blocks of a log with fewer than three runs."""
 ATTITUDES = 6
-"""Number of groups of samples with similar field directions, each of which is left out, too."""
+"""Number of groups of samples with similar field directions, which are also held out."""
 MAX_GROUP_AUTOCORRELATION = 0.98
-"""Autocorrelation of neighbours up to which groups of like attitude are left out."""
+"""Autocorrelation of successive residuals up to which groups of similar attitude are held out."""
 FORWARD_PARTS = 4
-"""Parts of a log in time, of which the earlier ones predict the next."""
+"""Number of successive parts of a log, each predicted from the earlier parts."""
 REFIT_STEPS = 10
-"""Largest number of Gauss-Newton steps of a fit without a part; it begins at the fit to all."""
+"""Largest number of Gauss-Newton steps of a fit without a part; it starts at the fit to all samples."""
 TESTED = 20_000
-"""Largest number of samples that are predicted."""
+"""Approximate number of samples in all parts that are predicted."""
 ISOLATED = 0.02
-"""Fraction of the samples up to which outliers are single wrong samples and do not count."""
+"""Largest fraction of outliers at which they count as single wrong samples and are not tested."""
 CHANCE = 2.0
-"""Standard errors by which R^2 must exceed 1 before it counts."""
+"""Number of standard errors by which R^2 must exceed 1 to be significant."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Errors of the parts left out, each predicted from the others."""
+    """Errors of held-out parts, each predicted from the other parts."""
 
     rms: float
-    """RMS error in the sensor's units, nT; an outlier counts as five sigmas."""
+    """RMS error, nT as the sensor measures; an outlier counts as five sigmas."""
     ratio: float
-    """RMS of errors over claimed sigmas, of parts or of groups; 1 where not more than chance."""
+    """RMS of errors over their predicted sigmas, for parts or for groups; 1 if it is not significantly
+    larger."""
     carried: float
-    """RMS that includes later parts predicted from the earlier ones, nT."""
+    """RMS error, nT, that also includes later parts predicted from the earlier parts."""
 
 
 def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitudes: bool = False) -> LeftOut:
-    """Predict each part of a fit's samples from the others, and later parts from the earlier ones.
+    """Return the errors of a fit on held-out parts, by linearised predictions from the other parts.
 
-    `runs` (n,): labels; whole runs are left out, or blocks of neighbours where there are few runs.
-    `attitudes`: leave out groups of like attitude, too, where neighbours that stay do not predict the group.
+    `runs` (n,): labels of the samples' runs; a part consists of whole runs, or of successive samples if the
+    log has few runs. `attitudes`: also hold out groups of similar attitude, unless the residuals are so
+    correlated that the remaining samples predict the group.
     """
-    # positions that come late in the log do not test the fit to its beginning
+    # predict later parts only for fits without positions: new positions would dominate the errors
     left = _left_out(found, _parts(runs), forward=found.samples.phi.shape[1] == 1)
     if attitudes and found.noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:
         apart = _left_out(found, _alike(found.samples))
@@ -77,7 +79,7 @@ def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitud
 
 
 def _left_out(found: CoefficientPosterior, parts: list[IndexArray], *, forward: bool = False) -> LeftOut:
-    """Predict each of the `parts` from the others and, if `forward`, from the earlier ones."""
+    """Return the errors of `parts` (rows), predicted from all others and, if `forward`, from earlier."""
     samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
     c = found.coefficients
     # Normal equations are sums over samples. Those without a part are the whole minus the part's, and one
@@ -104,7 +106,7 @@ def _left_out(found: CoefficientPosterior, parts: list[IndexArray], *, forward: 
         # prediction error, and its variance: noise plus J P J^T
         e.append(off + J @ (P @ lacking / s2_fit))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
-    # as many independent errors as the noise's memory allows
+    # number of independent errors, which the autocorrelation of the noise reduces
     count = len(samples.field) * effective_fraction(*noise.shape)
     among = _judged(np.concatenate(e[: len(parts)]), np.concatenate(s2[: len(parts)]), count)
     if not forward:
@@ -113,9 +115,9 @@ def _left_out(found: CoefficientPosterior, parts: list[IndexArray], *, forward: 
 
 
 def error_between(found: CoefficientPosterior, runs: NDArray[np.generic]) -> float:
-    """Return the RMS error of the parts left out, nT, each predicted by a fit without it.
+    """Return the RMS error, nT, of held-out parts, each predicted by a new fit without the part.
 
-    The labels `runs` (n,) as for :func:`leave_out`. Prior and noise stay those of the fit to all. An outlier
+    `runs` (n,): labels as for :func:`leave_out`. The new fits use the prior and noise of `found`. An outlier
     counts as five robust sigmas.
     """
     rows = np.arange(len(found.samples.field))
@@ -123,18 +125,18 @@ def error_between(found: CoefficientPosterior, runs: NDArray[np.generic]) -> flo
 
 
 def error_forward(found: CoefficientPosterior) -> float:
-    """Return the RMS error, nT, of parts of a log that a fit to the earlier parts alone is carried to.
+    """Return the RMS error, nT, of parts of a log, each predicted by a new fit to the earlier parts.
 
-    Forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
-    :data:`FORWARD_PARTS` parts predict the next one. Coefficients that the beginning of a log does not
-    determine count here, and so do later changes; neither counts where parts between others are held out.
+    The method is forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
+    :data:`FORWARD_PARTS` parts predict the next part. Unlike :func:`error_between`, this error includes
+    coefficients that the beginning of a log does not determine, and later changes of the vehicle.
     """
     parts = np.array_split(thinned_rows(len(found.samples.field)), FORWARD_PARTS)
     return _refitted_error(found, [(np.concatenate(parts[:k]), parts[k]) for k in range(1, FORWARD_PARTS)])
 
 
 def _refitted_error(found: CoefficientPosterior, splits: list[tuple[IndexArray, IndexArray]]) -> float:
-    """Return the RMS error, nT, of the second rows of each split, predicted by a fit to the first ones."""
+    """Return the RMS error, nT, over all splits, of the second rows predicted by a fit to the first rows."""
     samples, prior, noise = found.samples, found.prior, found.weighted
     weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
     errors = []
@@ -148,9 +150,12 @@ def _refitted_error(found: CoefficientPosterior, splits: list[tuple[IndexArray, 
 
 
 def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
-    """Return the ratio of errors (n,) over their variances, of which `count` are independent."""
+    """Return RMS and ratio of errors e (n,), nT, with predicted variances s2 (n,), nT².
+
+    `count`: number of independent errors.
+    """
     ratio2 = 1.0
-    for _ in range(20):  # an outlier counts as one just at the limit, and the limit grows with the ratio
+    for _ in range(20):  # an outlier counts as an error at the limit, which grows with the ratio
         last, limit = ratio2, OUTLIER_SIGMA**2 * ratio2
         ratio2 = max(float(np.minimum(e * e / s2, limit).mean()), 1.0)
         if ratio2 < 1.01 * last:
@@ -162,14 +167,14 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
 
 
 def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
-    """Return the rows of each part: runs, several in one where there are many; else blocks.
+    """Return the rows of each part: one or several runs, or a block of successive samples.
 
-    Blocks, too, where one run is most of the log, since the rest says little about it.
+    Parts are blocks if the log has fewer than three runs, or one run is more than half of it.
     """
     _, first, label, count = np.unique(runs, return_index=True, return_inverse=True, return_counts=True)
     if len(first) < 3 or count.max() > len(runs) / 2:
         return np.array_split(np.arange(len(runs)), BLOCKS)
-    # runs in the order of the log, several in one part where there are many
+    # runs in the order of the log; if there are many, a part has several runs
     order = np.argsort(np.argsort(first))  # labels in the order of the log
     part = order[label] * min(PARTS, len(first)) // len(first)
     return [np.flatnonzero(part == k) for k in range(part.max() + 1)]
@@ -190,7 +195,7 @@ def _normal(found: CoefficientPosterior, rows: IndexArray) -> NormalEquations:
 
 
 def _rows_of(samples: ResidualSamples, rows: IndexArray) -> ResidualSamples:
-    """Return these samples; neighbours across a gap are not successive."""
+    """Return the samples of `rows`; across a gap in the rows they count as independent."""
     part = samples.part(rows)
     part.steps[0] = np.inf
     part.steps[1:][np.diff(rows) > 1] = np.inf

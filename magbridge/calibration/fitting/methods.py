@@ -1,34 +1,33 @@
-r"""The methods of a fit: configurations of one loop (:mod:`.solve`).
+r"""Methods of a fit, which are configurations of one loop (:mod:`.solve`).
 
 Notes
 -----
-``auto`` has physical priors whose widths the evidence chooses. The start with the largest evidence wins; its
-scales must not have collapsed. Choosing the widths by leaving out
-one run at a time is not better (survey error 1.045 times the noise floor, against 1.036; median of 8 gliders)
-and takes hundreds of fits. Held-out parts check the fit: sigmas grow to what they show (:mod:`.left_out`),
-and where one ellipsoid predicts them better, it is taken.
+``auto`` fits polynomials with physical priors, whose widths maximise the evidence. It returns the start with
+the largest evidence, unless its scales have collapsed. Cross-validation over runs would need hundreds of fits
+to choose the widths, and is not better. Held-out parts test the fit: all sigmas grow until they agree with
+the errors (:mod:`.left_out`). If one ellipsoid predicts these parts better, ``auto`` returns the ellipsoid.
 
-``nominal`` (section 2.1 of the paper, see :mod:`magbridge.calibration.model`) is one block of nine numbers
-whose prior is given, and the error of its model lasts. On a glider's narrow range of attitudes a free
-ellipsoid can collapse: ``A -> 0`` with ``T -> infinity`` makes every residual zero. So scale and soft iron
-have a prior of physical width, and a fit that collapsed all the same is refused.
+``nominal`` (section 2.1 of the paper, see :mod:`magbridge.calibration.model`) fits one ellipsoid, with nine
+coefficients and a fixed prior. Its model error is correlated in time. On a glider's narrow range of attitudes
+a free ellipsoid can collapse: ``A -> 0`` with ``T -> infinity`` makes every residual zero. Therefore scale
+and soft iron have a prior of physical width, and the method rejects a fit that has collapsed.
 
-``cubic`` (section 2.2): every coefficient is a free polynomial, from a nominal start. Out of sample it is
-wrong in every direction that the runs do not determine; such combinations of coefficients keep the width
-:data:`FREE_SIGMA_NT`.
+``cubic`` (section 2.2 of the paper) fits free polynomials, starting at the nominal ellipsoid. Outside its
+data it is wrong in every combination of coefficients that the runs do not determine; these keep the prior
+width :data:`FREE_SIGMA_NT`.
 
-``runs`` (the first stage of section 2.2): an ellipsoid for each run, with a prior about the nominal ellipsoid
-of all runs, then polynomials through them, each run weighted by its precision::
+``runs`` (the first stage of section 2.2) fits an ellipsoid to each run, with a prior about the nominal
+ellipsoid of all runs. It then fits polynomials to these ellipsoids, each weighted by its precision::
 
     c = argmin sum_r (Phi_r c - c_r)^T Lambda_r (Phi_r c - c_r),   Lambda_r = H_r / sigma_r^2 + P
 
-``horizontal`` (Isezaki 1986, Korenaga 1995) uses the sizes of the horizontal and the vertical part of the
-field, which roll and pitch separate at any heading::
+``horizontal`` (Isezaki 1986, Korenaga 1995) fits the magnitude of the horizontal part of the field and the
+vertical part, which roll and pitch separate at any heading::
 
     l = R_y(pitch) R_x(roll) B (H_r - T),   |l_xy| = H_h,   l_z = Z
 
-with a full matrix ``B = R A``, A symmetric (polar decomposition). A tilt of half a degree puts 0.9 % of Z
-into H_h, 400 nT of 46,000 nT.
+with a full matrix ``B = R A``, A symmetric (polar decomposition). A tilt error of half a degree adds 0.9 % of
+Z to H_h, for example 400 nT of 46,000 nT.
 """
 
 from __future__ import annotations
@@ -69,20 +68,21 @@ from magbridge.wording import counted
 # ---- Polynomials with physical priors ----
 
 SHRUNK = 0.15
-"""Departure of the middle scale from 1 that no magnetometer has."""
+"""Departure of the middle scale factor from 1 above which a fit is implausible."""
 USUAL = 3
-"""The order that is usually enough: below it, the evidence is asked for one more."""
+"""Order that is usually sufficient; a fit of a lower order also computes the gain of the next order."""
 
 
 def fit_auto(
     data: Observations, order: int = 3, *, vehicle: Vehicle | None = None, known: Known | None = None
 ) -> Fit:
-    """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
+    """Fit polynomials up to a total degree with physical priors (method ``auto`` of the module's notes).
 
-    `order`: highest total degree. `vehicle`: where the masses sit, by parameter: their coefficients' prior is
-    then that of dipoles there. `known`: what the coefficients are expected to be, instead of physical widths.
+    `order`: highest total degree. `vehicle`: measured position of masses, by parameter; the prior of their
+    coefficients then consists of dipoles there. `known`: expected coefficients, instead of the physical
+    prior.
 
-    CalibrationError: no start converged, or the best one collapsed.
+    CalibrationError: no start converged, or the best fit collapsed.
     """
     # 1. coefficients, widths and noise that maximise the evidence, from several starts
     posed = pose(data, order, vehicle, known)
@@ -95,10 +95,10 @@ def fit_auto(
         if inner is not None:
             kept[kept] = inner
         return replace(found, details={**found.details, "flown": kept})
-    # 3. noise as a slow and a white part, where the residuals show both
+    # 3. noise as a slow and a white part, if the residuals show both
     best = with_slow_noise(best)
     check_scales(posed.samples, best.coefficients)
-    # 4. the posterior, and what held-out parts say of it
+    # 4. errors of the posterior on held-out parts
     left = leave_out(best, data.runs, attitudes=True)
     details = {
         "log_evidence": best.log_evidence,
@@ -108,7 +108,7 @@ def fit_auto(
         "widths_nT": dict(zip(best.family.names, np.exp(best.widths.eta).tolist(), strict=True)),
     }
     if known is None:
-        # always: the choice of parameters compares this error of fits with and without one
+        # always: the choice of parameters compares this error of fits with and without a parameter
         details["forward_nT"] = error_forward(best)
     found = assemble(data, posed, best, "auto", left, details, informative=True)
     if known is not None or (left.ratio <= 1.0 and data.names):
@@ -117,12 +117,12 @@ def fit_auto(
 
 
 def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
-    """Return the fit of one ellipsoid, if it predicts held-out parts better than `found`.
+    """Return the fit of one ellipsoid if it predicts held-out parts better than `found`, else None.
 
-    Both are fitted again without each part: parts among the others, and the later parts of the log from the
-    earlier ones. What counts is the geometric mean of the two errors' ratios. If the reference is nearly
-    constant, such errors reward a collapse: the ellipsoid is not taken if its scales are implausible, and
-    further from 1 than those of `found`.
+    The comparison uses the geometric mean of two error ratios: of parts predicted from all other parts, and
+    of later parts predicted from the earlier parts. If the reference is nearly constant, such errors favour a
+    collapsed fit. The ellipsoid is therefore rejected if its scales are implausible, and farther from 1 than
+    those of `found`.
     """
     try:
         posed, one, left = ellipsoid(data)
@@ -131,7 +131,7 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
     forward = error_forward(one) / found.details["forward_nT"]
     simpler = _nominal(data, posed, one, left)
     simpler.details["forward_nT"] = forward * found.details["forward_nT"]
-    if data.names:  # to first order is enough to compare fits that differ by their parameters
+    if data.names:  # errors to first order suffice to compare fits that differ by their parameters
         among = left.rms / found.details["left_out_nT"]
         return simpler if among * forward < 1.0 else None
     among = error_between(one, data.runs) / error_between(best, data.runs)
@@ -139,12 +139,15 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
 
 
 def _shrinks(found: Fit) -> float:
-    """Return departure of the middle scale from 1."""
+    """Return the departure of the middle scale factor of A from 1."""
     return abs(0.5 * sum(found.scales) - 1.0)
 
 
 def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
-    """Return the gain in log evidence of one more order; 0 if it has no fit, or the order is usual."""
+    """Return the gain in log evidence if the order is raised by one.
+
+    The gain is 0 if the fit has no parameters, its order is at least :data:`USUAL`, or a fit fails.
+    """
     if not data.names or order >= USUAL:
         return 0.0
     scores = []
@@ -160,18 +163,18 @@ def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
 # ---- One ellipsoid ----
 
 WEIGHT_ITERATIONS = 5
-"""Fits, each with the noise and the number of independent samples that the last one left."""
+"""Largest number of fits, each with the noise and the number of independent samples of the previous fit."""
 SAME_WEIGHT = 0.02
-"""Relative change of the weights below which they have converged."""
+"""Relative change of the weighting noise below which the fits have converged."""
 CHOOSING_SAMPLES, MAX_ELLIPSOID_SAMPLES = 3_000, 50_000
-"""Samples at most that choose the prior and the start, and that are fitted in the end."""
+"""Largest numbers of samples that choose the prior and the start, and of the final fit."""
 WIDTH_FACTORS = (1.0, 2.0, 4.0, 8.0)
-"""Factors of the prior widths of gain and soft iron. Fluxgates have scales within a few per cent of 1, some
-compasses of 0.8 to 1.5; parts left out, later ones predicted from earlier ones among them, choose one."""
+"""Factors of the prior widths of gain and soft iron, of which held-out errors choose one. Fluxgates have
+scale factors within a few per cent of 1, some compasses of 0.8 to 1.5."""
 WORTHWHILE_ERROR_RATIO = 0.7
-"""Share of the error on parts left out, below which a wider prior is taken."""
+"""Ratio of held-out errors with a wider and a narrower prior below which the wider prior is used."""
 CONVERGED_LOG_LIKELIHOOD_GAIN = 0.02
-"""Gain in log likelihood of one more step, below which a fit has converged."""
+"""Gain in log likelihood of one more step below which a fit has converged."""
 
 
 def fit_nominal(
@@ -182,7 +185,7 @@ def fit_nominal(
     equal_xz: bool = False,
     gain_sigma: float = GAIN_SIGMA,
 ) -> Fit:
-    """Return the fit of :func:`ellipsoid` as a calibration without parameters."""
+    """Fit one ellipsoid by :func:`ellipsoid`; return the fit, whose calibration has no parameters."""
     return _nominal(data, *ellipsoid(data, axes_fixed=axes_fixed, equal_xz=equal_xz, gain_sigma=gain_sigma))
 
 
@@ -205,10 +208,11 @@ def ellipsoid(
     scale_sigma: float = SOFT_IRON_SIGMA,
     gain_sigma: float = GAIN_SIGMA,
 ) -> tuple[Posed, CoefficientPosterior, LeftOut]:
-    """Fit one ellipsoid; return it with its problem, and its errors on parts left out.
+    """Fit one ellipsoid; return its problem, its posterior, and its errors on held-out parts.
 
-    `axes_fixed`: ``M = I``: no rotation, as the paper does. `equal_xz`: ``S_x = S_z``, as the paper does.
-    `scale_sigma`, `gain_sigma`: prior 1-sigma of soft iron, and of the gain common to all axes.
+    `axes_fixed`: set ``M = I`` (no rotation), as the paper does. `equal_xz`: set ``S_x = S_z``, as the paper
+    does. `scale_sigma`, `gain_sigma`: prior 1-sigma of soft iron, and of the gain common to all axes, as
+    fractions of the field.
 
     NoSolutionError: the fit collapsed or did not converge.
     """
@@ -241,7 +245,7 @@ def ellipsoid(
     one, left = best
     if len(few) == len(data):
         return posed, one, left
-    # the fit of more samples begins at that of a few, and is judged on all
+    # the fit of more samples starts at the fit of a few; its residuals include all samples
     one = _settled(replace(pose(bare.thinned(MAX_ELLIPSOID_SAMPLES), 0).samples, F_0=F_0), one.prior, one.z)
     one = replace(one, samples=posed.samples)
     weight = (np.abs(one.residual) <= OUTLIER_SIGMA * one.noise.sigma).astype(float)
@@ -252,7 +256,7 @@ def ellipsoid(
 def _settled(
     samples: ResidualSamples, prior: Prior, start_z: FloatArray | None = None
 ) -> CoefficientPosterior:
-    """Return the fit with a prior, from the better one of two starts or from `start_z` (q,) its minimum.
+    """Return the posterior of one ellipsoid with a prior, from `start_z` (q,), else the better of two starts.
 
     NoSolutionError: the fit collapsed or did not converge.
     """
@@ -273,7 +277,10 @@ def _settled(
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
-    """Return the prior precision, in units of the field, of the numbers that E leaves free."""
+    """Return the prior precision (q, q) of z in ``c = E z``, for coefficients c as fractions of the field.
+
+    `E` (9, q): constraints. `scale_sigma`, `gain_sigma`: 1-sigma of soft iron and of the common gain.
+    """
     # independent soft iron and hard iron, plus a gain that is common to the three axes
     covariance = np.diag(np.array([scale_sigma] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += gain_sigma**2
@@ -283,13 +290,14 @@ def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArr
 # ---- The paper's cubic polynomials ----
 
 REFERENCE_NOISE_RATIO = 1e4
-"""kappa at which all noise counts as the reference's: the residual is the paper's ``|A(H_r - T)| - H_e``."""
+"""Value of kappa that assigns all noise to the reference, so that the residual is proportional to the paper's
+``|A(H_r - T)| - H_e``."""
 FREE_SIGMA_NT = 1e4
-"""Prior 1-sigma of a free coefficient, nT: so wide that it only keeps steps finite."""
+"""Prior 1-sigma of a free coefficient, nT, which is wide enough not to affect determined coefficients."""
 
 
 def fit_cubic(data: Observations, order: int = 3) -> Fit:
-    """Fit all coefficients by damped least squares on the scalar residual; the paper's order is 3."""
+    """Fit free polynomials as the paper does, by damped least squares; the paper's order is 3."""
     # eq. 8: each of the nine coefficients is a polynomial in the positions; start with the nominal ones
     posed = pose(data, order)
     samples = replace(posed.samples, kappa=REFERENCE_NOISE_RATIO)
@@ -297,7 +305,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     start = np.zeros(size)
     with suppress(CalibrationError):  # without a nominal fit the start is a sensor without error
         start[:9] = ellipsoid(data, axes_fixed=True, equal_xz=True)[1].coefficients
-    # white noise: its samples have no steps; they cannot have determined more numbers than half of them
+    # white noise: infinite steps; the coefficients take at most half of the degrees of freedom
     alone = replace(samples, steps=np.full(len(data), np.inf))
     noise_of = partial(_noise_of, alone, min(float(size), len(data) / 2))
     wide = NoiseModel(float(np.std(residuals_of(samples, start))) or 1e-9)
@@ -312,7 +320,10 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
 def _noise_of(
     samples: ResidualSamples, free: float, prior: Prior, found: Solution, _: NoiseModel
 ) -> tuple[NoiseModel, NoiseModel]:
-    """Return the noise of the residuals of a fit with `free` parameters, to state and to weigh with."""
+    """Return the noise of a fit's residuals twice: of a sample, and for weighting.
+
+    `free`: number of parameters that the fit determines.
+    """
     noise = estimate_noise(residuals_of(samples, prior.coefficients(found.z)), samples.steps, free)
     return noise, noise
 
@@ -320,17 +331,17 @@ def _noise_of(
 # ---- An ellipsoid for each run, then polynomials through them ----
 
 MIN_RUN_SAMPLES = 20
-"""Samples of a run that is fitted."""
+"""Smallest number of samples of a run for which an ellipsoid is fitted."""
 MAX_MONOMIAL_DIFFERENCE = 0.05
-"""Largest difference of a monomial from the run's median in a sample with the masses at rest."""
+"""Largest difference of a monomial from the run's median at which the masses count as at rest."""
 RUN_SIGMA_FRACTIONS = np.array([0.005] * 6 + [0.02] * 3)
 """1-sigma of a run's nine coefficients about the nominal ellipsoid, as fractions of the field."""
 
 
 def fit_per_run(data: Observations, order: int = 3) -> Fit:
-    """Fit every run on its own, then polynomials through the runs.
+    """Fit an ellipsoid to each run, then polynomials of the positions to the ellipsoids (method ``runs``).
 
-    CalibrationError: fewer runs than the order plus one.
+    CalibrationError: the number of usable runs is smaller than the order plus one.
     """
     posed = pose(data, order)
     samples = posed.samples
@@ -343,7 +354,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     for label in np.unique(data.runs):
         rows = data.runs == label
         typical = np.median(samples.phi[rows], axis=0)
-        # only samples with the masses at rest: one run is one position
+        # use samples with the masses at rest only, because a run represents one position
         rows &= np.abs(samples.phi - typical).max(axis=1) < MAX_MONOMIAL_DIFFERENCE
         if rows.sum() < MIN_RUN_SAMPLES:
             continue
@@ -368,7 +379,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
 def _assembled(
     data: Observations, posed: Posed, coefficients: FloatArray, covariance: FloatArray, method: str
 ) -> Fit:
-    """Return a fit whose coefficients were found without a common posterior."""
+    """Return a fit with coefficients (9 m,), nT, and a covariance from a method without a joint posterior."""
     samples, free = posed.samples, 0.0 if method == "runs" else 9.0
     check_scales(samples, coefficients)
     noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, free)
@@ -382,17 +393,17 @@ def _assembled(
 # ---- The horizontal fit ----
 
 MIN_LEVELLED_SAMPLES = 30
-"""Samples that an ellipsoid's twelve unknowns need."""
+"""Smallest number of samples for the twelve unknowns of the horizontal fit."""
 DIFFERENCE_STEP = 1e-6
-"""Step of B, and of T over the field: the symmetric difference over it is good to 1e-9."""
+"""Step of B, and of T over the field, for symmetric differences, whose relative error is 1e-9."""
 FIRST_NOISE_FRACTION = 1e-3
-"""Noise that attitude errors make, before it is estimated, as a fraction of the field."""
+"""Initial value of the noise that attitude errors cause, as a fraction of the field."""
 
 
 def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
-    """Fit one ellipsoid by levelled components.
+    """Fit one ellipsoid to the horizontal and vertical parts of the field (method ``horizontal``).
 
-    CalibrationError: roll and pitch, or the reference's direction, are lacking.
+    CalibrationError: roll and pitch, or the reference's direction, are missing.
     """
     if data.attitude is None or data.reference_ned is None:
         raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")
@@ -417,7 +428,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         parts = np.concatenate([np.hypot(l[:, 0], l[:, 1]) - horizontal, l[:, 2] - vertical])
         return np.concatenate([parts / sigma, x / widths])
 
-    # robust least squares, each time with the noise that the last one left
+    # robust least squares, each time with the noise of the previous fit
     sigma, x = FIRST_NOISE_FRACTION * F_0, np.zeros(12)
     for _ in range(3):
         found = least_squares(misfit, x, args=(sigma,), loss="soft_l1", f_scale=3.0)
@@ -432,7 +443,10 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
 
 
 def _ellipsoid_of(x: FloatArray, F_0: float) -> FloatArray:
-    """Return the nine coefficients (nT) for B and T: A of ``B = R A``, and T."""
+    """Return the nine coefficients (nT) of A, from the decomposition ``B = R A``, and of T.
+
+    `x` (12,): ``B - I`` row by row, then T over `F_0`.
+    """
     _, A = polar(np.eye(3) + x[:9].reshape(3, 3))
     a = F_0 * (A - np.eye(3))
     return np.concatenate([a[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], F_0 * x[9:]])
