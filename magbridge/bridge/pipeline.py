@@ -1,4 +1,4 @@
-"""The bridge without its ports: events in, frames out. Equal events always give equal bytes."""
+"""Processing of the bridge without its ports, from events to frames; equal events give equal bytes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
 ATTITUDE_ID: Final = spec("ATTITUDE").id
 HEADING_INPUTS: Final = frozenset((ATTITUDE_ID, EKF_STATUS, PX4_STATUS, spec("HEARTBEAT").id))
-"""Messages from which the heading is computed and sent."""
+"""Ids of the messages that the computation of the heading uses."""
 ANNOUNCED_FLAGS = int(
     Quality.STALE_TELEMETRY
     | Quality.SATURATED
@@ -60,20 +60,22 @@ ANNOUNCED_FLAGS = int(
     | Quality.OFFSET_SUSPECT
     | Quality.UNEXPLAINED
 )
-"""Flags whose changes are announced; the others change with every manoeuvre."""
+"""Quality flags whose changes are sent as STATUSTEXT; other flags change with every manoeuvre."""
 
 
 class Pipeline:
-    """Sensor bytes, link bytes and changes of state in; MAVLink frames and sensor commands out.
+    """Processor of events (sensor bytes, link bytes, changes of state) to MAVLink frames and sensor commands.
 
-    `key`: the signing key.
-    `navigate`: makes the navigation of ``[navigation]`` for the component that sends its messages.
+    `calibration`: calibration of the first sensor, or None.
+    `start`: state at the start of the run.
+    `key`: key of 32 bytes for signing; None for a link without signatures.
+    `navigate`: function that creates the navigation service; None without ``[navigation]``.
     `more`: calibrations of the sensors after the first, by sensor id.
-    `component`: the MAVLink side.
-    `recorder`: all inputs and outputs since it was last drained: the records for the log.
+    `component`: the MAVLink component.
+    `recorder`: records for the log of all inputs and outputs since the recorder was last drained.
     `streams`: the sensors; the first is the main sensor.
-    ConfigError: a driver, an option, a message, a field or a rate that does not exist; a calibration that
-        needs a parameter which ``[telemetry]`` does not provide, or in another unit.
+    ConfigError: a driver, option, message, field or rate is not valid, or ``[telemetry]`` lacks a parameter
+        of a calibration or has it in another unit.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class Pipeline:
         self._begin(start, used, foreign=foreign)
 
     def _open_component(self) -> Component:
-        """Return the MAVLink side, with what can be tuned and the messages that are needed."""
+        """Return the MAVLink component, with its parameters and the needed rates of messages."""
         config, start = self._config, self._start
         tunables = [*alignment(config.align), *telemetry_ages(config.telemetry), *file_rate()]
         if config.learning is not None:
@@ -153,7 +155,10 @@ class Pipeline:
     def _other_streams(
         self, drivers: Sequence[Driver], calibrations: Mapping[int, Calibration], main: Calibration | None
     ) -> Iterator[SensorStream]:
-        """Yield the sensors after the first, each with its own calibration; `main` is that of the first."""
+        """Yield the sensors after the first.
+
+        `calibrations`: calibrations of these sensors, by sensor id. `main`: calibration of the first sensor.
+        """
         config, component = self._config, self.component
         for sensor, driver in zip(config.more_sensors, drivers, strict=True):
             number = sensor.id or 0
@@ -166,7 +171,7 @@ class Pipeline:
 
     @property
     def declarations(self) -> list[bytes]:
-        """The frames that every file of the log begins with."""
+        """Frames at the begin of each log file, which declare its columns."""
         own, parameters = self._config.link, self.component.parameters
         keys = [row.key for row in parameters.table.values()]
         settings = {key: parameters.value_of(key) for key in keys if key.startswith(("align.", "telemetry."))}
@@ -176,7 +181,7 @@ class Pipeline:
 
     @property
     def deadline(self) -> int:
-        """µs since 1970 UTC by which :meth:`feed` must be called, if only with an empty event."""
+        """Time by which :meth:`feed` must be called, if only with an empty event, µs since 1970 UTC."""
         return self.component.next_deadline
 
     def feed(self, event: Event) -> list[tuple[int, bytes]]:
@@ -185,7 +190,7 @@ class Pipeline:
         outbox, time_us, channel, data = component.outbox, event.time_us, event.channel, event.data
         if channel is Channel.STATE and data and (held_us := self._changes.held_up(data)):
             for name in ("autopilot", *(stream.line.timer for stream in self.streams)):
-                component.timers.delay(name, held_us)  # who was not listened to was not silent
+                component.timers.delay(name, held_us)  # during a stall, silence cannot be observed
         component.advance(time_us)
         due = outbox.drain() if outbox.frames else []
         recorder.sent(due)
@@ -210,13 +215,16 @@ class Pipeline:
         return due + answers if due else answers
 
     def interleaved(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
-        """Return the frames of messages that are sent besides those of :meth:`feed` and are not logged."""
+        """Return the bytes of messages to send that are not logged; the log records only their number.
+
+        `messages`: layout and packed payload of each message.
+        """
         codec = self.component.codec
         self.recorder.state(codec.now_us, events.interleaved(len(messages)))
         return b"".join([codec.frame(layout, payload) for layout, payload in messages])
 
     def _set_late(self, since_us: int) -> None:
-        """Set since when inputs may have waited, µs; 0: they did not."""
+        """Set the time since which inputs may have waited in a buffer, µs; 0 if they did not wait."""
         for stream in self.streams:
             stream.correction.aligner.late_since_us = since_us
 
@@ -233,7 +241,7 @@ class Pipeline:
                     self._process(other, sample, corrected)
 
     def _process(self, stream: SensorStream, sample: Sample, corrected: Corrected) -> None:
-        """Check, use and publish a corrected sample."""
+        """Check a corrected sample, pass it to navigation, heading and learning, and publish it."""
         if self._comparisons:
             call, compare = self._parts.call, self._compare
             corrected = call("comparison of sensors", corrected, compare, stream, sample.time_us, corrected)
@@ -260,7 +268,7 @@ class Pipeline:
             self._parts.call("learning", None, self.learning.sample, sample.time_us)
 
     def _compare(self, stream: SensorStream, time_us: int, corrected: Corrected) -> Corrected:
-        """Return a sample with the flags and the sigma that the comparison of the sensors adds."""
+        """Return `corrected` with flags and sigmas updated by the comparison of the sensors."""
         stated = corrected.stated_sigma
         total = corrected.total_field, stated
         main = corrected.main_field, stream.correction.aligner.settings.reference_sigma
@@ -277,7 +285,7 @@ class Pipeline:
                 comparison.message = ""
         if isinstance(stream.correction, Correction):
             stream.correction.is_contradicted = bool(flags or variance)
-        # the checks of the sensor itself may have added that difference already
+        # the checks of the sensor itself may have added this variance already
         missing = stated * stated + variance - corrected.total_field_sigma**2
         if not flags and not (variance and missing > 0.0):
             return corrected
@@ -288,7 +296,7 @@ class Pipeline:
         return replace(corrected, total_field_sigma=sigma, field_sigma=(x, y, z), quality=quality)
 
     def _attitude(self, sample: Sample, corrected: Corrected) -> Attitude:
-        """Return the attitude at a sample with the heading that follows from the corrected field."""
+        """Return the attitude at a sample, with the heading computed from the corrected field."""
         time_us, correction = sample.time_us, self._correction
         assert self.heading is not None
         assert isinstance(correction, Correction)
@@ -324,11 +332,11 @@ class Pipeline:
         component.received.clear()
 
     def _is_autopilot(self, message: Message) -> bool:
-        """Return True if the autopilot sent a message."""
+        """Return True if the autopilot sent `message`."""
         return message.component == self._config.link.autopilot
 
     def _locate(self, message: Message, time_us: int) -> None:
-        """Use the autopilot's position; report that another component sends one, too, and ignore that."""
+        """Use a position of the autopilot; ignore the position of another component and report it once."""
         if self._is_autopilot(message):
             self._parts.call("position", None, self._position.update, message, time_us)
         elif message.component not in self._ignored_positions:
@@ -338,7 +346,7 @@ class Pipeline:
             )
 
     def _turn(self, message: Message, time_us: int) -> None:
-        """Set the vehicle's attitude, with which the vector's direction is compared."""
+        """Pass the vehicle's attitude and the main field to the check of the measured field's direction."""
         if self._direction is not None:
             utc_us = time_us + self.component.codec.utc_offset_us
             main_field = self._position.main_field(time_us, utc_us)
@@ -346,7 +354,7 @@ class Pipeline:
             self._direction.attitude(time_us, message["roll"], message["pitch"], message["yaw"])
 
     def _tune(self, _: str = "") -> None:
-        """Apply the present values of the parameters to the alignment."""
+        """Apply the present values of the parameters to the alignment of samples with telemetry."""
         parameters = self.component.parameters
         settings = {name: parameters.value_of(f"align.{name}") for name in Align.__struct_fields__}
         ages = {name: parameters.value_of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
@@ -367,14 +375,17 @@ class Pipeline:
         stream.correction.notices.clear()
 
     def _field_of(self, stream: SensorStream) -> str:
-        """Return the name of a sensor's field in messages."""
+        """Return the name of a sensor's field for STATUSTEXTs."""
         return f"field of {stream.sensor.label}" if len(self.streams) > 1 else "field"
 
     def _report_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
 
     def _begin(self, start: StartEvent, calibration: Calibration | None, *, foreign: bool) -> None:
-        """Record what a replay needs, and announce the calibration in use."""
+        """Record the frames that a replay needs, and send a STATUSTEXT about the calibration in use.
+
+        `foreign`: True if the calibration is of another type of sensor, and so is not used.
+        """
         for frame in self.beginning(start.parameters):
             self.recorder.state(start.time_us, frame)
         self._changes.check_clock()
@@ -394,18 +405,18 @@ class Pipeline:
                 send_statustext("calibration is not supported by its data", MAV_SEVERITY.WARNING)
 
     def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
-        """Return the frames that record how the run started, with these values of the parameters."""
+        """Return the frames that record the start of the run, with these values of `parameters` by name."""
         return beginning(self._config, self._start, self._calibration_id, parameters)
 
     def _status(self) -> dict[str, Any]:
-        """Return the fields of MAG_STATUS about sensor, samples and log."""
+        """Return the fields of MAG_STATUS about sensor, samples and log, by name."""
         now_us, main = self.component.codec.now_us, self.streams[0]
         tracks = self._correction.aligner.by_name
         stale = 0
         for bit, name in enumerate(self._config.telemetry):
             if bit < 32 and name in tracks and tracks[name].stale(now_us):
                 stale |= 1 << bit
-        # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
+        # count unsent frames, too: in a replay, several timers may fire before the outbox is drained
         records = self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0
         return {
             "samples": main.samples & MASK,
@@ -426,11 +437,11 @@ class Edge(Protocol):
     """Source of events and destination of bytes."""
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield events in order; at least an empty one by `deadline` (µs)."""
+        """Yield events in order; yield an empty event if none came by the time ``deadline()`` (µs)."""
         ...
 
     def send(self, number: int, data: bytes) -> None:
-        """Send to the link or to a sensor, by its MAG_PORT_NAME."""
+        """Send `data` to the link or to a sensor; `number` is the MAG_PORT_NAME of the port."""
         ...
 
     def credit(self, frames: list[bytes]) -> None:
@@ -441,8 +452,7 @@ class Edge(Protocol):
 def set_up(config: Config, start: StartEvent) -> Pipeline:
     """Return the pipeline that a configuration describes.
 
-    ConfigError, FormatError, CalibrationError: the content of the configuration, or of a file that it names,
-    is wrong.
+    ConfigError, FormatError, CalibrationError: the configuration, or a file that it names, is not valid.
     """
     calibration = first_calibration(config)
     key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
@@ -455,7 +465,11 @@ def set_up(config: Config, start: StartEvent) -> Pipeline:
 
 
 def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after_event: Callable[[int], None]) -> None:
-    """Feed the pipeline until the edge ends; call ``after_event(time_us)`` after each event."""
+    """Pass the events of `edge` to the pipeline until they end; send and log the results.
+
+    `log`: log for the records; None without a log.
+    `after_event`: function that is called with the event's time (µs) after each event.
+    """
     for event in edge.events(lambda: pipeline.deadline):
         sent = pipeline.feed(event)
         if pipeline.component.genuine:

@@ -1,4 +1,4 @@
-"""Recognise the device on a serial line: a fluxgate, an autopilot, a GPS, or an unknown one."""
+"""Recognition of the device on a serial line: a magnetometer, an autopilot, a GPS, or unknown."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from magbridge.sensors.framing import nmea_checksum
 __all__ = ["BAUDRATES", "Recognised", "SerialDevice", "listen", "ports", "recognise"]
 
 BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
-"""Bit/s at which a line is listened to, the most usual first."""
+"""Baud rates at which the device is searched, the most common first, bit/s."""
 NMEA_0183 = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
 TEXT_LINE = re.compile(rb"[^\r\n]+[\r\n]")
 TEXT_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
 SHOWN = 60
-"""Characters shown of a line that is not understood."""
+"""Most characters of an unrecognised line that are printed."""
 BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
-"""Error numbers of a port that another program has opened for itself."""
+"""Error numbers of a port that another program has opened exclusively."""
 MIN_RECOGNISED = 3
-"""Readings or frames by which a sender is known."""
+"""Smallest number of readings or frames by which a sender is recognised."""
 
 
 class Recognised(NamedTuple):
-    """Sender recognised on a line."""
+    """Sender that was recognised on a line."""
 
     who: str
-    """``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came."""
+    """Kind: ``mavlink``, ``nmea``, the name of a driver, ``text`` or ``bytes``; empty without any bytes."""
     text: str
-    """More of it, for people: rates, systems, the first line that cannot be parsed."""
+    """Description for the user: rate, systems, or a line that cannot be parsed."""
 
 
 class SerialDevice(NamedTuple):
-    """A serial port of this computer."""
+    """Serial port of this computer."""
 
     device: str
     description: str
-    """What the USB says of it."""
+    """Manufacturer, product and serial number, as the USB device states them."""
 
 
 def ports() -> list[SerialDevice]:
-    """Return the serial ports with hardware."""
+    """Return the serial ports of this computer to which hardware is attached."""
     found = [one for one in list_ports.comports() if one.hwid != "n/a" or one.vid is not None]
     return [SerialDevice(one.device, _described(one)) for one in sorted(found)]
 
@@ -68,11 +68,11 @@ def _described(device: Any) -> str:
 def listen(
     device: str, baudrates: Sequence[int] = BAUDRATES, seconds: float = 1.5
 ) -> tuple[Recognised, int | None, bytes]:
-    """Recognise the sender on a device, its baud rate, and the bytes received; nothing is sent.
+    """Return the sender on a device, its baud rate (None if unknown), and the received bytes; send nothing.
 
     `device`: a device or a pyserial URL.
-    `baudrates`: tried in turn, until one is understood.
-    `seconds`: for each.
+    `baudrates`: baud rates to try in this order, until the sender is recognised.
+    `seconds`: time for each baud rate, s.
     PortError: the device cannot be opened.
     """
     best, at, came = Recognised("", "silent"), None, b""
@@ -86,13 +86,13 @@ def listen(
             return recognised, baudrate, data
         if (recognised.who == "text") > (best.who == "text") or (recognised.who and not best.who):
             best, at, came = recognised, baudrate, data
-        if "://" in device:  # a network's line has no baud rate of ours
+        if "://" in device:  # the baud rate has no effect on a line over the network
             break
     return best, at, came
 
 
 def _refusal(device: str, error: Exception) -> str:
-    """Return why a port cannot be opened, and what to do."""
+    """Return why a port cannot be opened, and the remedy."""
     if getattr(error, "errno", None) in BUSY:
         users = _users(device)
         return f"busy: {users or 'another program'} has opened it; stop that program, then repeat"
@@ -106,7 +106,7 @@ def _users(device: str) -> str:
     """Return the programs that hold a device open, as far as this user may see them; empty if unknown."""
     found, real = set(), Path(device).resolve()
     for link in Path("/proc").glob("[0-9]*/fd/*"):
-        with suppress(OSError):  # another user's process, or one that has ended
+        with suppress(OSError):  # another user's process, or a process that has ended
             process = link.parts[2]
             if link.readlink() == real and int(process) != os.getpid():
                 found.add(f"{Path('/proc', process, 'comm').read_text().strip()} (process {process})")
@@ -126,7 +126,7 @@ def _read(device: str, baudrate: int, seconds: float) -> bytes:
 
 
 def recognise(data: bytes, seconds: float) -> Recognised:
-    """Return the sender of these bytes, received within `seconds`."""
+    """Return the sender of `data`, which were received within `seconds`."""
     if not data:
         return Recognised("", "silent")
     for known in (_mavlink(data), _nmea(data), *_drivers(data, seconds)):
@@ -164,7 +164,7 @@ def _nmea(data: bytes) -> Recognised | None:
 
 
 def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
-    """Yield the built-in drivers that recognise the bytes without a request."""
+    """Yield each built-in driver that finds readings in `data`, received within `seconds`."""
     for name in DRIVERS:
         for options in OPTIONS.get(name, ({},)):
             kind = driver_class(name, "ports")
@@ -181,8 +181,8 @@ def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
 
 
 OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {
-    "ascii": (),  # any line of numbers would do: it has to be described
+    "ascii": (),  # not tried, because any line of numbers would match
     "digitizer": ({"sensitivity": 1e-5},),
     "hmr2300": ({"output": "ascii"}, {"output": "binary"}),
 }
-"""Driver -> the options to try; the sensitivity says nothing about the line."""
+"""Driver -> sets of options to try; the sensitivity has no effect on the recognition."""

@@ -1,4 +1,4 @@
-"""Iterations of a joint fit to a survey: coefficients, widths and field in turn, until no residual moves."""
+"""Iterations of a joint fit to a survey, which alternate coefficients, prior widths and crustal field."""
 
 from __future__ import annotations
 
@@ -55,21 +55,28 @@ from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """State of the iterations; `lacking` (n,), nT, is added to the reference at every sample."""
+    """Solution of the joint fit after an iteration."""
 
     z: FloatArray
+    """(q,): Unknowns other than the field: coefficients, and those of the blocks."""
     w: FloatArray
+    """(nodes,): Coefficients of the crustal field."""
     sums: SampleSums
+    """Normal equations from which z and w follow."""
     choice: Choice
+    """Chosen field and autocorrelation of the noise."""
     widths: Hyperparameters
+    """Prior widths (their logarithms eta) and noise."""
     family: PriorFamily
     lacking: FloatArray
+    """(n,): Part of the true field that the reference lacks: crustal field, bias and slow changes, nT."""
     score: float
+    """Natural logarithm of the evidence."""
 
     def covariance(self) -> FloatArray:
-        """Return the covariance of z (q, q) at the likeliest size and length of the field.
+        """Return the covariance of z (q, q) at the likeliest amplitude and length of the field.
 
-        Averaging over other sizes and lengths changes the normalised error of a survey by 0.0001.
+        An average over other amplitudes and lengths would change the normalised error of a survey by 0.0001.
         """
         choice = self.choice
         reduced = eliminate_field(self.sums, choice.field, choice.ratio, choice.rho)
@@ -80,38 +87,42 @@ class Answer:
 # ---- The iterations ----
 
 INITIAL_ITERATIONS = 2
-"""Iterations before the field is searched: before, coefficients look like crustal field."""
+"""Number of iterations before the search of the field, because initially errors of the coefficients look like
+crustal field."""
 SEARCHES = 2
-"""Further iterations in which the search continues."""
+"""Number of further iterations in which the search continues."""
 MAX_SURVEY_ITERATIONS = 40
-"""Largest number of iterations; six are usual, twenty from a start 10,000 nT off."""
+"""Largest number of iterations; six are usual, twenty if the start is wrong by 10,000 nT."""
 MAX_LATE_ITERATIONS = 8
-"""Iterations after the search in which the fit should converge; a bent track needs more."""
+"""Number of iterations after the search, after which the optional terms are selected at the latest."""
 MAX_LAST_CHANGE = 0.05
-"""RMS change of the residuals, as a fraction of the noise, at which the fit has converged."""
+"""RMS change of the residuals, as a fraction of the noise, below which the fit has converged."""
 FIT_OUTLIER_SIGMA = 5.0
-"""Robust sigmas beyond which a sample is left out."""
+"""Residual beyond which a sample is excluded, in robust sigmas."""
 OVERSHOT = 10.0
-"""Growth of the objective from which on a step is shortened."""
+"""Factor of growth of the objective above which a step is halved."""
 MIN_ITERATION_STEP = 1e-3
-"""Smallest fraction of a step."""
+"""Smallest fraction to which a step is shortened."""
 SEARCHED, WIDE = 12_000, 5_000.0
-"""Number of samples about the middle that the field's size and length are searched with, and distance, m:
-where there are more samples within it, every second or third is used."""
+"""The search of the field's amplitude and length uses the SEARCHED samples nearest to the middle, or all
+within WIDE m. If these are too many, it uses every second, third ... sample of them."""
 FIRST_SAMPLES = 50_000
-"""Samples with which the iterations converge, before those with all of a longer log."""
+"""Approximate number of samples with which a longer log converges, before it continues with all."""
 NOISE_ALONE: dict[str, Any] = {"move_ratio": False, "move_length": False, "steps": 16}
-"""Search of the noise's autocorrelation alone, with all samples."""
+"""Arguments of :func:`climb` for a search of the noise's autocorrelation only."""
 MAX_SAMPLE_NODES = 40_000
-"""Largest number of nodes about all samples."""
+"""Approximate largest number of nodes around all samples."""
 
 
 class Rounds:
-    """Alternate coefficients, widths and the field until no residual moves."""
+    """Iterative solver of a joint fit, which alternates coefficients, prior widths and field.
+
+    `survey`: data of the fit. `family`: prior of the coefficients.
+    """
 
     def __init__(self, survey: SurveySamples, family: PriorFamily) -> None:
         self.survey, self.own, self.q = survey, family, family.E.shape[1]
-        # the field is searched in the rounds up to `until`, and only then may the iterations end
+        # iterations up to `until` search the field; the fit may end only after them
         self.until = INITIAL_ITERATIONS + SEARCHES
         self.offers = any(one.offered for one in survey.groups)
         self.family = with_blocks(family, survey.groups)
@@ -130,15 +141,15 @@ class Rounds:
         self.nodes = self.choice.field.nodes
         self.last: FloatArray | None = None
         self.unsure: set[str] = set()
-        """Offers that are kept but gain little: with another field the log may not need them."""
+        """Names of optional terms that stay but gain little; a fit with another field may omit them."""
 
     @property
     def names(self) -> set[str]:
-        """Names of the groups that are in the fit."""
+        """Names of the blocks of unknowns in the fit."""
         return {group.name for group in self.survey.groups}
 
     def worth(self, answer: Answer) -> float:
-        """Return the log evidence, less the prices of samples left out and of optional terms."""
+        """Return the log evidence of `answer` minus penalties for excluded samples and optional terms."""
         # a sample at the limit costs half its squared residual, and the logarithm of sigma
         survey, each = self.survey, 0.5 * FIT_OUTLIER_SIGMA**2 + float(np.log(answer.widths.sigma))
         left_out = int((survey.at_rest & ~survey.kept).sum())
@@ -149,7 +160,7 @@ class Rounds:
         )
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
-        """Continue with all samples, of which those so far were every `step`-th, without a search."""
+        """Continue with all samples, `survey`, and no search, after a fit of every `step`-th sample."""
         self.survey, self.until = survey, -1
         # samples are now closer by `step`: AR(1) noise has rho^(1/step) between neighbours
         self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
@@ -161,20 +172,20 @@ class Rounds:
         self.choice = climb(self._sums(field), self.choice, weighed, **NOISE_ALONE)
 
     def settle(self) -> Answer:
-        """Return the answer; NoSolutionError: the iterations do not converge."""
+        """Return the converged solution; NoSolutionError: the iterations do not converge."""
         survey, moved = self.survey, np.inf
         for turn in range(MAX_SURVEY_ITERATIONS):
-            # dipoles are not linear in their places: linearise the prior about the last answer
+            # dipoles are not linear in their positions: linearise the prior about the last solution
             if self.own.renew is not None and turn:
                 self.own = self.own.renew(self.z[: self.q])
                 self.family = with_blocks(self.own, survey.groups)
             answer = self._round(turn)
             e = self._residuals(answer.z, answer.lacking)
-            # converged when the residuals no longer move, whatever combination of coefficients still does
+            # the fit has converged when the residuals no longer change, even if coefficients still do
             if self.last is not None:
                 moved = float(np.sqrt(np.mean((e - self.last) ** 2)))
             self.last = e
-            # leave outliers out only when the residuals are no longer those of a wrong start
+            # exclude outliers only after the first iterations, whose residuals show the wrong start
             if turn >= INITIAL_ITERATIONS:
                 survey.kept = survey.at_rest & (np.abs(e) <= FIT_OUTLIER_SIGMA * robust_scale(e))
             still = turn > self.until and moved < MAX_LAST_CHANGE * self.sigma
@@ -187,7 +198,7 @@ class Rounds:
         return answer
 
     def _round(self, turn: int) -> Answer:
-        """Search the field if it is due, and solve the problem linearised about the last answer."""
+        """Return the solution after iteration number `turn`, which may include a search of the field."""
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
         if searched := self.until - SEARCHES <= turn <= self.until:
             self._search(weighed, anew=turn == self.until - SEARCHES)
@@ -216,9 +227,12 @@ class Rounds:
         return Answer(self.z, self.w, sums, choice, widths, self.family, lacking, score)
 
     def _search(self, weighed: Weighed, *, anew: bool) -> None:
-        """Choose the field with a part of the samples, and put it on nodes about all of them."""
+        """Choose the field with a part of the samples, and set it up on nodes around all samples.
+
+        `anew`: search over all lengths instead of from the last choice.
+        """
         place, before = self.survey.place[self.part], self.choice
-        # first from nothing over a ladder of lengths, later from the last choice
+        # first over a ladder of lengths, later from the last choice
         if anew:
             found = choose(self._few, place, weighed, before.ratio, harmonic=self.harmonic)
         else:
@@ -232,7 +246,7 @@ class Rounds:
         self.choice = self._everywhere(replace(found, rho=found.rho ** (1.0 / self.step)))
 
     def _everywhere(self, choice: Choice) -> Choice:
-        """Return a choice that was made with a part of the samples on nodes about them all."""
+        """Return a choice that was made with a part of the samples, with its nodes around all samples."""
         if self.part.all():
             return choice
         field = choice.field
@@ -240,12 +254,13 @@ class Rounds:
         return replace(choice, field=replace(field, nodes=nodes))
 
     def _weigh_offers(self, turn: int) -> None:
-        """Keep the optional terms that the log needs, and continue without the others.
+        """Keep the optional terms that the evidence supports, and remove the others from the fit.
 
-        Called after the iterations converged with all terms: until then the terms fit outliers.
+        The solver calls this after the iterations have converged with all terms, because before the terms fit
+        outliers. `turn`: number of the iteration.
         """
-        # keep a term if its evidence pays its price; the terms that stay without being decisive are noted,
-        # and a search without them follows
+        # keep a term if its evidence exceeds the penalty; note terms that are not decisive, because a
+        # search without them follows
         survey, choice = self.survey, self.choice
         self.offers = False
         reduced = eliminate_field(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
@@ -257,8 +272,8 @@ class Rounds:
             self.until = turn + SEARCHES
 
     def _regroup(self, groups: tuple[ParameterBlock, ...]) -> None:
-        """Continue with other blocks of unknowns; blocks that stay keep their values."""
-        # read the present values by name, and put them where the same group stands in the new order
+        """Continue with the blocks of unknowns `groups`; blocks that stay keep their values and widths."""
+        # read the present values by name, and copy them to the position of the same block in the new order
         at, width, row, column = {}, {}, self.q, len(self.own.centre)
         for one in self.survey.groups:
             at[one.name], width[one.name] = self.z[row : row + len(one.shape)], self.eta[column : column + 1]
@@ -273,9 +288,12 @@ class Rounds:
     def _damped(
         self, step: FloatArray, reduced: FieldEliminated, field: GaussianField
     ) -> tuple[FloatArray, FloatArray]:
-        """Return z after the step (q,), shortened while it overshoots, and what the reference lacks there."""
+        """Return z (q,) after a step, and the part (n,), nT, of the true field that the reference then lacks.
+
+        `step` (q,): Gauss-Newton step of z; it is halved while it increases the objective too much.
+        """
         precision, survey = self.family.prior(self.eta).precision, self.survey
-        # the reference lacks `here + part * change` along the step, linear in the part of it
+        # after the fraction `part` of the step the reference lacks `here + part * change`
         here, change = survey.rock(field, np.column_stack([reduced.field(self.z), reduced.follow @ step])).T
         here, change = here + self._slow(self.z), change + self._slow(step)
         if survey.slopes.size:
@@ -296,9 +314,10 @@ class Rounds:
         return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
 
     def _sums(self, field: GaussianField, rows: IndexArray | None = None, step: int = 1) -> SampleSums:
-        """Return the normal equations of all samples or `rows`, every `step`-th, about the last answer.
+        """Return the normal equations of all samples or of `rows`, linearised about the last solution.
 
-        On new nodes they are about a field of 0.
+        `step`: spacing of `rows` in samples. If the field has new nodes, the linearisation is about a field
+        of 0.
         """
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
@@ -319,11 +338,12 @@ class Rounds:
 
 
 def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
-    """Return True for samples (n,) next to a motion of a mass, as defined in :mod:`magbridge.align`.
+    """Return a mask (n,) that is True for samples before or after a motion of a mass.
 
-    `time` (n,): s. `values` (n, k): positions of the masses. `spans` (k,): their ranges.
+    A mass moves if its position changes faster than the default ``moving_rate`` of the alignment. `time`
+    (n,): s. `values` (n, k): positions of the masses. `spans` (k,): their ranges, in the same units.
     """
-    # a step of a position by more than its slowest motion allows means that the mass moves
+    # a step of a position that is larger than the slowest motion means that the mass moves
     fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
     step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
     moving = np.zeros(len(time), bool)
@@ -333,17 +353,21 @@ def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> Bo
 
 
 def _at_rest(data: Observations) -> BoolArray:
-    """Return True for samples (n,) without a motion of a mass; all True if most move, as with a current."""
+    """Return a mask (n,) that is True for samples without a motion of a mass.
+
+    The mask is True throughout if at least half of the samples have a motion, for example of a current.
+    """
     span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
     rest = ~beside_motion(data.time, data.parameters, span)
     return rest if rest.mean() > 0.5 else np.ones(len(data), bool)
 
 
 class SurveySamples:
-    """The data of a joint fit, and their linearisation about any answer.
+    """Samples of a joint fit, with the unknowns besides coefficients and field, and their linearisation.
 
-    `data`: with places; `unmapped` is 0 where the reference is the true field. `groups`: unknowns in addition
-    to the coefficients. `drift`: slow functions of the error of a position.
+    `data`: observations with positions and `unmapped`. `samples`: the same samples with their monomials.
+    `groups`: blocks of unknowns in addition to the coefficients. `drift`: block of slow functions for the
+    drift of a position; None: positions are exact.
     """
 
     def __init__(
@@ -369,7 +393,7 @@ class SurveySamples:
         self.keep(groups)
 
     def thinned(self, step: int) -> SurveySamples:
-        """Return every `step`-th sample."""
+        """Return a copy with every `step`-th sample."""
         few, rows = copy(self), np.arange(0, len(self.kept), step)
         for name in ("unmapped", "place", "as_logged", "deeper", "at_rest", "kept"):
             setattr(few, name, getattr(self, name)[rows])
@@ -381,24 +405,27 @@ class SurveySamples:
         return few
 
     def keep(self, groups: tuple[ParameterBlock, ...]) -> None:
-        """Continue with these blocks of unknowns: those of the reference first, then offsets."""
+        """Set the blocks of unknowns: blocks of the reference come first, then offsets, then drift."""
         self.groups = groups
         self.offsets = [group for group in groups if isinstance(group, OffsetBlock)]
         self.steady = BlockColumns([group for group in groups if not isinstance(group, OffsetBlock)])
         self.bent = len(self.steady) + sum(len(group.shape) for group in self.offsets)
-        """Where the unknowns of the positions begin."""
+        """Index of the first unknown of the positions' drift among the unknowns of all blocks."""
         many = 0 if self.drift is None else len(self.drift.shape)
         # columns: reference blocks, offset blocks (x, y, z of each), drift north, drift east
         self.slopes = np.zeros((len(self.kept), 2 * many))
 
     def slow(self, latent: FloatArray) -> FloatArray:
-        """Return level and slow changes that the reference lacks (n,), nT."""
+        """Return the constant bias and slow changes that the reference lacks, (n,), nT.
+
+        `latent` (p,): unknowns of all blocks.
+        """
         return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
     def offset(self, latent: FloatArray, blocks: Sequence[OffsetBlock] | None = None) -> FloatArray:
-        """Return the sensor's offset (n, 3), nT, without its dependence on the positions.
+        """Return the sensor's offset (n, 3), nT, by temperature and drift.
 
-        `latent` (p,): unknowns of all blocks. `blocks`: the offsets that count; default: all.
+        `latent` (p,): unknowns of all blocks. `blocks`: offset blocks to include; default: all.
         """
         # an offset block has its functions on each axis in turn: d = (x..., y..., z...)
         out, start = np.zeros((len(self.kept), 3)), len(self.steady)
@@ -410,16 +437,19 @@ class SurveySamples:
         return out
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
-        """Return the contribution of the field's coefficients to the reference at `rows`, (m, nodes)."""
+        """Return the matrix (m, nodes) from coefficients of the field to the reference at `rows`."""
         known = field.basis(self.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.unmapped[rows]) @ known)
 
     def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
-        """Return the field of coefficients w (nodes,) or (nodes, k) at every sample, (n,) or (n, k), nT."""
+        """Return the crustal field (n,) or (n, k), nT, of coefficients w, (nodes,) or (nodes, k)."""
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def bend(self, field: GaussianField, w: FloatArray, latent: FloatArray) -> None:
-        """Move the track by the unknowns `latent` (p,), and use the slope of the field w (nodes,) there."""
+        """Move the track by the drift in `latent`, and update the derivatives of the field by the drift.
+
+        `w` (nodes,): coefficients of the field. `latent` (p,): unknowns of all blocks.
+        """
         if self.drift is None:
             return
         # f(x + dx) = f(x) + grad f . dx, dx = waves @ (north, east): the slope is taken at the new place
@@ -438,7 +468,10 @@ class SurveySamples:
         rows: IndexArray,
         step: int = 1,
     ) -> Iterator[LinearisedRows]:
-        """Yield `rows` (m,), every `step`-th sample, linearised about z (q,) and w (nodes,)."""
+        """Yield blocks of the samples `rows` (m,), linearised about z (q,) and w (nodes,).
+
+        `step`: spacing of `rows` in samples.
+        """
         # One row of the linearised residual: e(z, w) = e_0 + D (z - z_0) + B (w - w_0). D holds the
         # derivatives by coefficients, reference blocks, offsets and drift; everything is over s, the size
         # of a sensor nT.
@@ -460,7 +493,7 @@ class SurveySamples:
             size = sizes(piece, c)
             # a higher reference lowers the residual: -1/s
             steady = self.steady[mine] * (-self.unmapped[mine] / size)[:, None]
-            # an offset acts as T does: columns 6 to 8 of the derivative by the nine numbers
+            # an offset acts as T does: columns 6 to 8 of the derivative by the nine slots
             offsets = [g[:, 6 + k, None] * one.functions[mine] for one in self.offsets for k in range(3)]
             slopes = -self.slopes[mine] / size[:, None]
             D = np.hstack([jacobian(piece.phi, g) @ E, steady, *offsets, slopes])
@@ -470,8 +503,8 @@ class SurveySamples:
             )
 
     def _intervals(self, rows: IndexArray) -> FloatArray:
-        """Return sampling intervals between successive `rows`; infinite across runs."""
-        # a run begins 1e9 intervals after the last: no correlation is left
+        """Return the number of sampling intervals between successive `rows`, (m - 1,); 1e9 across runs."""
+        # a run begins 1e9 intervals after the previous run, so that their noise is independent
         steps = np.where(np.isfinite(self.samples.steps), self.samples.steps, 1e9)
         steps[0] = 0.0
         return np.diff(np.cumsum(steps)[rows])
