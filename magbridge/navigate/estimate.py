@@ -45,9 +45,9 @@ class Estimate:
 
     `valid` is True if the map has described the field at odds of ``options.alarm_odds``, no other place
     remains possible, and no test rejects the position. For a smoother, `moved` holds F and Q of the last
-    prediction, and `jumps` the restarts, which it must not cross. `alone` (4, 4) is the covariance of
-    position and current by dead reckoning alone since the start or the last fix. `options` are the given
-    ones, but with a wider bias once the filter was lost.
+    prediction, and `jumps` the restarts, which it must not cross. `alone_x` (4,) and `alone` (4, 4) are mean
+    and covariance of position and current by dead reckoning alone since the start or the last fix. `options`
+    are the given ones, but with a wider bias once the filter was lost.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -65,7 +65,7 @@ class Estimate:
         self._unmapped = Unmapped(grid, options)
         self._log_odds_unmapped = 0.0
         self._resolution = inf
-        self.alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
+        self.alone_x, self.alone = self.x[:4].copy(), self.P[:4, :4].copy()
         self._level: tuple[float, int] | None = (
             None  # variance of the bias at a known place, nT²; its time, µs
         )
@@ -95,7 +95,7 @@ class Estimate:
         self.time_us = time_us
         self._measured = time_us, self.travelled, self.motion
         self.x, self.P = prior(self.options, sigma)
-        self.alone = self.P[:4, :4].copy()
+        self.alone_x, self.alone = self.x[:4].copy(), self.P[:4, :4].copy()
         self._unique = sigma >= self._reach()
         self.state = NavigationState.SEARCHING
 
@@ -123,6 +123,7 @@ class Estimate:
         if self._lost and not self._fixed:
             self._map_confirmed, self._log_odds_unmapped = False, 0.0
         self._monitor, self._unique, self._fixed = None, True, True
+        self.alone_x = self.x[:4].copy()
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def widen(self, metres: float) -> None:
@@ -190,6 +191,7 @@ class Estimate:
         # x' = F x, P' = F P F' + Q. Dead reckoning alone follows the same model without measurements.
         F, Q = transition(self.options, seconds, metres, motion.growth_since(self.motion))
         self.time_us, self.travelled, self.motion = time_us, travelled, motion
+        self.alone_x = F[:4, :4] @ self.alone_x
         self.alone = F[:4, :4] @ self.alone @ F[:4, :4].T + Q[:4, :4]
         self.moved = F, Q
         if self._filter is None:
@@ -288,7 +290,7 @@ class Estimate:
         self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)
         x, P = prior(self._claimed)
-        P[:4, :4] = self.alone
+        x[:4], P[:4, :4] = self.alone_x, self.alone
         # Dead reckoning's own covariance, widened by the radius of this search.
         P[:2, :2] += (self._reach() * SEARCH_SPREADS[self._searches % len(SEARCH_SPREADS)]) ** 2 * np.eye(2)
         self._searches += 1
