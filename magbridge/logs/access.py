@@ -333,4 +333,9 @@ class Writer:
         increasing(self._path, time, previous=self._last)
         if len(time):
             self._last = float(time[-1])
-        self._file.append(uncounted(dataset) if first else same_columns(dataset, self._columns), first=first)
+        try:
+            self._file.append(
+                uncounted(dataset) if first else same_columns(dataset, self._columns), first=first
+            )
+        except FormatError as error:  # it names the temporary file
+            raise FormatError(self._path, error.expected, column=error.column) from None

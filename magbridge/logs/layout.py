@@ -26,6 +26,8 @@ Rows = Sequence[Sequence[str]]
 """Cells of rows, row by row."""
 LAYOUT_LINES = 200
 """Number of lines at the start of a file from which its layout is found."""
+PROJECTED_UNIT = "EPSG:"
+"""Beginning of the unit of a latitude or longitude that holds northings or eastings of this EPSG code, m."""
 MAX_COLUMNS = 4_096
 """Largest number of columns that is read."""
 ATTRIBUTE_LINE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
@@ -85,7 +87,18 @@ class Layout:
     @property
     def column_units(self) -> dict[str, str]:
         """Units of all columns except the time, whose unit is a format."""
-        return {name: unit for name, unit in self.units.items() if name != "time"}
+        return {
+            name: unit
+            for name, unit in self.units.items()
+            if name != "time" and not unit.startswith(PROJECTED_UNIT)
+        }
+
+    @property
+    def projection(self) -> str:
+        """Coordinate system ``EPSG:n`` of a position in easting and northing; "" for degrees."""
+        systems = {self.units.get(name, "") for name in ("latitude", "longitude")}
+        system = systems.pop()
+        return system if not systems and system.startswith(PROJECTED_UNIT) else ""
 
     def guessing(self, *guesses: str) -> Layout:
         """Return the layout with further assumptions."""

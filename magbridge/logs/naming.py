@@ -14,7 +14,7 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import DAY, SECONDS_OF_DAY
-from magbridge.logs.layout import Layout, Rows
+from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
 from magbridge.logs.mapping import CELL_NUMBER, NAMES, WITH_UNIT, aliases, bare, is_unit, split
 
 ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
@@ -26,6 +26,8 @@ DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyy.?mm.?dd|dd.?mm.?yy|mm.?dd
 """Part of a heading that marks a column of dates."""
 TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
 """Part of a heading that marks the column of times, if only one heading has it."""
+UTM_HEADING = re.compile(r"[xy]_\w*?utm_?(\d{1,2})([ns])_m", re.IGNORECASE)
+"""Heading of an easting or northing that names a zone of UTM, as MagComPy's ``X_NAD83UTM10N_m``."""
 REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
 """Words in brackets after a heading that are not units."""
 DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
@@ -57,7 +59,7 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     layout = _with_names(path, layout, [name for name, _ in parts], declares)
     for k, name in enumerate(layout.names):
         layout = _with_unit(layout, name, layout.headings[k], declares[k])
-    layout = _with_calendar(_with_time(layout, rows), rows)
+    layout = _with_calendar(_with_time(_with_utm(layout), rows), rows)
     return _without_texts(with_total(with_units_of_axes(layout, rows), rows), rows)
 
 
@@ -135,6 +137,26 @@ def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str
             expected = f"expected this column; there are: {there}"
             raise FormatError(path, expected, row=layout.row, column=theirs)
     return taken
+
+
+def _with_utm(layout: Layout) -> Layout:
+    """Return the layout with eastings and northings of a named UTM zone as longitude and latitude.
+
+    All datums of such headings (WGS 84, NAD83, ETRS89) agree within 2 m, so the zone of WGS 84 is used.
+    """
+    zones = {
+        k: match for k, one in enumerate(layout.headings) if (match := UTM_HEADING.fullmatch(one.strip()))
+    }
+    if len(zones) != 2 or {"latitude", "longitude"} & set(layout.names):
+        return layout
+    names, units = list(layout.names), {}
+    for k, match in zones.items():
+        names[k] = "longitude" if layout.headings[k].strip()[0] in "xX" else "latitude"
+        units[names[k]] = f"{PROJECTED_UNIT}{'326' if match[2] in 'nN' else '327'}{int(match[1]):02d}"
+    if len(set(units)) != 2 or len(set(units.values())) != 1:
+        return layout
+    layout = replace(layout, names=tuple(names)).with_units(units)
+    return layout.guessing(f"position in the projection {layout.projection}")
 
 
 def _with_time(layout: Layout, rows: Rows) -> Layout:

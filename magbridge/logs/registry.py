@@ -112,6 +112,9 @@ FORMATS: dict[str, Format] = {
     ),
     "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002", packed=True),
     "seaglider": Format("magbridge.logs.seaglider", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
+    "magarrow": Format(
+        "magbridge.logs.text", (".magarrow.csv",), writes=True, writer="MagArrowWriter", maps_columns=True
+    ),
     "geosoft": Format(
         "magbridge.logs.text", (".xyz",), writes=True, writer="GeosoftWriter", maps_columns=True, packed=True
     ),
@@ -180,7 +183,9 @@ def format_of(path: Path, *, write: bool = False) -> Format:
         raise FormatError(path, f"expected a log, found {other}")
     if found is None:
         known = suffixes(write=write)
-        suffix = Path(path.stem if packed and path.suffix.lower() in PACKED else path).suffix.lower()
+        name = Path(path.stem if packed and path.suffix.lower() in PACKED else path)
+        double = "".join(name.suffixes[-2:]).lower()
+        suffix = double if double in known else name.suffix.lower()
         if suffix not in known:
             raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
         formats = [*FORMATS.values(), *_plugins().values()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import pandas as pd
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
-from magbridge.errors import FormatError
+from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, without_invalid
 from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, Rows, cells
@@ -24,6 +24,26 @@ from magbridge.wording import counted
 EMPTY_CELLS = "-", "--", "*", "---"
 """Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 UNCLOSED_QUOTE = "expected every quote to be closed in its line"
+
+
+def geographic(path: Path, system: str, columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return latitude and longitude (n,), deg of WGS 84, of northings and eastings (n,), m, by column.
+
+    FormatError: pyproj does not know the coordinate system. MissingExtra: pyproj is not installed.
+    """
+    try:
+        from pyproj import Transformer  # noqa: PLC0415 - an optional dependency
+        from pyproj.exceptions import ProjError  # noqa: PLC0415
+    except ImportError:
+        raise MissingExtra("pyproj", "grids") from None
+    try:
+        there = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    except ProjError:
+        expected = f"expected a projected coordinate system as EPSG:32633, got {system}"
+        raise FormatError(path, expected, column="latitude") from None
+    longitude, latitude = there.transform(columns["longitude"], columns["latitude"])
+    known = np.isfinite(longitude) & np.isfinite(latitude)
+    return {"longitude": np.where(known, longitude, np.nan), "latitude": np.where(known, latitude, np.nan)}
 
 
 class TableReader:
@@ -139,6 +159,8 @@ class TableReader:
             if (unsure := np.isnan(columns[name]) & np.isfinite(values)).any():
                 expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
                 self._note(name, unsure, kept, expected, wrong=False)
+        if self._layout.projection:
+            columns |= geographic(self._path, self._layout.projection, columns)
         rules = []
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:

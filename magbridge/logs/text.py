@@ -42,6 +42,7 @@ from typing import NamedTuple, TextIO
 
 import msgspec
 import numpy as np
+import pandas as pd
 import xarray as xr
 from msgspec.structs import replace
 
@@ -363,3 +364,82 @@ class GeosoftWriter(FileWriter):
         for line, part in groupby(np.arange(len(rows)).tolist(), key=lambda row: lines[row]):
             self._file.write(f"LINE {line:.12g}\n")
             self._csv.writerows(rows[row] for row in part)
+
+
+MAGARROW_HEADINGS = [
+    *(
+        "Counter",
+        "Date",
+        "Time",
+        "Latitude",
+        "Longitude",
+        "Mag",
+        "MagValid",
+        "CompassX",
+        "CompassY",
+        "CompassZ",
+    ),
+    *("GyroscopeX", "GyroscopeY", "GyroscopeZ", "AccelerometerX", "AccelerometerY", "AccelerometerZ"),
+    *(
+        "ImuTemperature",
+        "Track",
+        "LocationSource",
+        "Hdop",
+        "FixQuality",
+        "SatellitesUsed",
+        "Altitude",
+        "Line",
+    ),
+]
+"""Headings of Geometrics' MagArrow, in its order. GeoHammer finds them by name, MagComPy by their number."""
+
+
+MAGARROW_TEXTS = {"Latitude": ("latitude", "%.8f"), "Longitude": ("longitude", "%.8f")}
+"""Heading -> column and form of its numbers; ``NaN`` stands for an unknown value."""
+MAGARROW_NUMBERS = {
+    "CompassX": ("mag_y", 1.0),  # the instrument's x axis is our y, its y axis is opposite to our x
+    "CompassY": ("mag_x", -1.0),
+    "CompassZ": ("mag_z", 1.0),
+    "Line": ("line", 1.0),
+}
+"""Heading -> column and sign, for columns that a log may lack."""
+HEIGHTS = "altitude", "altitude_m", "height", "height_m"
+"""Names of a column with the height, m, in small letters; without one, the opposite of ``depth``."""
+
+
+class MagArrowWriter(FileWriter):
+    """Writer of the CSV of Geometrics' MagArrow, which GeoHammer and MagComPy open.
+
+    ``Mag`` is the compensated scalar field if there is one, else the total field, nT. ``MagValid`` is 0 for
+    an unknown field and for a sample with a flag.
+    """
+
+    _rows = 0
+
+    def append(self, dataset: xr.Dataset, *, first: bool) -> None:
+        """Write the rows; if `first`, write the headings before. FormatError: no field or no position."""
+        field = "scalar_field" if "scalar_field" in dataset else "total_field"
+        texts = MAGARROW_TEXTS | {"Mag": (field, "%.5f")}
+        for name, _ in texts.values():
+            if name not in dataset:
+                raise FormatError(Path(self._file.name), "expected this column in the log", column=name)
+        valid = np.isfinite(dataset[field].to_numpy())
+        if "quality" in dataset:
+            valid &= dataset["quality"].to_numpy() == 0
+        rows = len(valid)
+        moments = pd.to_datetime(np.rint(dataset["time"].to_numpy() * 1e3), unit="ms")
+        table = pd.DataFrame("", index=range(rows), columns=MAGARROW_HEADINGS)
+        table["Counter"] = np.arange(self._rows, self._rows + rows)
+        table["Date"] = moments.strftime("%Y/%m/%d")
+        table["Time"] = moments.strftime("%H:%M:%S.%f").str[:-3]
+        table["MagValid"] = valid.astype(int)
+        for heading, (name, form) in texts.items():
+            values = dataset[name].to_numpy().tolist()
+            table[heading] = ["NaN" if isnan(value) else form % value for value in values]
+        heights = [str(name) for name in dataset.data_vars if str(name).lower() in HEIGHTS]
+        height = (heights[0], 1.0) if heights else ("depth", -1.0)
+        for heading, (name, sign) in {**MAGARROW_NUMBERS, "Altitude": height}.items():
+            if name in dataset:
+                table[heading] = sign * dataset[name].to_numpy()
+        self._rows += rows
+        table.to_csv(self._file, index=False, header=first, lineterminator="\n", float_format="%.3f")
