@@ -28,6 +28,8 @@ TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECAS
 """Part of a heading that marks the column of times, if only one heading has it."""
 UTM_HEADING = re.compile(r"[xy]_\w*?utm_?(\d{1,2})([ns])_m", re.IGNORECASE)
 """Heading of an easting or northing that names a zone of UTM, as MagComPy's ``X_NAD83UTM10N_m``."""
+LINE_NAMES = "line", "linename", "lineno", "linenumber"
+"""Names of the column with the survey line, in lower case without punctuation."""
 REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
 """Words in brackets after a heading that are not units."""
 DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
@@ -59,7 +61,8 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     layout = _with_names(path, layout, [name for name, _ in parts], declares)
     for k, name in enumerate(layout.names):
         layout = _with_unit(layout, name, layout.headings[k], declares[k])
-    layout = _with_calendar(_with_time(_with_utm(layout), rows), rows)
+    layout = _with_line(_with_utm(layout))
+    layout = _with_calendar(_with_time(layout, rows), rows)
     return _without_texts(with_total(with_units_of_axes(layout, rows), rows), rows)
 
 
@@ -137,6 +140,15 @@ def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str
             expected = f"expected this column; there are: {there}"
             raise FormatError(path, expected, row=layout.row, column=theirs)
     return taken
+
+
+def _with_line(layout: Layout) -> Layout:
+    """Return the layout with a column Line or Line_Name of another program as ``line``."""
+    found = [k for k, name in enumerate(layout.names) if bare(name) in LINE_NAMES]
+    if len(found) != 1 or not layout.foreign:
+        return layout
+    (k,) = found
+    return replace(layout, names=(*layout.names[:k], "line", *layout.names[k + 1 :]))
 
 
 def _with_utm(layout: Layout) -> Layout:
@@ -243,7 +255,8 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
     left = []
     for k, name in enumerate(layout.names):
         values = {row[k] for row in rows if k < len(row) and row[k]}
-        if not name or (name in COLUMNS and name not in UNIT_CELL_COLUMNS) or not values:
+        kept = name == "line" or (name in COLUMNS and name not in UNIT_CELL_COLUMNS)
+        if not name or kept or not values:
             continue
         text = [layout.number(cell) for cell in values]
         if any(CELL_NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):

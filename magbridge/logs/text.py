@@ -55,7 +55,7 @@ from magbridge.logs.layout import LAYOUT_LINES, Layout, Rows, cells, header_of, 
 from magbridge.logs.mapping import ColumnMapping, ColumnSource, Options
 from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.registry import metadata_path, opened
-from magbridge.logs.table import TableReader
+from magbridge.logs.table import LineNumbers, TableReader
 from magbridge.records import Quality
 
 DEFAULTS = Options()
@@ -65,8 +65,6 @@ MAX_LINE_CHARACTERS = 1 << 20
 """Characters of the longest line that is read whole."""
 MAX_QUOTED_CHARACTERS = 1000
 """Characters that are kept of a longer line, which is then dropped and counted as a row."""
-FIRST_NAMED_LINE = 1e6
-"""Number given to the first survey line whose label is not a number."""
 LOOKED_AT, LINE = 1 << 16, 256
 """Bytes that are read to find the encoding, and bytes of the first line that are searched for zeros."""
 
@@ -179,7 +177,7 @@ class _LineMarks:
     def __init__(self, preamble: Sequence[str]) -> None:
         self.rows: list[int] = []
         self._labels: list[float] = []
-        self._known: dict[str, float] = {}
+        self._names = LineNumbers()
         for line in preamble:
             self.passes(0, line)
 
@@ -188,14 +186,8 @@ class _LineMarks:
         if not is_remark(line):
             return False
         if line[0] not in "#%/":
-            text = " ".join(line.upper().split())
-            number = re.sub(r"^(LINE|TIE)[\s:]*L?", "", text)
-            label = float(number) if re.fullmatch(r"\d+(\.\d*)?|NAN", number) else nan
-            taken = (isnan(label) and number != "NAN") or label in self._known.values()
-            # A label that is not a number, or that another line has, gets a number from a million on.
-            self._known.setdefault(text, FIRST_NAMED_LINE + len(self._known) if taken else label)
             self.rows.append(row)
-            self._labels.append(self._known[text])
+            self._labels.append(self._names.number(line))
         return True
 
     def labels(self, rows: Sequence[int]) -> FloatArray:
