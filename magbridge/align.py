@@ -260,7 +260,7 @@ class Aligner:
         settle_us = settings.settle_time * 1e6
         values: list[float] = []
         spans: list[tuple[int, float, float]] = []
-        quality, variance, oldest = 0, 0.0, 0.0
+        quality, variance, oldest = LATE_JOIN if undated else 0, 0.0, 0.0
         self.motion_since_us = sample_us
         for index, track in enumerate(self.tracks):
             if track.last_us == NEVER:

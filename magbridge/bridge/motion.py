@@ -13,17 +13,24 @@ from enum import IntEnum
 from math import degrees, hypot, isfinite, isnan, nan
 from typing import Any
 
+import numpy as np
+
 from magbridge.field.geodesy import separation
+from magbridge.field.igrf import igrf
 from magbridge.link.component import Component
 from magbridge.link.estimates import Pose, quaternion
 from magbridge.link.telemetry import AIRCRAFT, is_contradicted
 from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
+from magbridge.navigate.attitude import AttitudeFilter
 from magbridge.navigate.deadreckoning import GLIDE
+from magbridge.records import Corrected, Quality
 
 __all__ = ["FIX_3D", "Frame", "Motion", "MotionSource"]
 
+MAX_MAIN_FIELD_AGE_US = 60_000_000
+"""Longest time for which the main field at one position is used, µs."""
 MAX_STATE_AGE_US = 10_000_000
 """Longest time for which a received height or attitude is used, µs."""
 UNSET = (0, 0)
@@ -114,9 +121,13 @@ MIN_EQUAL = 5
 VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
 """Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS: horizontal velocity is valid; position is held
 constant."""
-HEADING_STEP_RAD, HEADING_STEP_US = 0.15, 10_000_000
-"""Heading uncertainty (rad) added for each interval (µs) in which the autopilot's filter contradicts a
-sensor."""
+CONTRADICTED_US = 10_000_000
+"""Time for which the autopilot's attitude stays doubtful after its filter contradicted a sensor, µs."""
+MIN_HEADING_SIGMA_RAD, HEADING_INTERVAL_US = 0.07, 5_000_000
+"""Smallest 1-sigma of a heading while the autopilot's is wrong, rad; the time from one widening of the
+current by it to the next, µs."""
+NO_DIRECTION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.NO_BORESIGHT | Quality.LATE_JOIN)
+"""Flags of samples whose direction is not used."""
 FIX_3D = 3
 """Smallest GPS_RAW_INT.fix_type whose position is used."""
 ARMED = 128
@@ -167,7 +178,10 @@ class Motion:
         self._unvouched_us = (
             -MAX_SOURCE_AGE_US
         )  # when the autopilot last reported that its velocity does not hold
-        self._contradicted_us = self._gps_us = -HEADING_STEP_US
+        self._contradicted_us = self._gps_us = self._widened_us = -MAX_SOURCE_AGE_US
+        self._filter = AttitudeFilter()
+        self._main_field = np.zeros(3)  # north, east, down, nT, at the time _main_us
+        self._main_us = -MAX_MAIN_FIELD_AGE_US
         self._is_aircraft = self._armed = self._grounded = False
         self._landed_state = STATE_UNKNOWN
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
@@ -178,7 +192,7 @@ class Motion:
             ATTITUDE=self._attitude, EKF_STATUS_REPORT=self._vouch, ESTIMATOR_STATUS=self._vouch,
             EXTENDED_SYS_STATE=self._extended, GLOBAL_POSITION_INT=self._global, GPS_RAW_INT=self._gps,
             HEARTBEAT=self._heartbeat, LOCAL_POSITION_NED=self._local, ODOMETRY=self._odometry,
-            VFR_HUD=self._speed,
+            RAW_IMU=self._gyro, VFR_HUD=self._speed,
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
@@ -196,8 +210,48 @@ class Motion:
         """Record that GPS has corrected the autopilot's position."""
         self.fed_back = False
 
+    def direct(self, time_us: int, corrected: Corrected, utc_us: int) -> None:
+        """Use the direction of a corrected sample, at `time_us` and at UNIX time `utc_us` (µs)."""
+        field = np.array(corrected.field)
+        if corrected.quality & NO_DIRECTION_FLAGS or not np.all(np.isfinite(field)):
+            return
+        if time_us - self._main_us >= MAX_MAIN_FIELD_AGE_US:
+            latitude, longitude = self._navigator.reckoned(time_us)
+            if not isfinite(latitude):
+                return
+            self._main_field = igrf(longitude, latitude, 0.0, utc_us * 1e-6).ravel()
+            self._main_us = time_us
+        self._filter.direct(time_us * 1e-6, field, self._main_field)
+
+    def _gyro(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+        if message.component == self._component.peer[1]:
+            rates = 1e-3 * np.array([message["xgyro"], message["ygyro"], message["zgyro"]])
+            self._filter.gyro(message["time_usec"] * 1e-6, rates)
+
+    def _turn(self, message: Message, time_us: int) -> float:
+        """Return the heading of an ATTITUDE, rad; while it is wrong, return that of rates and field."""
+        # While GPS is used, GPS is the more likely fault, and dead reckoning has to test GPS.
+        uses_gps = self.gps_trusted and time_us - self._gps_us < CONTRADICTED_US
+        vouched = uses_gps or time_us - self._contradicted_us >= CONTRADICTED_US
+        angles = message["roll"], message["pitch"], message["yaw"]
+        rates = np.array([message["rollspeed"], message["pitchspeed"], message["yawspeed"]])
+        if not np.all(np.isfinite(rates)):
+            return float(message["yaw"])
+        received = time_us * 1e-6
+        time = message["time_boot_ms"] * 1e-3 or received
+        self._filter.rotate(received, time, angles, rates, vouched=vouched)
+        if self._filter.agrees:
+            return float(message["yaw"])
+        if time_us - self._widened_us >= HEADING_INTERVAL_US:
+            self._widened_us = time_us
+            sigma = max(self._filter.heading_sigma, MIN_HEADING_SIGMA_RAD)
+            self._navigator.widen_heading(time_us, sigma)
+        return self._filter.heading
+
     def _attitude(self, message: Message, time_us: int) -> None:
-        self._heading, self._pitch = degrees(message["yaw"]) % 360.0, degrees(message["pitch"])
+        own = message.component == self._component.peer[1]
+        heading = self._turn(message, time_us) if own else message["yaw"]
+        self._heading, self._pitch = degrees(heading) % 360.0, degrees(message["pitch"])
         if abs(self._pitch) >= GLIDE:
             self._steep_us = time_us
         if self.source is MotionSource.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
@@ -261,13 +315,8 @@ class Motion:
             flags = message["flags"]
             holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
             self._unvouched_us = -MAX_SOURCE_AGE_US if holds else time_us
-            # A wrong heading makes dead reckoning wrong by a fraction of the speed. While GPS is used, GPS is
-            # the more likely fault, and dead reckoning has to test GPS.
-            uses_gps = self.gps_trusted and time_us - self._gps_us < HEADING_STEP_US
-            is_due = time_us - self._contradicted_us >= HEADING_STEP_US
-            if is_due and not uses_gps and is_contradicted(message):
+            if is_contradicted(message):
                 self._contradicted_us = time_us
-                self._navigator.widen_heading(time_us, HEADING_STEP_RAD)
 
     def _global(self, message: Message, time_us: int) -> None:
         self._pass(time_us, depth=self._frame.depth(time_us))

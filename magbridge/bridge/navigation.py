@@ -19,6 +19,7 @@ from magbridge.field.read import read_grid
 from magbridge.link.component import Component
 from magbridge.link.estimates import FIX_MESSAGES, Fix, Kind, widened
 from magbridge.link.output import Rate
+from magbridge.link.telemetry import own_time, sent_us
 from magbridge.mavlink import Message, by_id, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.navigate import NavigationOptions, NavigationState, Navigator, Record
@@ -303,6 +304,8 @@ GPS_AGE_S, GPS_AGE_SIGMA_S = 0.15, 0.1
 """Delay from the GPS measurement to the arrival of GPS_RAW_INT and its standard deviation, s. It is 0.1 to
 0.2 s in the receiver (ArduPilot's and PX4's defaults), and up to 0.2 s until the autopilot sends the
 message."""
+MAX_GPS_DELAY_S = 10.0
+"""Largest time by GPS_RAW_INT's own time stamp for which it waited, s; the clocks disagree beyond."""
 UNKNOWN_MOTION = 65535
 """Value of GPS_RAW_INT.vel and .cog that means 'unknown'."""
 STATE_TEXTS = {
@@ -347,6 +350,7 @@ class NavigationService:
         self.fixing = Fixing(fix, component, self._frame, self.navigator.gnss)
         self.motion = Motion(self.navigator, component, self._frame, lambda: self.fixing.velocity_stays)
         self._gnss_state = GnssState.GOOD
+        self._gps_time = own_time(spec("GPS_RAW_INT"))
         self._with_updates = fix.rate == 0.0
         if not self._with_updates:
             now_us = component.codec.now_us
@@ -370,7 +374,8 @@ class NavigationService:
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
         """Pass a corrected sample at `time_us` (µs) to the navigator, and send the resulting update."""
-        self.navigator.utc_offset_us = self._component.codec.utc_offset_us
+        self.navigator.utc_offset_us = utc_offset_us = self._component.codec.utc_offset_us
+        self.motion.direct(time_us, corrected, time_us + utc_offset_us)
         self._notify(self.navigator.sample(time_us, corrected))
 
     def _gps(self, message: Message, time_us: int) -> None:
@@ -381,7 +386,7 @@ class NavigationService:
         if UNKNOWN_MOTION not in (message["vel"], message["cog"]):
             # the vehicle has moved on since the receiver's measurement
             speed, course = message["vel"] * 1e-2, radians(message["cog"] * 1e-2)
-            moved = GPS_AGE_S * speed
+            moved = (GPS_AGE_S + self._delay(message, time_us)) * speed
             latitude, longitude = offset(latitude, longitude, moved * cos(course), moved * sin(course))
             accuracy = hypot(accuracy, GPS_AGE_SIGMA_S * speed) if accuracy > 0.0 else accuracy
         sigma = accuracy if accuracy > 0.0 else None
@@ -397,6 +402,12 @@ class NavigationService:
                 word = gnss.state.name.lower()
                 text, severity = f"GPS {word}: {GPS_REASONS[gnss.reason]}", MAV_SEVERITY.WARNING
             self._component.announcer.state("gps", text, severity)
+
+    def _delay(self, message: Message, time_us: int) -> float:
+        """Return how long a GPS_RAW_INT, received at `time_us` (µs), has waited, s; 0 if unknown."""
+        sent = sent_us(self._gps_time, message.payload, time_us, self._component.vehicle.clock)
+        delay = (time_us - sent) * 1e-6
+        return delay if delay < MAX_GPS_DELAY_S else 0.0
 
     def _notify(self, record: Record | None) -> None:
         """Send an update of the navigator, if any; also send a fix if fixes have no rate of their own."""

@@ -19,6 +19,9 @@ MAX_TELEMETRY_GAP_S = 3600.0
 """Longest time without telemetry for which the last velocity holds, s."""
 MAX_REPORT_INTERVAL_S = 60.0
 """Longest time between two reports of the velocity over which their change is averaged, s."""
+MIN_GAP_S, BURST_TIME_S = 1.0, 0.5
+"""Shortest time without a report that counts as a gap, s; and the time after it in which reports that have
+waited arrive, s."""
 MIN_TURN_FRACTION = 0.25
 """Smallest change of velocity that counts as a turn, as a fraction of the speed; noise is smaller."""
 
@@ -69,6 +72,7 @@ class DeadReckoning:
         self.noise = MotionNoise()
         self.time = self._reported = nan
         self._velocity = self._steady = (0.0, 0.0)
+        self._gap = nan, 0.0, 0.0  # end of the last gap and its length, s; velocity changed since then, m/s
         self._heading = self._pitch = self._speed = nan
         self._dive = (nan, nan)  # time and depth since when the rate of depth is taken
         self._rate = nan
@@ -149,8 +153,9 @@ class DeadReckoning:
         -----
         The velocity v₀ of the previous report, Δt ago, became v₁ at an unknown moment, uniformly distributed
         over Δt. The motion in Δt then has the mean (v₀ + v₁) Δt/2 and the covariance
-        (v₁ - v₀)(v₁ - v₀)ᵀ Δt²/12. An error of heading or speed turns with the vehicle, so that a turn
-        changes the error of the velocity in proportion to v₁ - v₀.
+        (v₁ - v₀)(v₁ - v₀)ᵀ Δt²/12. After a gap, several reports that have waited arrive at once; the changes
+        of all of them then took place during the gap. An error of heading or speed turns with the vehicle, so
+        that a turn changes the error of the velocity in proportion to v₁ - v₀.
         """
         # Change of the velocity since the previous report.
         north, east = velocity[0] - self._velocity[0], velocity[1] - self._velocity[1]
@@ -161,6 +166,8 @@ class DeadReckoning:
             self._shift(0.5 * north * elapsed, 0.5 * east * elapsed)
             scale = elapsed * elapsed / 12.0
             nn, ne, ee = nn + north * north * scale, ne + north * east * scale, ee + east * east * scale
+            waited = self._gap_noise(time, elapsed, hypot(north, east))
+            nn, ee = nn + waited, ee + waited
         change = hypot(velocity[0] - self._steady[0], velocity[1] - self._steady[1])
         if change > MIN_TURN_FRACTION * hypot(*self._steady):
             turns += change * change if self._steady != (0.0, 0.0) else 0.0
@@ -169,6 +176,20 @@ class DeadReckoning:
         self._velocity = velocity
         if reported:
             self._reported = time
+
+    def _gap_noise(self, time: float, elapsed: float, change: float) -> float:
+        """Return the variance (m²) of the motion in a gap that the reports after it add, on each axis.
+
+        `elapsed` (s) is the time since the previous report, and `change` (m/s) that of the velocity.
+        """
+        end, length, before = self._gap
+        if elapsed > MIN_GAP_S:
+            self._gap = time, elapsed, change
+            return 0.0  # this report's change is included already
+        if not time - end < BURST_TIME_S:
+            return 0.0
+        self._gap = end, length, before + change
+        return ((before + change) ** 2 - before**2) * length * length / 12.0
 
     def _sink(self, time: float) -> None:
         since, depth = self._dive

@@ -200,15 +200,15 @@ class Estimate:
             self._filter.predict(F, Q)
 
     def widen_current(self, sigma: float) -> None:
-        """Add an error of 1-sigma `sigma`, m/s, on each axis to the current of every filter."""
+        """Widen the current of every filter to a 1-sigma of at least `sigma`, m/s, on each axis."""
         if self._filter is None:
             return
         banks = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
-        Q = np.zeros_like(self.P)
-        Q[2, 2] = Q[3, 3] = sigma**2
-        for one in (self._filter, *banks):
-            one.predict(np.eye(len(Q)), Q)
-        self.alone += Q[:4, :4]
+        for bank in (self._filter, *banks):
+            Q = np.zeros_like(self.P)
+            Q[2:4, 2:4] = missing_variance(bank.moments()[1][2:4, 2:4], sigma)
+            bank.predict(np.eye(len(Q)), Q)
+        self.alone[2:, 2:] += missing_variance(self.alone[2:, 2:], sigma)
         self._refresh()
 
     def _refresh(self) -> None:
@@ -338,3 +338,8 @@ class Estimate:
             self.state = NavigationState.DEAD_RECKONING
         else:
             self.state = NavigationState.TRACKING
+
+
+def missing_variance(P: FloatArray, sigma: float) -> FloatArray:
+    """Return the diagonal matrix that raises the variances of `P` to at least `sigma` squared."""
+    return np.diag(np.maximum(sigma**2 - np.diag(P), 0.0))

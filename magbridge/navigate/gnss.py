@@ -112,10 +112,11 @@ class Prediction(NamedTuple):
     current: FloatArray
     """Velocity error of dead reckoning (2,), m/s."""
     current_sigma: float
+    heading_error: float
     travelled: float
     speed: float
-    """`current_sigma`, `travelled`, `speed`: 1-sigma of the current on each axis, m/s; distance travelled
-    since the start, m; speed, m/s."""
+    """`current_sigma`, `heading_error`, `travelled`, `speed`: 1-sigma of the current on each axis, and of the
+    velocity because of a heading known to be poor, m/s; distance travelled since the start, m; speed, m/s."""
     turns: float
     """:attr:`MotionNoise.turns` since the start."""
     lost: bool
@@ -278,7 +279,7 @@ class GnssMonitor:
             age = max((time_us - known.time_us) * 1e-6, 0.0)
             changed = o.current_sigma * sqrt(min(2.0 * age / o.current_time, 1.0))
             turned = o.motion_error * sqrt(prediction.turns - known.turns)
-            velocity_error = hypot(known.current_sigma, changed, turned)
+            velocity_error = hypot(known.current_sigma, changed, turned, prediction.heading_error)
             if seconds * 1e6 > OUTAGE_US:
                 velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * prediction.speed)
             # Two receiver errors, the velocity error over the time, and the random walk add in quadrature.

@@ -28,11 +28,17 @@ from magbridge.records import Corrected, Quality
 
 __all__ = ["NO_POSITION_FLAGS", "Navigator"]
 
-NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED)
+NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.LATE_JOIN)
 MAX_SAMPLE_AGE_S = 10.0
 """Largest age of a usable sample relative to the dead-reckoned position, which cannot go back, s."""
 MAX_UPDATE_AGE_INTERVALS = 3.0
 """Largest age of an update from which a position is still dead-reckoned, in intervals."""
+
+HEADING_AGE_US = 10_000_000
+"""Time for which a poor heading makes the dead-reckoned velocity uncertain, µs."""
+POOR_HEADING_SIGMA_RAD, MAX_HEADING_SIGMA_RAD = 0.15, 1.0
+"""1-sigma of a heading, rad, above which motion by GNSS may differ from dead reckoning; and the largest one:
+the direction is then unknown."""
 
 
 class Navigator:
@@ -58,6 +64,7 @@ class Navigator:
         self._reckoning = DeadReckoning()
         self._collector = Collector(options, block_length(grid))
         self._latest_us = 0
+        self._heading_error = -HEADING_AGE_US, 0.0  # time, µs; 1-sigma of the velocity, m/s
 
     def fix(
         self, time_us: int, latitude: float, longitude: float, sigma: float | None = None
@@ -85,7 +92,7 @@ class Navigator:
             # There is no estimate to compare with: only the receiver's own report counts.
             wide, zero, o = np.eye(2) * 1e12, np.zeros(2), estimate.options
             nothing = Prediction(
-                zero, wide, wide, zero, o.current_sigma, 0.0, 0.0, 0.0, lost=False, informed=False
+                zero, wide, wide, zero, o.current_sigma, 0.0, 0.0, 0.0, 0.0, lost=False, informed=False
             )
             state = monitor.check(time_us, place, (0.0, 0.0), known, nothing)
         else:
@@ -108,9 +115,11 @@ class Navigator:
         x, P = F @ now.x, F @ now.P @ F.T + Q
         current_sigma = worse_axis(P[2, 2], P[2, 3], P[3, 3])
         alone = (F[:4, :4] @ now.alone @ F[:4, :4].T + Q[:4, :4])[:2, :2]
+        since_us, error = self._heading_error
+        recent = time_us - since_us < HEADING_AGE_US
         return Prediction(
-            x[:2], P[:2, :2], alone, x[2:4], float(current_sigma), where.travelled, where.speed,
-            where.noise.turns, now.state is NavigationState.LOST, now.informed,
+            x[:2], P[:2, :2], alone, x[2:4], float(current_sigma), error if recent else 0.0, where.travelled,
+            where.speed, where.noise.turns, now.state is NavigationState.LOST, now.informed,
         )  # fmt: skip
 
     def _correct(
@@ -149,9 +158,11 @@ class Navigator:
         self.gnss.new_motion()
 
     def widen_heading(self, time_us: int, sigma: float) -> None:
-        """Widen the current by the effect of a heading error of 1-sigma `sigma`, rad, from `time_us` on."""
+        """Widen the current to the effect of a heading error of 1-sigma `sigma`, rad, from `time_us` on."""
         self._reckoning.advance(time_us * 1e-6)
-        self.estimate.widen_current(sigma * self._reckoning.speed)
+        error = min(sigma, MAX_HEADING_SIGMA_RAD) * self._reckoning.speed
+        self._heading_error = time_us, error if sigma > POOR_HEADING_SIGMA_RAD else 0.0
+        self.estimate.widen_current(error)
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
         """Add a corrected sample; return the update that this completes, or None."""

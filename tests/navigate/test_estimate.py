@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import sqrt
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -11,6 +13,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import NavigationOptions, with_level
+from magbridge.navigate.record import NavigationState
 
 HOUR_US = 3_600_000_000
 
@@ -95,3 +98,19 @@ def test_other_places_have_the_level_that_was_met_where_the_position_was_known(
         levels[sigma] = estimate._levels()[0]
     assert levels[20.0] < 20.0
     assert levels[2_000.0] == pytest.approx(145.0, abs=0.1)
+
+
+def test_a_search_begins_where_dead_reckoning_since_the_last_fix_is(
+    grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]]
+) -> None:
+    """A fix has shown that dead reckoning is 500 m off; then the field contradicts the map."""
+    estimate = begun(grid, options, measured[0][0], 300.0)
+    estimate.update(*measured[0])
+    fix = np.array([400.0, -300.0])
+    estimate.correct(fix, 10.0)
+    for block, travelled in measured[1:]:
+        estimate.update(block._replace(anomaly=-3.0 * block.anomaly), travelled)
+        if estimate.state is NavigationState.LOST:
+            break
+    assert estimate.jumps[-1].cause == "the map does not explain the field"
+    assert np.linalg.norm(estimate.x[:2] - fix) < 3.0 * sqrt(estimate.alone[0, 0])
