@@ -143,8 +143,8 @@ class AttitudeFilter:
     def direct(self, received: float, field: FloatArray, main: FloatArray) -> None:
         """Use the directions of a sample's corrected field (3,), body axes, and of the main field (3,).
 
-        `main` is in north-east-down axes, and `received` the time of the sample, s. The filter ignores directions between two reports
-        of the rates.
+        `main` is in north-east-down axes, and `received` the time of the sample, s. The filter ignores
+        directions between two reports of the rates.
         """
         since = received - self._received
         if self._directed == self._time or abs(since) > 1.0:
