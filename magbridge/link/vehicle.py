@@ -214,11 +214,10 @@ LEAP_MS: Final = 10_000
 autopilot explains, ms."""
 TWICE, CHANGES_US = 5, 10_000_000
 """Number of changes between two boot clocks, and the time (µs) within which they mean two autopilots."""
-BOOT_TIMES: Final = {
-    number: spec(number).fields["time_boot_ms"]
-    for number, layout in MESSAGES.items()
-    if layout.fieldunits_by_name.get("time_boot_ms") == "ms"
+HAS_BOOT_TIME: Final = {
+    number for number, layout in MESSAGES.items() if layout.fieldunits_by_name.get("time_boot_ms") == "ms"
 }
+"""Ids of the messages with the field ``time_boot_ms``."""
 
 
 class VehicleState:
@@ -262,8 +261,9 @@ class VehicleState:
             return False
         self._losses.count(message.component, message.sequence, t_us)
         if message.component == self.autopilot:
-            if message.id in BOOT_TIMES:
-                self._watch_boot(message.id, BOOT_TIMES[message.id].get(message.payload), t_us)
+            if message.id in HAS_BOOT_TIME:
+                boot_ms = spec(message.id).fields["time_boot_ms"].get(message.payload)
+                self._watch_boot(message.id, boot_ms, t_us)
             elif message.id == HEARTBEAT:
                 self._present(t_us)
         return True

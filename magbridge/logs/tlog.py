@@ -30,10 +30,10 @@ __all__ = ["TlogWriter"]
 Record = tuple[int, int, bytes]
 """Time of the event (µs since 1970 UTC), channel, and frame."""
 
-WRITE_INTERVAL_S = 0.005
-"""Interval between two writes, s. Up to 200 events a second, each event is written at once, and ``kill -9``
-costs at most the last event; at higher rates it costs the events of 5 ms. The writing thread takes 66 us per
-sample at 100 Hz, with a write for every event, and 19 us at 1,000 Hz."""
+WRITE_INTERVAL_S = 0.05
+"""Interval between two writes, s. Up to 20 events a second, each event is written at once, and ``kill -9``
+costs at most the last event; at higher rates it costs the events of 50 ms. With an interval of 5 ms, the
+writing thread would take a sixth of the bridge's processor time at 100 Hz."""
 QUEUE = 50_000
 """Largest number of events (some 10 MB) that wait for a stalled disk; further events are dropped."""
 LOG_RETRY_US = 2_000_000

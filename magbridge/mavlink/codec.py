@@ -23,7 +23,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
-from pymavlink.dialects.v20.all import MAVLink, MAVLink_message, MAVLinkSigning
+from pymavlink.dialects.v20.all import MAVLink, MAVLink_message, MAVLinkSigning, x25crc
 
 from magbridge.errors import FormatError
 from magbridge.files import contents
@@ -32,6 +32,7 @@ from magbridge.mavlink.messages import (
     NEEDS_MORE,
     REFUSED,
     SECRET,
+    SIGNED,
     Message,
     Spec,
     find_magic,
@@ -189,6 +190,34 @@ class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
         return ""
 
 
+class Packer(MAVLink_message):  # type: ignore[misc] # it has no annotations
+    """Packer of the frames of one message type.
+
+    The method replaces pymavlink's, which makes two header objects and two checksums for each frame; that is
+    half of its time. The frames are equal.
+    """
+
+    def __init__(self, layout: Spec, mav: MAVLink) -> None:
+        super().__init__(layout.id, layout.name)
+        self._extra = bytes((layout.extra,))
+        header = self._header
+        header.srcSystem, header.srcComponent = mav.srcSystem, mav.srcComponent
+        header.incompat_flags = SIGNED if mav.signing.sign_outgoing else 0
+
+    def pack(self, mav: MAVLink, payload: bytes) -> bytes:
+        """Return the frame of a full `payload`, with the sequence number and the signature of `mav`."""
+        header = self._header
+        sent = payload.rstrip(b"\0") or payload[:1]  # MAVLink 2 omits the zeros at the end
+        header.mlen, header.seq = len(sent), mav.seq
+        frame: bytes = header.pack() + sent
+        frame += x25crc(frame[1:] + self._extra).crc.to_bytes(2, "little")
+        if not header.incompat_flags:
+            return frame
+        self._msgbuf = bytearray(frame)
+        self.sign_packet(mav)
+        return bytes(self._msgbuf)
+
+
 MAX_PENDING_BYTES: Final = 4096
 """Most bytes that are stored until a frame is complete; the codec skips them if no frame completes within
 this number, to limit memory."""
@@ -220,7 +249,7 @@ class Codec:
         self._mav = MAVLink(None, system, component)
         if signing is not None:
             self._mav.signing = signing
-        self._packers: dict[int, Any] = {}
+        self._packers: dict[int, Packer] = {}
         self.frames = self.bytes_skipped = 0
         self._rest = b""
         self._looked = 0
@@ -295,8 +324,8 @@ class Codec:
             self.signing.set_clock(self.utc_us)
         packer = self._packers.get(layout.id)
         if packer is None:
-            packer = self._packers[layout.id] = MAVLink_message(layout.id, layout.name)
-        frame: bytes = packer._pack(self._mav, layout.extra, payload)  # noqa: SLF001 - pymavlink's own packer
+            packer = self._packers[layout.id] = Packer(layout, self._mav)
+        frame = packer.pack(self._mav, payload)
         self._mav.seq = self._mav.seq + 1 & 0xFF
         return frame
 

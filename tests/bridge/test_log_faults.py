@@ -153,7 +153,7 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
     assert first_difference(published[: len(recorded.published)], recorded.published) is None
     received = [message.frame for _, message in rig.received]
     missing = [frame for frame in received[-200:] if frame not in recorded.published]
-    assert len(missing) <= 20, "more than the last event"
+    assert len(missing) <= 20, "more than the last 50 ms"
     assert missing == received[len(received) - len(missing) :]
     with log.open("rb") as file:
         channels = {record.channel for record in LogReader(file)}
@@ -171,7 +171,7 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
         "`kill -9`, started again",
         "nothing, then a normal start. Parameters set over the link are kept",
         f"{back:.1f} s after the start",
-        f"at most the last event of the log: {len(missing)} messages here; the rest replays to the same "
+        f"at most the last 50 ms of the log: {len(missing)} messages here; the rest replays to the same "
         "bytes",
     )
 

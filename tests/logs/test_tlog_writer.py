@@ -227,5 +227,5 @@ for k in range(100_000):
     (path,) = tmp_path.iterdir()
     logged = records(path)
     assert logged == [(T0 + 4 * k, FRAME) for k in range(len(logged))]
-    due = sum(when < killed - 0.5 for _, when in seen)  # 10 windows: a loaded machine is slow to wake
+    due = sum(when < killed - 0.5 for _, when in seen)  # 10 intervals: a loaded machine is slow to wake
     assert len(logged) >= max(due, 1)

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from pace import cost
+from pymavlink.dialects.v20 import all as upstream
 
-from magbridge.mavlink import BAD_DATA, Codec, Message, spec
-from magbridge.mavlink.codec import MAX_PENDING_BYTES
+from magbridge.mavlink import BAD_DATA, Codec, Message, Signing, spec
+from magbridge.mavlink.codec import MAX_PENDING_BYTES, timestamp
+from magbridge.mavlink.messages import MESSAGES
 
 
 def stream(count: int, system: int = 1) -> list[bytes]:
@@ -125,3 +127,21 @@ def test_garbage_is_cheap_even_byte_by_byte() -> None:
         bytewise = (garbage[i : i + 1] for i in range(len(garbage)))
         assert cost(lambda: [codec.parse(byte) for byte in bytewise]) < 1000.0  # noqa: B023 - called at once
         assert codec.bytes_skipped > len(garbage) - MAX_PENDING_BYTES - 300
+
+
+@pytest.mark.parametrize("key", [None, bytes(range(32))])
+def test_each_frame_equals_pymavlinks(key: bytes | None) -> None:
+    """Payloads of zeros, of other bytes and with zeros at the end, of every message, signed or not."""
+    own = Codec(1, 191, Signing(key) if key else None)
+    own.now_us = 1_700_000_000_000_000
+    peer = upstream.MAVLink(None, 1, 191)
+    if key:
+        peer.signing.secret_key, peer.signing.sign_outgoing = key, True
+        peer.signing.timestamp = timestamp(own.now_us)
+    for number, kind in MESSAGES.items():
+        layout = spec(number)
+        full = random.Random(number).randbytes(layout.size)
+        for payload in (bytes(layout.size), full, full[: layout.size // 2].ljust(layout.size, b"\0")):
+            packed = upstream.MAVLink_message(number, kind.msgname)._pack(peer, kind.crc_extra, payload)
+            peer.seq = (peer.seq + 1) % 256
+            assert own.frame(layout, payload) == packed
