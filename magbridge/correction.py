@@ -58,6 +58,8 @@ class Correction:
         Object that applies the calibration in use to a sample.
     is_contradicted : bool
         True if another sensor contradicts the last sample; the learner then does not use the next sample.
+    is_learning : bool
+        False while the learner gets no samples, because the computer is overloaded.
     """
 
     def __init__(
@@ -90,7 +92,7 @@ class Correction:
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
         self._conditions = _unmodelled_conditions(calibration)
-        self.is_contradicted = False
+        self.is_contradicted, self.is_learning = False, True
         cutoff_hz = calibration.sensor.filter_cutoff
         self._filter_lag = LagCorrection(cutoff_hz) if cutoff_hz else None
 
@@ -158,7 +160,7 @@ class Correction:
             more, flags = parts.call("direction check", (0.0, 0), self._check_direction, sample, vector)
             quality |= flags
             turned += more
-        if self.learner is not None:
+        if self.learner is not None and self.is_learning:
             flags, variance = parts.call(
                 "learning", (0, 0.0), self._learn, sample, quality, main_field, position, restarted
             )

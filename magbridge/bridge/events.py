@@ -154,6 +154,9 @@ GRACE_US = 500_000
 """Time after a stall in which delayed inputs still arrive, because the buffers were full, µs."""
 NOTICE_US = 1_000_000
 """Shortest stall that is reported, µs."""
+OVERLOAD_US, PAUSE_US = 3_000_000, 5_000_000
+"""An overload begins if stalls fill half of the time for `OVERLOAD_US`, and ends after `PAUSE_US` without a
+stall, µs. While the inputs wait, each pass of the event loop has more to process and lasts longer."""
 
 
 class StateChanges:
@@ -164,13 +167,35 @@ class StateChanges:
     `log_state`: state of the log (MAG_LOG_STATE).
     `log_lost`: number of records that the log has lost.
     `since_us`, `until_us`: event times, µs; inputs up to `until_us` may have waited since `since_us`.
+    `is_overloaded`: True while the computer is too slow, so that the bridge omits optional work. This depends
+        only on event times, so that a replay omits the same work.
     """
 
     def __init__(self, codec: Codec, announcer: Announcer, sensors: Mapping[int, SensorLine]) -> None:
         self._codec, self._announcer, self._sensors = codec, announcer, sensors
         self.log_state, self.log_lost = MAG_LOG_STATE.OFF, 0
         self.since_us = self.until_us = 0
+        self.is_overloaded = False
+        self._stalled_since_us = self._stalled_us = self._last_stall_us = 0
         self._clock_unset = False
+
+    def end_overload(self, time_us: int) -> None:
+        """End an overload if no stall was reported for `PAUSE_US` before `time_us` (µs)."""
+        if time_us - self._last_stall_us > PAUSE_US:
+            self.is_overloaded = False
+            self._announcer.state("overload", "overload is over")
+
+    def _find_overload(self, time_us: int, duration_us: int) -> None:
+        """Detect that successive stalls, the last of `duration_us` until `time_us`, fill most of the time."""
+        if time_us - duration_us - self._last_stall_us > PAUSE_US:
+            self._stalled_since_us, self._stalled_us = time_us - duration_us, 0
+        self._stalled_us += duration_us
+        self._last_stall_us = time_us
+        elapsed_us, is_single = time_us - self._stalled_since_us, self._stalled_us == duration_us
+        if elapsed_us >= OVERLOAD_US and 2 * self._stalled_us >= elapsed_us and not is_single:
+            self.is_overloaded = True
+            text = "overload: learning pauses, fewer messages"
+            self._announcer.state("overload", text, MAV_SEVERITY.WARNING)
 
     @staticmethod
     def held_up(data: bytes) -> int:
@@ -208,7 +233,8 @@ class StateChanges:
         if time_us > self.until_us:  # else the stall continues an earlier one
             self.since_us = time_us - duration_us
         self.until_us = time_us + GRACE_US
-        if duration_us >= NOTICE_US:
+        self._find_overload(time_us, duration_us)
+        if duration_us >= NOTICE_US and not self.is_overloaded:
             text = f"stood still for {duration_us * 1e-6:.1f} s: late samples are flagged"
             self._announcer.send_statustext(text, MAV_SEVERITY.WARNING)
 

@@ -197,6 +197,8 @@ class Pipeline:
         if self._late and time_us > self._changes.until_us:
             self._late = False
             self._set_late(0)
+        if self._changes.is_overloaded:
+            self._changes.end_overload(time_us)
         if channel is SENSOR:
             recorder.sensor(time_us, data, event.sensor_id)
             if (stream := self._by_id.get(event.sensor_id)) is not None:
@@ -230,6 +232,8 @@ class Pipeline:
 
     def _sample(self, stream: SensorStream, reading: Reading, stamp: Stamp) -> None:
         position, main = self._position, self.streams[0]
+        if isinstance(self._correction, Correction):
+            self._correction.is_learning = not self._changes.is_overloaded
         utc_us = stamp.time_us + self.component.codec.utc_offset_us
         main_field = self._parts.call("position", nan, position.main_field, stamp.time_us, utc_us)
         place, depth = position.last_position, position.depth
@@ -241,7 +245,11 @@ class Pipeline:
                     self._process(other, sample, corrected)
 
     def _process(self, stream: SensorStream, sample: Sample, corrected: Corrected) -> None:
-        """Check a corrected sample, pass it to navigation, heading and learning, and publish it."""
+        """Check a corrected sample, pass it to navigation, heading and learning, and publish it.
+
+        During an overload, most samples are only checked and published as MAG_RAW and MAG_FIELD.
+        """
+        is_brief = self._changes.is_overloaded and not stream.overload_rate.due(sample.time_us)
         if self._comparisons:
             call, compare = self._parts.call, self._compare
             corrected = call("comparison of sensors", corrected, compare, stream, sample.time_us, corrected)
@@ -255,12 +263,12 @@ class Pipeline:
         if is_main:
             for other in self.streams[1:]:
                 other.use_vector(sample.time_us, corrected.field)
-            if self.navigation is not None:
+            if self.navigation is not None and not is_brief:
                 self._parts.call("navigation", None, self.navigation.sample, sample.time_us, corrected)
-            if self.heading is not None:
+            if self.heading is not None and not is_brief:
                 attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
-        stream.publisher.publish(sample, corrected, anomaly, attitude)
-        if is_main and self.heading is not None and self.heading.is_sending:
+        stream.publisher.publish(sample, corrected, anomaly, attitude, is_brief=is_brief)
+        if is_main and self.heading is not None and self.heading.is_sending and not is_brief:
             self.heading.send(attitude, sample.time_us, corrected.quality)
         if self.recorder.active and self._raw_rate.hertz != 0:
             self.recorder.raw(self.component.codec.now_us, stream.publisher.raw_payload(sample))

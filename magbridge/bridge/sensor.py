@@ -20,7 +20,7 @@ from magbridge.config import Align, Config, Sensor
 from magbridge.correction import Correction
 from magbridge.errors import ConfigError
 from magbridge.link.component import Component
-from magbridge.link.output import Announcer, Timers
+from magbridge.link.output import Announcer, Rate, Timers
 from magbridge.link.publish import Publisher
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Corrected, Reading, Vector
@@ -207,6 +207,8 @@ def check(units: Mapping[str, str], config: Config) -> None:
         raise error
 
 
+OVERLOAD_HZ = 5.0
+"""Rate of the samples that get all optional work during an overload, Hz."""
 RATE_SAMPLES = 64
 """Number of latest samples over which the sample rate is computed."""
 
@@ -279,6 +281,7 @@ class SensorStream:
     `line`: monitor of the line, with the commands to send to the sensor.
     `samples`, `lost`: number of readings received, and of readings missing in the instrument's numbering.
     `quality`: quality flags that were last sent as STATUSTEXT.
+    `overload_rate`: limit of the samples with all optional work during an overload.
     """
 
     def __init__(
@@ -299,6 +302,7 @@ class SensorStream:
         )  # fmt: skip
         self._component = component
         self.samples = self.lost = self.quality = 0
+        self.overload_rate = Rate(OVERLOAD_HZ)
         self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
 
     def receive(self, data: bytes, time_us: int) -> Iterable[tuple[Reading, Stamp]]:

@@ -71,11 +71,18 @@ class Publisher:
         self._messages = [
             (rates[name], getattr(self, method)) for name, method in PUBLISHED.items() if name in rates
         ]
+        self._main_messages = sum(name in rates for name in MAIN_MESSAGES)
         self.latest: tuple[Sample, Corrected, float, Attitude] | None = None
         self.samples = 0
 
     def publish(
-        self, sample: Sample, corrected: Corrected, anomaly: float = nan, attitude: Attitude = NO_ATTITUDE
+        self,
+        sample: Sample,
+        corrected: Corrected,
+        anomaly: float = nan,
+        attitude: Attitude = NO_ATTITUDE,
+        *,
+        is_brief: bool = False,
     ) -> None:
         """Send the messages whose rates are due for a sample, at the time ``outbox.codec.now_us``.
 
@@ -83,11 +90,12 @@ class Publisher:
         `corrected`: the corrected field of the sample.
         `anomaly`: total field minus the main field, nT; NaN if the position is unknown.
         `attitude`: attitude with the heading computed from the corrected field.
+        `is_brief`: True to send only MAG_RAW and MAG_FIELD.
         """
         self.latest = sample, corrected, anomaly, attitude
         self.samples += 1
         time_us = sample.time_us
-        for rate, send in self._messages:
+        for rate, send in self._messages[: self._main_messages] if is_brief else self._messages:
             hertz = rate.hertz
             if hertz == 0.0 or (hertz > 0.0 and rate.due(time_us)):
                 send(sample, corrected, anomaly, attitude)
@@ -171,6 +179,8 @@ PUBLISHED: dict[str, str] = {
     "ATTITUDE_QUATERNION_COV": "_quaternion",
 }
 """Messages that can be sent with each sample, each with the method of `Publisher` that sends it."""
+MAIN_MESSAGES = ("MAG_RAW", "MAG_FIELD")
+"""First messages of `PUBLISHED`, which are sent even during an overload."""
 
 
 LIMITS = {

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, HostClock, StartEvent, clock_step, declarations
+from magbridge.bridge.events import Event, HostClock, StartEvent, clock_step, declarations, standstill
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.run import SAVE_US, Keeper
 from magbridge.bridge.run import load_state as kept
@@ -263,3 +263,39 @@ def test_a_process_that_is_stopped_near_a_look_at_utc(monkeypatch: pytest.Monkey
         assert clock.step_us() == pytest.approx(expected, abs=HostClock.AT_ONCE_US)
         assert not waits
         monkeypatch.undo()
+
+
+def test_an_overloaded_bridge_omits_only_optional_work(tmp_path: Path) -> None:
+    """Passes of the event loop that last 1 s each; the omitted messages depend only on the log."""
+
+    def overloaded(pipeline: Pipeline) -> Iterator[Event]:
+        for second in range(40):
+            if 10 <= second < 20:
+                stalled_us = START + 1_000_000 * second
+                yield Event(stalled_us, Channel.STATE, standstill(stalled_us, 900_000))
+            yield from events(pipeline, 20 * second, 20 * (second + 1))
+
+    messages = ["MAG_FIELD", "HIGHRES_IMU"]
+    pipeline = small_bridge(
+        tmp_path, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), messages
+    )
+    received = Codec(255, 190)
+    count = {"MAG_FIELD": 0, "HIGHRES_IMU": 0}
+    texts = []
+    with closing(TlogWriter(tmp_path / "logs")) as log:
+        sent = []
+        for event in overloaded(pipeline):
+            sent += pipeline.feed(event)
+            log.extend(pipeline.recorder.drain())
+    for message in received.parse(b"".join(frame for _, frame in sent)):
+        if message.name in count:
+            count[message.name] += 1
+        elif message.name == "STATUSTEXT" and "overload" in message["text"]:
+            texts.append(message["text"].partition(":")[0])
+    assert texts == ["overload", "overload is over"]
+    assert count["MAG_FIELD"] == 800
+    # from the 4th stall to 5 s after the last one, a message is sent with every 4th sample
+    assert 600 < count["HIGHRES_IMU"] < 650
+    recorded = Recorded(sorted((tmp_path / "logs").iterdir()))
+    again = small_bridge(tmp_path, recorded.start, Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), messages)
+    assert [frame for event in recorded.events() for frame in again.feed(event)] == sent
