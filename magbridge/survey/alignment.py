@@ -396,7 +396,7 @@ class _JointFit:
         """Return the statistically significant terms: shift, heading error, channels."""
         names = ["heading error", *(term.name for term in self.rows.terms)]
         covariance, column = self.solution.covariance, self.rows.column
-        tests, found = len(names) + 1, []
+        tests, found = len(names) + 2, []
         if len(self.free):
             # At one speed only the shift along the track is known: forward lever arm minus speed times lag.
             along = np.array([-self.speed, 1.0, 0.0])[self.free]
@@ -412,8 +412,15 @@ class _JointFit:
                 found.append(Diagnostic("scalar.shift", values))
         edges = np.cumsum([0, *(len(part) for part in parts)])
         for name, part, first, last in zip(names, parts, edges[:-1], edges[1:], strict=True):
-            if name != COMPENSATION and is_significant(part, covariance[first:last, first:last], tests):
-                code = "scalar.heading_error" if name == "heading error" else "scalar.channel"
+            # Each harmonic of the heading is a test of its own: one of 4 degrees of freedom would be weaker.
+            is_heading = name == "heading error"
+            ends = [first, first + 2, last] if is_heading else [first, last]
+            named = any(
+                is_significant(part[a - first : b - first], covariance[a:b, a:b], tests)
+                for a, b in pairwise(ends)
+            )
+            if name != COMPENSATION and named:
+                code = "scalar.heading_error" if is_heading else "scalar.channel"
                 values = {"column": column, "channel": name, "effect_nT": contribution[name]}
                 found.append(Diagnostic(code, values))
         return tuple(found)

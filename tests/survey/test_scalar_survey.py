@@ -44,8 +44,13 @@ def rock(random: np.random.Generator, depth: float) -> tuple[FloatArray, FloatAr
     return np.stack([wave * np.cos(angle), wave * np.sin(angle)], axis=1), random.uniform(0, 2 * np.pi, 400)
 
 
-def grid(seed: int = 1, depth: float = 150.0, side: float = SIDE_M) -> Grid:
-    """Return lines 100 m and ties 500 m from each other, flown to and fro, with a level for each line."""
+def grid(
+    seed: int = 1, depth: float = 150.0, side: float = SIDE_M, *, level: float = 3.0, error: float = 2.0
+) -> Grid:
+    """Return lines 100 m and ties 500 m from each other, flown to and fro, with a level for each line.
+
+    `level` is the standard deviation of the lines' levels, and `error` the heading error's amplitude, nT.
+    """
     random = np.random.default_rng(seed)
     waves, phases = rock(random, depth)
     along = np.arange(0.0, side, SPEED_M_S / RATE_HZ)
@@ -73,7 +78,7 @@ def grid(seed: int = 1, depth: float = 150.0, side: float = SIDE_M) -> Grid:
     latitude, longitude = offset(*ORIGIN, position[:, 0], position[:, 1])
     clocks = np.concatenate(time)
     reading = magnitude(igrf(longitude, latitude, np.full(len(clocks), -80.0), clocks)) + truth
-    reading += 2.0 * np.cos(psi - 0.7) + random.normal(0, 3.0, len(starts))[label]
+    reading += error * np.cos(psi - 0.7) + random.normal(0, level, len(starts))[label]
     reading += random.normal(0, NOISE_NT, len(clocks))
     columns = {
         "latitude": (latitude, "deg"),
@@ -116,6 +121,15 @@ def test_shift_and_heading_error_are_found(flown: Grid) -> None:
     assert set(found.scalar.contribution) == {"heading error", "lag and lever arm"}
     # Levels of 3 nT on 14 lines hide a heading error of 2 nT.
     assert {finding.code for finding in found.scalar.findings} == {"scalar.shift"}
+
+
+@pytest.mark.parametrize("error", [2.0, 0.0])
+def test_a_heading_error_is_named_where_the_levels_of_lines_do_not_hide_it(error: float) -> None:
+    found = mb.survey([grid(level=1.0, error=error).log], scalar=SENSOR)
+    assert found.scalar is not None
+    named = {finding.code for finding in found.scalar.findings}
+    assert named == {"scalar.shift"} | ({"scalar.heading_error"} if error else set())
+    assert found.scalar.heading_error[:2] == pytest.approx(error * np.array([0.76, 0.64]), abs=0.7)
 
 
 def test_command_with_a_known_shift(flown: Grid, tmp_path: Path, command: Command) -> None:
