@@ -126,6 +126,8 @@ CONTRADICTED_US = 10_000_000
 MIN_HEADING_SIGMA_RAD, HEADING_INTERVAL_US = 0.07, 5_000_000
 """Smallest 1-sigma of a heading while the autopilot's is wrong, rad; the time from one widening of the
 current by it to the next, µs."""
+UNCHECKED_HEADING_SIGMA_RAD = 0.5
+"""1-sigma of the autopilot's heading while it is wrong and no rates check it, rad: 20 to 40 deg were seen."""
 NO_DIRECTION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.NO_BORESIGHT | Quality.LATE_JOIN)
 """Flags of samples whose direction is not used."""
 FIX_3D = 3
@@ -235,18 +237,17 @@ class Motion:
         vouched = uses_gps or time_us - self._contradicted_us >= CONTRADICTED_US
         angles = message["roll"], message["pitch"], message["yaw"]
         rates = np.array([message["rollspeed"], message["pitchspeed"], message["yawspeed"]])
-        if not np.all(np.isfinite(rates)):
-            return float(message["yaw"])
-        received = time_us * 1e-6
-        time = message["time_boot_ms"] * 1e-3 or received
-        self._filter.rotate(received, time, angles, rates, vouched=vouched)
-        if self._filter.agrees:
-            return float(message["yaw"])
-        if time_us - self._widened_us >= HEADING_INTERVAL_US:
+        received, heading, sigma = time_us * 1e-6, float(message["yaw"]), UNCHECKED_HEADING_SIGMA_RAD
+        if np.all(np.isfinite(rates)) and rates.any():  # all zero: the autopilot does not send them
+            time = message["time_boot_ms"] * 1e-3 or received
+            self._filter.rotate(received, time, angles, rates, vouched=vouched)
+            vouched = self._filter.agrees
+            if not vouched:
+                heading, sigma = self._filter.heading, self._filter.heading_sigma
+        if not vouched and time_us - self._widened_us >= HEADING_INTERVAL_US:
             self._widened_us = time_us
-            sigma = max(self._filter.heading_sigma, MIN_HEADING_SIGMA_RAD)
-            self._navigator.widen_heading(time_us, sigma)
-        return self._filter.heading
+            self._navigator.widen_heading(time_us, max(sigma, MIN_HEADING_SIGMA_RAD))
+        return heading
 
     def _attitude(self, message: Message, time_us: int) -> None:
         own = message.component == self._component.peer[1]

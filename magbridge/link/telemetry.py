@@ -264,6 +264,7 @@ def needed_rates(
     if navigation:
         names |= {"VFR_HUD": (5.0, 2.0), "GPS_RAW_INT": (2.0, 1.0), "EKF_STATUS_REPORT": (1.0, 1.0)}
         names["EXTENDED_SYS_STATE"] = (1.0, 0.0)  # states if an aircraft is on the ground
+        names["RAW_IMU"] = (1.0, 0.0)  # rates of the gyros without the autopilot's estimate of their bias
     return rates | {(autopilot, spec(name).id): pair for name, pair in names.items()}
 
 
@@ -314,6 +315,7 @@ class StreamRequests:
             ardupilot, px4 = (autopilot, EKF_STATUS), (autopilot, PX4_STATUS)
             if message["autopilot"] == MAV_AUTOPILOT.PX4 and ardupilot in self.needed:
                 self.needed[px4] = self.needed.pop(ardupilot)
+                self.needed.pop((autopilot, RAW_IMU), None)  # PX4 does not send it
                 self._numbers.add(PX4_STATUS)
             if not self._present:
                 self._present = True
@@ -393,6 +395,7 @@ class StreamRequests:
 HEARTBEAT: Final = spec("HEARTBEAT").id
 EKF_STATUS, PX4_STATUS = spec("EKF_STATUS_REPORT").id, spec("ESTIMATOR_STATUS").id
 """Ids of the messages with the state of the autopilot's estimator: ArduPilot's and PX4's."""
+RAW_IMU: Final = spec("RAW_IMU").id
 INNOVATION_RATIOS: Final = {
     EKF_STATUS: ("velocity_variance", "pos_horiz_variance", "compass_variance"),
     PX4_STATUS: ("vel_ratio", "pos_horiz_ratio", "mag_ratio"),

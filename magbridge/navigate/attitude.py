@@ -1,7 +1,7 @@
 """Attitude from gyro rates and the measured field's direction, for an autopilot whose own attitude is wrong.
 
 A wrong GPS position disturbs the autopilot's estimate of tilt, heading and gyro bias. The rates of its gyros
-without that bias, and the direction of the field, remain right. They determine the attitude but for a slow
+without that bias, and the direction of the field, remain right. They determine the attitude except for a slow
 drift about the field's direction.
 """
 
@@ -15,7 +15,7 @@ from magbridge.arrays import FloatArray
 
 __all__ = ["AttitudeFilter"]
 
-MAX_ANGLE_RAD = 0.05
+MAX_FIELD_ANGLE_RAD = 0.05
 """Largest angle between the measured field, rotated by the autopilot's attitude, and the main field with
 which this attitude counts as right, rad."""
 RECOVERY_TIME_S = 60.0
@@ -35,7 +35,7 @@ ATTITUDE_SIGMA_RAD = 0.3
 """1-sigma of one report of the autopilot's attitude, rad: errors of successive reports are correlated."""
 OFFSET_WEIGHT = 0.3
 """Weight of a new difference between the gyros' rates and the autopilot's, in their running mean."""
-MAX_GAP_S = 5.0
+MAX_RATE_INTERVAL_S = 5.0
 """Longest time over which rates are integrated, s."""
 
 
@@ -92,7 +92,7 @@ class AttitudeFilter:
         pitch and yaw, rad. `vouched` is False if the autopilot's filter contradicts its own sensors.
         """
         self._autopilot = rotation(*angles)
-        if not 0.0 < time - self._time < MAX_GAP_S:
+        if not 0.0 < time - self._time < MAX_RATE_INTERVAL_S:
             self._C, self._rates, self._time, self._received = self._autopilot, rates, time, received
             self._P[:3, :3] = np.eye(3) * ATTITUDE_SIGMA_RAD**2
             self.agrees = vouched
@@ -104,12 +104,14 @@ class AttitudeFilter:
             reported = self._rates + (then - self._time) / seconds * (rates - self._rates)
             # The autopilot's bias changed since the last such difference: the rates between were wrong.
             changed = self._C @ (gyro - reported - self._offset)
-            wrong_s = 2.0 * min(time - self._compared, MAX_GAP_S)
+            wrong_s = 2.0 * min(time - self._compared, MAX_RATE_INTERVAL_S)
             self._P[:3, :3] += np.outer(changed, changed) * wrong_s**2
             self._offset += OFFSET_WEIGHT * (gyro - reported - self._offset)
             self._compared = then
         drift = (
-            BIAS_DRIFT_RAD_S if time - self._compared < MAX_GAP_S or self.agrees else AUTOPILOT_DRIFT_RAD_S
+            BIAS_DRIFT_RAD_S
+            if time - self._compared < MAX_RATE_INTERVAL_S or self.agrees
+            else AUTOPILOT_DRIFT_RAD_S
         )
         mean = 0.5 * (rates + self._rates) + self._offset - self._bias
         F = np.eye(6)
@@ -125,7 +127,7 @@ class AttitudeFilter:
         # After a contradiction, the attitude must also agree with the field; a boresight that is wrong at all
         # times does not count.
         recovers = time - self._contradicted < RECOVERY_TIME_S
-        self.agrees = vouched and not (recovers and self._angle > MAX_ANGLE_RAD)
+        self.agrees = vouched and not (recovers and self._angle > MAX_FIELD_ANGLE_RAD)
         if self.agrees:
             error = self._autopilot @ self._C.T
             small = 0.5 * np.array(

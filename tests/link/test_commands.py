@@ -272,7 +272,7 @@ def test_what_is_needed_depends_on_the_task() -> None:
     full = {spec(number).name for _, number in needed_rates(1, attitude=True, navigation=True)}
     assert full == {
         *("ATTITUDE", "EKF_STATUS_REPORT", "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
-        "VFR_HUD",
+        *("RAW_IMU", "VFR_HUD"),
     }
 
 

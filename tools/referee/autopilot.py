@@ -102,7 +102,7 @@ EARLY_US = 1_000
 """Time by which a message may be early, µs, so that rounded time steps skip none."""
 ARMED, IN_AIR = 128, 2
 """Flag of HEARTBEAT.base_mode, and value of EXTENDED_SYS_STATE.landed_state."""
-OPTIONAL = frozenset(("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY"))
+OPTIONAL = frozenset(("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY", "RAW_IMU"))
 """Messages that the autopilot sends only if `streams` names them."""
 Place = tuple[float, float]
 
@@ -173,6 +173,7 @@ class Autopilot:
             "GPS_RAW_INT": self._gps_raw, "GLOBAL_POSITION_INT": self._global_position,
             "VFR_HUD": self._vfr_hud, "LOCAL_POSITION_NED": self._local_position,
             "ODOMETRY": self._own_odometry, "EXTENDED_SYS_STATE": self._extended_state,
+            "RAW_IMU": self._raw_imu,
         }  # fmt: skip
 
     @property
@@ -308,6 +309,9 @@ class Autopilot:
 
     def _extended_state(self, _: Truth) -> bytes:
         return self._codec.pack("EXTENDED_SYS_STATE", landed_state=IN_AIR)
+
+    def _raw_imu(self, _: Truth) -> bytes:
+        return self._codec.pack("RAW_IMU", time_usec=1000 * self._boot_ms())
 
     def _attitude(self, truth: Truth) -> bytes:
         angles = {"yaw": radians(truth.heading), "pitch": radians(truth.pitch)}
