@@ -13,8 +13,8 @@ vehicle does, and one model serves every estimator, the smoother and the bound:
 ==  =========================================  =====================================================
 
 :class:`Collector` averages samples into a block while the map is linear between them. A block is full if the
-next sample, at the same spacing, would lie beyond it. If the distance of samples exceeds the length of a block, each
-sample is a block.
+next sample, at the same spacing, would lie beyond it. If the distance of samples exceeds the length of a
+block, each sample is a block.
 """
 
 from __future__ import annotations
