@@ -128,6 +128,8 @@ MIN_HEADING_SIGMA_RAD, HEADING_INTERVAL_US = 0.07, 5_000_000
 current by it to the next, µs."""
 UNCHECKED_HEADING_SIGMA_RAD = 0.5
 """1-sigma of the autopilot's heading while it is wrong and no rates check it, rad: 20 to 40 deg were seen."""
+MAX_RATE_RAD_S, MAX_FIELD_NT = 50.0, 1e6
+"""Limits of a rate, rad/s, and of a field, nT, that no vehicle reaches."""
 NO_DIRECTION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.NO_BORESIGHT | Quality.LATE_JOIN)
 """Flags of samples whose direction is not used."""
 FIX_3D = 3
@@ -215,7 +217,8 @@ class Motion:
     def direct(self, time_us: int, corrected: Corrected, utc_us: int) -> None:
         """Use the direction of a corrected sample, at `time_us` and at UNIX time `utc_us` (µs)."""
         field = np.array(corrected.field)
-        if corrected.quality & NO_DIRECTION_FLAGS or not np.all(np.isfinite(field)):
+        known = 0.0 < corrected.total_field < MAX_FIELD_NT and bool(np.isfinite(field).all())
+        if corrected.quality & NO_DIRECTION_FLAGS or not known:
             return
         if time_us - self._main_us >= MAX_MAIN_FIELD_AGE_US:
             latitude, longitude = self._navigator.reckoned(time_us)
@@ -238,7 +241,7 @@ class Motion:
         angles = message["roll"], message["pitch"], message["yaw"]
         rates = np.array([message["rollspeed"], message["pitchspeed"], message["yawspeed"]])
         received, heading, sigma = time_us * 1e-6, float(message["yaw"]), UNCHECKED_HEADING_SIGMA_RAD
-        if np.all(np.isfinite(rates)) and rates.any():  # all zero: the autopilot does not send them
+        if np.all(np.abs(rates) < MAX_RATE_RAD_S) and rates.any():  # all 0: the autopilot sends none
             time = message["time_boot_ms"] * 1e-3 or received
             self._filter.rotate(received, time, angles, rates, vouched=vouched)
             vouched = self._filter.agrees
