@@ -56,7 +56,8 @@ __all__ = ["ScalarFit", "adapt_to_log", "fit_scalar", "is_significant"]
 
 WIDTH_CENTRES_NT = {"permanent": 1000.0, "induced": 100.0, "eddy": 10.0}
 """Centres of the priors of the widths, nT (eddy: nT s)."""
-LOG_WIDTH_SIGMA = 1.0
+LOG_WIDTH_SIGMA = 0.5
+"""1-sigma of the log of a width. If wider, permanent and induced field cancel over few attitudes."""
 CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA = 10.0, 1.5
 """nT a swing and its log's 1-sigma: centre of a channel's width."""
 LAG_SIGMA_S = 0.5
@@ -68,7 +69,10 @@ FIT_INTERVAL_S = 0.5
 FILTER_GAP_INTERVALS = 3.0
 """Intervals without a sample after which the whitening filter begins again."""
 MIN_SCALAR_SAMPLES = 100
-EVIDENCE_ITERATIONS = 15
+NOISE_STARTS_NT = 0.1, 1.0, 10.0
+"""Amplitudes of the slow processes from which the search starts: the evidence has several maxima."""
+START_ITERATIONS, EVIDENCE_ITERATIONS = 5, 25
+"""Iterations of the search from each start, and of the search from the best of them."""
 LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
 """Log of nT: centre and 1-sigma of white noise and fastest process, 1-sigma of the change to the next."""
 LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 15.0, 30.0])), 1.5
@@ -345,19 +349,28 @@ class _ScalarProblem:
                 best, warm = state, state.log_widths
             return state.cost
 
-        if start is None:
-            rough = np.diff(self.target) / np.sqrt(2.0)
-            white = np.log(max(1.4826 * float(np.median(np.abs(rough))), 1e-3))
-            start = np.full(1 + len(TIME_CONSTANTS_S), LOG_PROCESS_CENTRE)
-            start[0] = white
-            if not map_known:
-                start = np.append(start, LOG_CRUST_CENTRES)
-        minimize(
-            cost, start, method="L-BFGS-B", bounds=limits[: len(start)],
-            options={"maxiter": EVIDENCE_ITERATIONS, "ftol": 1e-6, "eps": 1e-3},
-        )  # fmt: skip
+        def search(start: FloatArray, iterations: int) -> FloatArray:
+            found = minimize(
+                cost, start, method="L-BFGS-B", bounds=limits[: len(start)],
+                options={"maxiter": iterations, "ftol": 1e-6, "eps": 1e-3},
+            )  # fmt: skip
+            return np.asarray(found.x)
+
+        starts = self.starts(map_known=map_known) if start is None else []
+        for one in starts:
+            warm = self.family.centre
+            search(one, START_ITERATIONS)
+        search(start if best is None else best.log_noise, EVIDENCE_ITERATIONS)
         assert best is not None
         return best
+
+    def starts(self, *, map_known: bool) -> list[FloatArray]:
+        """Return the starts of the search: logs of the amplitudes, nT, and of the crustal time scale, s."""
+        rough = np.diff(self.target) / np.sqrt(2.0)
+        white = np.log(max(1.4826 * float(np.median(np.abs(rough))), 1e-3))
+        crust = [] if map_known else LOG_CRUST_CENTRES
+        slow = [np.full(len(TIME_CONSTANTS_S), np.log(amplitude)) for amplitude in NOISE_STARTS_NT]
+        return [np.concatenate([[white], processes, crust]) for processes in slow]
 
     def outliers(self, state: _Posterior, kept: BoolArray) -> BoolArray:
         """Return samples (n,) whose whitened residual is far too large, with their neighbours."""
