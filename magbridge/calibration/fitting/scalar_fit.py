@@ -356,11 +356,13 @@ class _ScalarProblem:
             )  # fmt: skip
             return np.asarray(found.x)
 
-        starts = self.starts(map_known=map_known) if start is None else []
-        for one in starts:
-            warm = self.family.centre
-            search(one, START_ITERATIONS)
-        search(start if best is None else best.log_noise, EVIDENCE_ITERATIONS)
+        if start is None:
+            for one in self.starts(map_known=map_known):
+                warm = self.family.centre
+                search(one, START_ITERATIONS)
+            assert best is not None
+            start = best.log_noise
+        search(start, EVIDENCE_ITERATIONS)
         assert best is not None
         return best
 
