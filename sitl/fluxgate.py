@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from math import inf, isnan
 from pathlib import Path
-from struct import pack
+from struct import error, pack
 from typing import Any, ClassVar
 from zlib import crc32
 
@@ -23,10 +23,10 @@ from magbridge.plugins import load, plugins
 from magbridge.records import Reading
 from magbridge.sensors import ascii as ascii_wire
 from magbridge.sensors import digitizer as wire
-from magbridge.sensors import hmr2300, rm3100
-from magbridge.sensors import twinleaf as tio
+from magbridge.sensors import hmr2300, rm3100, tio
 from magbridge.sensors.digitizer import FULL_SCALE, DigitizerOptions
-from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_encode
+from magbridge.sensors.framing import Framer, cobs_encode
+from magbridge.sensors.twinleaf import TwinleafOptions
 from magbridge.toml import convert
 
 __all__ = ["ENCODERS", "Encoder", "Rm3100Registers", "open_encoder"]
@@ -221,7 +221,7 @@ class Rm3100Encoder(Encoder):
 
     def encode(self, reading: Reading) -> bytes:
         """Return the line of one reading."""
-        return rm3100.encode_line(results(reading, self.options.cycle_count), reading.device_time)
+        return rm3100.Rm3100.encode_line(results(reading, self.options.cycle_count), reading.device_time)
 
 
 def results(reading: Reading, cycle_count: int) -> bytes:
@@ -293,7 +293,7 @@ STREAM = {1: 0, 2: 1}
 class TwinleafEncoder(Encoder):
     """Emulated TIO device; set `generation` to 1 before the first reading for the older protocol."""
 
-    Options = tio.TwinleafOptions
+    Options = TwinleafOptions
     generation = 2
 
     def power_on(self) -> None:
@@ -330,14 +330,14 @@ class TwinleafEncoder(Encoder):
         """Execute requests; return the device's replies."""
         answers = b""
         for frame in self._frames.split(data):
-            packet = tio.unslip(frame)
-            if crc32(packet) != CRC32_RESIDUE:
+            try:
+                kind, payload, routing = tio.unpack(frame)
+            except (ValueError, error):
                 continue
-            kind, _, length = tio.TIO_HEADER.unpack_from(packet)
-            if kind != tio.RPC_REQUEST or packet[4 + length : -4] != self._routing:
+            if kind != tio.RPC_REQUEST or routing != self._routing or len(payload) < tio.RPC_HEADER.size:
                 continue
-            number, size = tio.RPC_HEADER.unpack_from(packet, 4)
-            method = packet[8 : 8 + size % 0x8000]
+            number, size = tio.RPC_HEADER.unpack_from(payload)
+            method = payload[4 : 4 + size % 0x8000]
             reply = number.to_bytes(2, "little")
             if method == b"dev.metadata" and self.generation == 2:
                 records = b"".join(bytes([kind, len(record)]) + record for kind, record in self._records())
@@ -363,42 +363,28 @@ class TwinleafEncoder(Encoder):
         axes = ",".join(column.rpartition(".")[2] for column in self._columns[:3])
         sources = [(f"{name}\t{axes}\t{name}\t{self._unit}", 3)]
         sources += [(f"{column}\t\t{column}\tC", 1) for column in self._columns[3:]]
-        packets = self._slip(
-            tio.TIMEBASE, tio.TIMEBASE_HEADER.pack(0, 1, 1, 0, numerator, denominator, 1, 0.0) + bytes(16)
-        )
+        packets = self._slip(tio.TIMEBASE, tio.TIMEBASE_HEADER.pack(0, numerator, denominator) + bytes(16))
         components = b""
         for number, (text, channels) in enumerate(sources):
-            header = tio.SOURCE_HEADER.pack(number, 0, 1, 0, 0, 0, channels, FLOAT32)
+            header = tio.SOURCE_HEADER.pack(number, channels, FLOAT32)
             packets += self._slip(tio.SOURCE, header + text.encode())
-            components += tio.COMPONENT.pack(number, 0, 1, 0)
-        return packets + self._slip(
-            tio.STREAM, tio.STREAM_HEADER.pack(0, 0, 1, 0, 0, len(sources), 0) + components
-        )
+            components += tio.COMPONENT.pack(number)
+        return packets + self._slip(tio.STREAM, tio.STREAM_HEADER.pack(0, 0, 1, len(sources)) + components)
 
     def _records(self) -> list[tuple[int, bytes]]:
         """Return the metadata records of generation 2, each with its type."""
         session, stream = self.power_cycle, STREAM[2]
-        size, active = 4 * len(self._columns), 3
+        rate, decimation = self._rate.numerator, self._rate.denominator
+        segment = tio.SEGMENT_HEADER.pack(stream, session % 256, 0, rate, decimation)
         records = [
-            (tio.DEVICE_RECORD, tio.DEVICE_HEADER.pack(tio.DEVICE_HEADER.size, 0, session, 0, 0, 1)),
-            (
-                tio.STREAM_RECORD,
-                tio.STREAM_RECORD_HEADER.pack(
-                    tio.STREAM_RECORD_HEADER.size, stream, len(self._columns), 1, size, 0, 0
-                ),
-            ),
-            (
-                tio.SEGMENT_RECORD,
-                tio.SEGMENT_HEADER.pack(
-                    tio.SEGMENT_HEADER.size, stream, session % 256, active, 1, 0, session, 0,
-                    self._rate.numerator, self._rate.denominator, 0.0, 0,
-                ),
-            ),
-        ]  # fmt: skip
+            (tio.DEVICE_RECORD, tio.DEVICE_HEADER.pack(session)),
+            (tio.STREAM_RECORD, tio.STREAM_RECORD_HEADER.pack(stream, len(self._columns))),
+            (tio.SEGMENT_RECORD, segment),
+        ]
         for index, name in enumerate(self._columns):
             unit = self._unit if index < 3 else "C"
             header = tio.COLUMN_HEADER.pack(
-                tio.COLUMN_HEADER.size, stream, index, FLOAT32, len(name), len(unit), 0
+                tio.COLUMN_HEADER.size, stream, index, FLOAT32, len(name), len(unit)
             )
             records.append((tio.COLUMN_RECORD, header + name.encode() + unit.encode()))
         return records

@@ -25,7 +25,7 @@ from magbridge.bridge.port import READ_BYTES, PacedPort, Port
 from magbridge.config import Sensor
 from magbridge.errors import ConfigError, PortError
 from magbridge.sensors import Bus, open_driver
-from magbridge.sensors.rm3100 import Rm3100
+from magbridge.sensors.framing import BusDriver
 
 __all__ = ["BusPort", "SerialPort", "may_be_device", "sensor_port", "serial_line"]
 
@@ -298,7 +298,7 @@ class BusPort(Port):
     `driver`: configures the part and reads its registers.
     """
 
-    def __init__(self, name: str, driver: Rm3100) -> None:
+    def __init__(self, name: str, driver: BusDriver) -> None:
         super().__init__(name, ended="the part does not answer")
         self._driver = driver
         self._bus: Any = None
@@ -379,7 +379,7 @@ def sensor_port(sensor: Sensor, path: Path) -> SerialPort | BusPort:
         expected = "expected i2c:BUS:ADDRESS such as i2c:1:0x20, or spi:BUS.DEVICE such as spi:0.0"
         raise ConfigError(source, f"{key}.port", f"{expected}, got {sensor.port!r}")
     driver = open_driver(sensor.driver, sensor.options, source, key)
-    if not isinstance(driver, Rm3100):
+    if not isinstance(driver, BusDriver):
         raise ConfigError(source, f"{key}.driver", f"expected rm3100 on a bus, got {sensor.driver!r}")
     library = "smbus2" if sensor.port.startswith("i2c:") else "spidev"
     if find_spec(library) is None:

@@ -6,13 +6,15 @@ from functools import reduce
 from itertools import pairwise
 from math import inf
 from operator import sub, xor
-from struct import Struct
+from struct import Struct, error
+from typing import ClassVar
 
-from magbridge.records import Reading
+from magbridge.records import MAX_DEVICE_TIME_S, Reading
+from magbridge.sensors import Bus
 
 __all__ = [
-    "CRC32_RESIDUE", "FixedFramer", "FramedDriver", "Framer", "cobs_decode", "cobs_encode", "nmea_checksum",
-    "saturated",
+    "CRC32_RESIDUE", "BusDriver", "FixedFramer", "FramedDriver", "Framer", "cobs_decode", "cobs_encode",
+    "nmea_checksum", "saturated",
 ]  # fmt: skip
 
 CRC32_RESIDUE = 0x2144DF1C
@@ -103,25 +105,77 @@ class FramedDriver:
 
     def feed(self, data: bytes) -> list[Reading]:
         """Process received bytes; return the readings that they complete."""
-        readings = []
+        readings: list[Reading] = []
         for frame in self._framer.split(data):
             try:
-                reading = self.read_frame(frame)
-            except ValueError:
+                found = self.read_frame(frame)
+            except (ValueError, IndexError, error):
                 self._framer.skipped += len(frame)
                 self.frames_bad += self.is_bad(frame)
-            else:
-                if reading is not None:
-                    readings.append(reading)
+                continue
+            if isinstance(found, Reading):
+                readings.append(found)
+            elif found:
+                readings += found
         return readings
 
-    def read_frame(self, frame: bytes) -> Reading | None:
-        """Return the reading in a frame, or None if it has none; ValueError: the frame is invalid."""
+    def read_frame(self, frame: bytes) -> Reading | list[Reading] | None:
+        """Return the reading or readings in a frame, or None if it has none.
+
+        ValueError, IndexError, struct.error: the frame is invalid.
+        """
         raise NotImplementedError
 
     def is_bad(self, frame: bytes) -> bool:  # noqa: ARG002 - some drivers look at it
         """Return True if an invalid frame counts in `frames_bad`; False for the reply to a command."""
         return True
+
+
+class BusDriver(FramedDriver):
+    """Base of drivers of parts on an I2C or SPI bus, whose results are logged as lines of text.
+
+    A subclass defines the class attribute `name`, :meth:`configure`, :meth:`read_results` and
+    :meth:`to_reading`. A line is ``$NAME,time,results*checksum``, with the bytes of the result registers in
+    hexadecimal digits.
+    """
+
+    name: ClassVar[bytes]
+
+    def __init__(self) -> None:
+        super().__init__(b"\n", 64)
+
+    def configure(self, bus: Bus) -> None:
+        """Stop, configure, test and start the part; OSError: another part responds, or it is at fault."""
+        raise NotImplementedError
+
+    def read_results(self, bus: Bus) -> bytes:
+        """Return the bytes of the result registers if a measurement is complete, else no bytes."""
+        raise NotImplementedError
+
+    def to_reading(self, results: bytes, time: float) -> Reading:
+        """Return the reading in result registers read at `time` (s); ValueError: they are invalid."""
+        raise NotImplementedError
+
+    def poll(self, bus: Bus, time: float) -> bytes:
+        """Return the line of a completed measurement at `time` (s, steady clock); empty if not ready."""
+        results = self.read_results(bus)
+        return self.encode_line(results, time) if results else b""
+
+    @classmethod
+    def encode_line(cls, results: bytes, time: float) -> bytes:
+        """Return the line of text for the result registers, read at `time` (s)."""
+        text = b"$%s,%.6f,%s" % (cls.name, time, results.hex().encode())
+        return b"%s*%02X\n" % (text, nmea_checksum(text))
+
+    def read_frame(self, frame: bytes) -> Reading:
+        """Return the reading in a line; ValueError: the line does not contain a valid reading."""
+        text, _, digits = frame.partition(b"*")
+        prefix, time, results = text.split(b",")
+        if len(digits) != 2 or int(digits, 16) != nmea_checksum(text) or prefix != b"$" + self.name:
+            raise ValueError
+        if not abs(float(time)) < MAX_DEVICE_TIME_S:
+            raise ValueError
+        return self.to_reading(bytes.fromhex(results.decode("ascii")), float(time))
 
 
 class FixedFramer:

@@ -7,8 +7,6 @@ Facts from PNI's user manual (r07):
 * The results are in the registers from 0x24 on, three times 24 bits, high byte first.
 * Data are ready if bit 7 of 0x34 is set. Register 0x36 always reads 0x22.
 * The part has no reset command. So the bridge stops the part and writes all registers again.
-
-The bus port polls the registers and converts the results to lines of text, which the log contains.
 """
 
 from __future__ import annotations
@@ -20,10 +18,9 @@ from typing import Annotated, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
-from magbridge.records import MAX_DEVICE_TIME_S, Reading
+from magbridge.records import Reading
 from magbridge.sensors import Bus
-from magbridge.sensors.ascii import strip_checksum
-from magbridge.sensors.framing import FramedDriver, nmea_checksum, saturated
+from magbridge.sensors.framing import BusDriver, saturated
 
 POLL, CMM, CYCLE_COUNTS, TMRC, RESULTS, BIST, STATUS = 0x00, 0x01, 0x04, 0x0B, 0x24, 0x33, 0x34
 REVISION = 0x22
@@ -50,13 +47,14 @@ class Rm3100Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise ValueError(f"rate: expected at most {fastest:.0f} with cycle_count {self.cycle_count}")
 
 
-class Rm3100(FramedDriver):
+class Rm3100(BusDriver):
     """Reader of the RM3100's registers, and parser of the lines in which its readings are logged."""
 
     Options: ClassVar = Rm3100Options
+    name = b"RM3100"
 
     def __init__(self, options: Rm3100Options) -> None:
-        super().__init__(b"\n", 64)
+        super().__init__()
         self._options = options
         self._step = max(0, round(log2(FASTEST_HZ / options.rate)))
         self.period = 2**self._step / FASTEST_HZ
@@ -74,22 +72,18 @@ class Rm3100(FramedDriver):
         is_single = self._options.mode == "single"
         bus.write(*((POLL, bytes([ALL_AXES])) if is_single else (CMM, bytes([CONTINUOUS]))))
 
-    def poll(self, bus: Bus, time: float) -> bytes:
-        """Return the line of a completed measurement at `time` (s, steady clock); empty if not ready."""
-        if not _is_ready(bus):
-            return b""
-        line = encode_line(bus.read(RESULTS, 9), time)
-        if self._options.mode == "single":
+    def read_results(self, bus: Bus) -> bytes:
+        """Return the result registers if a measurement is complete; start the next single measurement."""
+        results = bus.read(RESULTS, 9) if _is_ready(bus) else b""
+        if results and self._options.mode == "single":
             bus.write(POLL, bytes([ALL_AXES]))
-        return line
+        return results
 
-    def read_frame(self, frame: bytes) -> Reading:
-        """Return the reading in a line; ValueError: the line does not contain a valid reading."""
-        prefix, time_text, digits = strip_checksum(frame, "nmea").split(b",")
-        data, time = bytes.fromhex(digits.decode("ascii")), float(time_text)
-        if prefix != b"$RM3100" or len(data) != 9 or not abs(time) < MAX_DEVICE_TIME_S:
+    def to_reading(self, results: bytes, time: float) -> Reading:
+        """Return the reading in the nine result registers; ValueError: another number of registers."""
+        if len(results) != 9:
             raise ValueError
-        x, y, z = (int.from_bytes(data[i : i + 3], "big", signed=True) for i in (0, 3, 6))
+        x, y, z = (int.from_bytes(results[i : i + 3], "big", signed=True) for i in (0, 3, 6))
         field = (x * self.nt_per_count, y * self.nt_per_count, z * self.nt_per_count)
         return Reading(field, (x, y, z), device_time=time, saturated=saturated(x, y, z, MAX_COUNT))
 
@@ -97,12 +91,6 @@ class Rm3100(FramedDriver):
 def nt_per_count(cycle_count: int) -> float:
     """Return the field of one count (nT) for a cycle count."""
     return 1e3 / (0.3671 * cycle_count + 1.5)
-
-
-def encode_line(results: bytes, time: float) -> bytes:
-    """Return the line of text for nine bytes of result registers, read at `time` (s)."""
-    text = b"$RM3100,%.6f,%s" % (time, results.hex().encode())
-    return b"%s*%02X\n" % (text, nmea_checksum(text))
 
 
 def _test(bus: Bus) -> None:

@@ -180,7 +180,7 @@ def test_descriptors_do_not_pile_up() -> None:
     twinleaf = driver()
     for number in range(2000):
         twinleaf.feed(on_the_line(7, pack("<HHIIiHHB", number, 3, 1, 0, 0, 0, 3, F32) + b"a\tx,y,z\t\tnT"))
-    assert len(twinleaf._sources) <= 256  # type: ignore[attr-defined]
+    assert len(twinleaf._device._known) <= 1024  # type: ignore[attr-defined]
 
 
 def test_an_unknown_unit_is_not_guessed() -> None:
