@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from math import degrees, hypot, isfinite, isnan, nan
+from math import degrees, hypot, isfinite, isnan, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -305,7 +305,9 @@ class Motion:
             # if speed is the source already, the navigator has the heading since its own message
             heading = nan if self.source is MotionSource.SPEED else self._heading
             if self._use(MotionSource.SPEED, time_us, "heading and speed through the water or air"):
-                speed = message["groundspeed"] if self._grounded else speed
+                # the horizontal part of the airspeed in a climb or dive
+                level = sqrt(max(speed * speed - message["climb"] ** 2, 0.0))
+                speed = message["groundspeed"] if self._grounded else level
                 self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
 
     def _gps(self, message: Message, time_us: int) -> None:

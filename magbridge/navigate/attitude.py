@@ -104,7 +104,7 @@ class AttitudeFilter:
             reported = self._rates + (then - self._time) / seconds * (rates - self._rates)
             # The autopilot's bias changed since the last such difference: the rates between were wrong.
             changed = self._C @ (gyro - reported - self._offset)
-            wrong_s = 2.0 * min(time - self._compared, MAX_RATE_INTERVAL_S)
+            wrong_s = 4.0 * min(time - self._compared, MAX_RATE_INTERVAL_S)
             self._P[:3, :3] += np.outer(changed, changed) * wrong_s**2
             self._offset += OFFSET_WEIGHT * (gyro - reported - self._offset)
             self._compared = then
