@@ -29,7 +29,7 @@ from magbridge.errors import CalibrationError
 
 __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "RANGE_MARGIN", "CorrectedScalar",
-    "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "Witness",
+    "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "SensorComparison",
     "compare_sensors", "correct_scalar", "scalar_design", "term_columns",
 ]  # fmt: skip
 
@@ -251,7 +251,7 @@ def _level(
     return level, sigma, cross
 
 
-class Witness(NamedTuple):
+class SensorComparison(NamedTuple):
     """Variances and flags that the comparison of a scalar and a vector sensor adds, n samples."""
 
     scalar_variance: FloatArray
@@ -270,7 +270,7 @@ def compare_sensors(
     total: FloatArray,
     total_sigma: FloatArray,
     reference: FloatArray,
-) -> Witness:
+) -> SensorComparison:
     """Compare a compensated scalar sensor with the length of a corrected vector.
 
     All are (n,), nT: both sensors' total field with its standard deviation, and the expected field; NaN where
@@ -292,11 +292,13 @@ def compare_sensors(
         field, sigma = _expected_field(0.5 * (scalar + total), reference, disagrees)
         off_scalar = np.abs(scalar - field) / np.hypot(scalar_sigma, sigma)
         off_total = np.abs(total - field) / np.hypot(total_sigma, sigma)
-        # Both comparisons are False where the expected field is unknown.
-        spares_scalar = off_total > BLAME_RATIO * off_scalar
-        spares_vector = off_scalar > BLAME_RATIO * off_total
-    for_scalar, for_vector = (np.where(spared, 0.0, excess) for spared in (spares_scalar, spares_vector))
-    return Witness(for_scalar, for_vector, np.asarray(disagrees), _jumps(scalar) & ~_jumps(total))
+        # Neither sensor is blamed alone where the expected field is unknown: both comparisons are False.
+        blame_vector = off_total > BLAME_RATIO * off_scalar
+        blame_scalar = off_scalar > BLAME_RATIO * off_total
+    scalar_excess = np.where(blame_vector, 0.0, excess)
+    vector_excess = np.where(blame_scalar, 0.0, excess)
+    jump = _jumps(scalar) & ~_jumps(total)
+    return SensorComparison(scalar_excess, vector_excess, np.asarray(disagrees), jump)
 
 
 def _expected_field(
@@ -304,7 +306,8 @@ def _expected_field(
 ) -> tuple[FloatArray, float]:
     """Return the field that both sensors should read (n,), nT, and its 1-sigma, nT.
 
-    `mean` (n,) is that of both sensors; where they agree, it minus the reference is the crustal field.
+    `mean` (n,) is that of both sensors. Where they agree, `mean` minus the reference is the crustal field.
+    Without a reference, `mean` itself is interpolated over the samples at which they disagree.
     """
     rows = np.flatnonzero(np.isfinite(mean) & ~disagrees)
     base = reference if np.isfinite(reference).any() else np.zeros(len(mean))
