@@ -407,9 +407,10 @@ class Component:
         self.codec.now_us = t_us
         ours = []
         messages = self.codec.parse(data, final=self._whole)
-        self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
         self.received += self._frame_log.frames(messages, self.codec.pending)
-        self._report_clock()
+        if self.codec.signing is not None:
+            self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
+            self._report_clock(self.codec.signing)
         for message in messages:
             if not message.known:
                 if message.id == REFUSED:
@@ -440,12 +441,12 @@ class Component:
             self.announcer.state(f"refused: {why}", text, MAV_SEVERITY.WARNING)
         self._refusals_reported = len(refusals)
 
-    def _report_clock(self) -> None:
+    def _report_clock(self, signing: Signing) -> None:
         """Send a STATUSTEXT if the bridge's clock is a day or more behind the autopilot's.
 
         The bridge's signatures then follow the autopilot's time, because the autopilot rejects older ones.
         """
-        if self.codec.signing is not None and (days := self.codec.signing.followed_days) >= 1.0:
+        if (days := signing.followed_days) >= 1.0:
             text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
             self.announcer.state("signing clock", text, MAV_SEVERITY.WARNING)
 

@@ -122,7 +122,8 @@ class DeclaredField(MessageField):
         for field, text in self._others:
             part = payloads[:, field.offset : field.offset + field.struct.size]
             kinds, first, kind = np.unique(part, axis=0, return_index=True, return_inverse=True)
-            equal = [str(field.get(payloads[k].tobytes())) == text for k in first.tolist()]
+            shown = text.encode().decode("ascii", "replace")  # as fields are read
+            equal = [str(field.get(payloads[k].tobytes())) == shown for k in first.tolist()]
             found &= np.array(equal, bool)[kind.ravel()] if len(kinds) else found
         return found
 

@@ -1,8 +1,9 @@
 """Messages of pymavlink's dialect ``all`` and of magbridge: layouts, received messages, frames.
 
-pymavlink computes checksums and decodes frames. This module finds the frames in a stream of bytes, in place
-of pymavlink's ``parse_char``. After a wrong checksum, ``parse_char`` skips as many bytes as the header
-states, so that garbage that looks like a header hides valid frames (ArduPilot/pymavlink#387).
+pymavlink's classes define the layouts by which fields are read, and pymavlink computes checksums. This module
+finds the frames in a stream of bytes, in place of pymavlink's ``parse_char``. After a wrong checksum,
+``parse_char`` skips as many bytes as the header states, so that garbage that looks like a header hides valid
+frames (ArduPilot/pymavlink#387).
 """
 
 from __future__ import annotations
@@ -45,8 +46,6 @@ MESSAGES: Final[dict[int, Any]] = {**upstream.mavlink_map, **dialect.mavlink_map
 upstream.mavlink_map.update(dialect.mavlink_map)  # pymavlink's decoder takes the classes from there
 MESSAGE_IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
 """Message name -> id."""
-DECODER: Final = upstream.MAVLink(None)
-"""Decoder of accepted frames, without key and buffer."""
 
 
 class Field:
@@ -80,7 +79,7 @@ class Field:
         """Return the field's value in a full-length `payload`: int, float, str (text), bytes or a tuple."""
         values = self.struct.unpack_from(payload, self.offset)
         if self.code == "s":
-            return values[0].partition(b"\0")[0].decode("utf-8", "replace")
+            return values[0].partition(b"\0")[0].decode("ascii", "replace")  # as pymavlink
         return values if self.count and self.code != "B" else values[0]
 
     def put(self, value: Any) -> Any:
@@ -166,8 +165,6 @@ def by_id(**of: T) -> dict[int, T]:
 class Message:
     """Received message, whose fields are read by name: ``message["roll"]``.
 
-    pymavlink decodes the frame when a field is first read.
-
     Attributes
     ----------
     id : int
@@ -182,7 +179,7 @@ class Message:
         True if the message is in the dialect and its checksum is correct.
     """
 
-    __slots__ = ("_decoded", "component", "frame", "id", "known", "payload", "sequence", "system")
+    __slots__ = ("component", "frame", "id", "known", "payload", "sequence", "system")
 
     def __init__(
         self,
@@ -196,7 +193,6 @@ class Message:
     ) -> None:
         self.id, self.system, self.component, self.sequence = number, system, component, sequence
         self.payload, self.frame, self.known = payload, frame, known
-        self._decoded: Any = None
 
     @property
     def name(self) -> str:
@@ -211,14 +207,11 @@ class Message:
         return {name: self[name] for name in spec(self.id).fields} if self.known else {}
 
     def __getitem__(self, name: str) -> Any:
-        if self._decoded is None:
-            self._decoded = DECODER.decode(bytearray(self.frame))
-        value = getattr(self._decoded, name) if name in MESSAGES[self.id].fieldnames else None
-        if value is None:
-            raise KeyError(f"{spec(self.id).name} has no field {name}")
-        if isinstance(value, list):
-            return bytes(value) if spec(self.id).fields[name].code == "B" else tuple(value)
-        return value
+        layout = spec(self.id)
+        field = layout.fields.get(name)
+        if field is None:
+            raise KeyError(f"{layout.name} has no field {name}")
+        return field.get(self.payload)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Message) and (self.id, self.frame) == (other.id, other.frame)

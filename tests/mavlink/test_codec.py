@@ -145,3 +145,15 @@ def test_each_frame_equals_pymavlinks(key: bytes | None) -> None:
             packed = upstream.MAVLink_message(number, kind.msgname)._pack(peer, kind.crc_extra, payload)
             peer.seq = (peer.seq + 1) % 256
             assert own.frame(layout, payload) == packed
+
+
+def test_each_field_is_read_as_by_pymavlink() -> None:
+    own, peer = Codec(1, 191), upstream.MAVLink(None)
+    for number in MESSAGES:
+        layout = spec(number)
+        for payload in (bytes(layout.size), random.Random(number).randbytes(layout.size)):
+            (message,) = Codec(0, 0).parse(own.frame(layout, payload))
+            decoded = peer.decode(bytearray(message.frame))
+            for name, value in message.fields.items():
+                listed = list(value) if isinstance(value, tuple | bytes) else value
+                assert repr(listed) == repr(getattr(decoded, name)), f"{layout.name}.{name}"
