@@ -29,14 +29,6 @@ MAX_INTERVAL = 60_000_000
 """Longest gap over which a rate of change is computed, µs."""
 
 
-def offsets(regressors: int) -> FloatArray:
-    """Return the columns (3 r, r, 9) of an effect in which each regressor adds three coefficients to T."""
-    columns = np.zeros((3 * regressors, regressors, 9))
-    for r in range(regressors):
-        columns[3 * r : 3 * r + 3, r, 6:9] = np.eye(3)
-    return columns
-
-
 def powers(x: Any, order: int) -> tuple[Any, ...]:
     """Return ``x, x^2, ... x^order`` of a number or an array, by products: ``pow()`` is slower."""
     return tuple(accumulate(repeat(x, order), mul))
@@ -60,35 +52,16 @@ def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) ->
     """
     if lag <= 0.0 or len(time) < 2:
         return values
-    # Exact solution for a step input: y moves by 1 - exp(-dt / tau) of its distance from x.
+    from scipy.linalg.lapack import dtbtrs  # noqa: PLC0415  (the live path starts without scipy)
+
+    # Exact solution for a step input: y moves by s = 1 - exp(-dt / tau) of its distance from x. So
+    # y_t - (1 - s_t) y_(t-1) = s_t x_t, a bidiagonal system.
     share = -np.expm1(-np.diff(time) / (lag / stages))
-    usual = float(np.median(share))
-    even = np.abs(share - usual).max() <= 1e-6 * usual  # no gaps, and a clock that does not jitter
+    band = np.ones((2, len(time)))
+    band[1, :-1] = share - 1.0
     for _ in range(stages):
-        values = _filtered(values, usual) if even else _stepped(values, share)
+        values = dtbtrs(band, np.append(values[0], share * values[1:]), uplo="L", diag="U")[0]
     return values
-
-
-def _filtered(values: FloatArray, share: float) -> FloatArray:
-    """Return y (n,) with ``y_t = y_(t-1) + s (x_t - y_(t-1))``; the fraction s is equal for all steps."""
-    from scipy.signal import lfilter  # noqa: PLC0415  (the live path starts without scipy)
-
-    return np.asarray(lfilter([share], [1.0, share - 1.0], values, zi=[(1.0 - share) * values[0]])[0])
-
-
-def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
-    """Return y (n,) as :func:`_filtered` does, with a fraction `share` (n - 1,) for each step.
-
-    The function combines pairs of 2, 4, 8 ... rows, so the number of its passes grows with log2(n).
-    """
-    # y_t = kept_t y_(t-1) + share_t x_t. Two such maps in series are one: combine pairs by doubling.
-    y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
-    step = 1
-    while step < len(y):
-        y[step:] = y[step:] + kept[step:] * y[:-step]
-        kept[step:] = kept[step:] * kept[:-step]
-        step *= 2
-    return y
 
 
 class MomentaryEffect(Effect, frozen=True, kw_only=True):
@@ -108,11 +81,6 @@ class SingleChannelEffect(Effect, frozen=True, kw_only=True):
 
     channel: str
     """Name of the telemetry channel."""
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients: three, one for each axis."""
-        return 3
 
     def channels(self) -> tuple[str, ...]:
         """Return the name of the effect's only channel."""
@@ -180,10 +148,6 @@ class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
     scale: Width
     """`centre`, `scale`: In the channel's unit; the scaled position is ``(p - centre) / scale``."""
 
-    def columns(self, field: float) -> FloatArray:
-        """Return the columns (3 r, r, 9): each regressor adds three coefficients to T."""
-        return offsets(self.size // 3)
-
 
 class PathEffect(MassEffect, frozen=True, kw_only=True):
     """Effect on the offset T that depends only on the mass's present position, not on its path."""
@@ -223,9 +187,9 @@ class PowersEffect(PathEffect, frozen=True, kw_only=True):
     """Highest power."""
 
     @property
-    def size(self) -> int:
-        """Number of coefficients (nT): three for each power."""
-        return 3 * self.order
+    def regressor_count(self) -> int:
+        """Number of powers."""
+        return self.order
 
     def regressors(self, x: Any) -> tuple[Any, ...]:
         """Return the powers of x from 1 to `order`."""
@@ -248,9 +212,9 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
     """Number of sources."""
 
     @property
-    def size(self) -> int:
-        """Number of coefficients (nT): three for each source."""
-        return 3 * self.count
+    def regressor_count(self) -> int:
+        """Number of sources."""
+        return self.count
 
     def regressors(self, x: Any) -> tuple[Any, ...]:
         """Return the regressor of each source at the scaled position x."""
@@ -270,21 +234,12 @@ class LegendreEffect(MomentaryEffect, frozen=True, kw_only=True):
     exponents: Exponents
     """Degree e_k for each parameter, whose positions x_k are scaled by the calibration."""
 
-    @property
-    def size(self) -> int:
-        """Number of coefficients (nT): three, one for each axis."""
-        return 3
-
     def check(self, parameters: tuple[str, ...]) -> None:
         """Raise CalibrationError unless each parameter has an exponent >= 0, with a sum of at most 30."""
         if len(self.exponents) != len(parameters):
             raise CalibrationError(f"legendre: expected {len(parameters)} exponents, one for each parameter")
         if min(self.exponents, default=0) < 0 or sum(self.exponents) > MAX_ORDER:
             raise CalibrationError(f"legendre: expected exponents >= 0, together at most {MAX_ORDER}")
-
-    def columns(self, field: float) -> FloatArray:
-        """Return the columns (3, 1, 9): the only regressor adds three coefficients to T."""
-        return offsets(1)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a function that computes the product of the polynomials, by Horner's scheme."""
@@ -327,9 +282,9 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
     with ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``."""
 
     @property
-    def size(self) -> int:
-        """Number of coefficients (nT): one for each axis; for a polynomial, three for each power."""
-        return 3 * max(self.order, 1)
+    def regressor_count(self) -> int:
+        """Number of regressors: one, or one for each power of a polynomial."""
+        return max(self.order, 1)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper that starts with ``y = p`` at the first known value, the middle of the play."""
@@ -393,11 +348,6 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
     sign: float = 1.0
     """1 if the telemetry lags behind the field's samples, -1 if the samples lag, as after a filter."""
 
-    @property
-    def size(self) -> int:
-        """Number of coefficients: one, the delay."""
-        return 1
-
     def columns(self, field: float) -> FloatArray:
         """Return the columns (1, 9, 9): the delay multiplies the rate of change (nT/s) of each slot."""
         return self.sign * np.eye(9)[None]
@@ -451,18 +401,9 @@ class TimeEffect(MomentaryEffect, frozen=True, kw_only=True):
     """Highest power of a drift."""
 
     @property
-    def regressors(self) -> int:
-        """Number of regressors, each a function of time."""
+    def regressor_count(self) -> int:
+        """Number of functions of time."""
         return {"step": 1, "drift": self.order, "tone": 2}[self.shape]
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients (nT): three for each function of time."""
-        return 3 * self.regressors
-
-    def columns(self, field: float) -> FloatArray:
-        """Return the columns (3 r, r, 9): each function of time adds three coefficients to T."""
-        return offsets(self.regressors)
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a function that computes the functions of time at a sample's time."""
@@ -494,22 +435,13 @@ class RateEffect(Effect, frozen=True, kw_only=True):
     ``T_i = tau_i dH_i/dt``. ``eddy``: a changing field drives eddy currents; the six coefficients xy, xz, yx,
     yz, zx, zy are k_ij in ``T_i = k_ij dH_j/dt`` (Tolles & Lawson 1950, in the notation of Leliak 1961)."""
 
-    @property
-    def size(self) -> int:
-        """Number of coefficients, each a time in s."""
-        return {"skew": 3, "eddy": 6}[self.on]
-
     def columns(self, field: float) -> FloatArray:
-        """Return the columns (K, 3, 9): each coefficient adds the rate (nT/s) of one channel to T."""
-        columns = np.zeros((self.size, 3, 9))
-        if self.on == "skew":
-            for k in range(3):
-                columns[k, k, 6 + k] = 1.0
-        else:
-            # k_ij: channel j's rate adds to offset i.
-            pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
-            for k, (i, j) in enumerate(pairs):
-                columns[k, j, 6 + i] = 1.0
+        """Return the columns (K, 3, 9): each coefficient (s) adds the rate (nT/s) of one channel to T."""
+        # k_ij: the rate of channel j adds to offset i; the skews are the k_ii
+        pairs = [(i, j) for i in range(3) for j in range(3) if (i == j) == (self.on == "skew")]
+        columns = np.zeros((len(pairs), 3, 9))
+        for k, (i, j) in enumerate(pairs):
+            columns[k, j, 6 + i] = 1.0
         return columns
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
@@ -570,16 +502,12 @@ class ResponseEffect(MomentaryEffect, frozen=True, kw_only=True):
     """Reading at the knee, nT; s is its sign. Where ``s H >= s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``
     with two coefficients, nT."""
 
-    @property
-    def size(self) -> int:
-        """Number of coefficients (nT): three for a power, two for a knee."""
-        return 3 if self.power else 2
-
     def columns(self, field: float) -> FloatArray:
-        """Return the columns (K, K, 9): a power adds one regressor to each channel, a knee both to one."""
-        columns = np.zeros((self.size, self.size, 9))
-        for k in range(self.size):
-            columns[k, k, 6 + (k if self.power else self.axis)] = 1.0 if self.power else -1.0
+        """Return the columns (K, K, 9), nT: three for a power, one for each channel; two for a knee."""
+        if self.power:
+            return np.eye(3, 9, 6)[:, None, :] * np.eye(3)[:, :, None]
+        columns = np.zeros((2, 2, 9))
+        columns[[0, 1], [0, 1], 6 + self.axis] = -1.0
         return columns
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:

@@ -194,12 +194,24 @@ class Effect(Term, frozen=True, kw_only=True):
         """Return the names of the telemetry channels that the effect needs: parameters or other columns."""
         return ()
 
-    @abstractmethod
-    def columns(self, field: float) -> FloatArray:
+    @property
+    def regressor_count(self) -> int:
+        """Number of regressors r, if :meth:`columns` is not overridden."""
+        return 1
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients K."""
+        return len(self.columns(1.0))
+
+    def columns(self, field: float) -> FloatArray:  # noqa: ARG002  (overrides need it)
         """Return the contribution (K, r, 9) of each coefficient, times each regressor, to the nine slots.
 
-        `field`: F_0, nT.
+        By default each regressor adds three coefficients (nT) to T. `field`: F_0, nT.
         """
+        # coefficient 3 r + i multiplies regressor r and adds to T_i
+        r = self.regressor_count
+        return np.kron(np.eye(r)[:, :, None], np.eye(3, 9, 6)[:, None, :])
 
     @abstractmethod
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:

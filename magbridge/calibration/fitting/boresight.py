@@ -36,20 +36,21 @@ with the weight of :data:`RUN_TILT_PRIOR_COUNT` observations. Within a run, e ha
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
 from magbridge.calibration.model import Boresight, Calibration
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
-
-# ---- From roll and pitch alone ----
 
 INCLINATION_SIGMA_DEG = 0.2
 """1-sigma of a main-field model's inclination (Chulliat et al. 2020, table 14), deg."""
@@ -66,7 +67,6 @@ MIN_TILT_SIGMA_DEG = 0.02
 MAX_ITERATIONS = 50
 CONVERGED_RAD = 1e-8
 """Length of a Gauss-Newton step below which the iterations have converged, rad."""
-MIN_SAMPLES = 30
 SEARCH_SAMPLES = 400
 """Largest number of samples with which the search for the best start runs."""
 MAX_STEP_RAD = 0.5
@@ -75,34 +75,53 @@ LEAST_INFORMATION = 3.0 / np.pi**2
 """Information about an angle that is uniform over a full turn, 1/rad^2."""
 DAMPING = 1e-9
 """Damping of a step as a fraction of the information's trace: it fixes angles that no row determines."""
-AXIS_ANGLES = ("roll", "pitch", "heading")
-"""Name of the mounting angle about each body axis."""
+MAX_OPEN_ANGLE_DEG = 2.0
+"""1-sigma of the least determined angle above which the boresight uses headings, deg."""
+MIN_BORESIGHT_SAMPLES = 30
+"""Smallest number of samples with attitude and reference direction for a boresight."""
+MISMATCH = 10.0
+"""Largest accepted median angle between the directions after the best rotation, deg. Masses cause a smaller
+angle, a reversed channel or angle a larger one."""
+NEAR, LEAST = 2.0, 0.5
+"""Difference below which two angles count as equal, and lower limit of the mismatch to compare with, deg."""
+COMPASS_SIGMA = np.radians(0.5)
+"""1-sigma of a compass error that is common to all runs and does not show in their scatter, rad."""
 
 
-@dataclass(frozen=True, eq=False)
-class TiltBoresight:
-    """Boresight estimated from roll and pitch, with its covariance."""
+def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
+    """Return a field in body axes, (n, 3), nT.
 
-    rotation: FloatArray
-    """(3,): Rotation vector from corrected sensor axes to body axes, rad."""
-    covariance: FloatArray
-    """(3, 3): Covariance of the error, a small rotation about the body axes, rad^2."""
-    inclination_shift: float
-    """Difference of the field's inclination from the reference's, deg; positive: steeper."""
-    tilt_sigma: float
-    """Standard deviation of roll and of pitch, deg: white noise and the offset of a run together."""
-
-    @property
-    def open_angle(self) -> tuple[str, float]:
-        """Name of the least determined mounting angle (roll, pitch or heading), and its 1-sigma, deg."""
-        sigma = np.degrees(np.sqrt(np.diag(self.covariance)))
-        axis = int(np.argmax(sigma))
-        return AXIS_ANGLES[axis], float(sigma[axis])
+    `attitude` (n, 3): roll, pitch, heading (3-2-1 rotation), rad. `field_ned` (n, 3): the field north-east-
+    down, nT.
+    """
+    body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
+    return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
 
 
-def down_in_body(roll: FloatArray, pitch: FloatArray) -> FloatArray:
-    """Return the unit vector of gravity in body axes, (n, 3), from roll and pitch (n,), rad."""
-    return np.stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)], axis=1)
+def choose_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
+    """Return the boresight from roll and pitch if they determine it, else the boresight from headings.
+
+    Headings are the second choice, because a heading from the magnetometer itself contains the error that the
+    boresight should remove. None: as for :func:`find_boresight`.
+
+    CalibrationError: as for :func:`find_boresight`, which always checks the headings.
+    """
+    with_headings = find_boresight(calibration, data)
+    if data.attitude is None or data.reference_ned is None or calibration.effects:
+        return with_headings
+    known = np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1)
+    if known.sum() < MIN_BORESIGHT_SAMPLES:
+        return with_headings
+    vector, ned = _vectors(calibration, data.part(known)), data.reference_ned[known]
+    roll, pitch, _ = data.attitude[known].T
+    # the tilt method needs the magnitude and inclination of the field, but no heading
+    total = np.linalg.norm(ned, axis=1)
+    found = boresight_from_tilt(vector, roll, pitch, total, np.arcsin(ned[:, 2] / total), data.runs[known])
+    least_known = np.degrees(np.sqrt(np.diag(found.covariance))).max()
+    return with_headings if least_known > MAX_OPEN_ANGLE_DEG else found
+
+
+# ---- From roll and pitch alone ----
 
 
 def boresight_from_tilt(
@@ -111,25 +130,23 @@ def boresight_from_tilt(
     pitch: FloatArray,
     total: FloatArray,
     inclination: FloatArray,
-    runs: IndexArray,
-) -> TiltBoresight:
+    runs: NDArray[np.generic],
+) -> Boresight:
     """Estimate the rotation from corrected sensor axes to body axes from roll and pitch, without headings.
 
     `vector` (n, 3): corrected field in sensor axes, nT. `roll`, `pitch` (n,): rad. `total` (n,): reference of
     the total field, nT. `inclination` (n,): of the reference, rad, positive downwards. `runs` (n,): run of
     each sample; roll and pitch have one offset in each run.
-
-    CalibrationError: fewer than :data:`MIN_SAMPLES` samples.
     """
-    if len(vector) < MIN_SAMPLES:
-        raise CalibrationError(
-            f"boresight: expected at least {MIN_SAMPLES} samples with roll, pitch and reference, "
-            f"got {len(vector)}"
-        )
     horizontal = total * np.cos(inclination)
-    down = down_in_body(roll, pitch)
-    prior = np.zeros((4, 4))
-    prior[3, 3] = 1.0 / np.radians(INCLINATION_SIGMA_DEG) ** 2
+    zero, sin_roll, cos_roll, sin_pitch, cos_pitch = (
+        np.zeros(len(roll)), np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+    )  # fmt: skip
+    # direction of gravity, and its derivatives by roll and by pitch
+    down = np.stack([-sin_pitch, sin_roll * cos_pitch, cos_roll * cos_pitch], axis=1)
+    by_roll = np.stack([zero, cos_roll * cos_pitch, -sin_roll * cos_pitch], axis=1)
+    by_pitch = np.stack([-cos_pitch, -sin_roll * sin_pitch, -cos_roll * sin_pitch], axis=1)
+    prior = np.diag([0.0, 0.0, 0.0, np.radians(INCLINATION_SIGMA_DEG) ** -2.0])
 
     def rows(x: FloatArray, start: Rotation, part: IndexArray | slice) -> tuple[FloatArray, FloatArray]:
         """Return residuals (n,), as rad of tilt, and derivatives (n, 4) by the rotation and dI in x (4,)."""
@@ -150,22 +167,16 @@ def boresight_from_tilt(
     turned = rotation.apply(vector)
     e, J = rows(np.array([0.0, 0.0, 0.0, shift]), rotation, slice(None))
     tilt_sigma = max(float(np.sqrt(np.mean(e * e))), np.radians(MIN_TILT_SIGMA_DEG))
-    # derivatives of gravity's direction by roll and by pitch; from them t_i, the derivatives of the row
-    by_roll = np.stack([np.zeros(len(roll)), np.cos(roll) * np.cos(pitch), -np.sin(roll) * np.cos(pitch)], 1)
-    by_pitch = np.stack(
-        [-np.cos(pitch), -np.sin(roll) * np.sin(pitch), -np.cos(roll) * np.sin(pitch)], axis=1
-    )
+    # t_i, the derivatives of the row by roll and pitch
     offsets = np.stack([(turned * by_roll).sum(1), (turned * by_pitch).sum(1)], axis=1) / horizontal[:, None]
-    # Noise of the tilt changes J as a change of attitude does, which inflates N: subtract its part.
-    noise = sum(
-        turn.T @ turn for turn in (np.cross(turned, d) / horizontal[:, None] for d in (by_roll, by_pitch))
-    )
     N = J.T @ J / tilt_sigma**2 + prior
-    N[:3, :3] -= noise
+    # Noise of the tilt changes J as a change of attitude does, which inflates N: subtract its part.
+    for by_angle in (by_roll, by_pitch):
+        turn = np.cross(turned, by_angle) / horizontal[:, None]
+        N[:3, :3] -= turn.T @ turn
     values, axes = np.linalg.eigh(N)
     N = (axes * np.maximum(values, LEAST_INFORMATION)) @ axes.T
-    _, run = np.unique(runs, return_inverse=True)
-    parts = [run == index for index in range(int(run.max()) + 1)]
+    parts = [runs == label for label in np.unique(runs)]
     white, offset = _tilt_variances([e[part] for part in parts], [offsets[part] for part in parts])
     meat = N.copy()
     for part in parts:
@@ -173,10 +184,7 @@ def boresight_from_tilt(
         meat += offset * lever @ lever.T
     inverse = np.linalg.inv(N)
     covariance = (inverse @ meat @ inverse)[:3, :3]
-    return TiltBoresight(
-        rotation.as_rotvec(), 0.5 * (covariance + covariance.T), float(np.degrees(shift)),
-        float(np.degrees(np.sqrt(white + offset))),
-    )  # fmt: skip
+    return _boresight(rotation, covariance, float(np.degrees(np.sqrt(white + offset))))
 
 
 def _tilt_variances(residuals: list[FloatArray], levers: list[FloatArray]) -> tuple[float, float]:
@@ -227,45 +235,38 @@ def _gauss_newton(
     return rotation, float(x[3]), float(e @ e) / sigma**2 + prior[3, 3] * float(x[3]) ** 2
 
 
-# ---- With headings, and the choice ----
-
-MAX_OPEN_ANGLE_DEG = 2.0
-"""1-sigma of the least determined angle above which the boresight uses headings, deg."""
-MIN_BORESIGHT_SAMPLES = 30
-"""Smallest number of samples with attitude and reference direction for a boresight."""
-MISMATCH = 10.0
-"""Largest accepted median angle between the directions after the best rotation, deg. Masses cause a smaller
-angle, a reversed channel or angle a larger one."""
-NEAR, LEAST = 2.0, 0.5
-"""Difference below which two angles count as equal, and lower limit of the mismatch to compare with, deg."""
-COMPASS_SIGMA = np.radians(0.5)
-"""1-sigma of a compass error that is common to all runs and does not show in their scatter, rad."""
+# ---- With headings ----
 
 
-def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
-    """Return a field in body axes, (n, 3), nT.
+def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
+    """Return the rotation from corrected sensor axes to body axes, from roll, pitch and heading.
 
-    `attitude` (n, 3): roll, pitch, heading (3-2-1 rotation), rad. `field_ned` (n, 3): the field north-east-
-    down, nT.
+    The result is None if too few samples have attitude and reference direction, or the calibration has
+    effects.
+
+    CalibrationError: after the best rotation, the corrected vectors and the reference still differ by more
+    than :data:`MISMATCH`.
     """
-    body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
-    return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
-
-
-def _vectors(calibration: Calibration, data: Observations) -> FloatArray:
-    """Return the corrected vectors of `data` (n, 3) in sensor axes, without a boresight, nT."""
-    k = len(calibration.parameters)
-    return correct(replace(calibration, boresight=None), data.field, data.parameters[:, :k], data.time).vector
-
-
-def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
-    """Return the best rotation R of vectors b to v, (n, 3) each, and the median angle from R b to v, deg."""
-    # Wahba's problem: the rotation that minimises the sum of |v - R b|^2
-    rotation, _ = Rotation.align_vectors(v, b)
-    turned = rotation.apply(b)
-    # angles by the arctangent, which is accurate for small ones
-    left = np.arctan2(np.linalg.norm(np.cross(v, turned), axis=1), np.sum(v * turned, axis=1))
-    return rotation, float(np.degrees(np.median(left)))
+    known, attitude, reference_ned = data.directed()
+    if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
+        return None
+    part = data.part(known)
+    v, b = field_body(attitude, reference_ned), _vectors(calibration, part)
+    rotation, angle = _wahba(v, b)
+    if angle > MISMATCH:
+        raise CalibrationError(
+            f"however the sensor is turned, the field lies {angle:.0f} degrees (median) from where roll, "
+            "pitch, heading and IGRF say: a channel or an angle has the other sign, two are swapped, angles "
+            "are not in degrees, or the place is another; no boresight, so the vector stays in sensor axes"
+        )
+    # Sandwich covariance: attitude errors last as long as a run, so the scores (derivatives of the misfit by
+    # a small rotation) are summed within runs, and the scatter of these sums takes the place of the noise
+    # (Liang & Zeger 1986, Biometrika 73:13).
+    score = np.cross(v, rotation.apply(b) - v)
+    between = np.stack([score[part.runs == label].sum(axis=0) for label in np.unique(part.runs)])
+    inverse = np.linalg.inv(np.sum(v * v) * np.eye(3) - v.T @ v)
+    spread = between.T @ between * (len(between) / max(len(between) - 1, 1))
+    return _boresight(rotation, inverse @ spread @ inverse + COMPASS_SIGMA**2 * np.eye(3))
 
 
 def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnostic | None:
@@ -296,70 +297,32 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnosti
     return Diagnostic("magnetic_headings", angles)
 
 
-def choose_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
-    """Return the boresight from roll and pitch if they determine it, else the boresight from headings.
-
-    Headings are the second choice, because a heading from the magnetometer itself contains the error that the
-    boresight should remove. None: as for :func:`find_boresight`.
-
-    CalibrationError: as for :func:`find_boresight`, which always checks the headings.
-    """
-    with_headings = find_boresight(calibration, data)
-    if data.attitude is None or data.reference_ned is None or calibration.effects:
-        return with_headings
-    known = np.asarray(np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1))
-    if known.sum() < MIN_BORESIGHT_SAMPLES:
-        return with_headings
-    part = data.part(known)
-    assert part.attitude is not None
-    assert part.reference_ned is not None
-    # the tilt method needs the magnitude and inclination of the field, but no heading
-    total = np.linalg.norm(part.reference_ned, axis=1)
-    inclination = np.arcsin(part.reference_ned[:, 2] / total)
-    _, runs = np.unique(part.runs, return_inverse=True)
-    found = boresight_from_tilt(
-        _vectors(calibration, part), part.attitude[:, 0], part.attitude[:, 1], total, inclination, runs
-    )
-    if found.open_angle[1] > MAX_OPEN_ANGLE_DEG:
-        return with_headings
-    x, y, z = found.rotation.tolist()
-    first, second, third = ((x, y, z) for x, y, z in found.covariance.tolist())
-    return Boresight((x, y, z), (first, second, third), found.tilt_sigma)
+def _vectors(calibration: Calibration, data: Observations) -> FloatArray:
+    """Return the corrected vectors of `data` (n, 3) in sensor axes, without a boresight, nT."""
+    k = len(calibration.parameters)
+    return correct(replace(calibration, boresight=None), data.field, data.parameters[:, :k], data.time).vector
 
 
-def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
-    """Return the rotation from corrected sensor axes to body axes, from roll, pitch and heading.
-
-    The result is None if too few samples have attitude and reference direction, or the calibration has
-    effects.
-
-    CalibrationError: after the best rotation, the corrected vectors and the reference still differ by more
-    than :data:`MISMATCH`.
-    """
-    known, attitude, reference_ned = data.directed()
-    if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
-        return None
-    part = data.part(known)
-    v, b = field_body(attitude, reference_ned), _vectors(calibration, part)
-    rotation, angle = _wahba(v, b)
+def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
+    """Return the best rotation R of vectors b to v, (n, 3) each, and the median angle from R b to v, deg."""
+    # Wahba's problem: the rotation that minimises the sum of |v - R b|^2
+    rotation, _ = Rotation.align_vectors(v, b)
     turned = rotation.apply(b)
-    # the derivative of the misfit by a small rotation, for each sample
-    score = np.cross(v, turned - v)
-    if angle > MISMATCH:
-        raise CalibrationError(
-            f"however the sensor is turned, the field lies {angle:.0f} degrees (median) from where roll, "
-            "pitch, heading and IGRF say: a channel or an angle has the other sign, two are swapped, angles "
-            "are not in degrees, or the place is another; no boresight, so the vector stays in sensor axes"
-        )
-    # Sandwich covariance: attitude errors last as long as a run, so the scores are summed within runs, and
-    # the scatter of these sums takes the place of the noise (Liang & Zeger 1986, Biometrika 73:13).
-    information = np.sum(v * v) * np.eye(3) - v.T @ v
-    _, which = np.unique(part.runs, return_inverse=True)
-    between = np.stack([np.bincount(which, column) for column in score.T], axis=1)
-    runs = len(between)
-    inverse = np.linalg.inv(information)
-    spread = between.T @ between * (runs / max(runs - 1, 1))
-    covariance = inverse @ spread @ inverse + COMPASS_SIGMA**2 * np.eye(3)
-    x, y, z = rotation.as_rotvec().tolist()
-    first, second, third = ((x, y, z) for x, y, z in (0.5 * (covariance + covariance.T)).tolist())
-    return Boresight((x, y, z), (first, second, third))
+    # angles by the arctangent, which is accurate for small ones
+    left = np.arctan2(np.linalg.norm(np.cross(v, turned), axis=1), np.sum(v * turned, axis=1))
+    return rotation, float(np.degrees(np.median(left)))
+
+
+def _boresight(
+    rotation: Rotation, covariance: FloatArray, tilt_sigma: float = DEFAULT_TILT_SIGMA_DEG
+) -> Boresight:
+    """Return the boresight of a rotation; `covariance` (3, 3): rad^2; `tilt_sigma`: deg."""
+    symmetric = 0.5 * (covariance + covariance.T)
+    return msgspec.convert(
+        {
+            "rotation": rotation.as_rotvec().tolist(),
+            "covariance": symmetric.tolist(),
+            "tilt_sigma": tilt_sigma,
+        },
+        Boresight,
+    )
