@@ -211,7 +211,7 @@ class Effect(Term, frozen=True, kw_only=True):
         """
         # coefficient 3 r + i multiplies regressor r and adds to T_i
         r = self.regressor_count
-        return np.kron(np.eye(r)[:, :, None], np.eye(3, 9, 6)[:, None, :])
+        return np.asarray(np.kron(np.eye(r)[:, :, None], np.eye(3, 9, 6)[:, None, :]), float)
 
     @abstractmethod
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:

@@ -26,8 +26,8 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 
 __all__ = [
-    "CHUNK_ROWS", "PAIRS", "ResidualSamples", "jacobian", "residuals", "residuals_of", "rms", "robust_scale",
-    "scales_and_offsets", "symmetric",
+    "CHUNK_ROWS", "PAIRS", "ResidualSamples", "jacobian", "residual_scale", "residuals", "residuals_of",
+    "rms", "robust_scale", "scales_and_offsets", "symmetric",
 ]  # fmt: skip
 
 CHUNK_ROWS = 8192
@@ -95,6 +95,18 @@ def residuals(samples: ResidualSamples, coefficients: FloatArray) -> tuple[Float
     g[:, :6] /= samples.F_0
     g[:, 6:] = -_times(A, z)
     return e, g
+
+
+def residual_scale(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
+    """Return ``s = sqrt(kappa^2 + |A u|^2)`` (n,), by which the residual divides errors of the total field.
+
+    `coefficients` (9 m,): nT, monomial by monomial.
+    """
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
+    b = _times(A, samples.field - theta[:, 6:])
+    w = _times(A, b) / np.linalg.norm(b, axis=1)[:, None]
+    return np.asarray(np.sqrt(samples.kappa**2 + (w * w).sum(axis=1)))
 
 
 def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:

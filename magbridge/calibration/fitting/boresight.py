@@ -109,7 +109,7 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
     with_headings = find_boresight(calibration, data)
     if data.attitude is None or data.reference_ned is None or calibration.effects:
         return with_headings
-    known = np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1)
+    known = np.asarray(np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1))
     if known.sum() < MIN_BORESIGHT_SAMPLES:
         return with_headings
     vector, ned = _vectors(calibration, data.part(known)), data.reference_ned[known]

@@ -25,7 +25,6 @@ from magbridge.calibration.fitting.field_search import (
 )
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.solve import approach, starts
-from magbridge.calibration.fitting.uncertainty import sizes
 from magbridge.config import Align
 from magbridge.errors import NoSolutionError
 from magbridge.estimation.blocks import (
@@ -47,7 +46,14 @@ from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.estimation.hyperparameters import Hyperparameters, maximise_evidence
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.priors import PriorFamily
-from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
+from magbridge.estimation.residual import (
+    ResidualSamples,
+    jacobian,
+    residual_scale,
+    residuals,
+    residuals_of,
+    robust_scale,
+)
 from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
 # ---- The state of the iterations, and where they begin ----
@@ -490,7 +496,7 @@ class SurveySamples:
                 samples, reference=samples.reference + slow[mine] + B @ w, field=samples.field - offset[mine]
             )
             e, g = residuals(piece, c)
-            size = sizes(piece, c)
+            size = residual_scale(piece, c)
             # a higher reference lowers the residual: -1/s
             steady = self.steady[mine] * (-self.unmapped[mine] / size)[:, None]
             # an offset acts as T does: columns 6 to 8 of the derivative by the nine slots

@@ -22,7 +22,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.heading import heading, published_covariance
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Noise, Reference
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
+from magbridge.estimation.residual import ResidualSamples, jacobian, residual_scale, residuals
 
 CONTRADICTS = 2.0
 """Largest accepted bias of the reference that a fit estimates, in prior sigmas of this bias."""
@@ -42,29 +42,44 @@ def with_level(
     `samples`: samples of the fit, with its effects subtracted. `bias`, `bias_sigma`: estimated bias of the
     reference, and its prior 1-sigma, nT.
     """
-    part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
-    own = calibration.coefficients[: 9 * part.phi.shape[1]]
-    # j: mean slope of the corrected field by the coefficients (the residual is over its size)
-    _, g = residuals(part, own)
-    j = np.zeros(len(calibration.coefficients))
-    j[: len(own)] = (jacobian(part.phi, g) * sizes(part, own)[:, None]).mean(axis=0)
-    Pj = calibration.covariance @ j
-    sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
-    # w: how the coefficients move together when the mean moves by its sigma
-    w, covariance = Pj / max(sigma, 1e-300), calibration.covariance
-    coefficients = calibration.coefficients
+    direction, sigma = _level_direction(calibration, samples)
     if sigma and contradicts(bias, bias_sigma):
-        # a step of w changes the mean of the corrected field by sigma
-        coefficients = coefficients - w * (bias / sigma)
-        wider = max(bias_sigma / sigma, 1.0)
-        covariance = covariance + (wider**2 - 1.0) * np.outer(w, w)
-        w, sigma, bias = w * wider, sigma * wider, 0.0
+        calibration, direction, sigma = _without_bias(calibration, direction, sigma, bias, bias_sigma)
+        bias = 0.0
     known = calibration.reference
     reference = Reference(known.field, known.model, bias, bias_sigma, sigma)
-    return replace(
-        calibration, coefficients=coefficients, reference=reference, covariance=covariance,
-        level=tuple(w.tolist()),
-    )  # fmt: skip
+    return replace(calibration, reference=reference, level=tuple(direction.tolist()))
+
+
+def _level_direction(calibration: Calibration, samples: ResidualSamples) -> tuple[FloatArray, float]:
+    """Return the change of the coefficients (K,) with the level's 1-sigma, and this 1-sigma, nT."""
+    part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
+    position_terms = calibration.coefficients[: 9 * part.phi.shape[1]]
+    # j: mean derivative of the corrected field, which is the residual times its scale s
+    _, g = residuals(part, position_terms)
+    slopes = jacobian(part.phi, g) * residual_scale(part, position_terms)[:, None]
+    j = np.zeros(len(calibration.coefficients))
+    j[: len(position_terms)] = slopes.mean(axis=0)
+    Pj = calibration.covariance @ j
+    sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
+    return Pj / max(sigma, 1e-300), sigma
+
+
+def _without_bias(
+    calibration: Calibration, direction: FloatArray, sigma: float, bias: float, bias_sigma: float
+) -> tuple[Calibration, FloatArray, float]:
+    """Return the calibration for a bias of 0 with its prior's sigma, and the new level's direction and sigma.
+
+    `direction` (K,), `sigma`: from :func:`_level_direction`. `bias`, `bias_sigma`: as for :func:`with_level`.
+    """
+    # a step of `direction` changes the mean of the corrected field by `sigma`
+    factor = max(bias_sigma / sigma, 1.0)
+    moved = replace(
+        calibration,
+        coefficients=calibration.coefficients - direction * (bias / sigma),
+        covariance=calibration.covariance + (factor**2 - 1.0) * np.outer(direction, direction),
+    )
+    return moved, direction * factor, sigma * factor
 
 
 def contradicts(bias: float, bias_sigma: float) -> bool:
@@ -92,18 +107,6 @@ def level_of(
         return np.zeros(len(field))
     up, here = (correct(one, field, channels, time).total for one in (calibration.at_level(), calibration))
     return np.abs(up - here) / LEVEL_STEP_SIGMA
-
-
-def sizes(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
-    """Return ``s = sqrt(kappa^2 + |A u|^2)`` (n,), by which the residual divides errors of the total field.
-
-    `coefficients` (9 m,): nT.
-    """
-    theta = samples.phi @ coefficients.reshape(-1, 9)
-    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
-    b = np.matmul(A, (samples.field - theta[:, 6:])[:, :, None])
-    w = np.matmul(A, b)[:, :, 0] / np.linalg.norm(b[:, :, 0], axis=1)[:, None]
-    return np.asarray(np.sqrt(samples.kappa**2 + (w * w).sum(axis=1)))
 
 
 MISSION_SAMPLES = 600
@@ -177,15 +180,15 @@ def expected_error(calibration: Calibration, mission: Mission) -> FloatArray:
 
 
 def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return the error of the total field over ``|A^T u|`` (n,), nT, and over its sigma (n,), dimensionless.
+    """Return the error of the total field over ``|A u|`` (n,), nT, and over its sigma (n,), dimensionless.
 
-    The first is the error in nT as the sensor measures: unlike the error of the corrected field, a fit cannot
-    reduce it by shrinking A.
+    u is the direction of the corrected field. The first is the error in nT as the sensor measures: unlike the
+    error of the corrected field, a fit cannot reduce it by shrinking A.
     """
     got = correct(calibration, data.field, data.channels(calibration), data.time)
     A, T = calibration.matrices(data.parameters[:, : len(calibration.parameters)])
     b = np.matmul(A, (data.field - T)[:, :, None])
-    # |A^T u|: nT of the corrected field for one of the sensor
+    # 1 nT of the sensor is |A^T u| nT of the corrected field; A is symmetric
     size = np.linalg.norm(np.matmul(A, b)[:, :, 0], axis=1) / got.total
     error = got.total - data.reference
     return error / size, error / got.sigma
