@@ -275,9 +275,8 @@ class Recorder:
 
     def sent(self, frames: list[tuple[int, bytes]]) -> None:
         """Record the frames sent over the link, each with its event time (µs)."""
-        if self.active:
-            for time_us, frame in frames:
-                self._records.append((time_us, SENT, frame))
+        if self.active and frames:
+            self._records += [(time_us, SENT, frame) for time_us, frame in frames]
             self.count += len(frames)
 
     def link(self, time_us: int, frames: list[bytes]) -> None:
@@ -292,7 +291,8 @@ class Recorder:
         for start in range(0, len(data), RECORDED_BYTES):
             piece = data[start : start + RECORDED_BYTES]
             frame = self._scribe.frame(BYTES, BYTES_HEADER.pack(sensor_id, len(piece)) + piece)
-            self._add(time_us, SENSOR, frame)
+            self._records.append((time_us, SENSOR, frame))
+            self.count += 1
 
     def state(self, time_us: int, frame: bytes) -> None:
         """Record a state frame, or a frame of the start of the run."""

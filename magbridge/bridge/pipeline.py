@@ -192,8 +192,10 @@ class Pipeline:
             for name in ("autopilot", *(stream.line.timer for stream in self.streams)):
                 component.timers.delay(name, held_us)  # during a stall, silence cannot be observed
         component.advance(time_us)
-        due = outbox.drain() if outbox.frames else []
-        recorder.sent(due)
+        due: list[tuple[int, bytes]] = []
+        if outbox.frames:
+            due = outbox.drain()
+            recorder.sent(due)
         if self._late and time_us > self._changes.until_us:
             self._late = False
             self._set_late(0)
@@ -236,7 +238,7 @@ class Pipeline:
             self._correction.is_learning = not self._changes.is_overloaded
         utc_us = stamp.time_us + self.component.codec.utc_offset_us
         main_field = self._parts.call("position", nan, position.main_field, stamp.time_us, utc_us)
-        place, depth = position.last_position, position.depth
+        place, depth = position.place_and_depth
         for sample, corrected in stream.correct(reading, stamp, main_field, place, depth):
             self._process(stream, sample, corrected)
         if self._comparisons and stream is main:

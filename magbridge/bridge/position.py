@@ -83,14 +83,14 @@ class Position:
         self._trusted_us = self._jumped_us = 0
 
     @property
-    def last_position(self) -> tuple[float, float] | None:
-        """Latitude and longitude of the last position, deg; None before the first and after a jump."""
-        return None if self._jumped_us else self._where
+    def place_and_depth(self) -> tuple[tuple[float, float] | None, float]:
+        """Latitude and longitude (deg) of the last position, and its depth (m).
 
-    @property
-    def depth(self) -> float:
-        """Depth of the last position, m; NaN where :attr:`last_position` is None."""
-        return nan if self.last_position is None else self._depth
+        None and NaN before the first position and after a jump.
+        """
+        if self._jumped_us or self._where is None:
+            return None, nan
+        return self._where, self._depth
 
     def update(self, message: Message, time_us: int) -> None:
         """Update the position with a GLOBAL_POSITION_INT received at `time_us` (µs).

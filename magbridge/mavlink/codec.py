@@ -99,28 +99,14 @@ class Signing(MAVLinkSigning):  # type: ignore[misc] # it has no annotations
     The verification replaces pymavlink's ``check_signature``, which stores a stamp before it has verified the
     hash (ArduPilot/pymavlink#961).
 
-    Parameters
-    ----------
-    key : bytes
-        Key of 32 bytes.
-    last : int
-        Last time stamp that the previous run may have used, so that stamps increase even if the clock was
-        set back.
-    streams : iterable of Stream
-        Last accepted stamps of the previous run, from the property `streams`.
-    follow : (int, int) or None
-        System and component of the autopilot, whose stamps advance ours.
-
-    Attributes
-    ----------
-    last : int
-        Last time stamp of a sent frame, or a later accepted stamp of the autopilot.
-    followed_days : float
-        Lead of the autopilot's last stamp over our clock, days.
-    refused : int
-        Number of frames rejected because they were unsigned, wrongly signed or old.
-    refusals : dict of str to tuple of 2 int
-        Reason of a rejection -> system and component of the first frame rejected for it.
+    `key`: key of 32 bytes.
+    `streams`: last accepted stamps of the previous run, from the property `streams`.
+    `follow`: system and component of the autopilot, whose stamps advance ours.
+    `last`: last time stamp of a sent frame, or a later accepted stamp of the autopilot; first the stamp
+        that the previous run may have used, so that stamps increase even if the clock was set back.
+    `followed_days`: lead of the autopilot's last stamp over our clock, days.
+    `refused`: number of frames rejected because they were unsigned, wrongly signed or old.
+    `refusals`: reason of a rejection -> system and component of the first frame rejected for it.
     """
 
     def __init__(
@@ -226,20 +212,12 @@ this number, to limit memory."""
 class Codec:
     """Parser and packer of MAVLink frames for one link, without global state, clock or port.
 
-    Parameters
-    ----------
-    system, component : int
-        Our system id and component id in sent frames.
-    signing : Signing or None
-        If given, every sent frame is signed, and received frames without a valid signature are rejected.
-
-    Attributes
-    ----------
-    now_us, utc_offset_us : int
-        Event time (µs), which the caller sets before it parses or sends, and UNIX time minus event time
-        (µs): the steps of the host's clock since the start.
-    frames, bytes_skipped : int
-        Number of accepted messages, and number of bytes that belonged to no frame.
+    `system`, `component`: our system id and component id in sent frames.
+    `signing`: if given, every sent frame is signed, and received frames without a valid signature are
+        rejected.
+    `now_us`, `utc_offset_us`: event time (µs), which the caller sets before it parses or sends, and UNIX time
+        minus event time (µs): the steps of the host's clock since the start.
+    `frames`, `bytes_skipped`: number of accepted messages, and number of bytes that belonged to no frame.
     """
 
     def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
@@ -282,12 +260,9 @@ class Codec:
         log of every ``frame`` contains every byte. A frame without a valid signature has the id `REFUSED`. A
         frame that contains a secret has this id, too, and a payload of zeros.
 
-        Parameters
-        ----------
-        data : bytes
-            Received bytes, which may begin or end within a frame.
-        final : bool
-            True if no frame continues in later bytes, so that an incomplete frame is returned as `BAD_DATA`.
+        `data`: received bytes, which may begin or end within a frame.
+        `final`: true if no frame continues in later bytes, so that an incomplete frame is returned as
+            `BAD_DATA`.
         """
         data = self._rest + data
         found: list[Message] = []

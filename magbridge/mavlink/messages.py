@@ -51,16 +51,10 @@ MESSAGE_IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
 class Field:
     """Definition of one field of a message: its place in the payload and its type.
 
-    Attributes
-    ----------
-    name, unit : str
-        Name and unit in the dialect's XML.
-    count : int
-        Length of an array, 0 for a scalar.
-    code : str
-        Format character of :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
-    invalid : int or None
-        Value that means "not known"; in a float field, NaN always has this meaning.
+    `name`, `unit`: name and unit in the dialect's XML.
+    `count`: length of an array, 0 for a scalar.
+    `code`: format character of :mod:`struct`; ``s`` is text, ``B`` with a count is bytes.
+    `invalid`: value that means "not known"; in a float field, NaN always has this meaning.
     """
 
     __slots__ = ("code", "count", "invalid", "name", "offset", "struct", "unit")
@@ -92,21 +86,13 @@ class Field:
 class Spec:
     """Layout of one message, from pymavlink's class of the message.
 
-    Attributes
-    ----------
-    id : int
-        Message id.
-    name : str
-        Message name.
-    extra : int
-        CRC_EXTRA, the last byte that the checksum covers. It depends on the layout, so that a receiver with
-        another layout rejects the frame.
-    size : int
-        Number of bytes of a full payload.
-    struct : Struct
-        Format of the full payload, with fields in the order of the wire and arrays of bytes as bytes.
-    fields : dict of str to Field
-        Field name -> definition, in the order of the wire.
+    `id`: message id.
+    `name`: message name.
+    `extra`: CRC_EXTRA, the last byte that the checksum covers. It depends on the layout, so that a receiver
+        with another layout rejects the frame.
+    `size`: number of bytes of a full payload.
+    `struct`: format of the full payload, with fields in the order of the wire and arrays of bytes as bytes.
+    `fields`: field name -> definition, in the order of the wire.
     """
 
     def __init__(self, number: int) -> None:
@@ -165,18 +151,11 @@ def by_id(**of: T) -> dict[int, T]:
 class Message:
     """Received message, whose fields are read by name: ``message["roll"]``.
 
-    Attributes
-    ----------
-    id : int
-        Message id; `BAD_DATA` for bytes without a frame, `REFUSED` for a rejected frame.
-    system, component, sequence : int
-        System id, component id and sequence number of the sender.
-    payload : bytes
-        Payload, with the final zeros that MAVLink 2 does not transmit.
-    frame : bytes
-        All received bytes of the frame.
-    known : bool
-        True if the message is in the dialect and its checksum is correct.
+    `id`: message id; `BAD_DATA` for bytes without a frame, `REFUSED` for a rejected frame.
+    `system`, `component`, `sequence`: system id, component id and sequence number of the sender.
+    `payload`: payload, with the final zeros that MAVLink 2 does not transmit.
+    `frame`: all received bytes of the frame.
+    `known`: true if the message is in the dialect and its checksum is correct.
     """
 
     __slots__ = ("component", "frame", "id", "known", "payload", "sequence", "system")
@@ -277,7 +256,7 @@ def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
 
     `data`: received bytes; ``data[start]`` is a magic byte.
     `start`, `stop`: only ``data[start:stop]`` is used.
-    `last`: True if no bytes follow `stop`.
+    `last`: true if no bytes follow `stop`.
     Returns the end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the decision needs the bytes from `stop` on.
     """
     available = stop - start
@@ -362,19 +341,10 @@ class Source:
     The autopilot replaces any other source; another component replaces a source that has sent nothing for
     longer than `patience_us`.
 
-    Parameters
-    ----------
-    autopilot : int
-        Component id of the autopilot.
-    patience_us : int
-        Time without a value after which another component may become the source, µs.
-    wanted : int or None
-        Component id of the only accepted source; None to select it as described.
-
-    Attributes
-    ----------
-    component : int or None
-        Component id of the present source; None before the first value.
+    `autopilot`: component id of the autopilot.
+    `patience_us`: time without a value after which another component may become the source, µs.
+    `wanted`: component id of the only accepted source; None to select it as described.
+    `component`: component id of the present source; None before the first value.
     """
 
     __slots__ = ("_autopilot", "_patience_us", "_received_us", "component", "wanted")

@@ -71,11 +71,8 @@ def pack_record(time_us: int, channel: int, frame: bytes) -> bytes:
 
 def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
     """Return the bytes of records, each given as time (µs), channel and frame."""
-    pieces: list[bytes] = []
-    for time_us, channel, frame in records:
-        pieces.append(TLOG_STAMP.pack(time_us & ~3 | channel))
-        pieces.append(frame)
-    return b"".join(pieces)
+    stamp = TLOG_STAMP.pack
+    return b"".join([stamp(time_us & ~3 | channel) + frame for time_us, channel, frame in records])
 
 
 class RecordBlock(NamedTuple):
@@ -135,21 +132,12 @@ def blocks(file: BinaryIO, block_bytes: int = BLOCK_BYTES) -> Iterator[RecordBlo
 class LogReader:
     """Iterator over the records of a log, which skips damaged bytes.
 
-    Parameters
-    ----------
-    file : binary file
-        File, which is read from its present position to its end.
-    block_bytes : int
-        Number of bytes that are read at a time; a small number suits a caller that needs few records.
-
-    Attributes
-    ----------
-    records : int
-        Number of records read so far.
-    bytes_skipped : int
-        Number of bytes that belonged to no record, in the blocks read so far.
-    damages : int
-        Number of places with such bytes.
+    `file`: file, which is read from its present position to its end.
+    `block_bytes`: number of bytes that are read at a time; a small number suits a caller that needs few
+        records.
+    `records`: number of records read so far.
+    `bytes_skipped`: number of bytes that belonged to no record, in the blocks read so far.
+    `damages`: number of places with such bytes.
     """
 
     def __init__(self, file: BinaryIO, block_bytes: int = BLOCK_BYTES) -> None:
@@ -168,7 +156,7 @@ class LogReader:
 def _block(data: bytes, broken: bool, *, last: bool) -> tuple[RecordBlock, int, bool]:
     """Return the records in `data`, the position of the undecided rest, and True if `data` end in damage.
 
-    `broken`: True if the bytes before `data` were damaged. `last`: True if no bytes follow.
+    `broken`: true if the bytes before `data` were damaged. `last`: True if no bytes follow.
     """
     stop = len(data) if last else max(len(data) - MAX_RECORD_BYTES, 0)
     start, found = _candidates(data, stop)

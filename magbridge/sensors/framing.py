@@ -74,12 +74,8 @@ class FramedDriver:
 
     :class:`magbridge.sensors.Driver` documents the attributes.
 
-    Parameters
-    ----------
-    delimiter : bytes
-        One byte.
-    limit : int
-        Length of the longest frame without its delimiter, bytes.
+    `delimiter`: one byte.
+    `limit`: length of the longest frame without its delimiter, bytes.
     """
 
     range_nt: float = inf

@@ -44,7 +44,7 @@ STREAM_TYPE = 128
 """Packet type of stream 0; samples of stream n have the type 128 + n."""
 DEVICE_RECORD, STREAM_RECORD, SEGMENT_RECORD, COLUMN_RECORD = 1, 2, 3, 4
 METADATA_REQUEST = 2
-REQUESTS = {1: b"data.send_all", METADATA_REQUEST: b"dev.metadata"}
+DESCRIPTOR_REQUESTS = {1: b"data.send_all", METADATA_REQUEST: b"dev.metadata"}
 """Number and method of each generation's request for descriptors."""
 TYPE_FORMATS = {
     0x10: "B", 0x11: "b", 0x20: "H", 0x21: "h", 0x40: "I", 0x41: "i", 0x42: "f",
@@ -308,7 +308,7 @@ def unpack(frame: bytes) -> tuple[int, bytes, bytes]:
 def requests(routing: bytes) -> bytes:
     """Return the bytes that start a device: a heartbeat, and each generation's request for descriptors."""
     packets = [pack(HEARTBEAT, b"", routing)]
-    for number, method in REQUESTS.items():
+    for number, method in DESCRIPTOR_REQUESTS.items():
         call = RPC_HEADER.pack(number, 0x8000 | len(method)) + method
         packets.append(pack(RPC_REQUEST, call, routing))
     return END + b"".join(map(slip, packets))

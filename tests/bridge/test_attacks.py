@@ -135,7 +135,7 @@ def parsed(frame: bytes) -> Message:
 def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[int, int]) -> None:
     position = Position(print)
     position.update(parsed(global_position(lat=place[0], lon=place[1])), START)
-    assert position.last_position is None
+    assert position.place_and_depth[0] is None
     assert isnan(position.main_field(START, START))
 
 
