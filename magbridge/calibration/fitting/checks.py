@@ -1,4 +1,4 @@
-"""Determine what the data of a fit determine: rank, estimable combinations, and warnings."""
+"""Check a fit: rank, estimable combinations of coefficients, boresight, and warnings about its data."""
 
 from __future__ import annotations
 
@@ -27,36 +27,37 @@ if TYPE_CHECKING:
 # ---- What the data determine ----
 
 JACOBIAN_ROWS = 5_000
-"""Largest number of rows of the Jacobian: more do not change its rank."""
+"""Largest number of rows of the Jacobian; more rows do not change its rank."""
 MIN_POSITION_STEP_FRACTION = 0.02
-"""Difference of neighbouring positions of a mass, as a fraction of half its range, and fraction of the
-samples that a position must have to count."""
+"""Smallest distance between two positions of a mass, as a fraction of half its range, and smallest fraction
+of the samples at a position that counts."""
 SWEPT = 0.3
-"""Fraction of half the range that one position spans where its mass moved all along."""
+"""Width of one group of positions, as a fraction of half the range, above which the mass moved
+continuously."""
 MAX_CORRELATION = 0.9
 """Correlation of two positions above which their effects cannot be distinguished."""
 BANKED = 10.0
-"""Range of roll that shows the vertical offset, deg."""
+"""Smallest range of roll that determines the vertical offset, deg."""
 DIVE_PITCH_DEG = 5.0
-"""Pitch from which on a run is a dive or a climb, deg."""
+"""Smallest absolute pitch of a dive or climb, deg."""
 OPEN = 60.0
-"""Gap in the headings that is reported, deg."""
+"""Smallest gap in the headings that is reported, deg."""
 RANK_TOLERANCE = 1e-9
 """Fraction of the largest singular value below which one counts as zero."""
 
 
 def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> FloatArray:
-    """Return the 1-sigma, nT, of each estimable combination of coefficients (rank,), best known first.
+    """Return the 1-sigma of each estimable combination of coefficients, (rank,), nT, ascending.
 
-    From the data alone, by the singular values of the Jacobian at `coefficients` (9 m,) over the noise
-    `sigma` of a sample, nT.
+    The values follow from the data alone, by the singular values of the Jacobian at `coefficients` (9 m,),
+    nT. `sigma`: noise of a sample, nT.
     """
     # thin the rows, and scale them so that they carry the information of all
     step = max(len(samples.field) // JACOBIAN_ROWS, 1)
     part = samples.part(slice(None, None, step))
     _, g = residuals(part, coefficients)
     J = jacobian(part.phi, g) * np.sqrt(step) / sigma
-    # columns are scaled to one norm: a coefficient's unit must not decide whether it is estimable
+    # scale the columns to one norm, so that the rank does not depend on the coefficients' units
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0.0, size, 1.0)
     # singular values over the noise: 1 / value is the 1-sigma of a combination of coefficients
@@ -65,12 +66,13 @@ def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: floa
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
-    """Return the RMS error near the runs (any heading, 10 deg more roll) over a sample's noise."""
+    """Return the RMS error expected near the runs, over the noise of a sample (:func:`nearby_mission`)."""
     error = expected_error(calibration, nearby_mission(calibration, data))
     return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
 
 def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
+    """Yield a warning for each mass with too few different positions for the order of the fit."""
     for k, parameter in enumerate(calibration.parameters):
         order = max(
             (e[k] for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents),
@@ -81,7 +83,7 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnos
         jumps = np.flatnonzero(np.diff(column) > MIN_POSITION_STEP_FRACTION * parameter.scale)
         groups = [g for g in np.split(column, jumps + 1) if len(g) > MIN_POSITION_STEP_FRACTION * len(column)]
         if any(np.ptp(g) > SWEPT * parameter.scale for g in groups):
-            continue  # it moved all along: no positions to count
+            continue  # the mass moved continuously
         if len(groups) <= min(order, 3):
             places = " and ".join(f"{np.median(g):.4g}" for g in groups)
             yield Diagnostic(
@@ -95,6 +97,7 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnos
 
 
 def _moved_together(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
+    """Yield a warning for each pair of masses with correlated positions."""
     names = [parameter.name for parameter in calibration.parameters]
     if len(names) < 2:
         return
@@ -108,6 +111,7 @@ def _moved_together(calibration: Calibration, data: Observations) -> Iterator[Di
 
 
 def _attitudes(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
+    """Yield a warning for each range of roll, pitch or heading that the data lack."""
     if data.attitude is None:
         return
     known = data.attitude[np.isfinite(data.attitude).all(axis=1)]
@@ -132,7 +136,7 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[Diagnos
 
 
 def heading_gap(data: Observations) -> float:
-    """Return the width (deg) of the widest gap between headings; 0 without attitude telemetry."""
+    """Return the width of the widest gap between headings, deg; 0 if no heading is known."""
     if data.attitude is None:
         return 0.0
     heading = np.degrees(data.attitude[:, 2])
@@ -141,8 +145,8 @@ def heading_gap(data: Observations) -> float:
 
 
 def _widest_gap(heading: FloatArray) -> tuple[float, float]:
-    """Return where the widest gap between headings begins, and its width, deg."""
-    # gaps on the circle, the one through north included
+    """Return the start and the width of the widest gap between headings (n,), deg."""
+    # gaps on the circle, including the gap across north
     courses = np.sort(heading % 360.0)
     gaps = np.diff(np.append(courses, courses[0] + 360.0))
     widest = int(np.argmax(gaps))
@@ -150,6 +154,7 @@ def _widest_gap(heading: FloatArray) -> tuple[float, float]:
 
 
 def _runs(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
+    """Yield a warning if a calibration with parameters has fewer than four runs."""
     count = len(np.unique(data.runs))
     if calibration.parameters and count < 4:
         yield Diagnostic("few_runs", {"runs": counted(count, "run")})
@@ -161,42 +166,42 @@ CHECKS: tuple[Callable[[Calibration, Observations], Iterator[Diagnostic]], ...] 
     _attitudes,
     _runs,
 )
-"""Checks of a set of runs; each yields a diagnostic for each fault that it finds."""
+"""Checks of the runs; each yields a diagnostic for each fault that it finds."""
 
 
 # ---- The checks of a whole fit ----
 
 UNSUPPORTED = 5.0
-"""Expected error over noise, above which the data do not support the fit."""
+"""Ratio of expected error and noise above which the data do not support the fit."""
 LIKELIER = 3.0
-"""Gain in log evidence of one more order from which on the order is too low (20:1)."""
+"""Smallest gain in log evidence by the next order at which the order is too low (odds of 20:1)."""
 MAX_ERROR_RATIO = 1.25
-"""Errors of held-out parts over their sigmas from which on a warning is due."""
+"""Ratio of held-out errors and their sigmas above which a warning is given."""
 MIN_SIGNAL_TO_NOISE = 3.0
-"""Standard deviation of the field along the sensor axis with the least variation, over the noise. Below it, a
-fit takes noise for attitudes (errors in variables of second order): 6,000 samples of 1,500 nT noise gave an
-ideal compass an offset of 13,900 nT at nine sigmas."""
+"""Smallest ratio of the field's standard deviation, along its least varied axis, and the noise. Below it, a
+fit mistakes noise for attitudes (errors in variables of second order): with 6,000 samples of 1,500 nT noise,
+an ideal compass got an offset of 13,900 nT, nine sigmas."""
 GAIN = 0.08
-"""Departure of the middle scale from 1 that few sensors have, four sigmas of the prior. A wrong reference
-shrinks all scales: over an unmapped crustal anomaly of a real flight to 0.88 to 0.94."""
+"""Departure of the middle scale from 1 above which a warning is given: four sigmas of the prior. A wrong
+reference shrinks all scales; over an unmapped crustal anomaly of a real flight they became 0.88 to 0.94."""
 MAX_PRIOR_CHI_SQUARED = 27.9
-"""Sum of the squares of nine coefficients over their prior's sigmas that one sensor in 1,000 exceeds."""
+"""Chi squared of the nine coefficients about their prior that one sensor in 1,000 exceeds."""
 MAX_SCALE_SIGMA_RATIO = 0.25
-"""Sigma of a scale over its prior's, from which on the prior shows in it: at 0.25 it moves the scale by a
-sixteenth of its departure."""
+"""Ratio of posterior and prior sigma of a scale above which the prior influences the scale. At 0.25 the prior
+moves the scale by a sixteenth of its departure."""
 MAX_NOISE_AUTOCORRELATION = 0.98
-"""Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
+"""Autocorrelation of successive residuals of a survey fit above which they are not sensor noise."""
 MAX_HEADING_GAP_DEG = 270.0
-"""Gap in the headings above which they do not determine the rest, deg."""
+"""Largest gap in the headings with which the data support a fit, deg."""
 
 
 def judged(found: Fit, data: Observations) -> Fit:
     """Return the fit with its boresight and with warnings about undetermined quantities."""
-    # 1. boresight; 2. reasons against the fit, which `--strict` refuses; 3. remarks that leave it valid
+    # 1. boresight; 2. reasons against the fit, which `--strict` rejects; 3. further warnings
     whole = found.calibration
     mismatch: list[Diagnostic] = []
     calibration = whole.without_effects()
-    if whole.effects or found.creep:  # they have been subtracted
+    if whole.effects or found.creep:  # the fit has subtracted them from its samples
         data = replace(data, field=found.samples.field)
     if calibration.boresight is None:
         try:
@@ -206,7 +211,7 @@ def judged(found: Fit, data: Observations) -> Fit:
             data = replace(data, attitude=None)
         if magnetic := magnetic_headings(calibration, data):
             mismatch.append(magnetic)
-    # the level is common to all samples, and no manoeuvre reduces it: leave it out of the expected error
+    # the level is common to all samples, and no manoeuvre reduces it: exclude it from the expected error
     ratio = expected_ratio(apart_from_level(calibration), data)
     noise = calibration.noise.sensor
     warnings = tuple(_reasons(found, data, ratio, noise))
@@ -235,7 +240,10 @@ def judged(found: Fit, data: Observations) -> Fit:
 
 
 def _reasons(found: Fit, data: Observations, ratio: float, noise: float) -> Iterator[Diagnostic]:
-    """Yield reasons not to support a fit with `noise` (nT) and an expected error of `ratio` times that."""
+    """Yield reasons why the data do not support a fit.
+
+    `ratio`: expected error over the noise of a sample. `noise`: of a sample, nT.
+    """
     # autocorrelation of the residual after the crustal field has been subtracted
     lasting = found.details.get("autocorrelation", 0.0)
     if lasting > MAX_NOISE_AUTOCORRELATION:
@@ -244,13 +252,13 @@ def _reasons(found: Fit, data: Observations, ratio: float, noise: float) -> Iter
         yield Diagnostic("expected_error", {"error_nT": ratio * noise})
     if (gap := heading_gap(data)) > MAX_HEADING_GAP_DEG:
         yield Diagnostic("narrow_headings", {"width_deg": 360.0 - gap})
-    # smallest variation of the field along any axis: noise must be small against it (errors in variables)
+    # the noise must be small compared with the field's variation along any axis (errors in variables)
     least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(found.samples.field.T))[0], 0.0)))
     if least < MIN_SIGNAL_TO_NOISE * noise:
         yield Diagnostic("noise_for_attitudes", {"noise_nT": noise, "variation_nT": least})
     yield from rough_rock(data, found.details.get("crustal_field"), noise)
-    # scales that the prior of an ellipsoid does not expect, and attitudes that do not prove them: where the
-    # data overrule the prior, an unusual gain is the sensor's
+    # unusual scales are a fault of the fit only if the attitudes do not determine them: if the data overrule
+    # the prior, the sensor has an unusual gain
     unlikely = found.details.get("prior_chi_squared", 0.0) > MAX_PRIOR_CHI_SQUARED
     if unlikely and found.details["scale_sigma_ratio"] > MAX_SCALE_SIGMA_RATIO:
         low, high = found.scales
@@ -262,7 +270,7 @@ def _suspicions(found: Fit) -> Iterator[Diagnostic]:
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield Diagnostic("outliers", {"count": outliers, "samples": samples, "product": "fit"})
-    # the quantities that the offset depends on
+    # quantities on which the offset depends
     for effect in found.calibration.effects:
         if isinstance(effect, ChannelEffect):
             slope = float(np.linalg.norm(found.calibration.coefficients[-effect.size :]))

@@ -1,13 +1,14 @@
-r"""The field in place: nodes, lengths to try, the search for the likeliest one, and what that leaves open.
+r"""Search of the crustal field's amplitude, correlation length and smoothness, by maximum evidence.
 
-Amplitude, length and smoothness of a field, and the noise's autocorrelation, are chosen by the evidence. A
-few anomalies hardly determine amplitude and length: a solution at the likeliest values alone would be
-overconfident away from the track. The evidence is therefore summed over points about its maximum,
+The evidence also determines the noise's autocorrelation. A few anomalies hardly determine amplitude and
+length, so a solution at their likeliest values alone would be overconfident away from the track. The solution
+is therefore a mixture over points about the maximum of the evidence,
 
 .. math:: p(f) \approx \sum_k w_k\, p(f \mid \theta_k), \quad \theta_k = \hat\theta + V S g_k,
 
-of a Gauss-Hermite rule (3 x 3) along the axes V of its curvature with the spreads S, each weighed with its
-own evidence (Rue, Martino & Chopin 2009, section 6.5).
+The points :math:`g_k` are those of a Gauss-Hermite rule (3 x 3). V are the axes of the evidence's curvature,
+S the standard deviations along them, and each weight :math:`w_k` includes the evidence of its point (Rue,
+Martino & Chopin 2009, section 6.5).
 """
 
 from __future__ import annotations
@@ -29,23 +30,23 @@ from magbridge.estimation.priors import PriorFamily
 # ---- Lengths and nodes ----
 
 RUNGS = 7
-"""Lengths that are tried first."""
+"""Number of correlation lengths that the search tries first."""
 NODES_PER_LENGTH = {2: 8.0, 3: 8.0, 4: 5.0}
 SMOOTH, ENOUGH = 6, 3.0
-"""Nodes a length by the power alpha, and from SMOOTH on: of a field 40 times the noise they leave out less
-than the noise."""
+"""Number of nodes per correlation length for each power alpha; from the power SMOOTH on it is ENOUGH. With
+these numbers the error of a field of 40 times the noise is below the noise."""
 PAD_LENGTHS = 1.0
-"""Lengths around the track that have nodes."""
+"""Width of the margin around the track that has nodes, in correlation lengths."""
 MAX_FIELD_NODES = 4_000
-"""Nodes at most, unless more are asked for."""
+"""Default of the largest number of nodes."""
 SIDE = 1_500
-"""Nodes along a side of the area's box at most, where it is a square."""
+"""Largest number of nodes along a side of the area's box, if the box is a square."""
 MIN_LENGTH_M = 60.0
 """Shortest correlation length, m; a twentieth of an area smaller than that."""
 
 
 def fine_enough(nodes: Nodes, length: float, alpha: int, finer: float = 1.0) -> bool:
-    """Return True if nodes are fine enough for a field of a `length`, m, and power alpha."""
+    """Return True if the spacing of `nodes` suits a field of correlation `length`, m, and power `alpha`."""
     return 0.7 <= length / nodes.spacing / _nodes_per_length(alpha, finer) <= 1.5
 
 
@@ -56,12 +57,12 @@ def _nodes_per_length(alpha: int, finer: float) -> float:
 def nodes_for(
     place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES, finer: float = 1.0
 ) -> Nodes:
-    """Return the nodes of a field around places (n, 2), m, of a `length`, m, and power `alpha`.
+    """Return nodes around places (n, 2), m, for a field of correlation `length`, m, and power `alpha`.
 
-    `most`: number of nodes, about, at which they become coarser. `finer`: factor of the nodes per length of a
-    smooth field; the error of its splines falls as the fourth power.
+    `most`: approximate largest number of nodes; the spacing grows until it is reached. `finer`: factor of the
+    number of nodes per length of a smooth field; the splines' error decreases with its fourth power.
     """
-    # finest spacing that the length needs, coarser until there are few enough nodes
+    # begin with the spacing that the length needs, and increase it until there are few enough nodes
     box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
     spacing = max(length / _nodes_per_length(alpha, finer), float(np.sqrt(box.prod())) / SIDE)
     while (nodes := nodes_near(place, spacing, PAD_LENGTHS * length)).size > 1.05 * most:
@@ -70,9 +71,10 @@ def nodes_for(
 
 
 def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolArray:
-    """Return True for the `number` of places (n, 2), m, nearest to the middle, or within `wide` m.
+    """Return a mask (n,) of the `number` places nearest to the middle, and of all within `wide` m of it.
 
-    They lie in a square, so that whole stretches of lines are among them.
+    `place` (n, 2): m. Distances are the larger of north and east, so the places lie in a square, which
+    contains whole stretches of survey lines.
     """
     if len(place) <= number:
         return np.ones(len(place), bool)
@@ -81,7 +83,7 @@ def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolA
 
 
 def ladder(place: FloatArray) -> FloatArray:
-    """Return lengths to try, m: from the resolution of samples at places (n, 2), m, to the area."""
+    """Return the correlation lengths to try, m, for samples at `place` (n, 2), m."""
     # shortest: four steps between samples; longest: a fraction of the area
     known = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(known, axis=0)))
@@ -93,48 +95,53 @@ def ladder(place: FloatArray) -> FloatArray:
 # ---- The search ----
 
 RESOLVED = 2.0
-"""Nodes a length at least: a shorter one is not tried on so large an area."""
+"""Smallest number of nodes per correlation length; the search omits a length that has fewer."""
 FEWER = 1_500
-"""Nodes at most of the smoothest fields, whose precisions are nearly full."""
+"""Largest number of nodes of the smoothest fields, whose precision matrices are nearly full."""
 DECISIVE_LOG_RATIO = 30.0
-"""Nats by which one kind of field is likelier than the other at any smoothness, or an offer needed."""
+"""Difference of log evidence that decides between two kinds of field, or for an optional term."""
 BENDS = 0.25
-"""Fields are similar if the length times this power of alpha - 1 is equal."""
+"""Exponent x with which fields of equal ``length (alpha - 1)^x`` have similar correlations."""
 WHITE_AUTOCORRELATION = 0.03
 """Autocorrelation below which noise counts as white."""
 MAX_FIT_AUTOCORRELATION = 0.995
 """Largest autocorrelation of a sample with the next one."""
 SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
-"""Crustal field, nT, as airborne surveys find it, and the 1-sigma of its logarithm."""
+"""Prior median of the crustal field's amplitude, nT, from airborne surveys, and 1-sigma of its logarithm."""
 LENGTH_SPREAD = np.log(6.0)
-"""1-sigma of the logarithm of the length, about the middle of those that are tried."""
+"""Prior 1-sigma of the logarithm of the correlation length; its median is the middle length tried."""
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A field for a standard deviation of 1, its size over the noise's, and that noise's autocorrelation."""
+    """Candidate crustal field and noise, with their evidence."""
 
     field: GaussianField
     ratio: float
+    """Standard deviation of the field over that of the noise."""
     rho: float
+    """Autocorrelation of the noise of successive samples."""
     score: float = -np.inf
+    """Natural logarithm of the evidence."""
 
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """Settings of an evidence: the dense unknowns' prior at widths eta (h,), and the noise, nT."""
+    """Prior and noise with which the search computes the evidence of a field."""
 
     family: PriorFamily
     eta: FloatArray
+    """`family`, `eta`: Prior of the other unknowns, and its log widths (h,)."""
     sigma: float
+    """Initial standard deviation of the noise, nT."""
     middle: float
-    """Length that is expected, m."""
+    """Prior median of the correlation length, m."""
 
     def score(self, reduced: FieldEliminated, field: GaussianField, ratio: float) -> float:
-        """Return the log evidence, the noise's size being the likeliest one."""
-        # profile sigma out, then add the Gaussian priors of log size and log length
+        """Return the log evidence of a field, maximised over the standard deviation of the noise."""
+        # maximise over sigma, then add the Gaussian priors of log amplitude and log length
         log_sigma, value = float(np.log(self.sigma)), -np.inf
-        for _ in range(4):  # Newton's: in log sigma it is nearly a parabola of curvature -2n
+        for _ in range(4):  # Newton's method: in log sigma the evidence is nearly a parabola of curvature -2n
             value, slope, _ = log_evidence(reduced.quadratic, self.family, self.eta, log_sigma)
             step = float(np.clip(slope[-1] / (2.0 * reduced.quadratic.n), -1.0, 1.0))
             log_sigma += step
@@ -156,25 +163,25 @@ def choose(
     effort: float = 1.0,
     most: int = MAX_FIELD_NODES,
 ) -> Choice:
-    """Choose the field without a start: lengths from a ladder, then smoothness and the rest.
+    """Return the field and noise of the largest evidence, without an initial field.
 
-    `sums_of`: normal equations of the samples with a field. `place` (n, 2): m. `start`: size of the field
-    over the noise. `harmonic`: True if the depth varies, so that a field that falls off upwards differs.
-    `rho`: autocorrelation of the noise, if known. `effort`: fraction of the usual steps. `most`: nodes at
-    most.
+    `sums_of`: function that returns the normal equations of the samples for a field. `place` (n, 2): m.
+    `start`: initial ratio of field and noise. `harmonic`: True if the depth varies, so that the search also
+    tries a field that decreases upwards. `rho`: autocorrelation of the noise, if known. `effort`: fraction of
+    the usual number of steps. `most`: largest number of nodes.
     """
-    # 1. length by a ladder at the usual smoothness; 2. falling off upwards or not; 3. smoothness; 4.
-    # sources at a depth. Each step starts from the best so far and maximises the evidence over size, memory
-    # and length.
+    # 1. correlation length at the usual smoothness; 2. decrease upwards; 3. smoothness; 4. sources at a
+    # depth. Each step starts from the best field so far, and maximises the evidence over amplitude,
+    # autocorrelation of the noise and length.
     move_rho, memory = rho is None, 0.3 if rho is None else rho
 
     def search_lengths(alpha: int) -> tuple[Choice, bool]:
-        """Return the best of the lengths, from the longest on, and whether shorter ones are worse."""
+        """Return the best field over the lengths, longest first, and True if a shorter length was worse."""
         best: Choice | None = None
         worse, ratio, rho = 0, start, memory
         for length in ladder(place)[::-1]:
             nodes = nodes_for(place, length, alpha, most)
-            # too few nodes are allowed for this length: the grid cannot show it
+            # the allowed number of nodes is too small for this length
             if length < RESOLVED * nodes.spacing:
                 continue
             field = GaussianField(nodes, float(length), alpha, harmonic)
@@ -186,12 +193,12 @@ def choose(
             if best is None or found.score > best.score:
                 best, worse = found, 0
             elif (worse := worse + 1) == 2:
-                break  # shorter ones take more nodes, and would be worse still
+                break  # shorter lengths need more nodes, and the evidence has a single maximum
         assert best is not None
         return best, worse > 0
 
     best, enclosed = search_lengths(SMOOTH)
-    if not enclosed:  # the crustal field is rougher than every candidate
+    if not enclosed:  # the shortest length is best: try a rougher field
         rough, _ = search_lengths(SMOOTHNESS_POWERS[0])
         best = rough if rough.score > best.score else best
 
@@ -203,21 +210,21 @@ def choose(
         begin = replace(choice, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
-    # try both kinds if the depth varies; where neither is decisively better, try again after the smoothness
+    # if the depth varies, try both kinds; if neither is decisively better, try the other again after step 3
     kinds = [tried(best, best.field.alpha, kind) for kind in ((True, False) if harmonic else (False,))]
     kinds.sort(key=lambda one: one.score)
     best = _smoothness(kinds[-1], tried)
     if harmonic and kinds[1].score - kinds[0].score < DECISIVE_LOG_RATIO:
         other = tried(best, best.field.alpha, not best.field.harmonic)
         best = _smoothness(other, tried) if other.score > best.score else best
-    if best.field.alpha < SMOOTH:  # the spectrum of sources at a depth falls off slowly, too
+    if best.field.alpha < SMOOTH:  # sources at a depth also have a slowly decreasing spectrum
         other = tried(best, BURIED_FACTORS, best.field.harmonic, buried=True)
         best = other if other.score > best.score else best
     return best
 
 
 def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> Choice:
-    """Increase the power alpha from that of `best`, or decrease it if that is not better; return the best."""
+    """Return the best field over the powers alpha, increased from that of `best`, else decreased."""
     # one direction at a time: evidence is unimodal in the smoothness, so stop at the first power that is
     # worse
     at = SMOOTHNESS_POWERS.index(best.field.alpha)
@@ -234,7 +241,7 @@ def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> C
 
 
 def first_guess(place: FloatArray) -> Choice:
-    """Return an initial field at places (n, 2), m: of the middle length, usual amplitude and noise."""
+    """Return a field of middle length and usual amplitude, with white noise, at places (n, 2), m."""
     rungs = ladder(place)
     length = float(rungs[len(rungs) // 2 + 1])
     return Choice(GaussianField(nodes_for(place, length, SMOOTH), length, SMOOTH), SIZE, 0.0)
@@ -251,9 +258,10 @@ def climb(
     steps: int = 40,
     tolerance: float = 0.1,
 ) -> Choice:
-    """Maximise the evidence from a choice, its nodes kept, to within so much log evidence of the maximum.
+    """Maximise the evidence over ratio, length and autocorrelation on the nodes of `start`.
 
-    Its size, its length or its noise's memory stay where they must not move.
+    `move_ratio`, `move_length`, `move_rho`: False to keep the value of `start`. `steps`: largest number of
+    evaluations. `tolerance`: difference of log evidence at which the search ends.
     """
     # unknowns without bounds: log ratio, logit of rho over its largest value, log length
     share = np.clip(max(start.rho, 0.01) / MAX_FIT_AUTOCORRELATION, 1e-6, 1.0 - 1e-6)
@@ -276,7 +284,7 @@ def climb(
         except np.linalg.LinAlgError:
             return 1e300
 
-    # Nelder-Mead: the score has no cheap derivative by the length, and three unknowns at most
+    # Nelder-Mead, because the evidence has no cheap derivative by the length, and at most three unknowns
     begin = first[moves]
     simplex = begin + np.vstack([np.zeros(len(moves)), np.diag(np.array([0.7, 0.8, 0.3])[moves])])
     found = minimize(
@@ -291,7 +299,7 @@ def climb(
 def refined(
     sums_of: Callable[[GaussianField], SampleSums], place: FloatArray, choice: Choice, weighed: Weighed
 ) -> Choice:
-    """Maximise from a choice; nodes at places (n, 2), m, are rebuilt when they no longer suit the length."""
+    """Maximise the evidence from `choice`, on new nodes at `place` (n, 2), m, if its nodes do not suit it."""
     field = choice.field
     if not fine_enough(field.nodes, field.length, field.alpha):
         nodes = nodes_for(place, field.length, field.alpha)
@@ -299,24 +307,25 @@ def refined(
     return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
 
 
-# ---- What the search leaves open ----
+# ---- Uncertainty of amplitude and length ----
 
 MAX_UNCERTAIN_NODES = 2_500
-"""Number of nodes from which on size and length are known well enough."""
+"""Number of nodes above which the uncertainty of amplitude and length is negligible."""
 LOG_STEP = 0.3
 """Step in the logarithms of amplitude and length with which the evidence's curvature is computed."""
 WIDEST = 0.7
-"""Largest spread of these logarithms, beyond which the evidence is not a parabola."""
+"""Largest standard deviation of these logarithms; beyond it the evidence is not a parabola."""
 RULE = ((0.0, 2.0 / 3.0), (3.0**0.5, 1.0 / 6.0), (-(3.0**0.5), 1.0 / 6.0))
-"""Nodes and weights for a standard normal distribution."""
+"""Points and weights of the Gauss-Hermite rule for a standard normal distribution."""
 MIN_WEIGHT = 0.01
-"""Weight below which a point is not worth its cost."""
+"""Fraction of the total weight below which the mixture omits a point."""
 
 
 def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[float, Choice]]:
-    """Return choices about the best one with their weights, which add up to 1; the best one first.
+    """Return the points of the mixture in the module's notes, each with its weight; the first is `best`.
 
-    `score`: log evidence of a choice; may raise LinAlgError where there is none.
+    The weights add up to 1. `score`: function that returns the log evidence of a choice, or raises
+    LinAlgError.
     """
     if best.field.nodes.size > MAX_UNCERTAIN_NODES:
         return [(1.0, best)]
@@ -346,7 +355,10 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
 
 
 def _spread(value: Callable[[FloatArray], float], top: float) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviations (2,) along the axes, columns (2, 2), of the evidence's curvature."""
+    """Return the standard deviations (2,) along the axes of the evidence's curvature, and the axes (2, 2).
+
+    `value`: log evidence at steps of log amplitude and log length from the maximum. `top`: its maximum.
+    """
     a, b = LOG_STEP * np.eye(2)
     second = np.array([value(x) + value(-x) - 2.0 * top for x in (a, b, a + b)]) / LOG_STEP**2
     if not np.isfinite(second).all():

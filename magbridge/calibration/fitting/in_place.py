@@ -1,31 +1,31 @@
-r"""The fit to a survey: coefficients and the crustal field below the track, jointly.
+r"""Fit to a survey: coefficients and the crustal field below the track, jointly.
 
-If no true field is known, the reference is the main field, and the missing part at a place,
+If no true field is known, the reference is the main field. The true field is
 
 .. math:: H_e(x, t) = |\mathrm{IGRF}| + b + f(x) + s(t),
 
-has a level b, a Gaussian field f in place (:mod:`magbridge.estimation.gaussian_field`) and a slow part s in
-time. The level is that of the crust far around, so b has a gradient as well: once the level moves by
-:math:`-g F_0`, a gain g shows in the variation of :math:`H_e` only, and a long log would determine it by the
-main field's decrease with height, as if no other part decreased. A criss-cross survey meets the same crustal
-field with another heading, roll and position of the masses, so that f and the coefficients are
-distinguishable. The errors are in the readings, as in every fit here (:mod:`magbridge.estimation.residual`):
-without the weight of :math:`|A^T u|` a joint fit would shrink A, to have a smaller crustal field to explain.
+with a bias b (the level), a Gaussian field f in space (:mod:`magbridge.estimation.gaussian_field`) and a slow
+change s with time. The bias is the crustal field of a wide area, so it also has a gradient. Without the
+gradient, a long log would determine the gain from the main field's decrease with height, as if the bias were
+the same at every height. A criss-cross survey returns to places with other headings, rolls and positions of
+the masses, which separates f from the coefficients. The errors are in the readings, as in all fits
+(:mod:`magbridge.estimation.residual`): without the weight :math:`|A u|` a joint fit would shrink A, because
+this shrinks the crustal field.
 
 The offset may depend on temperature, with or without lag, and on time:
 
 .. math:: T(t) = T + c\,(\Theta_\tau(t) - \bar\Theta) + \sum_k d_k \cos(\pi k t / t_s)
 
-c along each axis, nT/degC, with the temperature through a lag tau; the rest a random walk along each axis. An
-offset of the body is another field on each heading: without these terms the crustal field would absorb it.
-All terms are in the fit during the field search; then those stay that make the log likelier.
+Here c (nT/degC) is the slope along each axis, for the temperature through a lag tau, and the sum is a random
+walk along each axis. Without these terms the crustal field would absorb such a change of the offset. The
+search of the field includes all terms; then the evidence selects those that stay.
 
 Notes
 -----
-Rounds of Gauss-Newton about the last answer (:mod:`.rounds`); in each the sparse field is eliminated
-(:mod:`magbridge.estimation.elimination`), the prior's widths are chosen by the evidence of what remains
-(:mod:`magbridge.estimation.hyperparameters`), and the field's size and length and the noise's autocorrelation
-by that of the whole (:mod:`.field_search`).
+The fit iterates Gauss-Newton steps (:mod:`.rounds`). Each iteration eliminates the sparse field
+(:mod:`magbridge.estimation.elimination`). The prior's widths maximise the evidence of the remaining unknowns
+(:mod:`magbridge.estimation.hyperparameters`). The field's amplitude and length and the noise's
+autocorrelation maximise the evidence of all unknowns (:mod:`.field_search`).
 """
 
 from __future__ import annotations
@@ -63,11 +63,12 @@ from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import rms
 
 REFERENCE_ERROR_LENGTH_M = 25_000.0
-"""Distance over which the reference's error changes by its size, m: 6 nT/km."""
+"""Distance over which the reference's bias changes by its 1-sigma, m; 6 nT/km for 145 nT."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
-"""Slow change over a stretch, nT, and 1-sigma of its logarithm: a quiet day's currents aloft."""
+"""Prior 1-sigma of the slow change with time on a magnetically quiet day, nT, and 1-sigma of its
+logarithm."""
 DRIFTING = 2700.0
-"""Half the period of the fastest drift of a position, s."""
+"""Half the period of the fastest drift of positions, s."""
 
 
 def fit_in_place(
@@ -79,11 +80,11 @@ def fit_in_place(
     position_sigma: float = 0.0,
     known: Known | None = None,
 ) -> Fit:
-    """Fit coefficients, level, slow changes, what the offset follows, and the field in place.
+    """Fit coefficients, bias of the reference, slow changes, changes of the offset, and the crustal field.
 
-    `level`: 1-sigma of the reference's error that is the same everywhere, nT. `vehicle`, `known`: as for
-    :func:`~.methods.fit_auto`. `position_sigma`: size of the slow drift of dead-reckoned positions, m; the
-    fit then corrects the track to the field.
+    `level`: prior 1-sigma of the reference's constant bias, nT. `vehicle`, `known`: as for
+    :func:`~.methods.fit_auto`. `position_sigma`: 1-sigma of the slow drift of dead-reckoned positions, m; the
+    fit then also estimates this drift.
 
     CalibrationError: the data have no positions. NoSolutionError: the fit collapsed or did not converge.
     """
@@ -91,8 +92,8 @@ def fit_in_place(
         raise CalibrationError(
             "method survey: expected latitude and longitude, and a field that is not known"
         )
-    # Unknowns: coefficients of the masses' positions, level and gradient of the reference, slow changes,
-    # offset terms, drift of the track, and the crustal field. The last is eliminated in every round.
+    # Unknowns: coefficients of the masses' positions, bias and gradient of the reference, slow changes,
+    # offset terms, drift of the track, and the crustal field, which each iteration eliminates.
     posed = pose(data, order, vehicle, known)
     samples, q = posed.samples, posed.family.E.shape[1]
     groups = (*_groups(data, level), *offered(data))
@@ -104,18 +105,18 @@ def fit_in_place(
     prior, z = found.family.prior(found.widths.eta), found.z
     covariance = found.covariance()
     creep = survey.offset(z[q:], [one for one in survey.offsets if one.lag is None])
-    # with what the survey found added to the reference, the samples are those of a fit with a true field
+    # with the estimated crustal field and bias added, the reference is the true field of an ordinary fit
     lifted = replace(
         samples, reference=samples.reference + found.lacking, field=samples.field - survey.offset(z[q:])
     )
     noise = NoiseModel(found.widths.sigma, found.choice.rho, weight=survey.kept.astype(float))
-    # the coefficients' part of prior and posterior, without that of the other unknowns
+    # prior and posterior of the coefficients only, without the other unknowns
     own = Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset)
     posterior = CoefficientPosterior(
         lifted, own, z[:q], covariance[:q, :q], noise, noise, settled=True, objective=0.0
     )
     check_scales(samples, posterior.coefficients)
-    # predict parts from the others, the field in place as found: a figure to compare parameters by
+    # held-out errors, with the estimated crustal field: the choice of parameters compares them
     details = {**_details(found, survey), "left_out_nT": leave_out(posterior, data.runs).rms}
     fit = assemble(data, posed, posterior, "survey", details=details, informative=True)
     calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
@@ -133,9 +134,9 @@ def fit_in_place(
 
 
 def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
-    """Return the unknowns other than coefficients and field: the level, its slope, changes with time."""
+    """Return the blocks of the reference's bias, its gradient and its slow changes with time."""
     assert data.place is not None
-    # the level is one constant of 1-sigma `level`, and changes by as much over 25 km
+    # the bias has the 1-sigma `level`, and changes by as much over 25 km
     away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REFERENCE_ERROR_LENGTH_M
     level = max(level, 1e-3)
     groups = [ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)]
@@ -149,10 +150,10 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
 
 
 def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, SurveySamples]:
-    """Return the converged fit, and the samples with the optional terms that the log needs.
+    """Return the converged fit, and its samples with the selected optional terms.
 
-    A long log converges with every second or tenth sample first, and then with all. The field was searched
-    with all optional terms in the fit: where a kept term gains little, a search without it may be better.
+    A long log converges with every second or tenth sample first, and then with all. The search of the field
+    included all optional terms, so the fit is repeated without each selected term that gains little evidence.
     """
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), family)
@@ -176,7 +177,7 @@ def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, Survey
 
 
 def _drift(data: Observations, sigma: float) -> ParameterBlock | None:
-    """Return the drift of positions, north or east, as a random walk of `sigma` m."""
+    """Return a block for the drift of positions, a random walk of 1-sigma `sigma` (m); None without drift."""
     waves = SlowFunctions(data.time, DRIFTING)
     return ParameterBlock("drift", waves, waves.shape, sigma) if sigma and len(waves.shape) else None
 
@@ -205,21 +206,22 @@ def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:
 
 
 TEMPERATURE_LAGS_S = (0.0, 600.0, 2400.0)
-"""Time constants between temperature and offset, s: a bare sensor, its housing, a hull."""
+"""Time constants between temperature and offset, s, for a bare sensor, a sensor in its housing, a hull."""
 SHORTEST_DRIFT_HALF_PERIOD_S = 1200.0
 """Half the period of the fastest drift of the offset, s."""
 VARIES = 0.5
-"""Smallest standard deviation of a temperature that can be fitted, degC."""
+"""Smallest standard deviation of a temperature whose slope is fitted, degC."""
 PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
-"""nT/degC and nT along an axis (fluxgates' data sheets: 0.1 to 3 nT/degC), 1-sigma of their logarithms."""
+"""Prior 1-sigma of the temperature slope (nT/degC; data sheets of fluxgates state 0.1 to 3) and of the drift
+(nT) along an axis, and 1-sigma of their logarithms."""
 
 
 def offered(data: Observations) -> tuple[OffsetBlock, ...]:
-    """Return the terms that a log allows: the temperature at each lag, and drift."""
+    """Return the optional offset terms that a log allows: the temperature at each lag, and drift."""
     groups = []
     if data.temperature is not None and TEMPERATURE not in data.names:
         for lag in TEMPERATURE_LAGS_S:
-            # a constant temperature is not distinguished from the offset
+            # a constant temperature cannot be separated from the offset
             warm = _temperature(data, lag)
             if np.std(warm) > VARIES:
                 column = (warm - warm.mean())[:, None]
@@ -236,7 +238,7 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
 
 
 def _temperature(data: Observations, lag: float) -> FloatArray:
-    """Return the temperature (n,), degC, through a lag; its mean before any is known."""
+    """Return the temperature (n,), degC, through a first-order lag (s); it starts at the mean if unknown."""
     assert data.temperature is not None
     known = data.temperature[np.isfinite(data.temperature)]
     return lagged(data.time, held(data.temperature, float(known.mean()) if len(known) else 0.0), lag)
@@ -248,13 +250,13 @@ def with_temperature(
     groups: tuple[ParameterBlock, ...],
     found: tuple[FloatArray, FloatArray, FloatArray],
 ) -> Calibration:
-    """Return the calibration with the effect of temperature that was found, if any.
+    """Return the calibration with the temperature term of the fit as an effect, if the fit kept one.
 
-    `groups`: the blocks of the fit, in order. `found`: the unknowns (q,), their covariance, and the matrix
-    from them to the coefficients.
+    `groups`: blocks of the fit, in order. `found`: unknowns z (q,), their covariance (q, q), and the matrix E
+    (K, q) from z to the coefficients.
     """
-    # The offset by temperature becomes a channel effect with three more coefficients: the rows of z that
-    # are its own are copied into them, with their covariance with all others.
+    # The temperature term becomes a channel effect with three more coefficients, which are three of z, with
+    # their covariance with all other coefficients.
     z, covariance, E = found
     row = E.shape[1] - sum(len(one.shape) for one in groups)
     for one in groups:
@@ -274,6 +276,6 @@ def with_temperature(
 def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
     """Return the calibration with the variance of the survey's offsets (n, 3), nT, added to that of T."""
     covariance = calibration.covariance.copy()
-    # beyond the survey the offset may have any value that it had: add its variance to that of T
+    # after the survey the offset may be any of its values during the survey: add their variance to that of T
     covariance[6:9, 6:9] += creep.T @ creep / len(creep)
     return replace(calibration, covariance=covariance)

@@ -1,9 +1,9 @@
-"""Columns of a log that change the field: suggestions of a fit, and useful parameters.
+"""Find the columns of a log that change the field, to report them or to use them as parameters.
 
-The columns are added one by one: first the one which explains most of the residual of the fit so far, as long
-as a fit with it predicts held-out parts better, and the later parts of the log from the earlier ones. A
-drone's motors move its field in proportion to their currents, and its log holds battery and motor currents,
-throttles and servos, most of which are collinear.
+:func:`best_parameters` adds columns one by one. It first tries the column that explains most of the residual
+of the present fit. It keeps the column if a fit with it predicts held-out parts better, and also later parts
+of the log from earlier parts. For example, the field of a drone's motors is proportional to their currents,
+and its log has currents, throttles and servos, most of which are collinear.
 """
 
 from __future__ import annotations
@@ -30,27 +30,29 @@ if TYPE_CHECKING:
 # ---- Columns that a fit suggests ----
 
 PARTS, BLOCKS = 8, 32
-"""Number of parts of a log, of which each is left out in turn, and of blocks of neighbours that they get: no
-part may have all motions of a mass that rarely moves alone."""
+"""Number of held-out parts of a log, and number of blocks of successive samples that the parts share. A mass
+that rarely moves then moves in several parts."""
 MAX_REMAINING_FRACTION = 0.8
-"""Fraction of the residual left on held-out parts, at most, for a column to be named."""
+"""Largest ratio of held-out errors with and without a column at which the column is reported."""
 MIN_IMPROVEMENT_NT = 2.0
-"""Least improvement that is reported, nT."""
+"""Smallest improvement that is reported, nT."""
 MAX_REPORTED_COLUMNS = 3
 """Largest number of reported columns, each given the previous ones."""
 WORTHY = 0.5
-"""Improvement by a further column, as a fraction of the first one's, from which on it is reported."""
+"""Smallest improvement by a further column that is reported, as a fraction of the first improvement."""
 
 
 def undeclared(calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray]) -> list[str]:
-    """Return a line for each column that explains the residual of a fit without being its parameter.
+    """Return a message for each column that explains the residual of a fit but is not its parameter.
 
-    `data`: of the fit. `columns` (n,): telemetry at the samples of `data`.
+    `data`: samples of the fit. `columns`: telemetry (n,) at these samples, by column name.
 
-    Notes ----- A mass at c adds a field ``d(c)`` to the vector, and ``d(c) . u`` to the total field, u its
-    direction: the residual is regressed on ``u, c u, c^2 u`` and the same functions of each declared
-    parameter, which may have absorbed part of it without c; the improvement by c is measured on held-out
-    parts.
+    Notes
+    -----
+    A mass at position c adds a field ``d(c)`` to the vector, and ``d(c) . u`` to the total field, with u the
+    field's direction. The residual is regressed on ``u, c u, c^2 u``, and on the same functions of each
+    declared parameter, which may have absorbed a part of the effect of c. The improvement by c is measured on
+    held-out parts.
     """
     lines: list[str] = []
     conditional_on: tuple[str, ...] = ()
@@ -77,10 +79,10 @@ def worths(
     better: float = MAX_REMAINING_FRACTION,
     conditional_on: tuple[str, ...] = (),
 ) -> dict[str, float]:
-    """Return the reduction (nT) of a residual on held-out parts by each column (n,); see :func:`undeclared`.
+    """Return the reduction (nT) of the held-out residual by each useful column, by name.
 
-    Omitted are columns that leave more than the fraction `better` of it, and those of `conditional_on`, which
-    explain their part first.
+    The regression is that of :func:`undeclared`. A column is useful if the ratio of held-out errors with and
+    without it is below `better`. `conditional_on`: columns that are part of both regressions.
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
@@ -98,7 +100,7 @@ def worths(
         given = [_moved(np.nan_to_num(columns[one][known]), direction[known], 2) for one in conditional_on]
         plain = np.column_stack([direction[known], np.ones(len(c)), *declared, *given])
         without = _left_out(plain, residual[known])
-        # a mass that was in two places has no second power to tell
+        # a mass at two positions does not determine a second power: use the better of both orders
         powers = (np.column_stack([plain, _moved(c, direction[known], order)]) for order in (1, 2))
         left = min(_left_out(design, residual[known]) for design in powers)
         worth = float(np.sqrt(max(without**2 - left**2, 0.0)))
@@ -108,7 +110,7 @@ def worths(
 
 
 def _moved(c: FloatArray, direction: FloatArray, order: int) -> FloatArray:
-    """Return powers of positions c (n,), scaled to -1 to 1, times the field's direction (n, 3)."""
+    """Return the powers 1 to `order` of c (n,), scaled to [-1, 1], times the direction: (n, 3 order)."""
     c = (c - c.min()) / (0.5 * np.ptp(c) or 1.0) - 1.0
     return np.column_stack([(c**k)[:, None] * direction for k in range(1, order + 1)])
 
@@ -129,37 +131,38 @@ def _left_out(design: FloatArray, residual: FloatArray) -> float:
 AUTO = "auto"
 """``--parameter auto``."""
 MAX_PARAMETERS = 3
-"""Largest number of parameters: each of several currents is in part the sum of the others."""
+"""Largest number of parameters; more are not useful, because several currents are collinear."""
 FAILURES = 2
-"""Number of rejected columns in a row after which no more are tried."""
+"""Number of successive rejected columns after which the search ends."""
 MAX_HELD_OUT_ERROR_RATIO = 0.95
-"""Fraction of the error on held-out parts that a useful column may leave."""
+"""Largest ratio of held-out errors with and without a column at which the column becomes a parameter."""
 SCREENING_SAMPLES = 20_000
 """Largest number of samples with which columns are chosen."""
 USUAL_DEPARTURE = 0.15
-"""Departure of a scale from 1 that sensors have. A parameter must not move the scales beyond it and further
-away: it moved with the attitude then, and its coefficients have absorbed that."""
+"""Usual departure of a sensor's scale from 1. A column that increases the departure beyond this value is
+rejected: it correlates with the attitude, and its coefficients have absorbed a part of the scales."""
 HINTED = 0.98
-"""Fraction of the residual that may be left, for a column to be tried."""
+"""Largest ratio of held-out residuals with and without a column at which a fit with the column is tried."""
 
 
 @dataclass(frozen=True)
 class Offer:
-    """A column that was tried as a parameter."""
+    """Column that was tried as a parameter, with its held-out errors."""
 
     name: str
     without: float
     left_out: float
-    """`without`, `left_out`: RMS on held-out parts without it, and with it, nT."""
+    """`without`, `left_out`: RMS error on held-out parts of fits without and with the column, nT."""
     taken: bool
+    """True if the column became a parameter."""
 
 
 def best_parameters(
     deployment: xr.Dataset, offered: Sequence[str], *, grid: AnomalyGrid | None = None, **options: Any
 ) -> tuple[tuple[str, ...], list[Offer]]:
-    """Return the columns to use as parameters, and the improvement of each that was tried.
+    """Return the columns to use as parameters, and the held-out errors of each column that was tried.
 
-    `offered`: columns that may move the field. `grid`: added to the IGRF. `options`: of :func:`~.fit.fit`.
+    `offered`: candidate columns. `grid`: anomaly map to add to the IGRF. `options`: as for :func:`~.fit.fit`.
 
     CalibrationError: the data do not support a fit without parameters.
     """
@@ -171,8 +174,8 @@ def best_parameters(
     found = fit(screened(taken), **options)
     offers: list[Offer] = []
     failures = 0
-    # Forward selection: offer the column that explains most of the residual; keep it if a new fit predicts
-    # held-out parts better, both those between others and the later ones.
+    # Forward selection: try the column that explains most of the residual; keep it if a new fit predicts
+    # held-out parts better, and also later parts from earlier parts.
     while len(taken) < MAX_PARAMETERS and failures < FAILURES:
         data = screened(taken)
         rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
@@ -185,17 +188,17 @@ def best_parameters(
         without = float(found.details["left_out_nT"])
         try:
             further = fit(screened((*taken, name)), **options)
-        except CalibrationError:  # a position that cannot be, or too few samples that have it
+        except CalibrationError:  # implausible positions, or too few samples with a value
             offers.append(Offer(name, without, np.inf, taken=False))
             failures += 1
             continue
         left = float(further.details["left_out_nT"])
         worth_it = left < MAX_HELD_OUT_ERROR_RATIO * without and bool(further.calibration.channels)
-        # a parameter must carry to later parts of the log as well
+        # a parameter must also improve the prediction of later parts of the log
         if {"forward_nT"} <= found.details.keys() & further.details.keys():
             forward = further.details["forward_nT"] / found.details["forward_nT"]
             worth_it = worth_it and forward < MAX_HELD_OUT_ERROR_RATIO
-        # a parameter that moves with the attitude absorbs it, and bends the scales instead
+        # a parameter that correlates with the attitude would distort the scales
         worth_it = worth_it and _departure(further) <= max(_departure(found), USUAL_DEPARTURE)
         offers.append(Offer(name, without, left, worth_it))
         if worth_it:
@@ -206,12 +209,12 @@ def best_parameters(
 
 
 def _departure(found: Fit) -> float:
-    """Return the largest departure of a scale from 1."""
+    """Return the largest departure of a scale factor of A from 1."""
     return max(abs(scale - 1.0) for scale in found.scales)
 
 
 def lines(offers: Sequence[Offer]) -> list[str]:
-    """Return a line for each column that was tried, with its improvement on held-out parts."""
+    """Return a message for each column that was tried, with its held-out errors."""
     return [
         f"--parameter {one.name}: {one.without:.0f} nT on parts left out without it, "
         f"{one.left_out:.0f} with it: {'taken' if one.taken else 'not worth it'}"

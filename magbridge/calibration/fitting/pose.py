@@ -1,25 +1,24 @@
 r"""Inputs of a fit: the samples with their monomials, and the prior of the coefficients.
 
-The prior is one of physical widths (:mod:`magbridge.estimation.priors`), of dipoles at measured places,
-or from earlier deployments of the vehicle (:class:`Known`).
+The prior has physical widths (:mod:`magbridge.estimation.priors`), or consists of dipoles at measured
+positions, or follows from earlier deployments of the vehicle (:class:`Known`).
 
 Notes
 -----
 Coefficients of two deployments can be compared only for the same scaling of the positions and the same field
-F_0. With :math:`x = s x' + t` for each parameter, a monomial of the old is a polynomial in the new,
+F_0. With :math:`x = s x' + t` for each parameter, an old monomial is a polynomial in the new positions,
 
 .. math:: x^p = \sum_q \prod_k \binom{p_k}{q_k} s_k^{q_k} t_k^{p_k - q_k} x'^q,
 
-so that the new coefficients are linear in the old (:func:`rescaling`).
+so the new coefficients are linear in the old ones (:func:`rescaling`).
 
-A known prior N(m, S) enters the fit as ``c = L z + m``, where ``S = L L^T`` and z has one common width, with
-a prior about 1, chosen by the evidence: where a deployment is unlike all that was known, S widens.
+A known prior N(m, S) enters the fit as ``c = L z + m`` with ``S = L L^T``. All z have one common width, with
+a prior about 1, which maximises the evidence. If a deployment differs from the earlier ones, S becomes wider.
 
-Latent numbers of a mounted mass: permanent moment (3), induced moment (3), error of its measured place (3)
-and of its measured travel (3). The free polynomials remain, with far smaller widths, for what dipoles do not
-describe (extended masses, a sensor a degree out of alignment). The coefficients are linear in the moments. In
-the errors of place and travel they are linearised again in each round of the fit, so that no place is held
-more certain than `at_sigma`.
+A mounted mass has twelve latent unknowns: permanent moment (3), induced moment (3), error of its measured
+position (3) and of its measured travel (3). The free polynomials remain, with far smaller widths, for effects
+that dipoles do not describe (extended masses, a sensor misaligned by a degree). The coefficients are linear
+in the moments. In the errors of position and travel the fit linearises them again in each iteration.
 """
 
 from __future__ import annotations
@@ -45,29 +44,30 @@ from magbridge.estimation.priors import FACTOR_MASS, PriorFamily, gain_rotation,
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.toml import check_entries, convert, load_toml
 
-# ---- Dipoles at measured places ----
+# ---- Dipoles at measured positions ----
 
 Vector = tuple[float, float, float]
 
 MOMENT, INDUCED = 2000.0, 30.0
-"""Permanent and induced moment of a mass, nT at the sensor: a battery pack at arm's length."""
+"""Prior median of a mass's permanent and induced moment, as a field at the sensor, nT; the values are those
+of a battery pack at arm's length."""
 INDUCED_APART = 0.4
-"""Difference of the susceptibilities of the three axes, as a fraction of the induced moment."""
+"""1-sigma of the susceptibilities' differences between axes, as a fraction of the induced moment."""
 TRAVEL_SIGMA = 0.03
-"""1-sigma of the travel, as a fraction: sensor and vehicle are a degree or two out of alignment."""
+"""1-sigma of the travel's error, as a fraction of the travel, for a misalignment of one or two degrees."""
 REST_T, REST_A = 1.0, 0.25
-"""Size of what the dipole does not describe, nT over half the range, in T and in a."""
+"""Prior median of the change of T and of a that the dipole does not describe, nT over half the range."""
 LATENT = 12
-"""Latent numbers of a mass."""
+"""Number of latent unknowns of a mass."""
 
 
 class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[mass.NAME]``: where the mass that parameter NAME moves sits, seen from the sensor."""
+    """``[mass.NAME]`` of ``vehicle.toml``: position from the sensor of the mass that parameter NAME moves."""
 
     at: Vector
-    """Position in the body frame where the parameter is 0, m."""
+    """Position of the mass from the sensor at parameter value 0, body axes, m."""
     travel: Vector
-    """m per unit of the parameter."""
+    """Change of the position for one unit of the parameter, body axes, m."""
     at_sigma: Annotated[float, Meta(gt=0)] = 0.05
     """1-sigma of `at`, m."""
 
@@ -77,7 +77,7 @@ class _VehicleFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_vehicle(path: str | Path) -> dict[str, Mounting]:
-    """Read ``vehicle.toml``; ConfigError: the file, a key or a type is not as expected."""
+    """Return the mounting of each mass in a ``vehicle.toml``; ConfigError: a key or type is wrong."""
     table = load_toml(path)
     check_entries(table, "mass", Mounting, path)
     return convert(table, _VehicleFile, path).mass
@@ -85,29 +85,31 @@ def read_vehicle(path: str | Path) -> dict[str, Mounting]:
 
 @dataclass(frozen=True, eq=False)
 class _Mass:
-    """A mounted mass in the fit: its monomials, and the line along which it travels."""
+    """Mounted mass in a fit."""
 
-    rows: IndexArray  # of its monomials x, x^2 ...
+    rows: IndexArray
+    """Indices of the monomials x, x^2 ... of its parameter."""
     at: FloatArray
     travel: FloatArray
     sigma: float
+    """`at`, `travel`, `sigma`: as in :class:`Mounting`."""
     parameter: Parameter
 
     def columns(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return ``dc/dl`` (order, 9, 12) and c (order, 9): its coefficients c at latent numbers l."""
-        # linear in the first six latent numbers (moments), so that c is their product with the derivative
+        """Return ``dc/dl`` (order, 9, 12) and c (order, 9): coefficients c at latent unknowns l (12,)."""
+        # c is linear in the first six unknowns (moments): it is their product with the derivative
         by = mass_columns(self.at, self.travel, self.parameter, len(self.rows), latent)
-        moved = by[1:]  # the constant is absorbed by the hard iron
+        moved = by[1:]  # the constant is part of the hard iron
         return moved, moved[..., :6] @ latent[:6]
 
 
 def mass_columns(
     place: FloatArray, travel: FloatArray, parameter: Parameter, order: int, latent: FloatArray
 ) -> FloatArray:
-    """Return ``dc/dl`` (order + 1, 9, 12): coefficients of a mass, the constant first, by its latent numbers.
+    """Return the derivatives ``dc/dl`` (order + 1, 9, 12) of a mass's coefficients, the constant first.
 
-    `place`, `travel` (3,): m, and m per unit of the parameter. `latent` (12,): moment and induced moment
-    (nT), shift (m), change of the travel (m per unit).
+    `place`, `travel` (3,): m, and m per unit of the parameter. `latent` (12,): unknowns l, namely moment and
+    induced moment (nT), shift (m), change of the travel (m per unit).
     """
     # A dipole's field is evaluated at Chebyshev points of the travel, together with its derivatives, and
     # expanded in powers of the position: these are the coefficients of the monomials x, x^2 ...
@@ -115,10 +117,10 @@ def mass_columns(
     induced = gain_rotation() @ pulled
     p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * order + 4)
     r = place + shift + p[:, None] * (travel + stretch)
-    # moments stay scaled by the measured distance, or a shift would change them too
+    # the moments refer to the measured distance, so that a shift does not change them
     by = dipole_columns(r, moment, induced, float(np.linalg.norm(place)))
     by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
-    # a change of the travel moves the mass by p times it
+    # a change of the travel moves the mass by p times this change
     by = np.concatenate([by, by[6:] * p[:, None]])
     return np.moveaxis(expand_dipole(by, order), 0, -1)
 
@@ -129,15 +131,15 @@ def mounted_prior(
     parameters: tuple[Parameter, ...],
     vehicle: Mapping[str, Mounting | Mapping[str, Any]],
 ) -> PriorFamily:
-    """Add to the free polynomials `free` a dipole for each mass of `vehicle`.
+    """Return the prior `free` of polynomials with the unknowns of a dipole added for each mass of `vehicle`.
 
-    CalibrationError: `vehicle` names a mass that no parameter moves, or one too near the sensor for a power
+    CalibrationError: no parameter moves a mass of `vehicle`, or a mass is too near the sensor for a power
     series.
     """
     names = [parameter.name for parameter in parameters]
     masses = [_mass(name, found, exponents, parameters) for name, found in vehicle.items()]
-    # Latent numbers: those of the free polynomials, then for each mass 3 of the moment, 3 of the induced
-    # moment, 3 of the shift and 3 of the travel. log sigma = constant + design @ eta for each.
+    # Unknowns: those of the free polynomials, then for each mass 3 of the moment, 3 of the induced moment,
+    # 3 of the shift and 3 of the travel. log sigma = constant + design @ eta for each.
     labels = tuple(f"{name} {kind}" for name in vehicle for kind in ("moment", "induced"))
     q, h, extra = free.design.shape[0], free.design.shape[1], len(labels)
     design = np.zeros((q + LATENT * len(masses), h + extra))
@@ -152,7 +154,7 @@ def mounted_prior(
         constant[first + 6 : first + 9] = np.log(mass.sigma)
         constant[first + 9 : first + 12] = np.log(TRAVEL_SIGMA * np.linalg.norm(mass.travel))
     centre = np.append(free.centre, np.log([MOMENT, INDUCED] * len(masses)))
-    # what the dipole does not describe is small: narrow the mass's own polynomials
+    # the remainder is small: give the mass's own polynomials a narrow prior
     for name in vehicle:
         k = 3 + 3 * names.index(name)
         centre[k], centre[k + 1] = np.log(REST_T), np.log(REST_A)
@@ -174,7 +176,7 @@ def _mass(
     exponents: tuple[Exponents, ...],
     parameters: tuple[Parameter, ...],
 ) -> _Mass:
-    """Return a mass with the rows of its parameter's pure powers; refuse one that is unknown or too near."""
+    """Return a mass of the fit; CalibrationError: no parameter moves it, or it is too near the sensor."""
     mounting = found if isinstance(found, Mounting) else msgspec.convert(found, Mounting)
     names = [parameter.name for parameter in parameters]
     if name not in names:
@@ -183,7 +185,7 @@ def _mass(
     order = max(powers[k] for powers in exponents)
     rows = [exponents.index(tuple(n * (i == k) for i in range(len(names)))) for n in range(1, order + 1)]
     parameter, travel = parameters[k], np.array(mounting.travel)
-    # a power series in x converges only if the mass stays well away from the sensor
+    # a power series in x converges only if the mass is far from the sensor, compared with its travel
     middle = np.linalg.norm(np.array(mounting.at) + parameter.centre * travel)
     if middle < 3.0 * parameter.scale * np.linalg.norm(travel) or middle == 0.0:
         raise CalibrationError(f"vehicle: mass {name!r} passes within three half-travels of the sensor")
@@ -209,33 +211,33 @@ def _linearised(family: PriorFamily, masses: list[_Mass], latent: FloatArray) ->
     return replace(family, E=J, offset=offset, renew=renew)
 
 
-# ---- A prior that is known ----
+# ---- A known prior ----
 
 DEPARTURE = "departure from the prior"
-"""Name of the width of z: 1 where a deployment is as it was expected."""
+"""Name of the common width of z, which is 1 if a deployment is as expected."""
 SPREAD = np.log(1.5)
-"""1-sigma of the logarithm of that width."""
+"""1-sigma of the logarithm of the common width of z."""
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A Gaussian expectation of the coefficients."""
+    """Gaussian prior of the coefficients, from earlier deployments."""
 
     parameters: tuple[Parameter, ...]
-    """How the positions are scaled, with the range that was seen."""
+    """Scaling of the positions, and their range in the earlier deployments."""
     exponents: tuple[Exponents, ...]
-    """The m monomials, all of them up to a degree."""
+    """The m monomials: all up to one degree."""
     field: float
-    """F_0 that the coefficients refer to, nT."""
+    """Reference field F_0 of the coefficients, nT."""
     mean: FloatArray
-    """(9 m,), nT."""
+    """(9 m,): Mean of the coefficients, nT."""
     covariance: FloatArray
-    """(9 m, 9 m), nT², positive definite."""
+    """(9 m, 9 m): Covariance of the coefficients, nT², positive definite."""
 
     def ranges(self, data: Observations) -> tuple[Parameter, ...]:
-        """Return the parameters, their ranges widened to what `data` have.
+        """Return the parameters with ranges that include the positions in `data`.
 
-        CalibrationError: the data have others, or in other units.
+        CalibrationError: names, units or order of the parameters in `data` differ.
         """
         # names, units and order must agree: coefficients have no meaning for other positions
         mine = [(one.name, one.unit) for one in self.parameters]
@@ -251,7 +253,7 @@ class Known:
 
     def prior(self, F_0: float) -> PriorFamily:
         """Return the prior of a fit whose coefficients refer to the field `F_0` (nT)."""
-        # c = L mean + chol(L P L^T) z: z is N(0, 1) times a width that the evidence chooses
+        # c = L mean + chol(L P L^T) z: z is N(0, 1) times a width that maximises the evidence
         L = rescaling(self.exponents, self.parameters, self.parameters, self.field, F_0)
         size = len(self.mean)
         return PriorFamily(
@@ -265,14 +267,14 @@ class Known:
         )
 
     def rescaled(self, parameters: tuple[Parameter, ...], field: float) -> Known:
-        """Return the same for other scales of the positions and another F_0 (nT)."""
+        """Return this prior for the scaling of other `parameters` and for another F_0 `field` (nT)."""
         L = rescaling(self.exponents, self.parameters, parameters, self.field, field)
         P = L @ self.covariance @ L.T
         return replace(self, parameters=parameters, field=field, mean=L @ self.mean, covariance=P)
 
 
 def _widened(parameter: Parameter, column: FloatArray) -> Parameter:
-    """Return a parameter whose range takes in a column (n,), on the same scale."""
+    """Return a parameter with the same scaling whose range includes the values of `column` (n,)."""
     low, high = min(parameter.low, float(column.min())), max(parameter.high, float(column.max()))
     return Parameter(parameter.name, parameter.unit, low, high, parameter.centre, parameter.scale)
 
@@ -284,9 +286,9 @@ def rescaling(
     field_old: float,
     field_new: float,
 ) -> FloatArray:
-    """Return the matrix (9 m, 9 m) from coefficients in `old` scales of the positions to `new` ones.
+    """Return the matrix (9 m, 9 m) from coefficients for the scaling of `old` to those for that of `new`.
 
-    `exponents`: the m monomials, all up to a degree. `field_old`, `field_new`: F_0, nT.
+    `exponents`: the m monomials, all up to one degree. `field_old`, `field_new`: F_0, nT.
     """
     # x_old = s x_new + t, so x_old^p = sum of binom(p, q) s^q t^(p-q) x_new^q; A is over F_0, T is not
     s = [n.scale / o.scale for o, n in zip(old, new, strict=True)]
@@ -300,14 +302,14 @@ def rescaling(
     return np.asarray(np.kron(M, np.diag([field_new / field_old] * 6 + [1.0] * 3)))
 
 
-# ---- The problem of a fit ----
+# ---- Samples and prior of a fit ----
 
 Vehicle = Mapping[str, Mounting | Mapping[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A fit as a problem: ranges of the positions, monomials in them, samples, prior."""
+    """Input of a fit: ranges and monomials of the positions, samples, and prior of the coefficients."""
 
     ranges: tuple[Parameter, ...]
     exponents: tuple[Exponents, ...]
@@ -316,13 +318,14 @@ class Posed:
 
 
 def pose(data: Observations, order: int, vehicle: Vehicle | None = None, known: Known | None = None) -> Posed:
-    """Return the problem of fitting polynomials up to the total degree `order` to `data`.
+    """Return the input of a fit of polynomials up to the total degree `order` to `data`.
 
-    `vehicle`: where the masses sit, by parameter. `known`: expected coefficients, with their own order.
+    `vehicle`: mounting of the masses, by parameter. `known`: prior with monomials of its own, instead of
+    `order`.
 
-    CalibrationError: both are given, or `known` is of other parameters.
+    CalibrationError: `vehicle` and `known` are both given, or `known` has other parameters than `data`.
     """
-    # without an expectation: priors of physical width, and dipoles where masses have a place
+    # without a known prior: physical widths, and dipoles for masses with a measured position
     if known is None:
         ranges = data.ranges()
         exponents = full_order(len(ranges), order)
