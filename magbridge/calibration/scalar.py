@@ -29,7 +29,7 @@ from magbridge.errors import CalibrationError
 
 __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "RANGE_MARGIN", "CorrectedScalar",
-    "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "SensorComparison",
+    "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "SensorDisagreement",
     "compare_sensors", "correct_scalar", "scalar_design", "term_columns",
 ]  # fmt: skip
 
@@ -251,7 +251,7 @@ def _level(
     return level, sigma, cross
 
 
-class SensorComparison(NamedTuple):
+class SensorDisagreement(NamedTuple):
     """Variances and flags that the comparison of a scalar and a vector sensor adds, n samples."""
 
     scalar_variance: FloatArray
@@ -270,7 +270,7 @@ def compare_sensors(
     total: FloatArray,
     total_sigma: FloatArray,
     reference: FloatArray,
-) -> SensorComparison:
+) -> SensorDisagreement:
     """Compare a compensated scalar sensor with the length of a corrected vector.
 
     All are (n,), nT: both sensors' total field with its standard deviation, and the expected field; NaN where
@@ -298,7 +298,7 @@ def compare_sensors(
     scalar_excess = np.where(blame_vector, 0.0, excess)
     vector_excess = np.where(blame_scalar, 0.0, excess)
     jump = _jumps(scalar) & ~_jumps(total)
-    return SensorComparison(scalar_excess, vector_excess, np.asarray(disagrees), jump)
+    return SensorDisagreement(scalar_excess, vector_excess, np.asarray(disagrees), jump)
 
 
 def _expected_field(

@@ -20,7 +20,7 @@ from magbridge.calibration.scalar import (
     ScalarQuality,
     ScalarSensor,
     ScalarSeries,
-    SensorComparison,
+    SensorDisagreement,
     compare_sensors,
     correct_scalar,
     scalar_design,
@@ -199,7 +199,7 @@ def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> 
 
 def _compensated(
     corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor
-) -> tuple[CorrectedScalar, SensorComparison, ScalarSensor, ScalarSeries]:
+) -> tuple[CorrectedScalar, SensorDisagreement, ScalarSensor, ScalarSeries]:
     """Return compensation and comparison with the vector, the sensor adapted to the log, and its samples.
 
     FormatError: a channel is missing.
