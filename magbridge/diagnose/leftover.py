@@ -11,13 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.diagnose.columns import Candidate, Columns, places
+from magbridge.calibration.effects import TimeEffect, powers
+from magbridge.diagnose.columns import AXIS_NAMES, Candidate, Columns, places, size_of, slices
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
 from magbridge.diagnose.joint import Joint, JointDesign, Ridge, Statistic, in_threads, precomputed
@@ -33,6 +36,12 @@ MAX_TESTED_COEFFICIENTS = 6
 shape."""
 COMPARED_DESCRIPTIONS = 3
 """Number of descriptions, the best under each noise, that are compared by the full likelihood."""
+AMPLITUDE_WAVES = 64
+"""Number of half waves over the log by which the amplitude of a cause may vary."""
+AMPLITUDE_CORNERS = ("drift", 1.0), ("switching", 8.0), ("broadband", 1e3)
+"""Kinds of variation, and the number of half waves from which on their spectrum falls."""
+AMPLITUDE_BANDS = (1, 2, 3, 5, 9, 17, 33, 65)
+"""First half wave of each band of an amplitude's variation; the last number ends the last band."""
 TURNS = 6
 """Number of alternations between the fit of a curve and the fit of its direction."""
 CALM = 2
@@ -45,34 +54,103 @@ ratio of its RMS to that of white noise with equal steps. Third: least RMS, as a
 
 
 def varying(
-    problem: Problem, candidate: Candidate, look_elsewhere: Mapping[str, float]
-) -> Description | None:
-    """Return a description of a named cause whose amplitude varies with other telemetry, attitude or time.
+    problem: Problem,
+    model: Sequence[Candidate],
+    coefficients: FloatArray,
+    look_elsewhere: Mapping[str, float],
+) -> list[Description]:
+    """Return descriptions of each cause of `model`, of coefficients (k,), with an amplitude that varies.
 
     A true cause has a constant amplitude in a log. A wrong one may leave its regressor times a function of
-    another series. Return None for a cause with so many coefficients that it can have almost any shape.
+    time, of other telemetry, or of the attitude. Causes with so many coefficients that they can have almost
+    any shape have none.
     """
-    if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
-        return None
-    # Regressor times (1, v_1, v_2, ...), every v from -1 to 1
-    values = _followed(problem, candidate.channel)
+    made = []
+    for candidate, place in zip(model, slices(model), strict=True):
+        if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
+            continue
+        holds = partial(_is_of, candidate.cause)
+        effect = _fitted_effect(problem, candidate, coefficients[place])
+        several = size_of(effect)
+        modulated, _ = _modulated(problem, effect, _half_waves(problem))
+        followed, size = _modulated(problem, candidate.columns, _series(problem, candidate.channel))
+        price = look_elsewhere[candidate.cause]
+        made += [
+            Description(
+                modulated, _bands(several), candidate.channel, price, holds=holds, wider=True
+            ),
+            Description(
+                followed, (("broadband", np.ones(size)),), candidate.channel, price,
+                holds=holds, turned=candidate.size == 3, wider=True,
+            ),
+        ]  # fmt: skip
+    return made
+
+
+def _bands(columns: int) -> tuple[tuple[str, FloatArray], ...]:
+    """Return the prior widths of an amplitude's constant and half waves, by kind of variation."""
+    k = np.arange(AMPLITUDE_WAVES + 1.0)
+    bands = [np.where((k >= low) & (k < high), 1.0, 1e-3) for low, high in pairwise(AMPLITUDE_BANDS)]
+    listed = [(kind, 1.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in AMPLITUDE_CORNERS]
+    listed += [("broadband", width) for width in bands]
+    return tuple((kind, np.repeat(width, columns)) for kind, width in listed)
+
+
+def _is_of(cause: str, candidate: Candidate) -> bool:
+    return candidate.cause == cause
+
+
+def _fitted_effect(problem: Problem, candidate: Candidate, b: FloatArray) -> Columns:
+    """Return the fitted effect (m, 1) of a candidate, for coefficients b (k,).
+
+    Of a tone, the effect a quarter of a period later is a second column. Of a step or a drift, the effect is
+    a constant offset in the same direction of the body.
+    """
+    shapes = {effect.shape for effect in candidate.effects if isinstance(effect, TimeEffect)}
+    if "tone" in shapes:
+        cos, sin = np.split(b, 2)
+        quadrature = np.column_stack([b, np.append(-sin, cos)])
+        return lambda rows: np.asarray(candidate.columns(rows) @ quadrature)
+    if shapes and b.size == len(AXIS_NAMES):
+        return lambda rows: np.asarray(-problem.jacobian[rows, 6:] @ b[:, None])
+    return lambda rows: np.asarray(candidate.columns(rows) @ b[:, None])
+
+
+def _half_waves(problem: Problem) -> Columns:
+    """Return half waves over the log, from the constant one on."""
+    time = problem.survey.time
+    turn = np.exp(1j * np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1.0))
+
+    def factors(rows: slice) -> FloatArray:
+        waves = np.stack(powers(turn[rows], AMPLITUDE_WAVES)).real
+        return np.concatenate([np.ones((1, waves.shape[1])), waves]).T
+
+    return factors
+
+
+def _series(problem: Problem, channel: str | None) -> Columns:
+    """Return 1, and all series that an amplitude may follow, each from -1 to 1."""
+    values = _followed(problem, channel)
     low = np.array([[value.min()] for value in values])
     half = np.array([[max(0.5 * float(np.ptp(value)), 1e-12)] for value in values])
-    regressor, n = candidate.columns, len(problem)
-    # an RMS of one: its coefficients are in nT, as those of other descriptions are
-    power = sum(float(np.sum(regressor(rows) ** 2)) for rows in row_blocks(n)) / (n * candidate.size)
+
+    def factors(rows: slice) -> FloatArray:
+        between = (np.stack([value[rows] for value in values]) - low) / half - 1.0
+        return np.concatenate([np.ones((1, between.shape[1])), between]).T
+
+    return factors
+
+
+def _modulated(problem: Problem, base: Columns, factors: Columns) -> tuple[Columns, int]:
+    """Return the products of columns and factors, with an RMS of one for a factor of 1, and their number."""
+    n = len(problem)
+    power = sum(float(np.sum(base(rows) ** 2)) for rows in row_blocks(n)) / (n * size_of(base))
 
     def columns(rows: slice) -> FloatArray:
-        part = regressor(rows).T / np.sqrt(max(power, 1e-300))
-        between = (np.stack([value[rows] for value in values]) - low) / half - 1.0
-        size = np.concatenate([np.ones((1, part.shape[1])), between])
-        return np.asarray((size[:, None] * part).reshape(-1, part.shape[1]).T)
+        part = base(rows).T / np.sqrt(max(power, 1e-300))
+        return np.asarray((factors(rows).T[:, None] * part).reshape(-1, part.shape[1]).T)
 
-    width = np.full((1 + len(values)) * candidate.size, 30.0)
-    return Description(
-        columns, (("broadband", width),), candidate.channel, look_elsewhere[candidate.cause],
-        holds=lambda other: other.cause == candidate.cause, turned=candidate.size == 3, wider=True,
-    )  # fmt: skip
+    return columns, size_of(base) * size_of(factors)
 
 
 def _followed(problem: Problem, channel: str | None) -> list[FloatArray]:
@@ -199,6 +277,27 @@ def leftover(
         kind, best.signal_to_noise, p_value, evidence, one.period, one.channel, one, count,
         fitted=tuple(entry for entry, _ in found), size=size,
     )  # fmt: skip
+
+
+def amplitude_evidence(
+    problem: Problem, fit: Joint, chosen: Sequence[Hypothesis], uneven: Sequence[Description]
+) -> float:
+    """Return the largest log evidence that the amplitude of a chosen cause varies; 0 if none does.
+
+    The evidence is the mean over the kinds of variation of a description in `uneven` (:func:`varying`). A
+    variation that may be a remnant of the strongest cause's idealised regressor counts as none. The grids of
+    the causes were not searched again, and have no price.
+    """
+    columns = [one.candidate.columns for one in chosen]
+    least = REMNANT * max(one.signal_to_noise for one in chosen)
+    largest = 0.0
+    for one in uneven:
+        ratios = [
+            np.exp(kind.evidence) if kind.best.signal_to_noise >= least else 1.0
+            for kind in _scored(problem, fit.noise, fit, columns, [one._replace(look_elsewhere=1.0)])
+        ]
+        largest = max(largest, float(np.log(np.mean(ratios))))
+    return largest
 
 
 def _scored(

@@ -177,13 +177,27 @@ def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float
     assert accept(problem, outcome)[0] == named
 
 
+@pytest.mark.parametrize("waves", [3, 20])
+def test_a_name_whose_size_varies_in_time_is_not_asserted(waves: int) -> None:
+    """A payload without telemetry that is switched with a logged one, but not always to the same power."""
+    problem, rng = right(ROWS), np.random.default_rng(10)
+    drawn = np.where(np.sin(np.arange(ROWS) / 3.0) > 0.3, 1.0, 0.0)
+    power = 1.0 + 0.8 * np.cos(np.pi * waves * np.arange(ROWS) / ROWS)
+    problem = replace(problem, residual=1.5 * drawn * power + rng.normal(size=ROWS))
+    outcome = search(problem, [candidate("a", drawn, channel="amps")], 1)
+    assert len(outcome.chosen) == 1
+    asserted, rest = accept(problem, outcome)
+    assert not asserted
+    assert rest is not None
+
+
 def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem) -> None:
     """An effect of pressure and pitch together is held; the remainder is the square of the pressure."""
     survey, rows = problem.survey, slice(0, len(problem))
     assert survey.attitude is not None
     squeezed = next(c for c in CAUSES["pressure_offset"].candidates(problem) if c.channel == "depth")
-    described = varying(problem, squeezed, {"pressure_offset": 2.0})
-    assert described is not None
+    ones, price = np.ones(squeezed.size), {"pressure_offset": 2.0}
+    *_, described = varying(problem, [squeezed], ones, price)
     X = described.columns(rows)
     assert X.shape[1] == described.widths[0][1].size
 
@@ -193,4 +207,4 @@ def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem
     assert missed(own * survey.channels["depth"].values ** 2, X) > 1e-3
     assert described.covers([squeezed])
     slow = replace(squeezed, spectra=np.ones((1, squeezed.size)))
-    assert varying(problem, slow, {"pressure_offset": 2.0}) is None
+    assert not varying(problem, [slow], ones, price)
