@@ -121,6 +121,7 @@ SCALAR_TEXTS = {
     "{sigma_m:.1f} m): a lag or a lever arm",
     "scalar.heading_error": "{column} has a heading error of {effect_nT:.1f} nT (standard deviation)",
     "scalar.channel": "{channel} disturbs {column} by {effect_nT:.2f} nT (standard deviation)",
+    "scalar.untested": "{column} was not tested: {reason}",
 }
 """Texts of the check of a scalar magnetometer."""
 

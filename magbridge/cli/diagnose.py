@@ -119,7 +119,8 @@ def summary(facts: dict[str, Any], parts: str) -> str:
         rms += f"; {number(improvement['refit_nT'])} nT by a refit of the calibration alone"
     verdict = "nothing needs explaining" if use["reason"] == "not_needed" else facts["verdict"]
     fit = f"fit for use: {use['fit_for_use']}. {use['summary']}"
-    return "\n  ".join([f"{verdict}: {rms}", fit, *causes_of(facts)])
+    scalar = [one["text"] for one in facts["scalar"]]
+    return "\n  ".join([f"{verdict}: {rms}", fit, *causes_of(facts), *scalar])
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ from magbridge.diagnose.observed import Seen, memory, seen
 from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.search import Outliers, SearchOutcome
 from magbridge.diagnose.state import CompetingHypothesis
+from magbridge.diagnostics import Diagnostic
 from magbridge.estimation.residual import rms
 
 MIN_RMS_REDUCTION = 0.01
@@ -124,6 +125,8 @@ class Diagnosis:
     """True if the findings hardly improve on a refit of the calibration's own coefficients."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
     """The tested causes, by name."""
+    scalars: tuple[Diagnostic, ...] = ()
+    """Findings for the calibration's scalar sensors (:mod:`.scalar`)."""
 
     @property
     def counts(self) -> BoolArray:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -38,10 +37,10 @@ COMPARED_DESCRIPTIONS = 3
 """Number of descriptions, the best under each noise, that are compared by the full likelihood."""
 AMPLITUDE_WAVES = 64
 """Number of half waves over the log by which the amplitude of a cause may vary."""
-AMPLITUDE_CORNERS = ("drift", 1.0), ("switching", 8.0), ("broadband", 1e3)
-"""Kinds of variation, and the number of half waves from which on their spectrum falls."""
+AMPLITUDE_CORNERS = 1.0, 8.0, 1e3
+"""Numbers of half waves from which on the spectrum of a variation falls."""
 AMPLITUDE_BANDS = (1, 2, 3, 5, 9, 17, 33, 65)
-"""First half wave of each band of an amplitude's variation; the last number ends the last band."""
+"""First half wave of each band of a variation; the last number ends the last band."""
 TURNS = 6
 """Number of alternations between the fit of a curve and the fit of its direction."""
 CALM = 2
@@ -54,50 +53,34 @@ ratio of its RMS to that of white noise with equal steps. Third: least RMS, as a
 
 
 def varying(
-    problem: Problem,
-    model: Sequence[Candidate],
-    coefficients: FloatArray,
-    look_elsewhere: Mapping[str, float],
-) -> list[Description]:
-    """Return descriptions of each cause of `model`, of coefficients (k,), with an amplitude that varies.
+    problem: Problem, candidate: Candidate, look_elsewhere: Mapping[str, float]
+) -> Description | None:
+    """Return a description of a named cause whose amplitude varies with other telemetry, attitude or time.
 
     A true cause has a constant amplitude in a log. A wrong one may leave its regressor times a function of
-    time, of other telemetry, or of the attitude. Causes with so many coefficients that they can have almost
-    any shape have none.
+    another series. Return None for a cause with so many coefficients that it can have almost any shape.
     """
-    made = []
-    for candidate, place in zip(model, slices(model), strict=True):
-        if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
-            continue
-        holds = partial(_is_of, candidate.cause)
-        effect = _fitted_effect(problem, candidate, coefficients[place])
-        several = size_of(effect)
-        modulated, _ = _modulated(problem, effect, _half_waves(problem))
-        followed, size = _modulated(problem, candidate.columns, _series(problem, candidate.channel))
-        price = look_elsewhere[candidate.cause]
-        made += [
-            Description(
-                modulated, _bands(several), candidate.channel, price, holds=holds, wider=True
-            ),
-            Description(
-                followed, (("broadband", np.ones(size)),), candidate.channel, price,
-                holds=holds, turned=candidate.size == 3, wider=True,
-            ),
-        ]  # fmt: skip
-    return made
+    if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
+        return None
+    # Regressor times (1, v_1, v_2, ...), every v from -1 to 1
+    values = _followed(problem, candidate.channel)
+    low = np.array([[value.min()] for value in values])
+    half = np.array([[max(0.5 * float(np.ptp(value)), 1e-12)] for value in values])
+    regressor, n = candidate.columns, len(problem)
+    # an RMS of one: its coefficients are in nT, as those of other descriptions are
+    power = sum(float(np.sum(regressor(rows) ** 2)) for rows in row_blocks(n)) / (n * candidate.size)
 
+    def columns(rows: slice) -> FloatArray:
+        part = regressor(rows).T / np.sqrt(max(power, 1e-300))
+        between = (np.stack([value[rows] for value in values]) - low) / half - 1.0
+        size = np.concatenate([np.ones((1, part.shape[1])), between])
+        return np.asarray((size[:, None] * part).reshape(-1, part.shape[1]).T)
 
-def _bands(columns: int) -> tuple[tuple[str, FloatArray], ...]:
-    """Return the prior widths of an amplitude's constant and half waves, by kind of variation."""
-    k = np.arange(AMPLITUDE_WAVES + 1.0)
-    bands = [np.where((k >= low) & (k < high), 1.0, 1e-3) for low, high in pairwise(AMPLITUDE_BANDS)]
-    listed = [(kind, 1.0 / np.sqrt(1.0 + (k / corner) ** 2)) for kind, corner in AMPLITUDE_CORNERS]
-    listed += [("broadband", width) for width in bands]
-    return tuple((kind, np.repeat(width, columns)) for kind, width in listed)
-
-
-def _is_of(cause: str, candidate: Candidate) -> bool:
-    return candidate.cause == cause
+    width = np.full((1 + len(values)) * candidate.size, 30.0)
+    return Description(
+        columns, (("broadband", width),), candidate.channel, look_elsewhere[candidate.cause],
+        holds=lambda other: other.cause == candidate.cause, turned=candidate.size == 3, wider=True,
+    )  # fmt: skip
 
 
 def _fitted_effect(problem: Problem, candidate: Candidate, b: FloatArray) -> Columns:
@@ -116,41 +99,44 @@ def _fitted_effect(problem: Problem, candidate: Candidate, b: FloatArray) -> Col
     return lambda rows: np.asarray(candidate.columns(rows) @ b[:, None])
 
 
-def _half_waves(problem: Problem) -> Columns:
-    """Return half waves over the log, from the constant one on."""
+def amplitude_evidence(problem: Problem, fit: Joint, chosen: Sequence[Hypothesis]) -> float:
+    """Return the largest log evidence that the amplitude of a chosen cause varies in time; 0 if none does.
+
+    A true cause has a constant amplitude in a log. The fitted effect of a wrong one is multiplied by half
+    waves over the log. The evidence is the mean over their spectra and bands. A variation that may be a
+    remnant of the strongest cause's idealised regressor counts as none.
+    """
+    columns = [one.candidate.columns for one in chosen]
+    least = REMNANT * max(one.signal_to_noise for one in chosen)
+    largest = 0.0
+    for one, place in zip(chosen, slices([one.candidate for one in chosen]), strict=True):
+        candidate = one.candidate
+        if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
+            continue
+        effect = _fitted_effect(problem, candidate, fit.coefficients[place])
+        scored = _scored(problem, fit.noise, fit, columns, [_modulated(problem, effect)])
+        odds = [np.exp(kind.evidence) for kind in scored if kind.best.signal_to_noise >= least]
+        spectra = len(AMPLITUDE_CORNERS) + len(AMPLITUDE_BANDS) - 1
+        largest = max(largest, float(np.log((sum(odds) + spectra - len(odds)) / spectra)))
+    return largest
+
+
+def _modulated(problem: Problem, effect: Columns) -> Description:
+    """Return the description of an effect (m, k), multiplied by half waves over the log."""
+    n, several = len(problem), size_of(effect)
+    # An RMS of one, so that the prior widths are in nT
+    scale = np.sqrt(max(sum(float(np.sum(effect(rows) ** 2)) for rows in row_blocks(n)) / n, 1e-300))
     time = problem.survey.time
     turn = np.exp(1j * np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1.0))
 
-    def factors(rows: slice) -> FloatArray:
-        waves = np.stack(powers(turn[rows], AMPLITUDE_WAVES)).real
-        return np.concatenate([np.ones((1, waves.shape[1])), waves]).T
-
-    return factors
-
-
-def _series(problem: Problem, channel: str | None) -> Columns:
-    """Return 1, and all series that an amplitude may follow, each from -1 to 1."""
-    values = _followed(problem, channel)
-    low = np.array([[value.min()] for value in values])
-    half = np.array([[max(0.5 * float(np.ptp(value)), 1e-12)] for value in values])
-
-    def factors(rows: slice) -> FloatArray:
-        between = (np.stack([value[rows] for value in values]) - low) / half - 1.0
-        return np.concatenate([np.ones((1, between.shape[1])), between]).T
-
-    return factors
-
-
-def _modulated(problem: Problem, base: Columns, factors: Columns) -> tuple[Columns, int]:
-    """Return the products of columns and factors, with an RMS of one for a factor of 1, and their number."""
-    n = len(problem)
-    power = sum(float(np.sum(base(rows) ** 2)) for rows in row_blocks(n)) / (n * size_of(base))
-
     def columns(rows: slice) -> FloatArray:
-        part = base(rows).T / np.sqrt(max(power, 1e-300))
-        return np.asarray((factors(rows).T[:, None] * part).reshape(-1, part.shape[1]).T)
+        waves = np.stack(powers(turn[rows], AMPLITUDE_WAVES)).real
+        return np.asarray((waves[:, None] * (effect(rows).T / scale)).reshape(-1, waves.shape[1]).T)
 
-    return columns, size_of(base) * size_of(factors)
+    k = np.arange(1.0, AMPLITUDE_WAVES + 1.0)
+    widths = [1.0 / np.sqrt(1.0 + (k / corner) ** 2) for corner in AMPLITUDE_CORNERS]
+    widths += [np.where((k >= low) & (k < high), 1.0, 1e-3) for low, high in pairwise(AMPLITUDE_BANDS)]
+    return Description(columns, tuple(("broadband", np.repeat(width, several)) for width in widths))
 
 
 def _followed(problem: Problem, channel: str | None) -> list[FloatArray]:
@@ -277,27 +263,6 @@ def leftover(
         kind, best.signal_to_noise, p_value, evidence, one.period, one.channel, one, count,
         fitted=tuple(entry for entry, _ in found), size=size,
     )  # fmt: skip
-
-
-def amplitude_evidence(
-    problem: Problem, fit: Joint, chosen: Sequence[Hypothesis], uneven: Sequence[Description]
-) -> float:
-    """Return the largest log evidence that the amplitude of a chosen cause varies; 0 if none does.
-
-    The evidence is the mean over the kinds of variation of a description in `uneven` (:func:`varying`). A
-    variation that may be a remnant of the strongest cause's idealised regressor counts as none. The grids of
-    the causes were not searched again, and have no price.
-    """
-    columns = [one.candidate.columns for one in chosen]
-    least = REMNANT * max(one.signal_to_noise for one in chosen)
-    largest = 0.0
-    for one in uneven:
-        ratios = [
-            np.exp(kind.evidence) if kind.best.signal_to_noise >= least else 1.0
-            for kind in _scored(problem, fit.noise, fit, columns, [one._replace(look_elsewhere=1.0)])
-        ]
-        largest = max(largest, float(np.log(np.mean(ratios))))
-    return largest
 
 
 def _scored(

@@ -35,6 +35,7 @@ def findings(result: DiagnosisResult, remarks: Sequence[str] = ()) -> dict[str, 
         "rms_after_nT": diagnosis.improvement.after,
         "improvement": _corrected(diagnosis),
         "findings": listed,
+        "scalar": [_of_scalar(one) for one in diagnosis.scalars],
         "unexplained": _unexplained(diagnosis, assessment),
         "assessment": _assessment(assessment),
         "remarks": list(remarks),
@@ -162,6 +163,17 @@ def _assessment(found: Assessment) -> dict[str, Any]:
             "returning_fraction": track.share, "longest_s": track.longest, "text": separation(track).text,
         },
     }  # fmt: skip
+
+
+def _of_scalar(one: Diagnostic) -> dict[str, Any]:
+    """Return the entry of a finding for a scalar sensor."""
+    return {
+        "column": one.values["column"],
+        "cause": one.code.partition(".")[2],
+        "channel": one.values.get("channel"),
+        "text": one.text,
+        "numbers": one.numbers,
+    }
 
 
 def _notes(notes: Sequence[Diagnostic]) -> list[dict[str, Any]]:
