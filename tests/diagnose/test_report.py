@@ -110,7 +110,7 @@ def test_the_command_reports_what_the_improvement_was_measured_on() -> None:
         "alternatives": [],
         "follows": None,
     }
-    facts: dict[str, Any] = {"verdict": "explained", "findings": [one], "unexplained": None}
+    facts: dict[str, Any] = {"verdict": "explained", "findings": [one], "unexplained": None, "scalar": []}
     facts |= {"rms_before_nT": 117.42, "rms_after_nT": 74.42}
     facts |= {"improvement": {"interval": [0.486, 0.84], "refit_nT": 101.2}}
     use = {
