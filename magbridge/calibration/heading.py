@@ -64,15 +64,6 @@ class Heading:
     `magnetic` is NaN."""
 
 
-def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> FloatArray:
-    """Return vectors (n, 3) in level axes: forward and starboard in the horizontal plane, and down.
-
-    `vector` (n, 3): vectors in body axes, any unit. `roll`, `pitch` (n,): rad.
-    """
-    turn = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
-    return np.stack(_level(tuple(vector.T), turn), axis=1)
-
-
 def _level(b: Components, turn: Components) -> Components:
     """Return the vector b in level axes, ``h = R_y(pitch) R_x(roll) b``.
 

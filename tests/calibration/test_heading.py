@@ -25,7 +25,6 @@ from magbridge.calibration.fitting.uncertainty import expected_heading_sigma
 from magbridge.calibration.heading import (
     heading,
     heading_of_sample,
-    level_vector,
     model_declination_sigma,
     published_covariance,
 )
@@ -58,8 +57,6 @@ def test_the_heading_of_an_exact_vector_is_the_vehicles() -> None:
     found = heading(body_field(roll, pitch, yaw), roll, pitch, DECLINATION_DEG)
     np.testing.assert_allclose(difference_deg(found.true, np.degrees(yaw)), 0.0, atol=1e-9)
     np.testing.assert_allclose(difference_deg(found.true, found.magnetic), DECLINATION_DEG, atol=1e-9)
-    level = level_vector(body_field(roll, pitch, yaw), roll, pitch)
-    np.testing.assert_allclose(level[:, 2], NED[2], atol=1e-6)
 
 
 @pytest.mark.parametrize("source", ["vector", "boresight", "tilt", "declination"])

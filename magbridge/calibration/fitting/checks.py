@@ -11,7 +11,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.fitting.boresight import choose_boresight, magnetic_headings
-from magbridge.calibration.fitting.crossings import rough_rock
+from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import apart_from_level, expected_error, nearby_mission
 from magbridge.calibration.model import Calibration
@@ -256,7 +256,9 @@ def _reasons(found: Fit, data: Observations, ratio: float, noise: float) -> Iter
     least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(found.samples.field.T))[0], 0.0)))
     if least < MIN_SIGNAL_TO_NOISE * noise:
         yield Diagnostic("noise_for_attitudes", {"noise_nT": noise, "variation_nT": least})
-    yield from rough_rock(data, found.details.get("crustal_field"), noise)
+    crust = found.details.get("crustal_field")
+    if crust and data.place is not None and crust["amplitude_nT"] > noise:
+        yield from too_rough(data.place[:, :2], crust["length_m"], crust["shortest_m"])
     # unusual scales are a fault of the fit only if the attitudes do not determine them: if the data overrule
     # the prior, the sensor has an unusual gain
     unlikely = found.details.get("prior_chi_squared", 0.0) > MAX_PRIOR_CHI_SQUARED

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -90,15 +89,6 @@ def left_open_by(track: FloatArray, length: float) -> Iterator[Diagnostic]:
         yield Diagnostic("never_crossed")
     elif cells < FEW and reversed_cells < FEW:
         yield Diagnostic("few_crossings", {"places": counted(cells + reversed_cells, "place")})
-
-
-def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[Diagnostic]:
-    """Yield a warning if a fit's crustal field exceeds the `noise`, nT, and is too rough for the track.
-
-    `rock`: details of the crustal field of a fit; None if the fit has no crustal field.
-    """
-    if rock and data.place is not None and rock["amplitude_nT"] > noise:
-        yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 
 def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[Diagnostic]:

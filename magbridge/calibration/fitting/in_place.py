@@ -152,23 +152,11 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
 def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, SurveySamples]:
     """Return the converged fit, and its samples with the selected optional terms.
 
-    A long log converges with every second or tenth sample first, and then with all. The search of the field
-    included all optional terms, so the fit is repeated without each selected term that gains little evidence.
+    A long log converges with every second or tenth sample first, and then with all.
     """
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), family)
     answer = best.settle()
-    # compare the evidence with and without each term that gained little
-    for one in sorted(best.unsure):
-        few = survey.thinned(step)
-        few.keep(tuple(group for group in few.groups if group.name in best.names - {one}))
-        other = Rounds(few, family)
-        try:
-            found = other.settle()
-        except (CalibrationError, np.linalg.LinAlgError):
-            continue
-        if other.worth(found) > best.worth(answer):
-            best, answer = other, found
     if step == 1:
         return answer, best.survey
     survey.keep(tuple(group for group in survey.groups if group.name in best.names))

@@ -12,7 +12,6 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.field_search import (
-    DECISIVE_LOG_RATIO,
     Choice,
     Weighed,
     about_the_middle,
@@ -54,7 +53,7 @@ from magbridge.estimation.residual import (
     residuals_of,
     robust_scale,
 )
-from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
+from magbridge.estimation.select import select_blocks
 
 # ---- The state of the iterations, and where they begin ----
 
@@ -146,24 +145,11 @@ class Rounds:
         self.eta, self.w = self.family.centre, np.zeros(self.choice.field.nodes.size)
         self.nodes = self.choice.field.nodes
         self.last: FloatArray | None = None
-        self.unsure: set[str] = set()
-        """Names of optional terms that stay but gain little; a fit with another field may omit them."""
 
     @property
     def names(self) -> set[str]:
         """Names of the blocks of unknowns in the fit."""
         return {group.name for group in self.survey.groups}
-
-    def worth(self, answer: Answer) -> float:
-        """Return the log evidence of `answer` minus penalties for excluded samples and optional terms."""
-        # a sample at the limit costs half its squared residual, and the logarithm of sigma
-        survey, each = self.survey, 0.5 * FIT_OUTLIER_SIGMA**2 + float(np.log(answer.widths.sigma))
-        left_out = int((survey.at_rest & ~survey.kept).sum())
-        return (
-            answer.score
-            - left_out * each
-            - BLOCK_LOG_EVIDENCE_PRICE * sum(one.offered for one in survey.groups)
-        )
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
         """Continue with all samples, `survey`, and no search, after a fit of every `step`-th sample."""
@@ -265,14 +251,10 @@ class Rounds:
         The solver calls this after the iterations have converged with all terms, because before the terms fit
         outliers. `turn`: number of the iteration.
         """
-        # keep a term if its evidence exceeds the penalty; note terms that are not decisive, because a
-        # search without them follows
         survey, choice = self.survey, self.choice
         self.offers = False
         reduced = eliminate_field(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
-        weighed = reduced.quadratic, self.own, survey.groups, self.eta, self.sigma
-        kept, sure = select_blocks(*weighed), select_blocks(*weighed, price=DECISIVE_LOG_RATIO)
-        self.unsure = {one.name for one in kept} - {one.name for one in sure}
+        kept = select_blocks(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)
         if len(kept) < len(survey.groups):
             self._regroup(kept)
             self.until = turn + SEARCHES

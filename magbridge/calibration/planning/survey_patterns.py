@@ -19,6 +19,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
 from magbridge.calibration.fitting.field_search import nodes_for
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.model import Calibration
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
 """Amplitude (nT), correlation length (m) and power of the crustal field assumed at an unmapped place."""
-LEVEL_SIGMA_NT = 145.0
-"""1-sigma of the constant bias of a main-field model at a place, nT."""
 PATTERN_SAMPLES = 1_500
 """Approximate number of samples that represent a pattern; each stands for the average of its neighbours."""
 SPIRAL = 1_800.0
@@ -182,7 +181,7 @@ def _expected(
     sums = sum_rows([LinearisedRows(D, -field.basis(place), np.zeros(len(phi), bool))])
     # Eliminate the field; prior and data give the covariance of the coefficients.
     H = eliminate_field(sums, field, ROCK / noise, 0.0).quadratic.precision / noise**2
-    prior = np.append(family.widths(family.centre), LEVEL_SIGMA_NT) ** -2.0
+    prior = np.append(family.widths(family.centre), MAIN_FIELD_SIGMA_NT) ** -2.0
     P = covariance_of(H + np.diag(prior))[:-1, :-1]
     # Error over the mission about its mean: the constant bias cancels.
     points = (design.points - design.points.mean(axis=0)) @ family.E
