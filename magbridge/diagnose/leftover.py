@@ -86,8 +86,8 @@ def varying(
 def _fitted_effect(problem: Problem, candidate: Candidate, b: FloatArray) -> Columns:
     """Return the fitted effect (m, 1) of a candidate, for coefficients b (k,).
 
-    Of a tone, the effect a quarter of a period later is a second column. Of a step or a drift, the effect is
-    a constant offset in the same direction of the body.
+    A tone has a second column: the effect a quarter of a period later. A step and a drift have a constant
+    offset in their direction of the body.
     """
     shapes = {effect.shape for effect in candidate.effects if isinstance(effect, TimeEffect)}
     if "tone" in shapes:
@@ -234,7 +234,7 @@ def leftover(
 
     Descriptions that only repeat the regressors of the causes in `but` are not tried; those in `also` are.
     """
-    # Descriptions that only repeat an excluded cause's own regressors are no alternatives
+    # Descriptions that only repeat an excluded cause's own regressors are not alternatives
     listed = [one for one in (*descriptions(problem, fit), *also) if not one.covers(but)]
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
@@ -393,7 +393,7 @@ def far_from_white(problem: Problem, found: Memory) -> bool:
 
 def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
     """Return the drift in a residual: far from white, or slow noise above the causes' remnants; or None."""
-    # Slow noise belongs to what is left: no sensor makes it
+    # Slow noise belongs to the unexplained structure: no sensor makes it
     slow = problem.slow_noise(fit.z)
     residual = (fit.residual + slow) / problem.reference_jacobian
     found = memory(problem, residual)

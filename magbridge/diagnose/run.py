@@ -360,7 +360,7 @@ def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Ca
         raise DataError(f"{problem.survey.source}: nothing can be tested here; it would take {needs}")
     every = [candidate for made in candidates.values() for candidate in made]
     if problem.survey.learned.any():
-        # A variant that is absent from the calibration's own logs; what has a time of its own needs none
+        # A variant that is absent from the calibration's own logs; an effect with its own time needs none
         lasting = [c for c in every if c.effects and not any(isinstance(e, TimeEffect) for e in c.effects)]
         every += [absent_before(candidate, problem.survey.learned) for candidate in lasting]
     return every, untestable

@@ -165,14 +165,14 @@ def _assessment(found: Assessment) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _of_scalar(one: Diagnostic) -> dict[str, Any]:
+def _of_scalar(note: Diagnostic) -> dict[str, Any]:
     """Return the entry of a finding for a scalar sensor."""
     return {
-        "column": one.values["column"],
-        "cause": one.code.partition(".")[2],
-        "channel": one.values.get("channel"),
-        "text": one.text,
-        "numbers": one.numbers,
+        "column": note.values["column"],
+        "cause": note.code.partition(".")[2],
+        "channel": note.values.get("channel"),
+        "text": note.text,
+        "numbers": note.numbers,
     }
 
 
