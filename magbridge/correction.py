@@ -19,7 +19,7 @@ from magbridge.config import Align
 from magbridge.field.igrf import HeldField
 from magbridge.filter_lag import LagCorrection
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
-from magbridge.health.consistency import MASS_FRACTION
+from magbridge.health.consistency import MASS_FRACTION, Sensitivity
 from magbridge.parts import OptionalParts
 from magbridge.records import MAX_MEASURED_NT, Corrected, Quality, Reading, Vector
 from magbridge.toml import convert
@@ -211,18 +211,19 @@ class Correction:
             reference,
             reading.temperature,
             sample.age,
-            lambda: self._mass_changes(sample),
+            lambda: self._sensitivity(sample),
         )
         return variance, health.flags
 
-    def _mass_changes(self, sample: Sample) -> list[float]:
-        """Return the change of the total field, nT, if each mass moves by `MASS_FRACTION` of its range."""
+    def _sensitivity(self, sample: Sample) -> Sensitivity:
+        """Return the derivatives of the last sample's total field by mass positions and coefficients."""
         spans = []
         for index in self._masses:
             one, value = self.aligner.tracks[index].input, sample.values[index]
             half = 0.5 * MASS_FRACTION * (one.high - one.low)
             spans.append((index, value - half, value + half))
-        return list(self.corrector.changes(sample.field, sample.values, spans))
+        changes = self.corrector.changes(sample.field, sample.values, spans)
+        return Sensitivity(changes, self.corrector.error_effects())
 
     def _hold(self, name: str, value: float) -> None:
         """Store the value of a condition if it is finite and the calibration does not model the condition."""

@@ -9,7 +9,6 @@ derivatives are then central differences, as offline.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from math import inf, isfinite, nan, sqrt
 from typing import NamedTuple
 
@@ -21,6 +20,7 @@ from magbridge.calibration.model import Noise
 from magbridge.calibration.scalar import CYCLE_LEVEL_SIGMA_NT, ScalarSensor, ScalarSeries, correct_scalar
 from magbridge.config import Align
 from magbridge.health import HealthMonitor, Messages
+from magbridge.health.consistency import Sensitivity
 from magbridge.parts import OptionalParts
 from magbridge.records import Corrected, Quality, Reading, Vector
 
@@ -191,11 +191,10 @@ class ScalarCorrection:
         sample, F = pending.sample, pending.sample.field[0]
         if pending.where is not None:
             health.set_position(sample.time_us, *pending.where)
-        no_masses: Callable[[], tuple[float, ...]] = tuple
         reference = pending.main_field, self.aligner.settings.reference_sigma
         # one channel in place of three: its direction never changes, and it repeats only as a whole
         variance = health.check(
             sample.time_us, (F, F, F), (total[0], 0.0, 0.0), total, quality, reference,
-            sample.reading.temperature, sample.age, no_masses,
+            sample.reading.temperature, sample.age, Sensitivity,
         )  # fmt: skip
         return variance, health.flags

@@ -17,7 +17,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
 from magbridge.calibration.kernel import Kernel, Linear, Numbers, Prepared, apply, linear, prepare, variances
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.model import Calibration, coefficient_tensor
 from magbridge.calibration.terms import LogSeries, Step
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS, symmetric
@@ -61,6 +61,7 @@ class Corrector:
         self._there: list[Linear] = []
         self._field = (nan, nan, nan)
         self._time_us = 0
+        self._error_effects: FloatArray | None = None
 
     @property
     def regressors(self) -> list[float]:
@@ -85,6 +86,7 @@ class Corrector:
         before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
         self.calibration, self._kernel, self._omega = calibration, calibration.kernel, _omega_of(calibration)
         self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
+        self._error_effects = None
         self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
         self._wanted, self._base = len(calibration.channels), _base_flags(calibration)
         # Common effects keep their steppers, hence their state; new effects begin with the last sample.
@@ -189,6 +191,32 @@ class Corrector:
         # |A (H_r - T)| at both ends of each span.
         totals = [_total(field, there) for there in self._there]
         return [totals[high] - totals[low] for low, high in self._ends]
+
+    def error_effects(self) -> FloatArray:
+        """Return the derivative (r,) of the last total field, nT, by the calibration's independent errors.
+
+        An error of 1 is one standard deviation, and the sum of squares is the variance of the total field
+        that the covariance of the coefficients causes.
+        """
+        if self._error_effects is None:
+            # C = R R^T; the effect of each column of R on the nine coefficients of each regressor
+            calibration = self.calibration
+            tensor = coefficient_tensor(calibration)[0]
+            eigenvalues, vectors = np.linalg.eigh(calibration.covariance)
+            known = eigenvalues > 0.0
+            root = vectors[:, known] * np.sqrt(eigenvalues[known])
+            self._error_effects = root.T @ tensor.reshape(len(tensor), -1)
+        phi = np.array(self._last)
+        theta = phi @ self._kernel.weights
+        # b = A d with d = H_r - T; dF/dA_ij = u_i d_j, and dF/dT = -A^T u
+        A, d = symmetric(theta[None])[0], np.array(self._field) - theta[6:]
+        b = A @ d
+        u = b / np.sqrt(b @ b)
+        by_A = np.outer(u, d)
+        by_A += by_A.T
+        by_six = [by_A[i, j] * (0.5 if i == j else 1.0) for i, j in PAIRS]
+        by_nine = np.concatenate([np.array(by_six) / self._kernel.field, -(A @ u)])
+        return np.asarray(self._error_effects @ np.outer(phi, by_nine).ravel())
 
     def _linear_at(self, positions: tuple[float, ...]) -> Linear:
         """Return A's six entries and T (nT) at the positions, without effects."""

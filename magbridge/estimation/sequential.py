@@ -82,14 +82,12 @@ class SequentialTest:
         Time of each row's onset, s.
     start : (rows,) array
         Regressor of each row at its onset; 0 where the effect is proportional to the regressor.
-    log_ratio, statistic : (rows,) array
-        L, and L minus the L of changes that the model itself allows.
+    log_ratio : (rows,) array
+        L.
     amplitude : (rows, 3) array
         Estimated amplitudes.
     signature : (rows, 3) array
         f, the change of the last residual per unit of each component.
-    squared_residual : float
-        Square of the last innovation minus the effect of the likeliest change, divided by S.
     absorbed : (n, rows, 3) array
         Xi, the change of the filter's state per unit of each component.
     """
@@ -107,11 +105,14 @@ class SequentialTest:
         self._period = np.tile(RESTART_PERIODS, len(since_onset))
         self._states, self._keep = states, 1.0 - 1.0 / retention_samples
         self._excess, self._dof = 1.0, noise_dof
-        self.squared_residual = 1.0
         self.restart()
 
-    def restart(self) -> None:
-        """Discard all evidence, but keep the estimate of the excess noise."""
+    def restart(self, states: int | None = None) -> None:
+        """Discard all evidence, but keep the estimate of the excess noise.
+
+        `states`: new number of states of the filter; by default it stays.
+        """
+        self._states = self._states if states is None else states
         rows = len(self.kind)
         self._M, self._energy = np.zeros((rows, 3, 3)), np.zeros((rows, 3, 3))
         self._y = np.zeros((rows, 3))
@@ -120,7 +121,7 @@ class SequentialTest:
         self._phi, self.signature = np.zeros((rows, 3)), np.zeros((rows, 3))
         self.onset, self.start = np.zeros(rows), np.zeros(rows)
         self.count = self._period.copy()
-        self.log_ratio = self.statistic = np.zeros(rows)
+        self.log_ratio = np.zeros(rows)
         self.amplitude = np.zeros((rows, 3))
 
     def test(
@@ -129,14 +130,12 @@ class SequentialTest:
         time: float,
         regressors: FloatArray,
         effects: FloatArray,
-        null: FloatArray | None = None,
     ) -> float:
-        """Test the filter's innovation and return the largest statistic.
+        """Test the filter's innovation and return the largest L.
 
         `estimator`: the filter, after :meth:`.KalmanFilter.innovate` and before its update. `time`: time of
         the measurement, s. `regressors` (kinds,): regressor of each kind of change. `effects` (kinds, 3):
-        change of the residual per unit of each component where the regressor is 1. `null` (kinds,): 1-sigma
-        of the amplitude that the model itself allows, in units of the change.
+        change of the residual per unit of each component where the regressor is 1.
         """
         S, v = estimator.variance, estimator.innovation
         regressor, effect = regressors[self.kind], effects[self.kind]
@@ -144,7 +143,6 @@ class SequentialTest:
         absorbed = np.dot(estimator.row[None], self.absorbed.reshape(self._states, -1)).reshape(-1, 3)
         phi = (regressor - self.start)[:, None] * effect + absorbed
         residual = v - np.sum(phi * self.amplitude, axis=1)
-        self.squared_residual = float(residual[self.log_ratio.argmax()]) ** 2 / S
         begins = self._begin(time, residual / estimator.sigma)
         self.start = np.where(begins & self._since_onset, regressor, self.start)
         self.signature = (regressor - self.start)[:, None] * effect
@@ -167,13 +165,8 @@ class SequentialTest:
         self._y += phi * (v / S)
         self._squares += v * v / S
         self._samples += 1.0
-        self.amplitude, self.log_ratio = self._mixture(np.ones(len(phi)))
-        self.statistic = self.log_ratio
-        if null is not None:
-            # what the model allows of one kind may look like a change of another kind
-            allowed = self._mixture(null[self.kind] ** 2)[1].reshape(len(null), -1).max(axis=0)
-            self.statistic = (self.log_ratio.reshape(len(null), -1) - allowed).ravel()
-        return float(self.statistic.max())
+        self.amplitude, self.log_ratio = self._mixture()
+        return float(self.log_ratio.max())
 
     def _begin(self, time: float, residual: FloatArray) -> BoolArray:
         """Restart the onsets whose period is over; return a mask (rows,) of the restarted rows.
@@ -193,10 +186,10 @@ class SequentialTest:
             self.onset[begins], self.count[begins] = time, 1
         return np.asarray(begins)
 
-    def _mixture(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the estimated amplitudes (rows, 3) and L (rows,) for a prior variance `prior` (rows,)."""
-        W = prior[:, None, None] * self._M + UNIT_MATRIX
-        amplitude = prior[:, None] * np.linalg.solve(W, self._y[:, :, None])[:, :, 0]
+    def _mixture(self) -> tuple[FloatArray, FloatArray]:
+        """Return the estimated amplitudes (rows, 3) and L (rows,)."""
+        W = self._M + UNIT_MATRIX
+        amplitude = np.linalg.solve(W, self._y[:, :, None])[:, :, 0]
         explained = np.sum(self._y * amplitude, axis=1)
         if self._dof:
             squares = self._dof + self._squares

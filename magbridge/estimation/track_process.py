@@ -18,7 +18,7 @@ b and b' in an isotropic field. So the second column of F is multiplied by :math
 
 from __future__ import annotations
 
-from math import atan2, cos, exp, hypot, isfinite, nan, sqrt
+from math import atan2, cos, exp, hypot, isfinite, nan, sin, sqrt
 
 import numpy as np
 
@@ -130,10 +130,13 @@ class TrackProcess:
         self.initial = np.diag([spread**2, (spread * self._lambda) ** 2, slow, constant**2])
         self.white_variance = max(sensor**2 - slow, MIN_WHITE_NT**2) + reference**2
 
-    def transition(self, metres: float, seconds: float, turn: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    def transition(
+        self, metres: float, seconds: float, turn: float = 0.0, stretch: float = 1.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Return transition F and process noise Q, both (4, 4), over a distance and a time.
 
         `metres`, `seconds`: distance and time. `turn`: change of course before the distance, rad.
+        `stretch`: ratio of `metres` to the true distance, if it is scaled to the field's roughness.
         """
         # Matern 3/2 along the track, (value, slope): F = exp(-x) [[1 + x, x / l], [-l x, 1 - x]], x = l d.
         rate = self._lambda
@@ -143,12 +146,15 @@ class TrackProcess:
         fall = exp(-x)
         F[0, 0], F[0, 1] = fall * (1.0 + x), fall * x / rate
         F[1, 0], F[1, 1] = -fall * rate * x, fall * (1.0 - x)
+        # The slope per scaled metre of a field that is smoother than assumed may be steeper than b'.
+        steeper = self.initial[1, 1] * max(stretch**-2 - 1.0, 0.0) * sin(turn) ** 2
+        steep = steeper * np.outer(F[:, 1], F[:, 1])
         # Only the slope along the new course is known after a turn.
         F[:, 1] *= cos(turn)
         F[2, 2] = rho ** min(seconds / interval, 1e4) if rho > 0.0 else 0.0
         F[3, 3] = 1.0
         # A stationary process: the process noise restores the initial covariance.
-        Q = self.initial - F @ self.initial @ F.T
+        Q = self.initial - F @ self.initial @ F.T + steep
         return F, np.asarray(0.5 * (Q + Q.T))
 
     @staticmethod

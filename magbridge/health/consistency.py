@@ -13,18 +13,19 @@ A Kalman filter predicts the total field from a model of the crustal field along
 (:mod:`magbridge.estimation.track_process`). :mod:`magbridge.estimation.sequential` tests the innovations for
 each of these errors.
 
-The calibration's own uncertainty is part of the null hypothesis. Let f be the effect of a unit error on the
-total field. An error of amplitude :math:`N(0, a^2 I)` then adds the variance
-:math:`a^2\, \mathrm{tr\, Var}(f)` over the samples. The unknown constant error of the reference hides the
-mean of f, except for masses. The null hypothesis allows errors of offset, gain or mass telemetry with the
-amplitude a at which this variance equals the mean variance stated by the calibration. During an alarm, sigma
+The null hypothesis contains everything that is expected: the calibration's coefficients have independent
+errors of their stated covariance, which are states of the filter. The innovations are white only if the model
+of the crustal field is right. So its roughness is adapted until successive innovations are uncorrelated
+(Mehra 1970, IEEE Trans. Automatic Control 15:175), whatever the scale of the noise. Where the vehicle turns,
+dives or climbs, the field's slope along the new path is unknown. During an alarm, sigma
 includes the estimated error of the present sample, averaged over the errors and onsets that fit.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from math import exp, isfinite, nan
+from collections.abc import Sequence
+from math import acos, cos, exp, isfinite, nan
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -44,8 +45,8 @@ INTERVAL_M: Final = 25.0
 """Interval between two tested samples: shortest and longest time (s), and preferred distance (m)."""
 CRUST_SIGMA_NT: Final = 145.0
 CONSTANT_SIGMA_NT: Final = 1000.0
-MAX_GAP_S: Final = 600.0
-"""Pause between tested samples above which the elapsed time is limited to 1e5 s."""
+MAX_GAP_S: Final = 1e5
+"""Largest elapsed time between tested samples, s; after it, nothing is known of the field."""
 OFFSET_NT: Final = 20.0
 DRIFT_NT_PER_H: Final = 10.0
 PER_DEGREE_NT: Final = 1.0
@@ -75,15 +76,30 @@ AGREEING: Final = 3
 """Innovations above MAX_CONSISTENT_SIGMA sigmas are ignored as outliers, until AGREEING come in a row."""
 STRAIGHT_CHANGE: Final = 0.05
 """Change of each component of the unit vector up to which the attitude counts as unchanged."""
+MIN_TURN_COSINE: Final = 0.985
+"""Cosine of the change of the field's direction (10 deg) from which the path counts as turned."""
 MIN_STRAIGHT_SAMPLES: Final = 8
 """Number of samples without a turn after which the crustal field's roughness counts as known."""
-ADAPTATION: Final = 0.02
-MAX_CONSISTENCY_SQUARE: Final = 4.0
+ADAPTATION: Final = 0.1
+MAX_RESIDUAL_SIGMA: Final = 3.0
+MIN_LOG_ROUGHNESS: Final = -2.0
 MAX_LOG_ROUGHNESS: Final = 5.0
-"""Gain from a normalised squared innovation to the crustal field's log roughness; upper bounds of both."""
+"""Gain from the product of successive residuals to the crustal field's log roughness, the largest residual
+that counts, and the bounds of the log roughness: after a smooth stretch, the next one may be rougher."""
+PAST_GAIN: Final = 0.2
+"""Gain of the exponential average of past residuals."""
 ERROR_KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
-MIN_EFFECT_NT: Final = 1e-6
-"""Lower bound of an effect's standard deviation in a division, nT."""
+
+
+class Sensitivity(NamedTuple):
+    """Derivatives of a sample's corrected total field, nT.
+
+    `mass_changes` is the change if each mass moves by :data:`MASS_FRACTION` of its range, `error_effects`
+    (r,) the change by one standard deviation of each of the calibration's independent errors.
+    """
+
+    mass_changes: Sequence[float] = ()
+    error_effects: FloatArray = np.zeros(0)
 
 
 class TestedSample(NamedTuple):
@@ -92,8 +108,7 @@ class TestedSample(NamedTuple):
     `time_us` is the time (µs), `unit` the direction of the corrected field. `anomaly` is the corrected total
     field minus the main field, or the total field itself if no main field is known (nT). `sigma` is the part
     of its 1-sigma that is not common to all samples (nT), `temperature` the sensor's (degC; NaN if unknown).
-    `mass_changes` is the change of the total field if each mass moves by :data:`MASS_FRACTION` of its range
-    (nT), `speed` the speed across the crustal field (m/s), `course` the vehicle's (rad; NaN if unknown).
+    `speed` is the speed across the crustal field (m/s), `course` the vehicle's (rad; NaN if unknown).
     """
 
     time_us: int
@@ -101,9 +116,9 @@ class TestedSample(NamedTuple):
     anomaly: float
     sigma: float
     temperature: float
-    mass_changes: tuple[float, ...]
     speed: float
     course: float
+    sensitivity: Sensitivity
 
 
 class ConsistencyCheck:
@@ -119,28 +134,31 @@ class ConsistencyCheck:
             max(noise.sensor, 0.1), CRUST_SIGMA_NT, CONSTANT_SIGMA_NT,
             autocorrelation=noise.autocorrelation, interval=noise.interval, white=noise.white,
         )  # fmt: skip
-        self._noise2 = noise.sensor**2
         self._masses = masses
         # temperature effect and drift act by their change since the onset, offset and gain in full
         since_onset = [False, True, True, False] + [False] * masses
         self._test = SequentialTest(since_onset, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
-        self._log_roughness, self._straight_samples = 0.0, 0
+        self._log_roughness, self._straight_samples, self._past_residual = 0.0, 0, 0.0
         self._course = nan
         self.restart()
 
     def restart(self) -> None:
         """Discard all evidence and the filter's state, for example after a change of the calibration."""
-        self._filter = KalmanFilter(np.zeros(TRACK_STATES), self._process.initial)
-        self._test.restart()
+        self._begin_filter(0)
         self._time_us, self._due_us, self._level = 0, 0, 0.0
         self._pending: deque[TestedSample] = deque(maxlen=MAX_PENDING)
         self._outliers = 0
-        self._last_unit = np.zeros(3)
+        self._last_unit = self._path_unit = np.zeros(3)
         self._temperature = 0.0
         self._variance = 0.0
-        self._tested, self._systematic = 0, 0.0
-        self._mean_effect, self._mean_square = np.zeros((4 + self._masses, 3)), np.zeros(4 + self._masses)
         self.is_wrong = False
+
+    def _begin_filter(self, errors: int) -> None:
+        """Begin a filter with a number of independent errors of the calibration, which have 1-sigma 1."""
+        covariance = np.eye(TRACK_STATES + errors)
+        covariance[:TRACK_STATES, :TRACK_STATES] = self._process.initial
+        self._filter = KalmanFilter(np.zeros(len(covariance)), covariance)
+        self._test.restart(len(covariance))
 
     def forget_crust(self) -> None:
         """Discard all evidence and the estimated roughness: the vehicle has become much faster."""
@@ -179,25 +197,30 @@ class ConsistencyCheck:
 
     def _test_sample(self, sample: TestedSample) -> None:
         """Predict the total field of a sample, test the innovation, and update the filter."""
-        time_us, unit, total, sigma, temperature, mass_changes, speed, course = sample
+        time_us, unit, total, sigma, temperature, speed, course, (mass_changes, errors) = sample
         seconds = 1e-6 * (time_us - self._time_us)
-        # the first sample, and a clock that goes back, restart the check
-        if not 0.0 < seconds < MAX_GAP_S:
-            if self._time_us == 0 or seconds < 0.0:
-                self.restart()
-                self._level = total
-            seconds = min(max(seconds, 0.0), 1e5)
+        # the first sample, a clock that goes back, and a calibration of other terms restart the check
+        other_terms = len(self._filter.mean) != TRACK_STATES + len(errors)
+        if self._time_us == 0 or seconds < 0.0 or other_terms:
+            self.restart()
+            self._level, seconds = total, 0.0
+            self._begin_filter(len(errors))
+        seconds = min(seconds, MAX_GAP_S)
         self._time_us = time_us
         if isfinite(temperature):
             self._temperature = temperature
         turn, self._course = course - self._course, course
-        metres = speed * exp(self._log_roughness / 3.0) * seconds
+        stretch = exp(self._log_roughness / 3.0)
+        metres = speed * stretch * seconds
         # time update of the crustal field, and of the part of each error that the filter has absorbed
-        F, Q = self._process.transition(metres, seconds, turn if isfinite(turn) else 0.0)
-        self._filter.predict(F, Q)
-        absorbed = self._test.absorbed
+        turn = self._turn(turn if isfinite(turn) else 0.0, np.array(unit))
+        F, Q = self._process.transition(metres, seconds, turn, stretch)
+        self._filter.predict(F, Q, slice(TRACK_STATES))
+        absorbed = self._test.absorbed[:TRACK_STATES]
         absorbed[:] = np.dot(F, absorbed.reshape(len(F), -1)).reshape(absorbed.shape)
-        v = self._filter.innovate(total - self._level, self._process.row(1.0), self._process.white_variance)
+        # the calibration's own errors are states, so that the innovation is white while they are as stated
+        row = np.concatenate([self._process.row(1.0), -errors])
+        v = self._filter.innovate(total - self._level, row, self._process.white_variance)
         normalised = v / self._filter.sigma
         self._outliers = self._outliers + 1 if abs(normalised) > MAX_CONSISTENT_SIGMA else 0
         if 0 < self._outliers < AGREEING and not self.is_wrong:
@@ -206,41 +229,35 @@ class ConsistencyCheck:
         seconds_now = 1e-6 * time_us
         regressors = np.array([1.0, self._temperature, seconds_now / 3600.0] + [1.0] * (1 + self._masses))
         effects = self._effects(np.array(unit), np.array(mass_changes))
-        null = self._null(effects, max(sigma * sigma - self._noise2, 0.0))
-        largest = self._test.test(self._filter, seconds_now, regressors, effects, null)
-        self._learn_roughness(self._test.squared_residual, np.array(unit))
+        largest = self._test.test(self._filter, seconds_now, regressors, effects)
+        self._learn_roughness(normalised, np.array(unit))
         self._test.update(self._filter.update())
         self._decide(largest, sigma)
 
-    def _learn_roughness(self, squared: float, unit: FloatArray) -> None:
-        """Adapt the crustal field's roughness to a normalised squared residual, unless the vehicle turns."""
+    def _turn(self, course_change: float, unit: FloatArray) -> float:
+        """Return the angle between old and new direction of travel (rad), by the course and the attitude.
+
+        A vehicle that dives or climbs moves along its axis, so that its attitude shows a change of the path
+        that the course does not.
+        """
+        cosine = max(float(unit @ self._path_unit), 0.0) if self._path_unit.any() else 1.0
+        if self._path_unit.any() and cosine > MIN_TURN_COSINE:
+            return course_change
+        self._path_unit = unit
+        return acos(cosine * cos(course_change))
+
+    def _learn_roughness(self, residual: float, unit: FloatArray) -> None:
+        """Adapt the crustal field's roughness to a residual (sigmas), unless the vehicle turns."""
         # not in a turn, where an error of the calibration looks like roughness
         turned = float(np.abs(unit - self._last_unit).max())
         self._last_unit = unit
+        residual = min(max(residual, -MAX_RESIDUAL_SIGMA), MAX_RESIDUAL_SIGMA)
         if turned < STRAIGHT_CHANGE and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:
             self._straight_samples += 1
-            self._log_roughness += ADAPTATION * (min(squared, MAX_CONSISTENCY_SQUARE) - 1.0)
-            self._log_roughness = min(max(self._log_roughness, -MAX_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
-
-    def _null(self, effects: FloatArray, systematic: float) -> FloatArray:
-        """Return each error's 1-sigma amplitude (kinds,) under the null hypothesis, in units of its prior.
-
-        `effects` (kinds, 3) are from :meth:`_effects`; `systematic` is the variance of the sample's total
-        field that the calibration's uncertainty causes, nT².
-        """
-        # running moments of the samples that the evidence comes from
-        self._tested = min(self._tested + 1, int(RETENTION_SAMPLES))
-        share = 1.0 / self._tested
-        self._systematic += share * (systematic - self._systematic)
-        self._mean_effect += share * (effects - self._mean_effect)
-        self._mean_square += share * (np.sum(effects**2, axis=1) - self._mean_square)
-        variance = self._mean_square.copy()
-        variance[:4] -= np.sum(self._mean_effect[:4] ** 2, axis=1)
-        # a^2 = systematic variance / tr Var(f), see the module
-        allowed = self._systematic / np.maximum(variance, MIN_EFFECT_NT**2)
-        # the null hypothesis has no drift and no temperature effect
-        allowed[1:3] = 0.0
-        return np.minimum(np.sqrt(allowed), 1.0)
+            # the innovations of the right model are white (Mehra 1970)
+            self._log_roughness += ADAPTATION * residual * self._past_residual
+            self._log_roughness = min(max(self._log_roughness, MIN_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
+        self._past_residual += PAST_GAIN * (residual - self._past_residual)
 
     def _effects(self, u: FloatArray, mass_changes: FloatArray) -> FloatArray:
         """Return the effect (kinds, 3) of each error's prior 1-sigma on the total field, nT."""
@@ -267,9 +284,11 @@ class ConsistencyCheck:
             return
         # second moment of the error at the present attitude, over the errors and onsets that compete
         for row, weight in zip(rows, weights.tolist(), strict=True):
-            f = test.signature[row]
-            error = float(f @ test.amplitude[row])
-            self._variance += weight * (error * error + float(f @ test.covariance(row) @ f))
+            f, a = test.signature[row], test.amplitude[row]
+            error = float(f @ a)
+            # an amplitude beyond its prior shows that the prior was too narrow, by this factor
+            wider = max(1.0, float(a @ a) / len(a))
+            self._variance += weight * (error * error + wider * float(f @ test.covariance(row) @ f))
         if size <= REPORTED_ERROR_SIGMA * sigma or largest < REPORTED_LOG_RATIO:
             return
         kind = ERROR_KINDS[min(int(test.kind[rows[0]]), len(ERROR_KINDS) - 1)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import inf, isfinite, sqrt
 from typing import Final
 
@@ -10,7 +10,7 @@ from magbridge.calibration.model import Noise
 from magbridge.estimation.track_process import Course, ReferenceSteps
 from magbridge.field.geodesy import separation
 from magbridge.health.checks import LevelCheck, Messages, RepetitionCheck
-from magbridge.health.consistency import ConsistencyCheck, TestedSample
+from magbridge.health.consistency import ConsistencyCheck, Sensitivity, TestedSample
 from magbridge.health.scatter import ACCELERATION, MIN_FASTER_M_S, Scatter
 from magbridge.health.trend import TrendCheck
 from magbridge.records import Quality, Vector
@@ -92,15 +92,15 @@ class HealthMonitor:
         main_field: tuple[float, float],
         temperature: float,
         age: float,
-        mass_changes: Callable[[], Sequence[float]],
+        sensitivity: Callable[[], Sensitivity],
     ) -> float:
         """Check a sample, set :attr:`flags`, and return the variance (nT²) that the checks add.
 
         `raw` and `field` are the reading and the corrected vector (nT), `total_field` is the corrected total
         field with its 1-sigma (nT), `quality` has the sample's flags so far. `main_field` is the main field
         (NaN if the position is unknown) with the 1-sigma of the Earth's field about it (nT). `temperature`
-        is the sensor's (degC; NaN if unknown), `age` the age of the oldest telemetry (s). `mass_changes`
-        returns the effect of each mass's motion, see :class:`.consistency.TestedSample`.
+        is the sensor's (degC; NaN if unknown), `age` the age of the oldest telemetry (s). `sensitivity`
+        returns the derivatives of the total field, see :class:`.consistency.Sensitivity`.
         """
         self.flags = 0
         self.is_fault = True
@@ -136,8 +136,8 @@ class HealthMonitor:
         # the consistency check uses samples at rest that no other check has flagged
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, trend):
             anomaly = total - reference + self._reference_steps.total if isfinite(reference) else total
-            changes, course, speed = tuple(mass_changes()), self._course.angle, trend.crossing_speed
-            new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, changes, speed, course)
+            course, speed = self._course.angle, trend.crossing_speed
+            new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, speed, course, sensitivity())
             consistency.add(new)
         if consistency.is_waiting:
             consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))

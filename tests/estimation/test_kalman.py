@@ -51,7 +51,7 @@ def test_prediction_of_some_states_is_that_of_the_whole_transition() -> None:
     np.testing.assert_allclose(kalman.covariance, covariance, atol=1e-12)
 
 
-def test_statistic_is_the_log_likelihood_ratio_of_a_random_amplitude() -> None:
+def test_log_ratio_is_the_log_likelihood_ratio_of_a_random_amplitude() -> None:
     rng = np.random.default_rng(3)
     m, R = 40, 0.7
     F = rng.normal(size=(m, 3))
@@ -68,13 +68,13 @@ def test_statistic_is_the_log_likelihood_ratio_of_a_random_amplitude() -> None:
     ratio = multivariate_normal(np.zeros(m), null + F @ F.T).logpdf(y) - multivariate_normal(
         np.zeros(m), null
     ).logpdf(y)
-    np.testing.assert_allclose(test.statistic[row], ratio, rtol=0.02)
+    np.testing.assert_allclose(test.log_ratio[row], ratio, rtol=0.02)
     posterior = np.linalg.inv(np.eye(3) + F.T @ np.linalg.solve(null, F))
     np.testing.assert_allclose(test.amplitude[row], posterior @ F.T @ np.linalg.solve(null, y), atol=0.02)
     np.testing.assert_allclose(test.covariance(row), posterior, atol=0.01)
 
 
-def test_statistic_of_unknown_noise_is_the_ratio_of_student_densities() -> None:
+def test_log_ratio_of_unknown_noise_is_the_ratio_of_student_densities() -> None:
     rng = np.random.default_rng(4)
     m, dof = 30, 8.0
     F = rng.normal(size=(m, 3))
@@ -90,7 +90,7 @@ def test_statistic_of_unknown_noise_is_the_ratio_of_student_densities() -> None:
     squares = (y @ y / S, y @ np.linalg.solve(both, y))
     ratio = 0.5 * (dof + m) * np.log((dof + squares[0]) / (dof + squares[1]))
     ratio -= 0.5 * np.linalg.slogdet(both / S)[1]
-    np.testing.assert_allclose(test.statistic[5], ratio, atol=1e-8)
+    np.testing.assert_allclose(test.log_ratio[5], ratio, atol=1e-8)
 
 
 def test_track_process_is_matern() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import nan
 
 import numpy as np
@@ -11,6 +12,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Noise
 from magbridge.estimation.residual import rms
 from magbridge.health import HealthMonitor
+from magbridge.health.consistency import Sensitivity
 from magbridge.records import Quality
 
 FIELD = 52_000.0
@@ -48,8 +50,13 @@ def monitor(
     speed: float,
     step: float,
     own: FloatArray | None = None,
+    error_effects: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, list[str]]:
-    """Return sigma (n,), flags (n,) and messages; each sample's own sigma (n,) is 1.5 nT by default."""
+    """Return sigma (n,), flags (n,) and messages; each sample's own sigma (n,) is 1.5 nT by default.
+
+    `error_effects` (n, r) are the effects of the calibration's independent errors, nT.
+    """
+    error_effects = np.zeros((len(total), 0)) if error_effects is None else error_effects
     own = np.full(len(total), 1.5) if own is None else own
     health, rng = HealthMonitor(Noise(1.0)), np.random.default_rng(9)
     sigma, flags = np.empty((2, len(total)))
@@ -59,7 +66,8 @@ def monitor(
         field = tuple((F * u[k]).tolist())
         raw = tuple((F * u[k] + rng.normal(0.0, 0.1, 3)).tolist())
         fields = F, float(own[k])
-        more = health.check(time_us, raw, field, fields, 0, (FIELD, 145.0), float(warmth[k]), 0.0, list)
+        effects = partial(Sensitivity, error_effects=error_effects[k])
+        more = health.check(time_us, raw, field, fields, 0, (FIELD, 145.0), float(warmth[k]), 0.0, effects)
         sigma[k], flags[k] = (own[k] ** 2 + more) ** 0.5, health.flags
     return sigma, flags, health.messages
 
@@ -94,11 +102,12 @@ def test_error_that_the_calibration_states_hardly_widens_sigma(seed: int) -> Non
     """On the way up sigma is 1.9 nT with an error of 1.5, on the way down it is that of the noise."""
     u, crust = glide(seed)
     rising = u[:, 0] > 0.3
-    noise = np.random.default_rng(seed).normal(0.0, 1.0, len(u))
+    noise = np.random.default_rng(seed + 100).normal(0.0, 1.0, len(u))
     own = np.where(rising, 1.9, 1.0)
     warmth = np.full(len(u), nan)
     total = FIELD + 0.2 * crust + 1.5 * rising + noise
-    sigma, flags, _ = monitor(total, u, warmth, speed=0.35, step=4.0, own=own)
+    effects = np.sqrt(own**2 - 1.0)[:, None]
+    sigma, flags, _ = monitor(total, u, warmth, speed=0.35, step=4.0, own=own, error_effects=effects)
     assert not flags.any()
     assert rms(sigma) < 1.1 * rms(own)
 
@@ -141,7 +150,7 @@ def test_vehicle_that_takes_off_is_not_a_fault(speed: float, seed: int) -> None:
         field = tuple((total[k] * u[k]).tolist())
         raw = tuple((total[k] * u[k] + rng.normal(0.0, 0.1, 3)).tolist())
         one = float(total[k]), 1.0
-        more.append(health.check(time_us, raw, field, one, 0, (FIELD, 145.0), nan, 0.0, list))
+        more.append(health.check(time_us, raw, field, one, 0, (FIELD, 145.0), nan, 0.0, Sensitivity))
         flags.append(health.flags)
     assert np.mean(np.array(flags) != 0) < 0.003
     assert np.mean(np.array(more) > 8.0) < 0.05
@@ -156,7 +165,7 @@ def test_reading_that_repeats_on_all_axes_is_flagged_after_a_few() -> None:
     for k, field in enumerate(raw.tolist()):
         total = float(np.linalg.norm(field))
         one = (field[0], field[1], field[2])
-        health.check(4_000_000 * (k + 1), one, one, (total, 1.5), 0, (FIELD, 145.0), nan, 0.0, list)
+        health.check(4_000_000 * (k + 1), one, one, (total, 1.5), 0, (FIELD, 145.0), nan, 0.0, Sensitivity)
         flags.append(health.flags)
     assert not any(flags[:600])
     assert all(flags[606:])
@@ -176,7 +185,7 @@ def test_motion_that_is_reported_late_is_not_a_jump() -> None:
             health.begin_motion(time_us - 1_000_000)
         total = FIELD + off + float(rng.normal())
         field = (0.3 * total, 0.2 * total, 0.93 * total)
-        health.check(time_us, field, field, (total, 1.5), quality, (FIELD, 145.0), nan, 0.0, list)
+        health.check(time_us, field, field, (total, 1.5), quality, (FIELD, 145.0), nan, 0.0, Sensitivity)
         flags.append(health.flags)
     assert not any(flags[1200:])
 
@@ -190,5 +199,5 @@ def test_step_of_the_reference_widens_nothing() -> None:
         health.set_position(4_000_000 * (k + 1), 47.0 + 0.35 * 4.0 * k / 111_200.0, -59.0)
         field = tuple((F * u[k]).tolist())
         main = FIELD + 60.0 * (k > 1000), 145.0
-        more.append(health.check(4_000_000 * (k + 1), field, field, (F, 1.5), 0, main, nan, 0.0, list))
+        more.append(health.check(4_000_000 * (k + 1), field, field, (F, 1.5), 0, main, nan, 0.0, Sensitivity))
     assert max(more) < 1.0

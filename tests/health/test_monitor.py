@@ -11,6 +11,7 @@ import pytest
 from magbridge.arrays import FloatArray, IntArray
 from magbridge.calibration.model import Noise
 from magbridge.health import HealthMonitor
+from magbridge.health.consistency import Sensitivity
 from magbridge.records import Quality
 
 IMPLAUSIBLE, MOVING = int(Quality.IMPLAUSIBLE), int(Quality.MOVING)
@@ -42,7 +43,7 @@ class Flight:
                 judge.set_position(k * PERIOD_US, 48.0 + speed * 4.0 * k / 111_200.0, -57.0)
             more = judge.check(
                 k * PERIOD_US, tuple(raw), tuple(raw), (total[k], SIGMA), quality, (reference, 145.0),
-                nan, 0.0, list,
+                nan, 0.0, Sensitivity,
             )  # fmt: skip
             flags.append(judge.flags)
             sigma.append((SIGMA**2 + more) ** 0.5)
@@ -266,5 +267,5 @@ def test_memory_and_state_do_not_grow() -> None:
     for k in range(3000):
         raw = tuple(rng.normal(0.0, 4e4, 3).tolist())
         total = float(np.linalg.norm(raw)), SIGMA
-        judge.check(k * PERIOD_US, raw, raw, total, 0, (FIELD, 145.0), nan, 0.0, list)
+        judge.check(k * PERIOD_US, raw, raw, total, 0, (FIELD, 145.0), nan, 0.0, Sensitivity)
     assert len(judge.messages) <= 5
