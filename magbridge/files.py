@@ -15,7 +15,7 @@ from magbridge.errors import FormatError, MagbridgeError, WriteError
 __all__ = ["atomic_path", "contents", "digest", "existing", "new_folder", "systems_reason"]
 
 PROBE_BYTES = 1 << 20
-"""Bytes written to learn why a write failed: more than a library writes at a time."""
+"""Number of bytes written to find the reason of a failed write; more than a library writes at once."""
 
 
 @contextmanager
@@ -30,7 +30,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
-    with suppress(OSError):  # a folder that cannot be read, or is not there: the write itself will fail
+    with suppress(OSError):  # the write itself reports a missing folder
         _clear(target)
     try:
         yield temporary
@@ -40,20 +40,22 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     except MagbridgeError:
         raise
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)  # not the library's wording
+        reason = (
+            os.strerror(error.errno) if error.errno else str(error)
+        )  # independent of the library that writes
         raise WriteError(target, reason) from error
     finally:
-        with suppress(OSError):  # it was renamed, or never made
+        with suppress(OSError):  # it was renamed, or never created
             temporary.unlink()
 
 
 def _sync(path: Path) -> None:
-    """Write a file or a folder through to the disk, so that a power cut leaves no empty file."""
+    """Sync a file or a folder to the disk, so that a power failure leaves no empty file."""
     if os.name == "nt" and path.is_dir():  # Windows syncs no folders
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        with suppress(OSError):  # a file system without fsync: the rename is all that there is
+        with suppress(OSError):  # the file system has no fsync
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
@@ -89,10 +91,10 @@ def digest(path: Path) -> str:
 
 @contextmanager
 def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a folder to write to, made where it is not there.
+    """Create a folder if it does not exist, and yield it.
 
-    When the block raises, the folders that were made for it are removed with their contents; one that
-    existed before stays.
+    If the block raises, the created folders are removed with their contents; a folder that existed before
+    remains.
     """
     folder = Path(path)
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
@@ -107,12 +109,12 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def systems_reason(path: Path) -> Iterator[None]:
-    """Raise the operating system's reason where a library that writes to `path` fails.
+    """Raise the operating system's error if a library fails to write to `path`.
 
-    netCDF hides that reason: it reports a full disk as 'HDF error' or 'Permission denied'. So `PROBE_BYTES`
-    bytes are appended to the file, which is spoilt already, and the system raises its own error.
+    netCDF reports a full disk as 'HDF error' or 'Permission denied'. So `PROBE_BYTES` bytes are appended to
+    the file, which is damaged already, and the operating system raises its own error.
 
-    OSError: the file cannot be written, and why.
+    OSError: the file cannot be written; the error has the reason.
     """
     try:
         yield
@@ -132,7 +134,7 @@ def _clear(target: Path) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Return True if a process runs, or if that cannot be found out."""
+    """Return True if a process runs, or if its state is unknown."""
     if os.name != "posix":  # elsewhere, os.kill(process, 0) may end the process
         return True
     try:

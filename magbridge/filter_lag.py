@@ -1,19 +1,19 @@
-r"""Undo the lag of a sensor's anti-alias filter in the direction of the vector, sample after sample.
+r"""Correct the direction of the vector for the lag of the sensor's anti-alias filter, sample by sample.
 
 A first-order filter of cutoff frequency :math:`f_c` gives y with
 :math:`\mathbf y + \tau \dot{\mathbf y} = \mathbf x`, :math:`\tau = 1 / (2 \pi f_c)`. A calibration is linear
-in the reading, so the corrected vector lags behind the field in the same way. In a turn of the rate
-:math:`\omega` the heading is late by :math:`\omega \tau`; the length of the vector is not, to first order.
-So the vector is turned by :math:`\tau \dot{\mathbf y}_\perp`, the part across it, and keeps its length and
-its noise along the field.
+in the reading, so the corrected vector has the same lag. In a turn of rate :math:`\omega`, the lag changes
+the heading by :math:`\omega \tau`, and to first order does not change the length. The correction adds
+:math:`\tau \dot{\mathbf y}_\perp`, the component of the derivative perpendicular to the vector, and restores
+the length. It does not change the noise along the field.
 
-The derivative is that of a parabola at its end, fitted by weighted least squares to the means of blocks of
-samples over the last :data:`SPAN_TIME_CONSTANTS` time constants, or over three samples where these are fewer.
+The derivative is that of a parabola at its last sample. The parabola is fitted by weighted least squares to
+means of blocks of samples over the last :data:`SPAN_TIME_CONSTANTS` time constants (at least three blocks).
 The weights are the numbers of samples in the blocks: :math:`W_i = n_i (N^{-1} a_i)_1`,
-:math:`a_i = (1, t_i, t_i^2)`, with the normal matrix N of the parabola about the last sample. After an abrupt
-change of attitude the parabola overshoots; so the derivative d counts by
-:math:`k = 1 - |\Delta \mathbf d|^2 / |\mathbf d|^2` at least 0, with its change since the last sample, and
-what that leaves out counts in sigma.
+:math:`a_i = (1, t_i, t_i^2)`, with the normal matrix N of the parabola and times relative to the last sample.
+After an abrupt change of attitude the parabola overshoots. So the derivative d is multiplied by
+:math:`k = \max(0, 1 - |\Delta \mathbf d|^2 / |\mathbf d|^2)`, where :math:`\Delta \mathbf d` is its change
+since the last sample. Sigma includes the omitted part.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from magbridge.records import Vector
 __all__ = ["LagCorrection"]
 
 SPAN_TIME_CONSTANTS: Final = 4.0
-"""Time constants that the parabola spans: over shorter spans the derivative would be noise."""
+"""Time span of the parabola, in time constants; shorter spans give a noisier derivative."""
 BLOCKS: Final = 12
-"""Blocks of samples in that span."""
+"""Number of blocks of samples in that span."""
 MIN_PARABOLA_BLOCKS: Final = 3
-"""Blocks of a parabola, also where one sample lasts longer than a block."""
+"""Smallest number of blocks, also if the sample interval is longer than a block."""
 MAX_INTERVAL_RATIO: Final = 10.0
-"""Interval over the one before it, beyond which it is a gap: no derivative is taken across it."""
+"""Ratio of an interval to the one before it, from which it is a gap; the fit starts again after a gap."""
 
 
 class LagCorrection:
-    """Undo the lag of a first-order filter of the cutoff frequency `cutoff_hz`.
+    """Correction for the lag of a first-order low-pass filter with cutoff frequency `cutoff_hz`.
 
-    `time_constant` is that of the filter, s; `variance` (nT²) is the part of the variance of each component
-    of the last vector that comes from the uncertainty of the lag.
+    `time_constant` is the filter's time constant, s; `variance` (nT²) is the variance of each component of
+    the last vector due to the uncertainty of the lag.
     """
 
     def __init__(self, cutoff_hz: float) -> None:
@@ -54,10 +54,10 @@ class LagCorrection:
         self._rate: Vector = (0.0, 0.0, 0.0)
 
     def undo(self, time_us: int, field: Vector, delay_s: float = 0.0) -> Vector:
-        """Return the corrected vector `field` (nT) at `time_us` (µs) without lag.
+        """Return the calibrated vector `field` (nT) at `time_us` (µs), corrected for the lag.
 
-        It is `field` itself if that is not finite. `delay_s` is the part of the filter's delay that `time_us`
-        is corrected for already.
+        A vector that is zero or not finite is returned unchanged. `delay_s` is the part of the filter's delay
+        for which `time_us` is already corrected.
         """
         x, y, z = field
         length2 = x * x + y * y + z * z
@@ -88,7 +88,7 @@ class LagCorrection:
         return x * scale, y * scale, z * scale
 
     def _add(self, time_s: float, field: Vector) -> None:
-        """Add a sample to its block, and drop the blocks that are too old."""
+        """Add a sample to its block, and remove blocks older than the span."""
         blocks = self._blocks
         if blocks and time_s - blocks[-1][5] < self._block_s:
             last = blocks[-1]
@@ -114,7 +114,7 @@ class LagCorrection:
 
 
 def _weights(times: list[float], counts: list[float]) -> list[float]:
-    """Return the weight (1/s) of each block's mean, of `counts` samples, in the derivative at the time 0."""
+    """Return the weight (1/s) of each block's mean in the derivative at time 0; `counts` are block sizes."""
     if len(times) < 2:
         return [0.0] * len(times)
     if len(times) == 2:

@@ -32,78 +32,81 @@ __all__ = ["Guarded", "GuardedJob", "guarded"]
 
 T = TypeVar("T")
 
-SECONDS, PER_MEGABYTE = 8.0, 0.2
-"""Processor time for a file, s, and for each MB of it: any format needs a tenth of that."""
-MEMORY, PER_BYTE = 500_000_000, 50
-"""Bytes of memory for a file, and for each byte of it: compressed, a log may be thirty times smaller."""
+BASE_TIME_S, TIME_S_PER_MB = 8.0, 0.2
+"""Allowed processor time for a file: a constant, and an amount for each MB. Each format needs a tenth."""
+BASE_MEMORY_BYTES, MEMORY_PER_FILE_BYTE = 500_000_000, 50
+"""Allowed memory for a file: a constant, and a multiple of its size, because logs may be compressed."""
 RESERVED_BYTES = 8_000_000_000
-"""Bytes of address space beyond that: dbdreader asks for a GB, and uses little of it."""
-POLL = 0.1
+"""Address space allowed in addition, because dbdreader reserves 1 GB and uses little of it."""
+MEMORY_POLL_S = 0.1
 """Time between two checks of a child's memory, s."""
 TOO_LARGE = "asks for far more memory than its size allows: damaged"
-WAIT = 10.0
-"""Wall-clock over processor time after which a child counts as stuck: disks and other processes are slow."""
+MAX_WAIT_RATIO = 10.0
+"""Allowed ratio of elapsed time to allowed processor time; the disk and other processes may be slow."""
 
 
 class Raised(NamedTuple):
-    """An error that the child sends to the parent: the function that builds it, and its arguments."""
+    """Error as the child process sends it: a function that constructs the error, and its arguments."""
 
     rebuild: Callable[..., BaseException]
     arguments: tuple[Any, ...]
 
     @classmethod
     def from_exception(cls, error: BaseException) -> Raised:
-        """Return an error without its causes, which other packages would pickle with it."""
+        """Return an error without its causes, because causes from other packages may not be picklable."""
         how = error.__reduce__()
         assert isinstance(how, tuple)
         return cls(*how[:2])
 
 
 class GuardedJob(NamedTuple):
-    """A file, and the function that returns an iterable of picklable objects read from it."""
+    """File to read, and a function that reads it and returns an iterable of picklable objects."""
 
     path: Path
     read: Callable[[], Iterable[Any]]
 
     @property
     def limits(self) -> tuple[int, int]:
-        """The s of processor time and the bytes of memory that reading it may take, by its size."""
-        files = self.path.iterdir() if self.path.is_dir() else [self.path]  # a folder is one log, too
+        """Allowed processor time (s) and memory (bytes), computed from the size of the file."""
+        files = self.path.iterdir() if self.path.is_dir() else [self.path]  # a folder holds one log
         size = sum(file.stat().st_size for file in files if file.is_file())
-        return round(SECONDS + PER_MEGABYTE * size / 1e6), MEMORY + PER_BYTE * size
+        return round(
+            BASE_TIME_S + TIME_S_PER_MB * size / 1e6
+        ), BASE_MEMORY_BYTES + MEMORY_PER_FILE_BYTE * size
 
 
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
-    """Yield what ``read()`` yields, run in a child process with limits on time and memory.
+    """Run ``read()`` in a child process with limits on time and memory, and yield the objects it yields.
 
-    The objects must be picklable; the size of the file `path` sets the limits. Without fork (Windows), and
-    in a process that may not have children (a worker of a pool), this process reads the file without limits.
+    The objects must be picklable. The limits follow from the size of the file `path`. On Windows, and in a
+    process that cannot start child processes (a worker of a pool), the file is read in this process without
+    limits.
 
-    FormatError: the file makes its reader fail in an unexpected way, crash, need more than 8 s of processor
-    time and 0.2 s a MB, or more than 500 MB of memory and 50 times its size. MagbridgeError, OSError: as
-    `read` raises them.
+    FormatError: the reader crashes, raises an unexpected exception, or exceeds the limit on processor time
+    (8 s plus 0.2 s per MB) or on memory (500 MB plus 50 times the size). MagbridgeError, OSError: `read`
+    raises it.
     """
-    one = Guarded([GuardedJob(path, read)])
+    reader = Guarded([GuardedJob(path, read)])
     try:
-        yield from one.pieces(0)
+        yield from reader.pieces(0)
     finally:
-        one.close()
+        reader.close()
 
 
 class Guarded:
-    """Read several small files in one child process, as :func:`guarded` reads one.
+    """Reader of several small files in one child process; limits and errors are those of :func:`guarded`.
 
-    If a file ends the child, another child reads the files after it.
+    If reading a file ends the child process, a new child process reads the remaining files.
     """
 
     def __init__(self, jobs: Sequence[GuardedJob]) -> None:
         self._jobs = jobs
         self._received: list[deque[tuple[bool, Any]]] = [deque() for _ in jobs]
-        self._at = 0
+        self._current = 0
         self._child: _Child | None = None
 
     def pieces(self, k: int) -> Iterator[Any]:
-        """Yield the pieces of a file, once; the pieces of files before it are kept."""
+        """Yield the objects read from file `k`; objects of earlier files remain available."""
         import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
 
         if sys.platform == "win32" or multiprocessing.current_process().daemon:
@@ -120,29 +123,29 @@ class Guarded:
             yield piece
 
     def close(self) -> None:
-        """End the child."""
+        """End the child process."""
         if self._child is not None:
             self._child.end()
             self._child = None
 
     def _receive(self) -> None:
-        """Wait for the next piece of the file that is being read."""
-        job = self._jobs[self._at]
+        """Wait for the next object, or the end, of the file that the child process is reading."""
+        job = self._jobs[self._current]
         if self._child is None:
-            self._child = _Child(self._jobs[self._at :])
+            self._child = _Child(self._jobs[self._current :])
         try:
             done, piece = self._child.receive(job)
         except FormatError as error:
             self.close()
             done, piece = True, Raised.from_exception(error)
-        self._received[self._at].append((done, piece))
-        self._at += done
-        if self._at == len(self._jobs):
+        self._received[self._current].append((done, piece))
+        self._current += done
+        if self._current == len(self._jobs):
             self.close()
 
 
 class _Child:
-    """A process that reads files, and the pipe through which the pieces come."""
+    """Child process that reads files, and the pipe from which the parent receives the objects."""
 
     def __init__(self, jobs: Sequence[GuardedJob]) -> None:
         import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
@@ -152,20 +155,21 @@ class _Child:
         self._pieces, end = context.Pipe(duplex=False)
         self._process = context.Process(target=_send, args=(end, jobs), daemon=True)
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", DeprecationWarning
-            )  # of a fork with other threads: the child uses none
+            # Python warns of a fork while other threads run; the child does not use these threads
+            warnings.simplefilter("ignore", DeprecationWarning)
             self._process.start()
         end.close()
         self.end = weakref.finalize(self, _end, os.getpid(), self._process, self._pieces)
 
     def receive(self, job: GuardedJob) -> tuple[bool, Any]:
-        """Return whether `job` is done, and its piece; FormatError: it takes too much, or ends the child."""
+        """Return (True at the end of `job`, object); FormatError: `job` exceeds a limit or ends the child."""
         (seconds, memory), waited = job.limits, 0.0
-        while not self._pieces.poll(POLL):
-            waited += POLL
-            if waited > WAIT * seconds:
-                raise FormatError(job.path, f"takes longer than {WAIT * seconds:.0f} s to read: damaged")
+        while not self._pieces.poll(MEMORY_POLL_S):
+            waited += MEMORY_POLL_S
+            if waited > MAX_WAIT_RATIO * seconds:
+                raise FormatError(
+                    job.path, f"takes longer than {MAX_WAIT_RATIO * seconds:.0f} s to read: damaged"
+                )
             if _memory(self._process.pid)[1] > self._used + memory:
                 raise FormatError(job.path, TOO_LARGE)
         try:
@@ -177,8 +181,8 @@ class _Child:
 
 
 def _end(parent: int, process: BaseProcess, pieces: Connection) -> None:
-    """End the child, in the process that started it: `parent` is its number."""
-    if os.getpid() != parent:  # a copy of the object in a process that was forked since
+    """End the child process, if this process is the one that started it (process id `parent`)."""
+    if os.getpid() != parent:  # this process was forked later and holds a copy
         return
     process.kill()
     process.join()
@@ -186,7 +190,7 @@ def _end(parent: int, process: BaseProcess, pieces: Connection) -> None:
 
 
 def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
-    """Yield what ``read()`` yields; any unexpected exception becomes a FormatError."""
+    """Yield the objects of ``read()``; raise a FormatError in place of an unexpected exception."""
     try:
         yield from read()
     except (MagbridgeError, OSError):
@@ -198,7 +202,7 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
             raise FormatError(path, f"cannot be read, damaged? {error}"[:300]) from error
         raise FormatError(path, f"expected a name in {error.encoding}; rename the file") from error
     except Exception as error:
-        # whatever a library raises on bytes that it was not made for; the traceback goes with the error
+        # a library may raise any exception on damaged bytes; the note keeps its traceback
         first = next(iter(str(error).splitlines()), "")
         damaged = FormatError(path, f"cannot be read, damaged? {type(error).__name__}: {first}"[:300])
         damaged.add_note(traceback.format_exc())
@@ -206,10 +210,10 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
 
 
 def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
-    """Read in the child, and send (False, piece) for each of a file, then (True, None) or (True, Raised)."""
+    """Read files in the child; send (False, object) for each object, then (True, None) or (True, Raised)."""
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_WRONLY)
-    for stream in (1, 2):  # HDF5 and dbdreader print what they find
+    for stream in (1, 2):  # HDF5 and dbdreader print messages
         os.dup2(silent, stream)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the child
     for number in (signal.SIGTERM, signal.SIGXCPU):
@@ -225,7 +229,7 @@ def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
                 raise
             except (MagbridgeError, OSError) as error:
                 end.send((True, Raised.from_exception(error)))
-    except BrokenPipeError:  # the parent wants no more
+    except BrokenPipeError:  # the parent has stopped reading
         pass
 
 
@@ -253,7 +257,7 @@ def _set(kind: int, limit: int) -> None:
 
 
 def _ended_by(code: int, seconds: int) -> str:
-    """Return the fault of a file whose child ended with this exit code."""
+    """Return the message about a file whose child process ended with exit code `code`."""
     if code == -signal.SIGXCPU:
         return f"takes longer than {seconds} s of processor time to read: damaged"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"

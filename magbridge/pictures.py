@@ -1,4 +1,4 @@
-"""Pictures: written whole, and a name from a file is drawn as it is, not as mathematics."""
+"""Write matplotlib figures to files, with all texts drawn literally."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> None:
 
 
 def literal(figure: Figure) -> None:
-    r"""Draw the words of a figure letter by letter: matplotlib would set ``$\frac{$`` and fail.
+    """Make matplotlib draw the texts of a figure literally, because a ``$`` in a name would start a formula.
 
-    Numbers at the ticks are its own, and stay as they are.
+    The labels of ticks do not change, because matplotlib itself formats them as formulas.
     """
     axes = [axis for one in figure.axes for axis in (one.xaxis, one.yaxis)]
     ticks = {id(label) for axis in axes for label in axis.get_ticklabels(which="both")}

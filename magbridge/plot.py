@@ -1,4 +1,4 @@
-"""Pictures for a notebook: each draws on axes of yours, or on new ones, and returns them.
+"""Draw logs, residuals and grids in a notebook, on given or on new axes, which each function returns.
 
 ::
 
@@ -36,23 +36,23 @@ __all__ = ["corrected", "grid", "residuals"]
 
 
 def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = None) -> Axes:
-    """Draw a corrected log against time: the value with its 2-sigma band, flagged samples separately.
+    """Draw a column of a corrected log over time, with its 2-sigma band and the flagged samples.
 
     Parameters
     ----------
     log : Dataset (time)
-        From :func:`magbridge.correct_rows`, or a file that ``magbridge correct`` wrote.
+        Result of :func:`magbridge.correct_rows`, or the log in a file written by ``magbridge correct``.
     column : str
-        ``total_field``, ``anomaly`` (both nT) or their ``total_field_sigma``.
+        ``total_field``, ``anomaly`` or ``total_field_sigma``, nT.
     ax : Axes, optional
-        New ones if not given.
+        Axes to draw on; new axes by default.
 
     Raises
     ------
     WrongUse
-        The log has no such column: it is not corrected.
+        The log lacks the column because it has not been corrected.
     """
-    from magbridge.logs.draw import corrected_panel  # noqa: PLC0415 - xarray is for those who draw logs
+    from magbridge.logs.draw import corrected_panel  # noqa: PLC0415 - imports xarray
 
     if column not in log:
         raise WrongUse(f"expected a column {column!r}, got a log without it; correct the log first")
@@ -65,23 +65,23 @@ def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = No
 def residuals(
     calibration: Calibration, data: Observations, against: str = "time", ax: Axes | None = None
 ) -> Axes:
-    """Draw the residual of the total field after calibration: a trend is an effect that the model lacks.
+    """Draw the residual of the corrected total field; a trend shows an effect that the model lacks.
 
     Parameters
     ----------
     calibration : Calibration
-        Calibration to correct with.
+        Calibration that corrects the readings.
     data : Observations
-        Of any log with a reference: :func:`magbridge.observations`.
+        Observations of a log with a reference field (:func:`magbridge.observations`).
     against : str
-        ``time``, ``heading``, or a parameter of the data.
+        Abscissa: ``time``, ``heading``, or a parameter of the data.
     ax : Axes, optional
-        New ones if not given.
+        Axes to draw on; new axes by default.
 
     Raises
     ------
     WrongUse
-        The data have nothing of that name.
+        `against` is none of these.
     """
     left, _ = in_sensor_units(calibration, data)
     if against == "time":
@@ -104,16 +104,16 @@ def residuals(
 
 
 def grid(anomaly: AnomalyGrid, track: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:
-    """Draw an anomaly grid, and a log's track on it.
+    """Draw an anomaly grid, and the track of a log on it.
 
     Parameters
     ----------
     anomaly : AnomalyGrid
-        From :func:`magbridge.read_grid`.
+        Grid to draw (:func:`magbridge.read_grid`).
     track : Dataset (time), optional
-        A log with ``latitude`` and ``longitude``.
+        Log with ``latitude`` and ``longitude``, deg.
     ax : Axes, optional
-        New ones if not given.
+        Axes to draw on; new axes by default.
     """
     axes = _axes(ax)
     middle = float(np.nanmedian(anomaly.anomaly))

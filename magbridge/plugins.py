@@ -1,7 +1,7 @@
-"""Plug-ins of other packages, by entry points: drivers, formats, terms, emulated instruments.
+"""Load plug-ins of other packages by entry points: drivers, formats, terms, emulated instruments.
 
-Every exception of such code ends in one line that names the plug-in, its package and the line of code, so
-that the user knows where to report it.
+An exception in a plug-in becomes a one-line error with the plug-in's name, its package and the line of code,
+so that the user can report it to the author.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ __all__ = ["blamed", "load", "plugins"]
 
 
 def plugins(group: str) -> dict[str, EntryPoint]:
-    """Return the entry points of a group, as ``magbridge.formats``, by name."""
+    """Return the entry points of a group, such as ``magbridge.formats``, by name."""
     from importlib.metadata import entry_points  # noqa: PLC0415 - slow to import, and rarely needed
 
     return {point.name: point for point in entry_points(group=group)}
 
 
 def load(point: EntryPoint) -> Any:
-    """Import what an entry point names; PluginError: it cannot be imported."""
+    """Import and return the object of an entry point; PluginError: it cannot be imported."""
     with blamed(point):
         return point.load()
 
 
 @contextmanager
 def blamed(point: EntryPoint) -> Iterator[None]:
-    """Turn every exception of a plug-in, except ours and those of files, into a :class:`PluginError`."""
+    """Raise a :class:`PluginError` in place of any exception except :class:`MagbridgeError` and OSError."""
     try:
         yield
     except (MagbridgeError, OSError):

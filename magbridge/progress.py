@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal; elsewhere nothing, or a line at intervals."""
+"""Show the progress of long operations: a bar on a terminal, else nothing or a line at intervals."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ T = TypeVar("T")
 BAR_DELAY_S = 2.0
 """Time before a bar appears, s."""
 BAR_INTERVAL_S = 0.1
-"""Time between two updates of the bar, s: drawing takes longer than most items."""
-
-
+"""Time between two updates of the bar, s; most items take less time than drawing the bar."""
 LINE_INTERVAL_S = 10.0
 """Time between two lines if stderr is not a terminal, s."""
 
 
 def track(items: Iterable[T], task: str, total: int | None = None, *, in_lines: bool = False) -> Iterator[T]:
-    """Yield `items`; once that has taken two seconds, show on a terminal how far it is.
+    """Yield `items`, and after 2 s show a bar with the fraction of the items that are done.
 
-    Without a terminal nothing is shown, or with `in_lines` a line on stderr every :data:`LINE_INTERVAL_S`.
+    If stderr is not a terminal, no bar is shown; with `in_lines`, a line is printed to stderr every
+    :data:`LINE_INTERVAL_S`. `total` is the number of items, and `task` the title.
     """
     if in_lines and not sys.stderr.isatty():
         yield from _lines(items, task, total)
@@ -41,7 +40,7 @@ def track(items: Iterable[T], task: str, total: int | None = None, *, in_lines: 
 
 
 def _lines(items: Iterable[T], task: str, total: int | None) -> Iterator[T]:
-    """Yield `items`, and print how many are done: at intervals, and after the last where it took as long."""
+    """Yield `items`, and print the number of finished items at intervals and after the last item."""
     begin = printed = time.monotonic()
     of = "" if total is None else f" of {total}"
     for done, item in enumerate(items, 1):
@@ -55,9 +54,9 @@ def _lines(items: Iterable[T], task: str, total: int | None) -> Iterator[T]:
 
 @contextmanager
 def waiting(task: str) -> Iterator[Callable[[str], object]]:
-    """Once the block has taken two seconds, show on a terminal that it is at work, and for how long.
+    """Show on a terminal the title and the elapsed time of the block, from 2 s after its start.
 
-    Yields a function that shows the name of the next step.
+    Yields a function that replaces the title, to name the next step.
     """
     with _bar(task) as update:
         yield lambda step: update(description=step)
@@ -65,7 +64,7 @@ def waiting(task: str) -> Iterator[Callable[[str], object]]:
 
 @contextmanager
 def _bar(title: str, total: float | None = None) -> Iterator[Callable[..., object]]:
-    """Show a bar from two seconds on, and the time it has taken; yield a function that updates it."""
+    """Show a bar and the elapsed time, from 2 s after the start; yield a function that updates the bar."""
     if not sys.stderr.isatty():
         yield lambda **_: None
         return

@@ -1,4 +1,4 @@
-"""A log's rows, corrected as the live bridge would have done."""
+"""Correct the rows of a log with the algorithm and state of the live bridge."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ __all__ = ["correct_rows"]
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """Correct the rows of a deployment, or of its pieces in order, as the live bridge would.
 
-    One flag is added that a live bridge cannot know yet: ``moving`` for the last sample before the telemetry
-    reports a motion, if the telemetry of that sample is older than the sample. A motion that begins with the
-    first row of a piece does not flag the piece before.
+    One flag is added that needs later telemetry, which a live bridge does not have: ``moving`` for the last
+    sample before the telemetry reports a motion, if the telemetry of that sample is older than the sample. A
+    motion that begins with the first row of a piece does not flag the last row of the previous piece.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:
 
 
 def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
-    """Flag the samples that a bridge flagged as late, and keep its sigma: rows do not hold their delay."""
+    """Keep ``late_join`` flags and sigmas that the bridge recorded, because rows do not hold delays."""
     if not {"quality", "total_field_sigma"} <= set(deployment):
         return
     recorded = np.nan_to_num(deployment["quality"].to_numpy().astype(float)).astype(int)
@@ -179,7 +179,7 @@ def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
 
 
 def _flag_onsets(results: FloatArray, age: FloatArray) -> None:
-    """Flag samples as moving after whose telemetry, `age` (n,) s old, a mass began to move."""
+    """Flag the last sample before each motion as moving if its telemetry is old; `age` (n,) is in s."""
     quality = CORRECTED.index("quality")
     sampled = np.flatnonzero(np.isfinite(age))
     moving = results[sampled, quality].astype(int) & Quality.MOVING != 0

@@ -69,7 +69,7 @@ def test_one_line_whatever_happens(
     file: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[], Iterator[int]], words: str
 ) -> None:
     if read is hangs:  # to fill the memory may itself take a second on a loaded computer
-        monkeypatch.setattr(guard, "SECONDS", 1.0)
+        monkeypatch.setattr(guard, "BASE_TIME_S", 1.0)
     pieces = guarded(file, read)
     assert next(pieces) == 1
     with pytest.raises(FormatError, match=words) as caught:
@@ -111,8 +111,8 @@ def test_who_reads_no_further_leaves_no_process(file: Path) -> None:
 
 
 def test_a_child_that_waits_for_ever_is_ended(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guard, "SECONDS", 1.0)
-    monkeypatch.setattr(guard, "WAIT", 0.2)
+    monkeypatch.setattr(guard, "BASE_TIME_S", 1.0)
+    monkeypatch.setattr(guard, "MAX_WAIT_RATIO", 0.2)
 
     def sleeps() -> Iterator[int]:
         time.sleep(60.0)
@@ -152,7 +152,7 @@ def test_one_child_reads_several_files_and_another_what_follows_a_crash(
 
 
 def test_each_of_several_files_has_its_own_time(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guard, "SECONDS", 2.0)
+    monkeypatch.setattr(guard, "BASE_TIME_S", 2.0)
 
     def busy() -> Iterator[int]:
         until = time.process_time() + 0.7

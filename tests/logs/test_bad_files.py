@@ -370,7 +370,7 @@ def test_a_slocums_number_that_is_too_large_for_its_reader(
 @pytest.mark.parametrize("name", ["no_row_group.parquet", "attribute.nc", "hangs.ulg", "short.dbd"])
 def test_files_that_once_failed(cases: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each file gives a result or one line, within the processor time of the guard."""
-    monkeypatch.setattr(guard, "SECONDS", 2.0)
+    monkeypatch.setattr(guard, "BASE_TIME_S", 2.0)
     path = cases / "files" / name
     output = f"{path}: "
     try:
