@@ -144,6 +144,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
         "findings",
         "unexplained",
         "remarks",
+        "scalar",
     }
     assert set(found) == {*keys, "format", "assessment"}
     assert found["findings"][0]["cause"] == "current_field"
