@@ -80,7 +80,7 @@ MIN_TURN_COSINE: Final = 0.985
 """Cosine of the change of the field's direction (10 deg) from which the path counts as turned."""
 MIN_STRAIGHT_SAMPLES: Final = 8
 """Number of samples without a turn after which the crustal field's roughness counts as known."""
-ADAPTATION: Final = 0.1
+ROUGHNESS_GAIN: Final = 0.1
 MAX_RESIDUAL_SIGMA: Final = 3.0
 MIN_LOG_ROUGHNESS: Final = -2.0
 MAX_LOG_ROUGHNESS: Final = 5.0
@@ -255,7 +255,7 @@ class ConsistencyCheck:
         if turned < STRAIGHT_CHANGE and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:
             self._straight_samples += 1
             # the innovations of the right model are white (Mehra 1970)
-            self._log_roughness += ADAPTATION * residual * self._past_residual
+            self._log_roughness += ROUGHNESS_GAIN * residual * self._past_residual
             self._log_roughness = min(max(self._log_roughness, MIN_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
         self._past_residual += PAST_GAIN * (residual - self._past_residual)
 
