@@ -141,7 +141,8 @@ def test_unknown_suffix(tmp_path: Path) -> None:
     path = tmp_path / "log.xlsx"
     path.write_text("x")
     assert re.match(r"expected a file name that ends in one of .*\.csv .*\.ulg", refused(path))
-    with pytest.raises(FormatError, match=r"ends in one of \.csv \.mcap \.nc \.parquet \.tlog \.xyz$"):
+    expected = r"ends in one of \.csv \.magarrow\.csv \.mcap \.nc \.parquet \.tlog \.xyz$"
+    with pytest.raises(FormatError, match=expected):
         logs.Writer(tmp_path / "log.ulg")
 
 
