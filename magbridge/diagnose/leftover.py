@@ -100,25 +100,22 @@ def _fitted_effect(problem: Problem, candidate: Candidate, b: FloatArray) -> Col
 
 
 def amplitude_evidence(problem: Problem, fit: Joint, chosen: Sequence[Hypothesis]) -> float:
-    """Return the largest log evidence that the amplitude of a chosen cause varies in time; 0 if none does.
+    """Return the log evidence that the amplitude of the strongest cause varies in time; 0 if it does not.
 
     A true cause has a constant amplitude in a log. The fitted effect of a wrong one is multiplied by half
     waves over the log. The evidence is the mean over their spectra and bands. A variation that may be a
-    remnant of the strongest cause's idealised regressor counts as none.
+    remnant of the cause's idealised regressor counts as none.
     """
-    columns = [one.candidate.columns for one in chosen]
-    least = REMNANT * max(one.signal_to_noise for one in chosen)
-    largest = 0.0
-    for one, place in zip(chosen, slices([one.candidate for one in chosen]), strict=True):
-        candidate = one.candidate
-        if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
-            continue
-        effect = _fitted_effect(problem, candidate, fit.coefficients[place])
-        scored = _scored(problem, fit.noise, fit, columns, [_modulated(problem, effect)])
-        odds = [np.exp(kind.evidence) for kind in scored if kind.best.signal_to_noise >= least]
-        spectra = len(AMPLITUDE_CORNERS) + len(AMPLITUDE_BANDS) - 1
-        largest = max(largest, float(np.log((sum(odds) + spectra - len(odds)) / spectra)))
-    return largest
+    model = [one.candidate for one in chosen]
+    k = max(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
+    candidate, least = model[k], REMNANT * chosen[k].signal_to_noise
+    if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
+        return 0.0
+    effect = _fitted_effect(problem, candidate, fit.coefficients[slices(model)[k]])
+    columns = [one.columns for one in model]
+    scored = list(_scored(problem, fit.noise, fit, columns, [_modulated(problem, effect)]))
+    odds = [np.exp(one.evidence) if one.best.signal_to_noise >= least else 1.0 for one in scored]
+    return max(float(np.log(np.mean(odds))), 0.0)
 
 
 def _modulated(problem: Problem, effect: Columns) -> Description:
