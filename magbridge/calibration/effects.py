@@ -502,6 +502,11 @@ class ResponseEffect(MomentaryEffect, frozen=True, kw_only=True):
     """Reading at the knee, nT; s is its sign. Where ``s H >= s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``
     with two coefficients, nT."""
 
+    @property
+    def size(self) -> int:
+        """Number K of the amplitudes, also of an axis that does not exist."""
+        return 3 if self.power else 2
+
     def columns(self, field: float) -> FloatArray:
         """Return the columns (K, K, 9), nT: three for a power, one for each channel; two for a knee."""
         if self.power:
