@@ -159,7 +159,7 @@ def convert(
     files
         The logs to convert.
     output
-        The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
+        The file to write; its suffix sets the format: .csv .magarrow.csv .mcap .nc .parquet .tlog .xyz.
     metadata
         A metadata.toml about people, platform and sensor, to write a netCDF in the format OceanGliders OG1.0.
     """

@@ -104,7 +104,7 @@ def test_a_position_in_another_unit_is_refused(
     [
         ("convert -o x.csv", 2, "expected at least one FILE"),
         ("convert none.csv -o x.csv", 1, "none.csv: expected a file"),
-        ("convert {d} -o x.foo", 2, "must end in .csv or .mcap or .nc or .parquet or .tlog"),
+        ("convert {d} -o x.foo", 2, "must end in .csv or .magarrow.csv or .mcap or .nc or .parquet or .tlog"),
         ("simulate demo -o x.bin", 2, "must end in .csv"),
         ("convert {d}", 2, "parameter --output is required"),
         ("convert {d} -o", 2, "parameter -o requires an argument"),
