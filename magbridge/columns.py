@@ -197,7 +197,7 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
 
 
 def factor(unit: str, column: str) -> float | None:
-    """Return the factor that converts `unit` to the unit of `column`; None if there is no conversion.
+    """Return the factor that converts `unit` to the unit of `column`; None without a conversion.
 
     The factor is 1 for a column that is not in :data:`COLUMNS`, which keeps its declared unit. It is also 1
     for an undeclared unit (an empty text or "1").

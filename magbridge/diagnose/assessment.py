@@ -131,7 +131,7 @@ def motion(problem: Problem, finding: Finding) -> dict[str, float] | None:
 
 
 def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | None:
-    """Return the telemetry delay and its effect on the corrected field; None if the cause is no delay."""
+    """Return the telemetry delay and its effect on the corrected field; None if the cause is not a delay."""
     candidate = finding.candidate
     row = diagnosis.causes.get(candidate.cause)
     if row is None or not row.delays_telemetry:

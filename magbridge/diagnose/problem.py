@@ -177,7 +177,7 @@ def _constants(calibration: Calibration) -> list[slice]:
 
 def _factor(covariance: FloatArray) -> FloatArray:
     """Return L (K, r) with ``L L^T`` equal to the covariance (K, K) of rank r."""
-    # Of the correlations: coefficients have units that differ by orders of magnitude
+    # decompose the correlations, because units of coefficients differ by orders of magnitude
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     kept = values > 1e-12 * values[-1]

@@ -147,8 +147,8 @@ class Fleet:
     def known(self, vehicle: str, refit: str, before_time: float = np.inf) -> Known:
         """Predict the coefficients of the next deployment of a vehicle, which may be new to the fleet.
 
-        `refit` may be an earlier refit of the vehicle, or a new one. Of the vehicle's own deployments, only
-        those that began before `before_time` (s since 1970) are used.
+        `refit` may be an earlier refit of the vehicle, or a new one. The prediction uses only
+        those deployments of the vehicle that began before `before_time` (s since 1970).
         """
         past = [
             seen

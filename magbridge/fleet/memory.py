@@ -288,7 +288,7 @@ def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
 
 
 class FleetPrediction(NamedTuple):
-    """Prior for a calibration, with the number of deployments of the vehicle (`own`) and of others."""
+    """Prior for a calibration, with the numbers of deployments: of the vehicle (`own`), and of all others."""
 
     known: Known
     vehicle: str

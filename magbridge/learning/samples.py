@@ -1,6 +1,6 @@
 """Compute the residual of a sample, select the samples for learning, and define the learned terms.
 
-The equations of :func:`observe` are those of :mod:`magbridge.estimation.residual`, but for one sample and
+The equations of :func:`observe` are those of :mod:`magbridge.estimation.residual`, for one sample and
 without scipy, because they run in the live path. Learning uses at most ``max_rate`` samples a second, each
 once newer telemetry has come.
 

@@ -284,8 +284,8 @@ MEDIAN_ROWS = 5
 def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
     """Return a mask (n,) of the rows to keep so that `time` (n,), s, increases; drop the fewest rows.
 
-    A single time that is too early or too late costs only its own row. NaN is never kept. Of several rows
-    with one time, `strictly` keeps only the first.
+    A single time that is too early or too late costs only its own row. NaN is never kept. If several rows
+    have one time, `strictly` keeps only the first of them.
 
     Notes
     -----

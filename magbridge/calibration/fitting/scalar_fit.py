@@ -472,7 +472,7 @@ def _power_cycles(
 
 
 def _prior_family(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool) -> PriorFamily:
-    """Return the prior of the coefficients: free widths but for the lag and the levels."""
+    """Return the prior of the coefficients: free widths, except for the lag and the levels."""
     widths = {name: (centre, LOG_WIDTH_SIGMA) for name, centre in WIDTH_CENTRES_NT.items()}
     widths["lag"] = 1e-9 if fixed_lag else LAG_SIGMA_S, 0.0
     blocks = []
