@@ -106,7 +106,7 @@ def lesson(flight: Flight) -> Lesson | str:
     except CalibrationError as error:
         return str(error)
     calibration, term = found.calibration, found.calibration.terms[0]
-    if found.information is None or not isinstance(term, Polynomial):
+    if found.information is None:
         return f"{calibration.method}: has nothing to teach"
     return Lesson(
         f"vehicle {flight.vehicle}", f"refit {flight.number // flight.every}", str(flight.number),

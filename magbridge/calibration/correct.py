@@ -10,13 +10,14 @@ computes the readings from the true field: ``H_r = A^-1 R^T H + T``.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from math import inf, isnan, nan, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.kernel import Kernel, Linear, Numbers, Prepared, apply, linear, prepare, variances
+from magbridge.calibration.kernel import Kernel, Numbers, Prepared, apply, prepare, variances
 from magbridge.calibration.model import Calibration, coefficient_tensor
 from magbridge.calibration.terms import LogSeries, Step
 from magbridge.errors import CalibrationError
@@ -31,6 +32,8 @@ EXTRAPOLATED: Final = int(Quality.EXTRAPOLATED)
 RANGE_MARGIN_FRACTION = 0.02
 """Fraction of a parameter's half range by which it may leave the range before a sample counts as
 extrapolated, because telemetry jitters at the end of its range."""
+CACHED_POSITIONS = 16
+"""Number of sets of positions whose coefficients :meth:`Corrector.changes` keeps."""
 
 
 class Corrector:
@@ -53,12 +56,7 @@ class Corrector:
         self._flags = self._base
         self._last: list[float] = []
         self._prepared: Prepared = [], []
-        self._weights: list[Linear] = [tuple(row) for row in self._kernel.weights.tolist()]
-        self._positions = len(calibration.parameters)
-        self._asked: tuple[tuple[float, ...], Sequence[Span]] = (), ()
-        self._ends: list[tuple[int, int]] = []
-        self._places: dict[tuple[float, ...], int] = {}
-        self._there: list[Linear] = []
+        self._linear_at = lru_cache(CACHED_POSITIONS)(self._kernel.linear_at)
         self._field = (nan, nan, nan)
         self._time_us = 0
         self._error_effects: FloatArray | None = None
@@ -85,13 +83,12 @@ class Corrector:
         # Total field of the last sample by the old coefficients, for the change that is returned.
         before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
         self.calibration, self._kernel, self._omega = calibration, calibration.kernel, _omega_of(calibration)
-        self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
-        self._error_effects = None
-        self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
+        self._linear_at = lru_cache(CACHED_POSITIONS)(self._kernel.linear_at)
+        self._error_effects, self._values = None, None
         self._wanted, self._base = len(calibration.channels), _base_flags(calibration)
         # Common effects keep their steppers, hence their state; new effects begin with the last sample.
         del self._steps[len(calibration.effects) :]
-        regressors = self._last[: len(self._weights)]
+        regressors = self._last[: len(self._kernel.weights)]
         for effect in calibration.effects[len(self._steps) :]:
             step = effect.begin(calibration.channels, self._kernel)
             self._steps.append(step)
@@ -173,24 +170,16 @@ class Corrector:
         order. `spans`: index of a channel, and the two values between which it lies. The result omits spans
         of channels that are not positions, and does not include effects.
         """
-        positions = values[: self._positions]
-        asked = positions, spans
-        if asked != self._asked:
-            self._asked = asked
-            # Coefficients at the ends of all spans; those of the previous call are kept.
-            known = {place: self._there[n] for place, n in self._places.items()}
-            places: dict[tuple[float, ...], int] = {}  # each once: most spans share an end
-            self._ends = []
-            for index, low, high in spans:
-                if index < self._positions:
-                    before, after = positions[:index], positions[index + 1 :]
-                    start = places.setdefault((*before, low, *after), len(places))
-                    self._ends.append((start, places.setdefault((*before, high, *after), len(places))))
-            self._places = places
-            self._there = [known.get(place) or self._linear_at(place) for place in places]
-        # |A (H_r - T)| at both ends of each span.
-        totals = [_total(field, there) for there in self._there]
-        return [totals[high] - totals[low] for low, high in self._ends]
+        k = len(self._kernel.centre)
+        found = []
+        for index, low, high in spans:
+            if index < k:
+                before, after = values[:index], values[index + 1 : k]
+                start, end = (
+                    _total(field, self._linear_at((*before, value, *after))) for value in (low, high)
+                )
+                found.append(end - start)
+        return found
 
     def error_effects(self) -> FloatArray:
         """Return the derivative (r,) of the last total field, nT, by the calibration's independent errors.
@@ -218,13 +207,9 @@ class Corrector:
         by_nine = np.concatenate([np.array(by_six) / self._kernel.field, -(A @ u)])
         return np.asarray(self._error_effects @ np.outer(phi, by_nine).ravel())
 
-    def _linear_at(self, positions: tuple[float, ...]) -> Linear:
-        """Return A's six entries and T (nT) at the positions, without effects."""
-        return linear(self._kernel.monomials(positions, 1.0), self._weights)
 
-
-def _total(field: tuple[float, float, float], linear: Linear) -> float:
-    """Return the corrected total field ``|A (H_r - T)|``, nT, of a raw reading `field`, nT."""
+def _total(field: tuple[float, float, float], linear: list[float]) -> float:
+    """Return the total field ``|A (H_r - T)|``, nT, of a raw reading `field`, nT; `linear`: A and T."""
     xx, yy, zz, xy, xz, yz, tx, ty, tz = linear
     hx, hy, hz = field
     dx, dy, dz = hx - tx, hy - ty, hz - tz

@@ -1,4 +1,4 @@
-"""Dipole term: permanent and induced moment of a mass that travels along a line.
+"""Field of a dipole that travels along a line, as a power series in its position.
 
 Notes
 -----
@@ -9,31 +9,18 @@ m includes mu_0/4pi)::
     G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + G(r) chi) H
 
 To first order, A therefore decreases by the symmetric part of ``G(r) chi``. The second order, ``(G chi)^2``,
-depends on p alone, so the polynomial term can represent it. Moments are stored as the field that they cause
-at the sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
-
-If the travel is short compared with the distance, the power series of G in p converges fast. The term is
-therefore expanded into a polynomial of order :data:`SERIES_ORDER`, and correcting costs as much as with one.
+depends on p alone, so a polynomial can represent it. Moments are given as the field that they cause at the
+sensor, in nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``. If the travel is short compared with the distance,
+the power series of G in p converges fast.
 """
 
 from __future__ import annotations
-
-from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.terms import Expansion, Parameter, PositionTerm
-from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
-from magbridge.wording import one_of
-
-Vector = tuple[float, float, float]
-
-SERIES_ORDER = 8
-"""Order of the power series. Its relative error is 1e-4 with a half travel of a fifth of the distance, and
-1e-7 with a tenth."""
 
 
 def dipole_tensor(r: FloatArray) -> FloatArray:
@@ -87,59 +74,3 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
     for degree in range(order + 1):
         powers[: degree + 1, degree] = chebyshev.cheb2poly(np.eye(order + 1)[degree])[: degree + 1]
     return np.asarray((powers @ fit) @ values)
-
-
-class Dipole(PositionTerm, frozen=True, kw_only=True):
-    """Term of one moving mass as a dipole.
-
-    Its nine coefficients are the moment (3, nT at the sensor), the induced moment (3, nT at the sensor) and
-    the displacement from `at` (3, m).
-    """
-
-    kind: ClassVar[str] = "dipole"
-    parameter: str
-    """Name of the parameter that moves the mass."""
-    at: Vector
-    """Position of the mass from the sensor at parameter value 0, in body axes, m."""
-    travel: Vector
-    """Change of the mass's position for one unit of the parameter, body axes, m."""
-    at_sigma: float = 0.0
-    """1-sigma of `at`, m: the prior of the displacement."""
-    moment: Vector = (0.0, 0.0, 0.0)
-    induced: Vector = (0.0, 0.0, 0.0)
-    """`moment`, `induced`: Moments at which the displacement is linearised, as a field at the sensor, nT."""
-
-    @property
-    def size(self) -> int:
-        """Number of coefficients: three each for moment, induced moment and displacement."""
-        return 9
-
-    def check(self, parameters: tuple[str, ...]) -> None:
-        """Raise CalibrationError if the parameter does not exist, or `at` is the position of the sensor."""
-        if self.parameter not in parameters:
-            raise CalibrationError(f"dipole: parameter: {one_of(self.parameter, parameters)}")
-        if not np.linalg.norm(self.at) > 0.0:
-            raise CalibrationError("dipole: at: expected a place away from the sensor")
-
-    def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:
-        """Return the dipole as a power series in its scaled parameter.
-
-        CalibrationError: the mass passes the sensor within three half travels, where no series converges.
-        """
-        names = [parameter.name for parameter in parameters]
-        k = names.index(self.parameter)
-        parameter = parameters[k]
-        # Positions of the mass at the Chebyshev nodes of the travel.
-        p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * SERIES_ORDER)
-        r = np.array(self.at) + p[:, None] * np.array(self.travel)
-        if np.linalg.norm(r, axis=1).min() < 3.0 * parameter.scale * np.linalg.norm(self.travel):
-            raise CalibrationError(
-                f"dipole on {self.parameter!r}: passes the sensor within three half-travels; "
-                "no series stands for it there"
-            )
-        r_0 = float(np.linalg.norm(self.at))
-        columns = dipole_columns(r, np.array(self.moment), np.array(self.induced), r_0)
-        exponents = tuple(
-            tuple(power if i == k else 0 for i in range(len(names))) for power in range(SERIES_ORDER + 1)
-        )
-        return Expansion(exponents, expand_dipole(columns, SERIES_ORDER))

@@ -27,7 +27,7 @@ from magbridge.calibration.model import (
     Run,
 )
 from magbridge.calibration.scalar import PLATFORM_TERMS, ScalarSensor
-from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
+from magbridge.calibration.terms import Effect, Polynomial, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.files import atomic_path, contents
 
@@ -211,7 +211,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
             raise CalibrationError("boresight: tilt_sigma: expected deg above 0, up to 90")
     _check_settings(content)
     # plugins may define terms and effects; each must be in its own list
-    positions = tuple(term for term in terms if isinstance(term, PositionTerm))
+    positions = tuple(term for term in terms if isinstance(term, Polynomial))
     others = tuple(effect for effect in effects if isinstance(effect, Effect))
     if len(positions) < len(terms) or len(others) < len(effects):
         raise CalibrationError(

@@ -44,8 +44,6 @@ Prepared = tuple[list[Any], list[list[Any]]]
 six entries Q (6), L (3) and O (1)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
 """Total field, its sigma, the corrected vector x, y, z, and the sigmas of x, y, z; all nT."""
-Linear = tuple[float, float, float, float, float, float, float, float, float]
-"""A's entries xx, yy, zz, xy, xz, yz; then T's x, y, z in nT."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,25 +121,16 @@ class Kernel:
             phi.append(phi[parent] * x[k])
         return phi
 
+    def linear_at(self, positions: Sequence[float]) -> list[float]:
+        """Return A's six entries xx, yy, zz, xy, xz, yz, and T (nT), at one set of positions, no effects."""
+        phi = np.array(self.monomials(positions, 1.0))
+        # a reduction adds the rows in order, so the bits do not depend on the processor
+        found: list[float] = np.add.reduce(self.position_weights * phi[:, None], axis=0).tolist()
+        return found
+
     def monomials_of(self, positions: FloatArray) -> FloatArray:
         """Return the monomials (m, n) of n samples' positions (n, k), given in the parameters' units."""
         return np.stack(self.monomials(list(positions.T), np.ones(len(positions))))
-
-
-def linear(phi: list[float], weights: list[Linear]) -> Linear:
-    """Return A's six entries, then T (nT): the sums of monomials times their weights."""
-    xx = yy = zz = xy = xz = yz = tx = ty = tz = 0.0
-    for value, (a, b, c, d, e, f, g, h, i) in zip(phi, weights):  # noqa: B905 - the weights of effects are left aside
-        xx += value * a
-        yy += value * b
-        zz += value * c
-        xy += value * d
-        xz += value * e
-        yz += value * f
-        tx += value * g
-        ty += value * h
-        tz += value * i
-    return xx, yy, zz, xy, xz, yz, tx, ty, tz
 
 
 def prepare(t: list[Any]) -> Prepared:

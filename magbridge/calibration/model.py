@@ -35,7 +35,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
 from magbridge.calibration.kernel import TABLE_SUMS, Kernel
 from magbridge.calibration.scalar import ScalarSensor
-from magbridge.calibration.terms import Effect, Exponents, Parameter, Polynomial, PositionTerm
+from magbridge.calibration.terms import Effect, Exponents, Parameter, Polynomial
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.wording import counted
@@ -78,17 +78,16 @@ def coefficient_tensor(calibration: Calibration) -> tuple[FloatArray, list[Expon
     r. The regressors are the monomials, then those of the effects. Returns `exponents`: the monomials in the
     kernel's order, each after its parent.
     """
-    expansions = [term.expand(calibration.parameters) for term in calibration.terms]
-    exponents = _closed({e for expansion in expansions for e in expansion.exponents}, calibration)
+    polynomials = [exponent for term in calibration.terms for exponent in term.exponents]
+    exponents = _closed(set(polynomials), calibration)
     row = {exponent: i for i, exponent in enumerate(exponents)}
     effects = [effect.columns(calibration.reference.field) for effect in calibration.effects]
     m = len(exponents) + sum(columns.shape[1] for columns in effects)
     tensor = np.zeros((calibration.coefficients.size, m, 9))
     k, r = 0, len(exponents)
-    for expansion in expansions:
-        rows = [row[exponent] for exponent in expansion.exponents]
-        tensor[k : k + len(expansion.columns), rows] = expansion.columns
-        k += len(expansion.columns)
+    for exponent in polynomials:  # nine coefficients of a monomial, one for each slot
+        tensor[k : k + 9, row[exponent]] = np.eye(9)
+        k += 9
     for columns in effects:
         tensor[k : k + columns.shape[0], r : r + columns.shape[1]] = columns
         k, r = k + columns.shape[0], r + columns.shape[1]
@@ -280,10 +279,9 @@ class Calibration:
     """Calibration of a vector magnetometer with its uncertainty; immutable."""
 
     parameters: tuple[Parameter, ...]
-    terms: tuple[PositionTerm, ...]
+    terms: tuple[Polynomial, ...]
     coefficients: FloatArray
-    """(K,): Coefficients of the terms, then of the effects. The unit is nT, or m for a dipole's displacement;
-    the class of an effect states the unit of its coefficients."""
+    """(K,): Coefficients of the terms, nT, then of the effects, whose class states the unit."""
     covariance: FloatArray
     """(K, K): Covariance of the coefficients."""
     noise: Noise

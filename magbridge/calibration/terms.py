@@ -1,9 +1,8 @@
 """Terms of a calibration; each adds to the nine coefficients of ``A`` and ``T``.
 
-A *position term* is a polynomial in the scaled actuator positions (:class:`Polynomial`), or expands into one
-(:class:`~magbridge.calibration.dipole.Dipole`). An *effect* depends on another quantity, such as a
-temperature, and may have a state (:mod:`magbridge.calibration.effects`). A new term needs one class and one
-row in :data:`TERMS`.
+A :class:`Polynomial` depends on the scaled positions of the masses. An *effect* depends on another quantity,
+such as a temperature, and may have a state (:mod:`magbridge.calibration.effects`). A new effect needs one
+class and one row in :data:`TERMS`.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from magbridge.plugins import load, plugins
 from magbridge.wording import one_of
 
 __all__ = [
-    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "LogSeries", "Parameter",
-    "Polynomial", "PositionTerm", "Power", "Step", "Term", "Width", "full_order", "term_class",
+    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Exponents", "LogSeries", "Parameter", "Polynomial", "Power",
+    "Step", "Term", "Width", "full_order", "term_class",
 ]  # fmt: skip
 
 Exponents = tuple[int, ...]
@@ -48,7 +47,6 @@ in nT."""
 
 TERMS: dict[str, str] = {
     "polynomial": "magbridge.calibration.terms:Polynomial",
-    "dipole": "magbridge.calibration.dipole:Dipole",
     "channel": "magbridge.calibration.effects:ChannelEffect",
     "powers": "magbridge.calibration.effects:PowersEffect",
     "sources": "magbridge.calibration.effects:SourcesEffect",
@@ -77,15 +75,6 @@ class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`centre`, `scale`: In `unit`; the scaled position of a value p is ``x = (p - centre) / scale``."""
 
 
-class Expansion(msgspec.Struct, frozen=True):
-    """Position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``."""
-
-    exponents: tuple[Exponents, ...]
-    """The m monomials, each with one exponent for each parameter."""
-    columns: FloatArray
-    """(K, m, 9): Contribution of one unit of coefficient k, times monomial m, to :data:`SLOTS`, nT."""
-
-
 class _Interface(msgspec.StructMeta, ABCMeta):
     """Metaclass of structs with abstract methods."""
 
@@ -105,15 +94,7 @@ class Term(msgspec.Struct, metaclass=_Interface, frozen=True, kw_only=True, forb
         """Raise CalibrationError if the settings do not fit the calibration's `parameters` (their names)."""
 
 
-class PositionTerm(Term, frozen=True, kw_only=True):
-    """Term that depends on the positions only, and is or expands into a polynomial in them."""
-
-    @abstractmethod
-    def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:
-        """Return the term as a polynomial in the positions scaled by the centre and scale of `parameters`."""
-
-
-class Polynomial(PositionTerm, frozen=True, kw_only=True):
+class Polynomial(Term, frozen=True, kw_only=True):
     """Term in which each of the nine slots is a polynomial in the scaled positions (paper, eq. 8).
 
     The term's coefficient ``9 m + s`` multiplies monomial m in slot s.
@@ -143,12 +124,6 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
                 )
         if len(set(self.exponents)) != len(self.exponents):
             raise CalibrationError("exponents: a monomial stands there twice")
-
-    def expand(self, parameters: tuple[Parameter, ...]) -> Expansion:  # noqa: ARG002  (a dipole needs them)
-        """Return the monomials with columns that map each coefficient to its own slot and monomial."""
-        # coefficient 9 m + s adds 1 to slot s of monomial m
-        m = len(self.exponents)
-        return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
 
 
 class LogSeries(NamedTuple):

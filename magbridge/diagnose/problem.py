@@ -39,7 +39,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.effects import powers
 from magbridge.calibration.model import Calibration, coefficient_tensor
-from magbridge.calibration.terms import Effect, LogSeries, Polynomial
+from magbridge.calibration.terms import Effect, LogSeries
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.noise import whiten
 from magbridge.estimation.priors import HARD_IRON_SIGMA_NT, SOFT_IRON_SIGMA
@@ -168,7 +168,7 @@ def _constants(calibration: Calibration) -> list[slice]:
     """Return the slice of the nine constants (exponents zero) of each polynomial that contains them."""
     found, k, none = [], 0, (0,) * len(calibration.parameters)
     for term in calibration.terms:
-        if isinstance(term, Polynomial) and none in term.exponents:
+        if none in term.exponents:
             first = k + 9 * term.exponents.index(none)
             found.append(slice(first, first + 9))
         k += term.size
@@ -234,12 +234,11 @@ def _physical(calibration: Calibration) -> FloatArray:
     """
     width, k = np.full(calibration.coefficients.size, np.inf), 0
     for term in calibration.terms:
-        if isinstance(term, Polynomial):
-            for i, exponents in enumerate(term.exponents):
-                fall = FALL ** sum(exponents)
-                width[k + 9 * i : k + 9 * i + 6] = SOFT_IRON_SIGMA * calibration.reference.field * fall
-                width[k + 9 * i + 6 : k + 9 * i + 9] = HARD_IRON_SIGMA_NT * fall
-        k += term.size
+        for exponents in term.exponents:
+            fall = FALL ** sum(exponents)
+            width[k : k + 6] = SOFT_IRON_SIGMA * calibration.reference.field * fall
+            width[k + 6 : k + 9] = HARD_IRON_SIGMA_NT * fall
+            k += 9
     return width
 
 

@@ -184,7 +184,6 @@ def _taught(row: Row) -> _Taught:
     """Return the training record in a row of the table ``calibrations``."""
     calibration = decode_calibration(row["calibration"].encode(), f"calibration of {row['deployment']}")
     term = calibration.terms[0]
-    assert isinstance(term, Polynomial)
     lesson = Lesson(
         row["vehicle"], row["refit"], row["deployment"], row["start"], calibration.parameters,
         term.exponents, calibration.reference.field, calibration.noise.sensor, unpacked(row),
@@ -256,7 +255,7 @@ def _information(calibration: Calibration, order: int) -> GaussianInformation | 
     :data:`MAX_VARIANCE_FRACTION` gets the precision ``1 / lambda_k - 1``; all others get 0.
     """
     term, *others = calibration.terms
-    if others or not isinstance(term, Polynomial) or max(map(sum, term.exponents)) != order:
+    if others or max(map(sum, term.exponents)) != order:
         return None
     size = term.size
     family = polynomial_prior(

@@ -11,7 +11,6 @@ from gliders import Gliders
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.dipole import Dipole, dipole_tensor
 from magbridge.calibration.effects import (
     ChannelEffect,
     ClockEffect,
@@ -283,42 +282,7 @@ def test_a_gain_that_the_attitudes_do_not_show_is_refused(gain: float) -> None:
     assert fit(turned(1.0, tilt=5.0), "nominal").supported
 
 
-# ---- Dipoles that move: their polynomials, and the vehicle file that says where they are -----------------
-
-
-def test_a_dipole_term_is_the_dipole() -> None:
-    """Hard iron along the travel is G(r) m to a millionth, and the induced part turns with the field."""
-    at, travel, moment = (
-        np.array([-0.4, 0.05, 0.1]),
-        np.array([0.03, 0.0, 0.01]),
-        np.array([900.0, -300.0, 50.0]),
-    )
-    cal = Calibration(
-        parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),),
-        terms=(Dipole(parameter="p", at=tuple(at), travel=tuple(travel)),),
-        coefficients=np.concatenate([moment, [30.0, 20.0, 10.0], np.zeros(3)]),
-        covariance=np.zeros((9, 9)),
-        noise=Noise(0.0),
-        reference=Reference(5e4),
-    )
-    p = np.linspace(-1, 1, 9)[:, None]
-    A, T = cal.matrices(p)
-    G = dipole_tensor(at + p * travel) * np.linalg.norm(at) ** 3
-    np.testing.assert_allclose(T, G @ moment, atol=2e-3)
-    pulled = G * np.array([30.0, 20.0, 10.0]) / 5e4
-    np.testing.assert_allclose(A, np.eye(3) - (pulled + np.swapaxes(pulled, 1, 2)) / 2, atol=1e-8)
-
-
-def test_a_dipole_that_passes_the_sensor_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="within three half-travels"):
-        Calibration(
-            parameters=(Parameter("p", "in", -1.0, 1.0, 0.0, 1.0),),
-            terms=(Dipole(parameter="p", at=(0.1, 0.0, 0.0), travel=(0.05, 0.0, 0.0)),),
-            coefficients=np.zeros(9),
-            covariance=np.zeros((9, 9)),
-            noise=Noise(0.0),
-            reference=Reference(5e4),
-        ).matrices(np.zeros((1, 1)))
+# ---- The vehicle file that says where moving dipoles are ---------------------------------------------------
 
 
 def test_vehicle_toml(tmp_path: Path) -> None:

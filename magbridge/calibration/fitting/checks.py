@@ -15,7 +15,6 @@ from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import apart_from_level, expected_error, nearby_mission
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.terms import Polynomial
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
@@ -74,10 +73,7 @@ def expected_ratio(calibration: Calibration, data: Observations) -> float:
 def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
     """Yield a warning for each mass with too few different positions for the order of the fit."""
     for k, parameter in enumerate(calibration.parameters):
-        order = max(
-            (e[k] for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents),
-            default=0,
-        )
+        order = max((e[k] for term in calibration.terms for e in term.exponents), default=0)
         # group the positions: a gap in their sorted values separates two places
         column = np.sort(data.parameters[:, k])
         jumps = np.flatnonzero(np.diff(column) > MIN_POSITION_STEP_FRACTION * parameter.scale)

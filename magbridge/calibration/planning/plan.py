@@ -187,11 +187,7 @@ class Design:
     """
 
     def __init__(self, calibration: Calibration, mission: Mission, field_ned: FloatArray) -> None:
-        if (
-            len(calibration.terms) != 1
-            or not isinstance(calibration.terms[0], Polynomial)
-            or calibration.effects
-        ):
+        if len(calibration.terms) != 1 or calibration.effects:
             raise CalibrationError(
                 "plan: needs a calibration of polynomials only, as magbridge calibrate makes it, not one "
                 "that diagnose extended"

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from magbridge.calibration.effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
-from magbridge.calibration.terms import Exponents, Polynomial, full_order
+from magbridge.calibration.terms import Exponents, full_order
 from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.problem import FALL, Problem
@@ -76,7 +76,7 @@ class ActuatorOrder(Cause):
         if not calibration.parameters:
             return []
         # What the calibration's polynomials lack, up to one order more
-        present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
+        present = {e for term in calibration.terms for e in term.exponents}
         # Legendre terms that are missing, then whole masses again, then sources near each path
         order = max(sum(e) for e in present) + 1
         missing = [e for e in full_order(len(calibration.parameters), order) if e not in present]
