@@ -146,44 +146,6 @@ def test_the_calibrations_own_columns_are_derivatives_too(agreeing: Survey, cali
         np.testing.assert_allclose(-difference, jacobian[:, k], atol=1e-5 * np.abs(jacobian).max())
 
 
-def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibration: Calibration) -> None:
-    effect = TimeEffect(cause="offset_drift", shape="drift", start=T0 + 600.0, period=300.0, order=2)
-    first, second = regressors_of(survey, calibration, effect)
-    x = np.clip((survey.time - T0 - 600.0) / 300.0, -1.0, 1.0)
-    np.testing.assert_allclose(first, x)
-    np.testing.assert_allclose(second, x**2)
-
-
-@pytest.mark.parametrize(("centre", "scale"), [(0.0, 1e3), (0.2, 0.3)])
-def test_play_remembers_the_side(
-    survey: Survey, calibration: Calibration, centre: float, scale: float
-) -> None:
-    """The backlash shifts by half its width, in full on a straight way, else only near the steel."""
-    effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=centre, scale=scale)
-    phi = regressors_of(survey, calibration, effect)[0]
-    p = survey.channels["p"].values
-    rising = np.gradient(p) > 0.01
-    steady = np.arange(len(p)) > 100
-    middle = steady & (np.abs(p) < 0.3)
-    lower, here, upper = (np.tanh((p + side - centre) / scale) for side in (-0.2, 0.0, 0.2))
-    lower, upper = scale / 0.4 * (lower - here), scale / 0.4 * (upper - here)
-    np.testing.assert_allclose(phi[rising & middle], lower[rising & middle])
-    np.testing.assert_allclose(phi[~rising & middle], upper[~rising & middle])
-    assert phi[rising & middle].max() < 0.0 < phi[~rising & middle].min()
-
-
-def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibration) -> None:
-    """The branches of an older backlash effect are polynomials of the degree in the key ``order``."""
-    effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.1, scale=0.5, order=3)
-    phi = regressors_of(survey, calibration, effect)
-    straight = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.0, scale=0.5, order=1)
-    p = survey.channels["p"].values
-    y = p + 0.5 * regressors_of(survey, calibration, straight)[0]
-    for k in range(3):
-        naive = ((y - 0.1) / 0.5) ** (k + 1) - ((p - 0.1) / 0.5) ** (k + 1)
-        np.testing.assert_allclose(phi[k], naive, atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("effect", "line"),
     [

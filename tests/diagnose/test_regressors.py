@@ -6,24 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posed import calibrated, missed, regressors_of, right, surveyed, thinned, walk
+from posed import calibrated, missed, right, surveyed, thinned, walk
 
-from magbridge.calibration.effects import (
-    ChannelEffect,
-    LegendreEffect,
-    PlayEffect,
-    PowersEffect,
-    SourcesEffect,
-    lagged,
-)
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.instrument import OffsetStep
 from magbridge.diagnose.causes.masses import ActuatorOrder
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.columns import effect_columns
-from magbridge.diagnose.problem import Problem, pose, rates
+from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.survey import MAX_LAG, TelemetryChannel
 
 
@@ -49,31 +40,6 @@ def problem() -> Problem:
     steps = np.append(MAX_LAG, np.rint(np.diff(t) / 4.0).astype(int))
     survey = surveyed(directions, p, time=t, steps=steps, channels=channels)
     return pose(survey, calibrated(rng.normal(0, 50.0, 27), centre=0.1, scale=0.9))
-
-
-FOLLOWERS = (ChannelEffect, PowersEffect, LegendreEffect, PlayEffect, SourcesEffect)
-
-
-def test_columns_are_those_of_the_stepped_effect(problem: Problem) -> None:
-    seen = 0
-    for cause in CAUSES.values():
-        for candidate in cause.candidates(problem):
-            if (
-                not all(isinstance(effect, FOLLOWERS) for effect in candidate.effects)
-                or not candidate.effects
-            ):
-                continue
-            stepped = [
-                effect_columns(problem, effect, regressors_of(problem.survey, problem.calibration, effect))(
-                    slice(0, None)
-                )
-                for effect in candidate.effects
-            ]
-            np.testing.assert_allclose(
-                candidate.columns(slice(0, None)) / candidate.width, np.hstack(stepped), rtol=1e-6, atol=1e-6
-            )
-            seen += 1
-    assert seen > 30
 
 
 @pytest.mark.parametrize("share", [0.05, 0.125])
@@ -106,16 +72,6 @@ def test_a_rate_of_change_holds_a_turn_of_a_few_samples() -> None:
     found = field_rates(replace(whole, survey=survey)).T
     np.testing.assert_allclose(found[10:-10], 0.992 * expected[10:-10], rtol=0.002, atol=1.0)
     assert not found[[0, -1]].any()
-
-
-def test_a_second_derivative_is_that_of_a_turn() -> None:
-    """The turn has 30 samples; in a separate leg, the ends have no second derivative."""
-    survey = right(300).survey
-    phase = 2.0 * np.pi * np.arange(len(survey)) / 30.0 + np.arange(3.0)[:, None]
-    found = rates(survey, 2e4 * np.sin(phase), 2)
-    expected = -2e4 * (2.0 * np.pi / 30.0 / survey.interval) ** 2 * np.sin(phase)
-    np.testing.assert_allclose(found[:, 20:-20], expected[:, 20:-20], rtol=0.005, atol=0.1)
-    assert not found[:, [0, -1]].any()
 
 
 def test_a_filter_shortens_a_field_that_turns() -> None:
@@ -201,26 +157,6 @@ def test_a_mass_that_stops_while_another_goes_on_has_no_rate(problem: Problem) -
     np.testing.assert_allclose(only_b[6:], -0.04 * (10.0 + np.arange(6.0, 9.0)), rtol=1e-6)
     np.testing.assert_allclose(both[6:] - only_b[6:], np.arange(6.0, 9.0) / 3.6 / 4.0, rtol=1e-6)
     assert not rates[:, 30:].any()
-
-
-def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
-    """A slab whose faces follow the water, by finite differences: its centre against one lag and two."""
-    dt, cells, rng = 4.0, 8, np.random.default_rng(4)
-    t = dt * np.arange(4000.0)
-    water = np.convolve(rng.normal(size=len(t)).cumsum(), np.ones(100) / 100.0, mode="same")
-    slab = np.full(cells, water[0])
-    centre = []
-    for face in water:
-        beyond = np.array([face, *slab, slab[-1]])  # half of it: nothing flows through the middle
-        slab = slab + 0.05 * np.diff(beyond, 2)
-        centre.append(slab[-1])
-    received = np.array(centre) - np.mean(centre)
-
-    def least(stages: int) -> float:
-        followed = (lagged(t, water, lag, stages) for lag in np.geomspace(500.0, 10_000.0, 40))
-        return min(missed(received, (y - y.mean())[:, None]) for y in followed)
-
-    assert least(2) < 0.25 * least(1)
 
 
 def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem: Problem) -> None:

@@ -79,64 +79,53 @@ def test_a_chance_is_written_to_one_digit(p_value: float, text: str) -> None:
     assert chance(p_value) == text
 
 
+SEEN = {"channel": "battpos", "lag_s": 2.0, "axis": "z"}
+CLOCK = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04, "follows": SEEN}
+CURRENT = {"cause": "current_field", "channel": "pitch_current"}
+
+
 def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> None:
-    seen = {"channel": "battpos", "lag_s": 2.0, "axis": "z"}
-    clock = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04, "follows": seen}
-    current = {"cause": "current_field", "channel": "pitch_current"}
-    rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current]}
-    rest |= {"follows": seen | {"channel": None}, "correlation_time_s": 112.3, "rms_nT": 19.96}
-    found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
+    rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [CLOCK, CURRENT]}
+    rest |= {"follows": SEEN | {"channel": None}, "correlation_time_s": 112.3, "rms_nT": 19.96}
+    found = {"verdict": "explained", "findings": [CLOCK | {"alternatives": [CURRENT]}], "unexplained": None}
     line = "clock_offset, S/N 9.0, follows battpos 2 s late along z; or current_field (pitch_current)"
-    assert causes_of(found | {"assessment": {"warnings": [[]]}}) == [line]
-    walks = {"assessment": {"warnings": [[{"code": "random_walk"}]]}}
-    assert causes_of(found | walks) == [f"{line} or noise that wanders"]
+    walks = [{"code": "random_walk"}]
+    for notes, expected in (([], line), (walks, f"{line} or noise that wanders")):
+        assert causes_of(found | {"assessment": {"warnings": [notes]}}) == [expected]
     nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
-    nameless |= {"assessment": {"warnings": [], "residual": {"rms_nT": 21.71, "white_nT": 3.0}}}
-    words = "resembles clock_offset, current_field (pitch_current)"
-    assert causes_of(nameless) == [
-        f"left without a name: drift, S/N 7.0, 20.0 of 21.7 nT RMS, lasts 112 s, along z; {words}"
-    ]
-    white = {"assessment": {"warnings": [], "residual": {"rms_nT": 21.71, "white_nT": 21.6}}}
-    assert "20.0 of 21.7 nT RMS, along z" in causes_of(nameless | white)[0]
-    assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == ["no cause"]
+    for white, lasts in ((3.0, "lasts 112 s, "), (21.6, "")):
+        known = {"assessment": {"warnings": [], "residual": {"rms_nT": 21.71, "white_nT": white}}}
+        (line,) = causes_of(nameless | known)
+        assert line.startswith(f"left without a name: drift, S/N 7.0, 20.0 of 21.7 nT RMS, {lasts}along z; ")
+        assert line.endswith("resembles clock_offset, current_field (pitch_current)")
+    nothing = nameless | known | {"unexplained": None, "verdict": "nothing_found"}
+    assert causes_of(nothing) == ["no cause"]
 
 
 def test_the_command_reports_what_the_improvement_was_measured_on() -> None:
     """The command reports no improvement if no cause was added: 1.14 -> 1.14 nT would look like a failure."""
-    one = {
-        "cause": "clock_offset",
-        "channel": None,
-        "signal_to_noise": 9.04,
-        "alternatives": [],
-        "follows": None,
-    }
-    facts: dict[str, Any] = {"verdict": "explained", "findings": [one], "unexplained": None, "scalar": []}
-    facts |= {"rms_before_nT": 117.42, "rms_after_nT": 74.42}
-    facts |= {"improvement": {"interval": [0.486, 0.84], "refit_nT": 101.2}}
-    use = {
-        "fit_for_use": "conditional",
-        "reason": "one_condition",
-        "summary": "Fit for use on one condition: x.",
-    }
-    facts |= {"assessment": use | {"warnings": [[{"code": "no_improvement"}]]}}
-    first, second, third = summary(facts, "dives").splitlines()
+    use = {"fit_for_use": "conditional", "summary": "Fit for use on one condition: x."}
+    facts: dict[str, Any] = {
+        "verdict": "explained", "findings": [CLOCK | {"alternatives": [], "follows": None}],
+        "unexplained": None, "scalar": [], "rms_before_nT": 117.42, "rms_after_nT": 74.42,
+        "improvement": {"interval": [0.486, 0.84], "refit_nT": 101.2},
+        "assessment": use | {"reason": "one_condition", "warnings": [[{"code": "no_improvement"}]]},
+    }  # fmt: skip
+    first, *others = summary(facts, "dives").splitlines()
     assert first == (
         "explained: error of the corrected field 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to "
         "0.84 times, 95 %); 101 nT by a refit of the calibration alone"
     )
-    assert second == "  fit for use: conditional. Fit for use on one condition: x."
-    assert third == "  clock_offset, S/N 9.0; no improvement is shown"
-    none = {"assessment": facts["assessment"] | {"reason": "not_needed"}}
-    assert summary(facts | none, "dives").startswith("nothing needs explaining: error")
-    assert "nT RMS, not held out (0.49" in summary(facts, "")
+    assert others == [
+        "  fit for use: conditional. Fit for use on one condition: x.",
+        "  clock_offset, S/N 9.0; no improvement is shown",
+    ]
     weak = facts | {"improvement": {"interval": [0.9, 1.02], "refit_nT": 101.2}}
-    assert "95 %): no improvement is shown" in summary(weak, "dives")
+    assert "nT RMS, not held out (0.90 to 1.02 times, 95 %): no improvement is shown" in summary(weak, "")
     plain = facts | {"verdict": "nothing_found", "findings": []}
     plain |= {"assessment": facts["assessment"] | {"reason": "nothing_added"}}
-    assert summary(plain, "dives").startswith(
-        "nothing_found: 117 nT RMS; nothing is added to the calibration"
-    )
-    assert "117 nT RMS, not held out;" in summary(plain, "")
+    output = summary(plain, "dives")
+    assert output.startswith("nothing_found: 117 nT RMS; nothing is added to the calibration")
 
 
 def test_a_cause_of_unusual_size_is_questioned() -> None:

@@ -111,18 +111,6 @@ def test_each_other_objection_is_reported(clear: Diagnosis) -> None:
         assert any(text in reason for reason in reasons(found)), text
 
 
-def test_where_nothing_was_added_there_is_nothing_to_fly(clear: Diagnosis) -> None:
-    plain = replace(clear, findings=(), verdict="nothing_found")
-    assert reasons(answer(plain)) == []
-    assert "it holds" in answer(plain).summary
-    rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
-    assert "expect errors like the" in answer(replace(plain, unexplained=rest)).summary
-
-
-def test_every_cause_has_a_meaning() -> None:
-    assert all(row.meaning for row in CAUSES.values())
-
-
 def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
     """The sizes of an undetectable cause would all be infinite."""
     report = clear.isolability
@@ -132,14 +120,6 @@ def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
     assert part.count("<tr><td>") == len(report.visible) - 1
     assert "Not to be found at any plausible size" in part
     assert "Not to be found at any plausible size" not in whole
-
-
-def test_predicted_and_remaining_residual_stand_next_to_each_other(clear: Diagnosis) -> None:
-    output = section(clear, "What is left")
-    assert output.count("<tr><td>") == 5
-    assert "times worse than fitted ones" not in output
-    worse = replace(clear, total=clear.total.__class__(5.0, 3.0, 0.6, (0.5, 0.7)))
-    assert "times worse than fitted ones" in section(worse, "What is left")
 
 
 def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> None:
@@ -153,15 +133,6 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
     lasts = f", which last {last} s" * residual.lasts
     assert f"in all {number(residual.rms)}\N{NO-BREAK SPACE}nT RMS{lasts})" in first
     assert f"None of {len(CAUSES)} causes is named." in below
-
-
-def test_wrong_samples_alone_promise_no_gain(clear: Diagnosis) -> None:
-    """Every RMS excludes wrong samples, and no effect is added that could improve it."""
-    wrong = Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0, lasting=False)
-    alone = replace(clear, findings=(), wrong=wrong, verdict="explained")
-    page = page_of(alone)
-    assert "(2 wrong samples). Without them, " in page
-    assert "became" not in page
 
 
 def test_the_page_is_whole(clear: Diagnosis) -> None:
@@ -208,20 +179,6 @@ def test_the_times_of_wrong_samples_are_all_or_the_first(clear: Diagnosis) -> No
     assert "1 isolated sample is wrong, at 08:00:00 UTC. No RMS before or after counts them." in output(1)
     assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC." in output(2)
     assert "13 isolated samples are wrong, the first 12 at 08:00:00, " in output(13)
-
-
-def test_a_gain_that_does_not_show_is_reported_as_none(clear: Diagnosis) -> None:
-    """An example is a compass in steps of 100 nT: a cause is named, but 588 nT become 587 nT."""
-    none = Improvement(588.1, 587.3, 0.999, (0.863, 1.021))
-    page = page_of(replace(clear, improvement=none)).replace("\N{NO-BREAK SPACE}", " ")
-    assert (
-        f"On {clear.problem.survey.parts} left out of the fit, the error of the corrected field, 588 nT RMS, "
-        "became 587 nT (ratio 1.00, 95 % interval 0.86 to 1.02: no improvement is shown)." in page
-    )
-    fitted = np.ones(len(clear.problem), bool)
-    own = replace(clear.problem, survey=replace(clear.problem.survey, fitted=fitted))
-    first = page_of(replace(clear, problem=own))
-    assert "On the log that the calibration was fitted to, the error of the corrected field, " in first
 
 
 def test_names_that_something_unexplained_keeps_are_listed(clear: Diagnosis) -> None:
