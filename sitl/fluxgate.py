@@ -221,13 +221,12 @@ class Rm3100Encoder(Encoder):
 
     def encode(self, reading: Reading) -> bytes:
         """Return the line of one reading."""
-        return rm3100.Rm3100.encode_line(results(reading, self.options.cycle_count), reading.device_time)
+        return rm3100.Rm3100.encode_line(results(reading, self.options.nt_per_count), reading.device_time)
 
 
-def results(reading: Reading, cycle_count: int) -> bytes:
+def results(reading: Reading, nt_per_count: float) -> bytes:
     """Return the nine bytes of the RM3100's result registers for a reading's field."""
-    step = rm3100.nt_per_count(cycle_count)
-    counts = (round(clip(value / step, rm3100.MAX_COUNT)) for value in reading.field)
+    counts = (round(clip(value / nt_per_count, rm3100.MAX_COUNT)) for value in reading.field)
     return b"".join(count.to_bytes(3, "big", signed=True) for count in counts)
 
 
@@ -258,7 +257,8 @@ class Rm3100Registers:
             self._registers[rm3100.STATUS] = 0x80 if is_measuring and not self.is_frozen else 0
         if register == rm3100.RESULTS:
             cycles = int.from_bytes(self._registers[4:6], "big")
-            self._registers[0x24:0x2D] = results(Reading(self.field), cycles)
+            step = rm3100.Rm3100Options(cycle_count=cycles).nt_per_count
+            self._registers[0x24:0x2D] = results(Reading(self.field), step)
             self._ready = False
         return bytes(self._registers[register : register + count])
 

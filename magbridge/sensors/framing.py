@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import pairwise
-from math import inf
+from math import inf, nan
 from operator import sub, xor
 from struct import Struct, error
+from time import monotonic
 from typing import ClassVar
 
 from magbridge.records import MAX_DEVICE_TIME_S, Reading
@@ -14,7 +16,7 @@ from magbridge.sensors import Bus
 
 __all__ = [
     "CRC32_RESIDUE", "BusDriver", "FixedFramer", "FramedDriver", "Framer", "cobs_decode", "cobs_encode",
-    "nmea_checksum", "saturated",
+    "nmea_checksum", "saturated", "wait_until",
 ]  # fmt: skip
 
 CRC32_RESIDUE = 0x2144DF1C
@@ -122,6 +124,12 @@ class FramedDriver:
         """
         raise NotImplementedError
 
+    def from_counts(self, counts: Sequence[int], limit: int, device_time: float = nan) -> Reading:
+        """Return the reading with `counts`; a channel of `limit` counts or more is saturated."""
+        x, y, z = counts
+        field = (x * self.nt_per_count, y * self.nt_per_count, z * self.nt_per_count)
+        return Reading(field, (x, y, z), device_time=device_time, saturated=saturated(x, y, z, limit))
+
     def is_bad(self, frame: bytes) -> bool:  # noqa: ARG002 - some drivers look at it
         """Return True if an invalid frame counts in `frames_bad`; False for the reply to a command."""
         return True
@@ -130,12 +138,13 @@ class FramedDriver:
 class BusDriver(FramedDriver):
     """Base of drivers of parts on an I2C or SPI bus, whose results are logged as lines of text.
 
-    A subclass defines the class attribute `name`, :meth:`configure`, :meth:`read_results` and
-    :meth:`to_reading`. A line is ``$NAME,time,results*checksum``, with the bytes of the result registers in
-    hexadecimal digits.
+    A subclass defines :meth:`configure`, :meth:`read_results`, :meth:`to_reading`, and the class attributes
+    `name` and `results_size`, the number of result registers. A line is ``$NAME,time,results*checksum``, with
+    the bytes of the result registers in hexadecimal digits.
     """
 
     name: ClassVar[bytes]
+    results_size: ClassVar[int]
 
     def __init__(self) -> None:
         super().__init__(b"\n", 64)
@@ -171,7 +180,10 @@ class BusDriver(FramedDriver):
             raise ValueError
         if not abs(float(time)) < MAX_DEVICE_TIME_S:
             raise ValueError
-        return self.to_reading(bytes.fromhex(results.decode("ascii")), float(time))
+        registers = bytes.fromhex(results.decode("ascii"))
+        if len(registers) != self.results_size:
+            raise ValueError
+        return self.to_reading(registers, float(time))
 
 
 class FixedFramer:
@@ -273,6 +285,14 @@ def cobs_decode(frame: bytes) -> bytes:
 def nmea_checksum(text: bytes) -> int:
     """Return the NMEA checksum of `text`: the exclusive or of all bytes except the first, the ``$``."""
     return reduce(xor, text[1:], 0)
+
+
+def wait_until(condition: Callable[[], bool], seconds: float, failure: str) -> None:
+    """Return when `condition()` is true; OSError with the text `failure`: it is false for `seconds`."""
+    end = monotonic() + seconds
+    while not condition():
+        if monotonic() > end:
+            raise OSError(failure)
 
 
 def saturated(x: float, y: float, z: float, limit: float) -> bool:

@@ -22,7 +22,7 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import Reading
-from magbridge.sensors.framing import FixedFramer, FramedDriver, saturated
+from magbridge.sensors.framing import FixedFramer, FramedDriver
 
 __all__ = ["Hmr2300", "Hmr2300Options"]
 
@@ -79,7 +79,7 @@ class Hmr2300(FramedDriver):
         """Process received bytes; return the readings that they complete."""
         if self._options.output == "ascii":
             return super().feed(data)
-        readings = [_reading(*counts) for counts in self._binary.split(data)]
+        readings = [self.from_counts(counts, MAX_COUNTS) for counts in self._binary.split(data)]
         self.frames_bad = self._binary.broken
         return readings
 
@@ -88,14 +88,9 @@ class Hmr2300(FramedDriver):
         match = ANSWER_LINE.fullmatch(frame)
         if match is None:
             raise ValueError
-        x, y, z = (int(number.translate(None, b" ,")) for number in match.groups())
-        return _reading(x, y, z)
+        counts = [int(number.translate(None, b" ,")) for number in match.groups()]
+        return self.from_counts(counts, MAX_COUNTS)
 
     def is_bad(self, frame: bytes) -> bool:
         """Return True for an invalid line, unless it begins with a letter, as the reply to a command does."""
         return not frame[:1].isalpha()
-
-
-def _reading(x: int, y: int, z: int) -> Reading:
-    field = (x * NT_PER_COUNT, y * NT_PER_COUNT, z * NT_PER_COUNT)
-    return Reading(field, (x, y, z), saturated=saturated(x, y, z, MAX_COUNTS))

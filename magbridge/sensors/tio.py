@@ -31,7 +31,6 @@ __all__ = [
     "STREAM_TYPE",
     "WRAP_1",
     "Device",
-    "TioSample",
     "pack",
     "requests",
     "slip",
@@ -84,41 +83,23 @@ class StreamColumn(NamedTuple):
     type: int
 
 
-class Segment(NamedTuple):
-    """Uninterrupted part of a stream, whose sample n is number ``first + n``, at ``start + n * period``."""
+class SampleLayout(NamedTuple):
+    """Layout and times of the samples of one segment; sample n has the time ``start + n * period``."""
 
+    struct: Struct
+    """Format of a sample up to the last needed channel, with padding for other columns."""
+    order: list[int]
+    """Index in `struct` of the three channels and of the temperature (-1: none); empty without channels."""
+    sizes: list[int]
+    """Lengths at which a sample may end, after each part, bytes; the last is that of a whole sample."""
+    scale: float
+    """Conversion factor from the channels' unit to nT."""
     start: int
     """Time of the first sample on the device's clock, s."""
     first: int
     """Number of the first sample in the stream."""
     period: float
     """Time between two samples, s."""
-
-
-class SampleLayout(NamedTuple):
-    """Layout of the samples of one stream."""
-
-    struct: Struct
-    """Format of a sample up to the last needed channel, with padding for other columns."""
-    order: list[int]
-    """Index in `struct` of the three channels and of the temperature; -1 without temperature."""
-    sizes: list[int]
-    """Lengths at which a sample may end, after each part, bytes; the last is that of a whole sample."""
-    scale: float
-    """Conversion factor from the channels' unit to nT."""
-
-
-class TioSample(NamedTuple):
-    """Sample of the chosen channels."""
-
-    number: int
-    """Number of the sample in its stream."""
-    time: float
-    """Time on the device's clock, s."""
-    channels: tuple[float, float, float]
-    """Field, nT."""
-    temperature: float
-    """Temperature, degC; NaN if the stream lacks it."""
 
 
 class Device:
@@ -134,7 +115,7 @@ class Device:
         self._wanted, self._unit = (*channels, temperature), unit
         self._last = 0, 0, 0  # segment, sample number and wraps of the last packet
         self._known: dict[tuple[Any, ...], Any] = {}
-        self._layouts: dict[int, SampleLayout | None] = {}
+        self._layouts: dict[tuple[int, int], SampleLayout] = {}
 
     def receive(self, kind: int, payload: bytes) -> None:
         """Process a packet without samples; struct.error, IndexError: its content is invalid."""
@@ -175,9 +156,8 @@ class Device:
         elif kind == SEGMENT_RECORD:
             number, segment, start, rate, decimation = SEGMENT_HEADER.unpack_from(record)
             rate, decimation = rate or 1, decimation or 1
-            self._store(
-                Segment(start, start * rate // decimation, decimation / rate), "segment", number, segment
-            )
+            times = start, start * rate // decimation, decimation / rate
+            self._store(times, "segment", number, segment)
 
     def _store(self, value: Any, *key: Any) -> None:
         if self._known.get(key) != value:
@@ -186,49 +166,36 @@ class Device:
             self._known[key] = value
             self._layouts.clear()
 
-    def samples(self, stream: int, payload: bytes) -> list[TioSample] | None:
+    def samples(self, stream: int, payload: bytes) -> list[tuple[int, float, list[float]]] | None:
         """Return the samples in a packet of a stream; None if the stream is not described yet.
 
-        The list is empty if the stream lacks a channel. ValueError: the packet has a wrong length, or a
-        channel has an unknown type or unit.
+        A sample has its number in the stream, its time on the device's clock (s), and the three channels (nT)
+        and the temperature (degC; NaN if the stream lacks it). The list is empty if the stream lacks a
+        channel. ValueError: the packet has a wrong length, or a channel has an unknown type or unit.
         """
         if len(payload) < 4:
             raise ValueError
-        count = int.from_bytes(payload[:4], "little")
-        segment, parts = self._segment(stream, count >> 24), self._parts(stream)
-        if segment is None or not parts or not all(parts):
-            return None
-        if stream not in self._layouts:
-            self._layouts[stream] = self._layout(parts)
-        layout = self._layouts[stream]
-        if layout is None:
-            return []
-        first = (
-            self._unwrap(count >> 24, count % WRAP_2, WRAP_2) if stream else self._unwrap(0, count, WRAP_1)
-        )
-        whole, rest = divmod(len(payload) - 4, layout.sizes[-1])
+        count, segment, wrap = int.from_bytes(payload[:4], "little"), 0, WRAP_1
+        if stream:  # generation 2: the upper 8 bits are the segment
+            count, segment, wrap = count % WRAP_2, count >> 24, WRAP_2
+        layout = self._layouts.get((stream, segment)) or self._layout(stream, segment)
+        if layout is None or not layout.order:
+            return None if layout is None else []
+        number = self._unwrap(segment, count, wrap)
+        size = len(payload) - 4
+        whole, rest = divmod(size, layout.sizes[-1])
         if rest:
-            if len(payload) - 4 not in layout.sizes:
+            if size not in layout.sizes:
                 raise ValueError
-            whole = int(len(payload) - 4 >= layout.struct.size)
+            whole = int(size >= layout.struct.size)
         samples = []
         for n in range(whole):
             values = (*layout.struct.unpack_from(payload, 4 + n * layout.sizes[-1]), nan)
             x, y, z, temperature = (values[index] for index in layout.order)
-            scale, number = layout.scale, first + n
-            time = segment.start + number * segment.period
-            samples.append(
-                TioSample(segment.first + number, time, (x * scale, y * scale, z * scale), temperature)
-            )
+            channels = [x * layout.scale, y * layout.scale, z * layout.scale, temperature]
+            time = layout.start + (number + n) * layout.period
+            samples.append((layout.first + number + n, time, channels))
         return samples
-
-    def _segment(self, stream: int, number: int) -> Segment | None:
-        """Return a segment of a stream, which in generation 1 is the whole stream; None if not described."""
-        if stream:
-            return self._known.get(("segment", stream, number))
-        _, timebase, period = self._known.get(("stream", 0), ((), -1, 0))
-        tick = self._known.get(("timebase", timebase))
-        return None if tick is None else Segment(0, 0, tick * period)
 
     def _unwrap(self, segment: int, number: int, wrap: int) -> int:
         """Return the sample number within `segment` after unwrapping: `number` plus a multiple of `wrap`."""
@@ -240,30 +207,33 @@ class Device:
         self._last = segment, number, turns
         return number + turns * wrap
 
-    def _parts(self, stream: int) -> list[tuple[StreamColumn, ...]]:
-        """Return the columns of each part of a sample; empty for a part that is not described yet."""
-        parts = self._known.get(("stream", stream), ((), 0, 1))[0]
-        keys = [("column", stream, part) if stream else ("source", part) for part in parts]
-        return [self._known.get(key, ()) for key in keys]
-
-    def _layout(self, parts: list[tuple[StreamColumn, ...]]) -> SampleLayout | None:
-        """Return the layout of samples with the given parts; None if they lack a channel."""
-        columns = [column for part in parts for column in part]
-        names = [column.name for column in columns]
-        if not set(self._wanted[:3]) <= set(names):
+    def _layout(self, stream: int, segment: int) -> SampleLayout | None:
+        """Return the layout of the samples of a segment, and store it; None if it is not described yet."""
+        sources, timebase, ticks = self._known.get(("stream", stream), ((), -1, 0))
+        keys = [("column", stream, part) if stream else ("source", part) for part in sources]
+        parts = [self._known.get(key, ()) for key in keys]
+        times = self._known.get(("segment", stream, segment))
+        if not stream and ("timebase", timebase) in self._known:  # generation 1 has one segment
+            times = 0, 0, self._known["timebase", timebase] * ticks
+        if times is None or not parts or not all(parts):
             return None
+        columns = [column for part in parts for column in part]
+        # the format skips the columns that are not wanted, also those of unknown types
+        names = [column.name for column in columns]
         wanted = [names.index(name) for name in self._wanted if name in names]
-        scale = NT_PER_UNIT.get(self._unit or columns[wanted[0]].unit)
-        if scale is None or any(columns[index].type not in TYPE_FORMATS for index in wanted):
-            raise ValueError
-        form = "<"
-        for index, column in enumerate(columns[: max(wanted) + 1]):
-            form += TYPE_FORMATS[column.type] if index in wanted else f"{column.type >> 4}x"
+        form, order, scale = "<", [], 1.0
+        if set(self._wanted[:3]) <= set(names):
+            scale = NT_PER_UNIT.get(self._unit or columns[wanted[0]].unit, 0.0)
+            if not scale or any(columns[index].type not in TYPE_FORMATS for index in wanted):
+                raise ValueError
+            for index, column in enumerate(columns[: max(wanted) + 1]):
+                form += TYPE_FORMATS[column.type] if index in wanted else f"{column.type >> 4}x"
+            places = sorted(set(wanted))
+            order = [*(places.index(index) for index in wanted), -1][:4]
         ends = [0, *accumulate(column.type >> 4 for column in columns)]
-        sizes = [ends[count] for count in accumulate(len(part) for part in parts)]
-        places = sorted(set(wanted))
-        order = [places.index(index) for index in wanted]
-        return SampleLayout(Struct(form), [*order, -1][:4], sizes, scale)
+        sizes = [ends[count] for count in accumulate(map(len, parts))]
+        layout = self._layouts[stream, segment] = SampleLayout(Struct(form), order, sizes, scale, *times)
+        return layout
 
 
 def _columns(text: bytes, channels: int, code: int) -> tuple[StreamColumn, ...]:

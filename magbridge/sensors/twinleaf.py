@@ -74,7 +74,7 @@ class Twinleaf(FramedDriver):
         if samples is None:
             self._framer.skipped += len(payload)
         readings = []
-        for number, time, (x, y, z), temperature in samples or ():
+        for number, time, (x, y, z, temperature) in samples or ():
             is_field = abs(x) + abs(y) + abs(z) < MAX_MEASURED_NT  # False for NaN
             if not is_field or abs(temperature) > MAX_MEASURED_NT:
                 self.frames_bad += 1

@@ -13,7 +13,7 @@ from magbridge.bridge.devices import BusPort, sensor_port
 from magbridge.config import load
 from magbridge.errors import ConfigError, PortError
 from magbridge.records import Reading
-from magbridge.sensors.rm3100 import Rm3100, Rm3100Options, nt_per_count
+from magbridge.sensors.rm3100 import Rm3100, Rm3100Options
 from sitl.fluxgate import Rm3100Registers
 
 
@@ -28,7 +28,7 @@ def read_one(part: Rm3100, bus: Rm3100Registers) -> Reading:
 
 @pytest.mark.parametrize(("cycles", "counts_per_ut"), [(50, 20.0), (100, 38.0), (200, 75.0), (400, 148.0)])
 def test_the_gain_is_that_of_the_data_sheet(cycles: int, counts_per_ut: float) -> None:
-    assert 1e3 / nt_per_count(cycles) == pytest.approx(counts_per_ut, rel=0.01)
+    assert 1e3 / driver(cycle_count=cycles).nt_per_count == pytest.approx(counts_per_ut, rel=0.01)
 
 
 @pytest.mark.parametrize("mode", ["continuous", "single"])
@@ -38,7 +38,7 @@ def test_field_axes_and_sign_come_back(mode: str, cycles: int) -> None:
     part.configure(bus)
     for _ in range(3):
         reading = read_one(part, bus)
-        assert reading.field == pytest.approx(bus.field, abs=nt_per_count(cycles) / 2)
+        assert reading.field == pytest.approx(bus.field, abs=part.nt_per_count / 2)
     assert reading.device_time == 1.5
 
 
