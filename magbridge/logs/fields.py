@@ -54,7 +54,7 @@ class FieldMap(NamedTuple):
         values = np.asarray(raw, np.float64)
         if self.missing:
             values = np.where(np.isin(values, self.missing), np.nan, values)
-        return values * self.factor
+        return values * self.factor + 0.0  # without the negative zero of a negative factor
 
 
 def field_maps(name: str) -> dict[str, list[FieldMap]]:

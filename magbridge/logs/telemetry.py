@@ -12,7 +12,7 @@ sender. Every other column is the vehicle's last value at or before the row, and
   ``mag1_x`` ... ``mag3_z``.
 - Without these messages, each ``ATTITUDE`` or position makes a row, and the deployment has no ``mag_x``.
 
-Telemetry has three sources: columns that the log declares by ``MAG_COLUMN``, the fields in :data:`TELEMETRY`,
+Telemetry has three sources: columns that the log declares by ``MAG_COLUMN``, the fields of ``fields.csv``,
 and every ``NAMED_VALUE_FLOAT`` by its name. Logs of a bridge (with the age of each value) and of
 :mod:`.telemetry_writer` declare columns. If a bridge's clock was set, all rows are dated by its last setting.
 Attitude and position come from the autopilot, not from a gimbal. A named value never replaces a column that
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,7 +38,7 @@ from magbridge.columns import AGE, CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass, by_columns, choose, compass_notes, listed
 from magbridge.logs.deployment import CHANGES_SETTING, NOTES, deployment, sliced
-from magbridge.logs.fields import MAX_AGE, FieldMap, field_maps
+from magbridge.logs.fields import MAX_AGE, FieldMap, field_maps, fields_of
 from magbridge.logs.telemetry_writer import POWER_CYCLE, FileWriter
 from magbridge.mavlink import Source, spec
 from magbridge.mavlink.messages import split_index
@@ -51,15 +52,19 @@ __all__ = ["FileWriter", "chunks"]
 
 Payloads = NDArray[np.uint8]
 """(n, size): Payloads of messages of one kind, padded with zeros to full size."""
-MAVLINK_FIELDS = field_maps("mavlink")
-"""Message -> its fields, without the invalid values of the dialect, which :class:`MessageField` adds."""
+MAVLINK_FIELDS = {spec(message).id: fields for message, fields in field_maps("mavlink").items()}
+"""Message id -> fields that fill columns."""
 SOURCES = field_maps("mavlink_rows") | {"ATTITUDE": [], "GLOBAL_POSITION_INT": []}
 """Messages that can make the rows, the best first -> fields of the message that fill columns."""
+SOURCE_FIELDS = {spec(message).id: fields for message, fields in SOURCES.items()}
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED_VALUE_FLOAT = spec("NAMED_VALUE_FLOAT").id
-RAW_COLUMNS = {one.column: one.unit for one in SOURCES["MAG_RAW"]}
+NAME_LETTERS = spec(NAMED_VALUE_FLOAT).fields["name"]
+RAW_COLUMNS = {one.column: one.unit for one in SOURCE_FIELDS[RAW]}
+READ_MESSAGES = [*MAVLINK_FIELDS, *SOURCE_FIELDS, NAMED_VALUE_FLOAT, COLUMN, STEP, START, BYTES, SET, VALUE]
+"""Ids of the messages that are always read; a log adds those in which it declares a column."""
 COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
 """Message -> number of the compass whose field it holds; of several for one compass, the first is read."""
 AUTOPILOT = 1
@@ -74,97 +79,19 @@ SENSOR_ID, OTHER_TIME = "sensor_id", "_time"
 """Field that assigns a column to a second or further sensor; ending of the column with its times."""
 
 
-class MessageField:
-    """Reader of one column from the payloads of a message: ``factor * field + offset``, in `unit`."""
+@cache
+def _place(number: int, field: str) -> tuple[slice, np.dtype[Any], float | None]:
+    """Return the bytes, the type and the invalid value of a field of numbers, as ``roll`` or ``data[3]``.
 
-    def __init__(self, source: FieldMap, offset: float = 0.0) -> None:
-        name, index = split_index(source.field)
-        field = spec(source.record).fields[name]
-        if field.code == "s":
-            raise ValueError(f"{source.record}.{name}: expected a field of numbers")
-        self.message = spec(source.record).id
-        self.column, self.unit, self.factor, self.offset = source.column, source.unit, source.factor, offset
-        self._layout = np.dtype(f"<{field.code}")
-        self._start = field.offset + (index or 0) * self._layout.itemsize
-        unknown = source.missing if field.invalid is None else (*source.missing, field.invalid)
-        self._source = source._replace(missing=unknown)
-
-    def values(self, payloads: Payloads) -> FloatArray:
-        """Return the values (n,) of the column in payloads (n, size); NaN where the sender has no value."""
-        raw = payloads[:, self._start : self._start + self._layout.itemsize].copy().view(self._layout)[:, 0]
-        return self._source.values(raw) + self.offset
-
-
-class DeclaredField(MessageField):
-    """Reader of a column that the log itself declares by a ``MAG_COLUMN``.
-
-    `match`: values, as text, that other fields of the message must have. `component`: the only sender that
-    counts, or None for any.
+    KeyError, ValueError: message `number` has no field of numbers with this name.
     """
-
-    def __init__(self, declaration: Mapping[str, Any]) -> None:
-        layout = spec(declaration["message"])
-        unit, scale = declaration["unit"] or "1", declaration["scale"]
-        source = FieldMap(layout.name, declaration["field"], declaration["column"], unit, scale)
-        super().__init__(source, declaration["offset"])
-        self.component: int | None = declaration["component"] or None
-        self.match = dict(part.split("=", 1) for part in declaration["match"].split(",") if part)
-        self._others = [(layout.fields[name], text) for name, text in self.match.items()]
-
-    @property
-    def is_named_value(self) -> bool:
-        """Return True if the column is a ``NAMED_VALUE_FLOAT`` that is selected by its name alone."""
-        return self.message == NAMED_VALUE_FLOAT and self.match.keys() == {"name"}
-
-    def matches(self, payloads: Payloads) -> BoolArray:
-        """Return a mask (n,) of the payloads (n, size) that hold the column."""
-        found = np.ones(len(payloads), bool)
-        for field, text in self._others:
-            part = payloads[:, field.offset : field.offset + field.struct.size]
-            kinds, first, kind = np.unique(part, axis=0, return_index=True, return_inverse=True)
-            shown = text.encode().decode("ascii", "replace")  # as fields are read
-            equal = [str(field.get(payloads[k].tobytes())) == shown for k in first.tolist()]
-            found &= np.array(equal, bool)[kind.ravel()] if len(kinds) else found
-        return found
-
-
-TELEMETRY = {
-    spec(message).id: [MessageField(one) for one in fields] for message, fields in MAVLINK_FIELDS.items()
-}
-"""Message id -> readers of the columns in the message."""
-SOURCE_FIELDS = {
-    spec(message).id: [MessageField(one) for one in fields] for message, fields in SOURCES.items()
-}
-SENSOR_IDS = {number: spec(number).fields["sensor_id"].offset for number in (RAW, FIELD)}
-STAMP_FIELDS = {
-    number: MessageField(FieldMap(spec(number).name, "time_usec", "time", "us")) for number in (RAW, FIELD)
-}
-DELAY_FIELDS = [
-    MessageField(FieldMap("MAG_RAW", f"delay_{axis}", name, "us"))
-    for axis, name in zip("xyz", CHANNEL_TIMES, strict=True)
-]
-NAMED_FIELD = MessageField(FieldMap("NAMED_VALUE_FLOAT", "value", "value", "1"))
-NAME_LETTERS = spec(NAMED_VALUE_FLOAT).fields["name"]
-RAW_FLAGS = MessageField(FieldMap("MAG_RAW", "flags", "flags", ""))
-READ_MESSAGES = [*TELEMETRY, *SOURCE_FIELDS, NAMED_VALUE_FLOAT, COLUMN, STEP, START, BYTES, SET, VALUE]
-"""Ids of the messages that are always read; a log adds those in which it declares a column."""
-
-
-def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
-    """Return the columns (n,) that messages with id `number` fill in their rows; a bridge's fill ``time``."""
-    columns = {one.column: one.values(payloads) for one in SOURCE_FIELDS[number]}
-    if number not in SENSOR_IDS:
-        return columns
-    time_us = STAMP_FIELDS[number].values(payloads)
-    columns["time"] = time_us / 1e6
-    if number == RAW:
-        delays_us = [field.values(payloads) for field in DELAY_FIELDS]
-        in_turn = np.any(delays_us, axis=0)
-        for one, delay_us in zip(DELAY_FIELDS, delays_us, strict=True):
-            columns[one.column] = np.where(in_turn, (time_us + delay_us) / 1e6, np.nan)
-        counted = RAW_FLAGS.values(payloads).astype(np.int64) & POWER_CYCLE
-        columns["power_cycle"] = np.where(counted > 0, columns["power_cycle"], np.nan)
-    return columns
+    name, index = split_index(field)
+    one = spec(number).fields[name]
+    if one.code == "s":
+        raise ValueError(f"{spec(number).name}.{name}: expected a field of numbers")
+    kind = np.dtype(f"<{one.code}")
+    start = one.offset + (index or 0) * kind.itemsize
+    return slice(start, start + kind.itemsize), kind, one.invalid
 
 
 class LogMessages(NamedTuple):
@@ -186,12 +113,22 @@ class LogMessages(NamedTuple):
         arrays: list[Any] = [array[keep] for array in self[1:]]
         return LogMessages(self.number, *arrays)
 
+    def numbers(self, field: str) -> FloatArray:
+        """Return the values (n,) of a field, as float64; NaN where the sender states that it has none."""
+        place, kind, invalid = _place(self.number, field)
+        raw = self.payloads[:, place].copy().view(kind)[:, 0].astype(np.float64)
+        return raw if invalid is None else np.where(raw == invalid, np.nan, raw)
+
+    def columns(self, fields: Sequence[FieldMap]) -> Iterator[tuple[str, str, FloatArray]]:
+        """Yield column, unit and values (n,) of each of the `fields`."""
+        return fields_of(fields, {one.field: self.numbers(one.field) for one in fields})
+
     @property
     def is_of_main_sensor(self) -> BoolArray:
         """Return a mask (n,) that is False for samples of a second or further sensor."""
-        if self.number not in SENSOR_IDS:
+        if self.number not in (RAW, FIELD):
             return np.ones(len(self.at), bool)
-        return np.asarray(self.payloads[:, SENSOR_IDS[self.number]] == 0)
+        return np.asarray(self.numbers(SENSOR_ID) == 0)
 
     def senders(self) -> dict[tuple[int, int], int]:
         """Return the number of messages of each system and component."""
@@ -202,6 +139,67 @@ class LogMessages(NamedTuple):
         """Return the fields of each message by name."""
         fields = spec(self.number).fields
         return [{name: one.get(row.tobytes()) for name, one in fields.items()} for row in self.payloads]
+
+
+class DeclaredColumn(NamedTuple):
+    """Column that the log itself declares by a ``MAG_COLUMN``: ``factor * number + offset``."""
+
+    number: int
+    """Id of the message that holds the column."""
+    source: FieldMap
+    offset: float
+    match: dict[str, str]
+    """Values, as text, that other fields of the message must have."""
+    component: int | None
+    """The only sender that counts; None for any."""
+
+    def values(self, messages: LogMessages) -> FloatArray:
+        """Return the values (n,) of the column in messages of its kind."""
+        return self.source.values(messages.numbers(self.source.field)) + self.offset
+
+    def matches(self, messages: LogMessages) -> BoolArray:
+        """Return a mask (n,) of the messages that hold the column."""
+        found = np.ones(len(messages.at), bool)
+        for name, text in self.match.items():
+            field = spec(messages.number).fields[name]
+            part = messages.payloads[:, field.offset : field.offset + field.struct.size]
+            kinds, first, kind = np.unique(part, axis=0, return_index=True, return_inverse=True)
+            shown = text.encode().decode("ascii", "replace")  # as fields are read
+            equal = [str(field.get(messages.payloads[k].tobytes())) == shown for k in first.tolist()]
+            found &= np.array(equal, bool)[kind.ravel()] if len(kinds) else found
+        return found
+
+
+def _declared(fields: Mapping[str, Any]) -> DeclaredColumn:
+    """Return the column that the fields of a ``MAG_COLUMN`` declare.
+
+    KeyError, ValueError: the dialect lacks the message or a field.
+    """
+    layout = spec(fields["message"])
+    match = dict(part.split("=", 1) for part in fields["match"].split(",") if part)
+    for name in match:
+        layout.fields[name]
+    _place(layout.id, fields["field"])
+    unit = fields["unit"] or "1"
+    source = FieldMap(layout.name, fields["field"], fields["column"], unit, fields["scale"])
+    return DeclaredColumn(layout.id, source, fields["offset"], match, fields["component"] or None)
+
+
+def source_columns(messages: LogMessages) -> dict[str, FloatArray]:
+    """Return the columns (n,) that messages fill in their own rows; a bridge's also fill ``time``."""
+    columns = {column: values for column, _, values in messages.columns(SOURCE_FIELDS[messages.number])}
+    if messages.number not in (RAW, FIELD):
+        return columns
+    time_us = messages.numbers("time_usec")
+    columns["time"] = time_us / 1e6
+    if messages.number == RAW:
+        delays_us = [messages.numbers(f"delay_{axis}") for axis in "xyz"]
+        in_turn = np.any(delays_us, axis=0)
+        for name, delay_us in zip(CHANNEL_TIMES, delays_us, strict=True):
+            columns[name] = np.where(in_turn, (time_us + delay_us) / 1e6, np.nan)
+        counted = messages.numbers("flags").astype(np.int64) & POWER_CYCLE
+        columns["power_cycle"] = np.where(counted > 0, columns["power_cycle"], np.nan)
+    return columns
 
 
 Kinds = dict[int, LogMessages]
@@ -292,11 +290,12 @@ class TelemetryLog:
         is_of_bridge = self.source in ("MAG_RAW", "MAG_FIELD")
         self.is_plain = not (is_of_bridge or self.ours or declared or self._steps_us[-1])
         self._updates: dict[str, list[Update]] = {}
-        self._units = self._telemetry({one.column for one in declared})
+        self._units = self._telemetry({one.source.column for one in declared})
         self._units |= self._columns_of_bridge()
         self._declared = declared
         self._add_declared()
-        self._add_named({one.match["name"] for one in declared if one.is_named_value})
+        by_name = (one.match for one in declared if one.number == NAMED_VALUE_FLOAT)
+        self._add_named({match["name"] for match in by_name if match.keys() == {"name"}})
 
     def _source_of(self, path: Path, kinds: Kinds) -> tuple[str, tuple[int, int]]:
         """Return the message that makes the rows, and its most frequent sender (system, component)."""
@@ -322,15 +321,15 @@ class TelemetryLog:
                 aligns = name.startswith("MB_") and not name.startswith("MB_R_")
                 self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
-    def _declarations(self, messages: LogMessages) -> list[DeclaredField]:
+    def _declarations(self, messages: LogMessages) -> list[DeclaredColumn]:
         """Return the columns that the log declares; store its declared attributes in `attrs`."""
-        found: dict[str, DeclaredField] = {}
+        found: dict[str, DeclaredColumn] = {}
         for one in messages.decoded():
             if not one["message"]:
                 self.attrs[one["column"]] = one["unit"] or one["scale"]
                 continue
             with suppress(KeyError, ValueError):  # a message or field that this dialect lacks
-                found[one["column"]] = DeclaredField(one)
+                found[one["column"]] = _declared(one)
         return [*found.values()]
 
     def compasses(self) -> list[LogCompass]:
@@ -352,14 +351,14 @@ class TelemetryLog:
         return found.chosen(found.component == self._component)
 
     def _telemetry(self, declared: set[str]) -> dict[str, str]:
-        """Add the columns of :data:`TELEMETRY`; return the units of the columns that have a value.
+        """Add the columns of :data:`MAVLINK_FIELDS`; return the units of the columns that have a value.
 
         Each message is read from one component: the sender of the rows, else the autopilot, else the most
         frequent sender. Gimbals come last.
         """
         units: dict[str, str] = {}
         read = []
-        for number, fields in TELEMETRY.items():
+        for number, fields in MAVLINK_FIELDS.items():
             messages = _messages_of(self._kinds, number)
             ranks = [
                 (one == self._component, one == AUTOPILOT, one not in GIMBALS, n, one)
@@ -368,11 +367,10 @@ class TelemetryLog:
             if not ranks:
                 continue
             messages = messages.chosen(messages.component == max(ranks)[-1])
-            for field in fields:
-                values = field.values(messages.payloads)
-                read.append((field.column, messages, values))
+            for column, unit, values in messages.columns(fields):
+                read.append((column, messages, values))
                 if not np.isnan(values).all():
-                    units.setdefault(field.column, field.unit)
+                    units.setdefault(column, unit)
         for column, messages, values in read:
             if column in units and column not in declared:
                 self._updates.setdefault(column, []).append((messages, values))
@@ -381,7 +379,7 @@ class TelemetryLog:
     def _columns_of_bridge(self) -> dict[str, str]:
         """Return the units of the columns that have a value in a bridge's ``MAG_RAW`` or ``MAG_FIELD``."""
         raw = _messages_of(self._kinds, RAW)
-        columns = source_columns(RAW, raw.payloads[raw.is_of_main_sensor])
+        columns = source_columns(raw.chosen(raw.is_of_main_sensor))
         possible = (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS)
         there = [name for name in possible if not np.isnan(columns[name]).all()]
         there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
@@ -393,14 +391,14 @@ class TelemetryLog:
         """Add the columns that the log declares, with the ages of their values in a bridge's own log."""
         source = spec(self.source).id
         for one in self._declared:
-            self._units[one.column] = one.unit
-            if self.ours and one.message not in (RAW, FIELD):
-                self._units[AGE + one.column] = "s"
-            if one.message == source:
+            self._units[one.source.column] = one.source.unit
+            if self.ours and one.number not in (RAW, FIELD):
+                self._units[AGE + one.source.column] = "s"
+            if one.number == source:
                 continue
-            messages = _messages_of(self._kinds, one.message)
-            messages = messages.chosen(one.matches(messages.payloads))
-            self._add_admitted(one.column, one.component, messages, one.values(messages.payloads))
+            messages = _messages_of(self._kinds, one.number)
+            messages = messages.chosen(one.matches(messages))
+            self._add_admitted(one.source.column, one.component, messages, one.values(messages))
 
     def _add_admitted(
         self, column: str, component: int | None, messages: LogMessages, values: FloatArray
@@ -422,7 +420,7 @@ class TelemetryLog:
             if name in declared:
                 continue
             messages = named.chosen((letters == row).all(axis=1))
-            values = NAMED_FIELD.values(messages.payloads)
+            values = messages.numbers("value")
             own = f"named_{name}" if name in self._units or name in RESERVED_COLUMNS else name
             if own != name:
                 why = f"the log has a {name} of its own"
@@ -441,14 +439,14 @@ class TelemetryLog:
         main = samples.is_of_main_sensor
         rows = samples.chosen(main)
         others = samples.chosen(~main)
-        of_others = [one for one in self._declared if one.message == others.number and SENSOR_ID in one.match]
+        of_others = [one for one in self._declared if one.number == others.number and SENSOR_ID in one.match]
         for one in of_others:
-            messages = others.chosen(one.matches(others.payloads))
-            values = one.values(messages.payloads)
-            if one.column.endswith(OTHER_TIME):
+            messages = others.chosen(one.matches(others))
+            values = one.values(messages)
+            if one.source.column.endswith(OTHER_TIME):
                 values = values + self._to_step_us(messages.at) / 1e6
-            self._updates.setdefault(one.column, []).append((messages, values))
-        raw = {one.column for one in TELEMETRY.get(rows.number, []) if one.column.startswith("mag")}
+            self._updates.setdefault(one.source.column, []).append((messages, values))
+        raw = {one.column for one in MAVLINK_FIELDS.get(rows.number, []) if one.column.startswith("mag")}
         own = [f"mag_{axis}" for axis in "xyz" if "IMU" in self.source]
         columns = {name: np.full(len(rows.at), np.nan) for name in (*own, *self._units) if name not in raw}
         for name, updates in self._updates.items():
@@ -458,7 +456,7 @@ class TelemetryLog:
                     columns[AGE + name] = age_s
         time = self._fill(rows, columns)
         self._correct(rows, columns)
-        _bring_to_rows(time, columns, [one.column for one in of_others])
+        _bring_to_rows(time, columns, [one.source.column for one in of_others])
         if "heading" in columns:
             columns["heading"] %= 360.0
         return time, columns, {name: self._units.get(name, "") for name in columns}
@@ -470,12 +468,12 @@ class TelemetryLog:
 
     def _fill(self, rows: LogMessages, columns: dict[str, FloatArray]) -> FloatArray:
         """Set the columns (n,) that the rows' own messages hold, in place; return the times (n,), s."""
-        found = source_columns(rows.number, rows.payloads)
+        found = source_columns(rows)
         for one in self._declared:
-            if one.message == rows.number and SENSOR_ID not in one.match and one.column in found:
-                exact, single = one.values(rows.payloads), found[one.column]
-                same = np.isclose(exact, single, rtol=SINGLE, atol=0.0) & one.matches(rows.payloads)
-                found[one.column] = np.where(same, exact, single)
+            if one.number == rows.number and SENSOR_ID not in one.match and one.source.column in found:
+                exact, single = one.values(rows), found[one.source.column]
+                same = np.isclose(exact, single, rtol=SINGLE, atol=0.0) & one.matches(rows)
+                found[one.source.column] = np.where(same, exact, single)
         to_step_us = self._to_step_us(rows.at)
         if "time" not in found:
             found["time"] = (rows.time_us + self._steps_us[-1] - to_step_us) / 1e6
@@ -495,7 +493,7 @@ class TelemetryLog:
         if not len(found.at):
             return
         row = np.searchsorted(rows.at, found.at, side="right") - 1
-        values = source_columns(FIELD, found.payloads)
+        values = source_columns(found)
         is_free = (row >= 0) & np.isnan(columns["total_field"][row])
         # of several for one row, the first with a total field counts: it is written last
         has_total = ~np.isnan(values["total_field"])
