@@ -14,17 +14,28 @@ from inspect import signature
 from itertools import accumulate, chain, pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
+
+import xarray as xr
 
 from magbridge.columns import counts_from_boot, decoded, in_seconds, require
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
+from magbridge.logs.checks import checked, increasing
+from magbridge.logs.compasses import by_columns
+from magbridge.logs.deployment import (
+    join,
+    passed_over,
+    renamed,
+    same_columns,
+    shifted,
+    uncounted,
+    with_losses,
+)  # fmt: skip
 from magbridge.logs.mapping import Options
+from magbridge.logs.merge import combine, merge, refuse_offset
 from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_of, is_bag, metadata_path
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
@@ -66,8 +77,6 @@ def read(
     MissingExtra
         The format needs a package that is not installed.
     """
-    from magbridge.logs.deployment import join  # noqa: PLC0415 - xarray is for ashore
-
     dataset = join(read_each(paths, options=options))
     require(dataset, required)
     return decoded(dataset) if decode_times else dataset
@@ -78,8 +87,6 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
 
     A log of a sensor's own logger gets the telemetry of the vehicle's logs, which are then not returned.
     """
-    from magbridge.logs.merge import combine  # noqa: PLC0415 - xarray is for ashore
-
     files = _Files(_paths(paths, options), options)
     whole, named = [], []
     for k in range(len(files.paths)):
@@ -98,8 +105,6 @@ def read_chunks(
     A single CSV, netCDF or Parquet file is streamed in bounded memory. A file of another format is in memory
     as a whole. Each of several files is in memory from its first time to its last.
     """
-    from magbridge.logs.merge import merge, refuse_offset  # noqa: PLC0415 - xarray is for ashore
-
     files = _Files(_paths(paths, options), options)
     sources = [partial(files.pieces, k) for k in range(len(files.paths))]
     required = tuple(required)
@@ -142,8 +147,6 @@ class _Files:
 
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
         """Return the deployment with attributes that count and name the files skipped since the last call."""
-        from magbridge.logs.deployment import with_losses  # noqa: PLC0415 - xarray is for ashore
-
         lines = [str(error) for error in self._bad.values()][self._reported :]
         self._reported += len(lines)
         return with_losses(dataset, {"files_skipped": len(lines)}, lines) if lines else dataset
@@ -200,9 +203,6 @@ def _chunks(
     path: Path, rows: int, options: Options, contents: Iterator[Any] | None = None
 ) -> Iterator[xr.Dataset]:
     """Yield a file's pieces, checked and dated; `contents` are its pieces if a shared child reads them."""
-    from magbridge.logs.checks import checked  # noqa: PLC0415 - xarray is for ashore
-    from magbridge.logs.deployment import passed_over  # noqa: PLC0415
-
     if not path.stat().st_size:
         raise FormatError(path, "expected a log, the file is empty")
     form = format_of(path)
@@ -212,12 +212,8 @@ def _chunks(
     try:
         numbered = _numbered(contents or (guarded(path, pieces) if form.guarded else pieces()))
         if options.compass is not None and not form.compasses:
-            from magbridge.logs.compasses import by_columns  # noqa: PLC0415 - xarray is for ashore
-
             numbered = ((by_columns(piece, options.compass), rows) for piece, rows in numbered)
         if options.declared.columns and not form.maps_columns:
-            from magbridge.logs.mapping import renamed  # noqa: PLC0415 - xarray is for ashore
-
             numbered = ((renamed(piece, options.declared), rows) for piece, rows in numbered)
         for part in checked(path, numbered, strict=options.strict):
             if options.strict and (lost := passed_over(part.attrs)):
@@ -249,7 +245,6 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
     """Return the deployment with `date` (s since 1970 UTC) added to times that count from a boot."""
     if date is None or not counts_from_boot(part):
         return part
-    from magbridge.logs.deployment import shifted  # noqa: PLC0415 - xarray is for ashore
 
     moved = shifted(part, date)
     moved.attrs.pop("time_reference", None)
@@ -317,9 +312,6 @@ class Writer:
 
         FormatError: time does not increase, or a column was not in the first deployment.
         """
-        from magbridge.logs.checks import increasing  # noqa: PLC0415 - xarray is for ashore
-        from magbridge.logs.deployment import same_columns, uncounted  # noqa: PLC0415
-
         dataset = in_seconds(dataset)
         first = not self._columns
         if first:

@@ -11,9 +11,18 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from magbridge.columns import CHANNEL_TIMES, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, in_seconds, usual
+from magbridge.columns import (
+    CHANNEL_TIMES,
+    COLUMNS,
+    FURTHER_AXIS,
+    NT_PER_UNIT,
+    factor,
+    in_seconds,
+    require,
+    usual,
+)  # fmt: skip
 from magbridge.errors import FormatError
-from magbridge.logs.mapping import split
+from magbridge.logs.mapping import ColumnMapping, ColumnSource, split
 from magbridge.records import Quality
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
@@ -133,6 +142,31 @@ def same_columns(dataset: xr.Dataset, like: Mapping[str, Mapping[str, Any]]) -> 
         for name, attrs in like.items()
     }
     return xr.Dataset(variables, coords={"time": dataset["time"]}, attrs=dataset.attrs)
+
+
+def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
+    """Return the deployment with columns renamed and scaled as declared, for formats with fixed names."""
+    taken: dict[str, Any] = {}
+    for name, source in declaration.columns.items():
+        theirs, unit = _column(dataset, name, source)
+        require(dataset, [theirs])
+        values = source.scale * dataset[theirs].to_numpy() + source.offset
+        unit = unit or str(dataset[theirs].attrs.get("units", ""))
+        part = deployment(dataset.attrs["source"], dataset["time"].to_numpy(), {name: values}, {name: unit})
+        taken[name] = part[name]
+    used = {_column(dataset, name, source)[0] for name, source in declaration.columns.items()}
+    named = dataset.drop_vars(used - declaration.columns.keys()).assign(taken)
+    reference = declaration.heading_reference
+    return named.assign_attrs({"heading_reference": reference}) if reference else named
+
+
+def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, str]:
+    """Return the name that the source of column `name` has in the deployment, and its declared unit."""
+    theirs = source.heading or name
+    if theirs in dataset:
+        return theirs, source.unit or ""
+    theirs, unit = split(theirs)
+    return theirs, source.unit or unit
 
 
 def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:

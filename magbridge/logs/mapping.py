@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import msgspec
@@ -24,9 +24,6 @@ import msgspec
 from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
 from magbridge.errors import WrongUse
 from magbridge.toml import Table, check_entries, convert, load_toml
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 MAKERS_FILE = Path(__file__).with_name("makers.toml")
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
@@ -141,34 +138,6 @@ def _named(text: str) -> tuple[str, ColumnSource]:
     if not (name and equals and heading):
         raise WrongUse(f'--column {text}: expected NAME="THEIRS [unit]", as mag_x="Bx [uT]"')
     return name, ColumnSource(heading=heading)
-
-
-def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
-    """Return the deployment with columns renamed and scaled as declared, for formats with fixed names."""
-    from magbridge.columns import require  # noqa: PLC0415 - xarray is for ashore
-    from magbridge.logs.deployment import deployment  # noqa: PLC0415
-
-    taken: dict[str, Any] = {}
-    for name, source in declaration.columns.items():
-        theirs, unit = _column(dataset, name, source)
-        require(dataset, [theirs])
-        values = source.scale * dataset[theirs].to_numpy() + source.offset
-        unit = unit or str(dataset[theirs].attrs.get("units", ""))
-        part = deployment(dataset.attrs["source"], dataset["time"].to_numpy(), {name: values}, {name: unit})
-        taken[name] = part[name]
-    used = {_column(dataset, name, source)[0] for name, source in declaration.columns.items()}
-    named = dataset.drop_vars(used - declaration.columns.keys()).assign(taken)
-    reference = declaration.heading_reference
-    return named.assign_attrs({"heading_reference": reference}) if reference else named
-
-
-def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, str]:
-    """Return the name that the source of column `name` has in the deployment, and its declared unit."""
-    theirs = source.heading or name
-    if theirs in dataset:
-        return theirs, source.unit or ""
-    theirs, unit = split(theirs)
-    return theirs, source.unit or unit
 
 
 class Maker(Table, frozen=True):

@@ -33,7 +33,7 @@ from magbridge.logs.deployment import (
     sliced,
     uncounted,
     with_losses,
-)
+)  # fmt: skip
 from magbridge.logs.fields import CIRCLES, latest, linear
 
 Open = Callable[[int], Iterator[xr.Dataset]]
