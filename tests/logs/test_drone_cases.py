@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -95,6 +96,25 @@ def test_records_without_any_time_are_named(tmp_path: Path) -> None:
         FormatError, match="expected an ArduPilot log with MAG records, whose records have times"
     ):
         logs.read(path)
+
+
+def test_angles_currents_and_places_are_in_the_rows(tmp_path: Path) -> None:
+    log = Log()
+    log.write_message("BAT", 5_000_000, 1, 12.0, 0.5)
+    back = logs.read(write(tmp_path, flight(compasses=2, log=log)))
+    k = np.arange(30.0)
+    np.testing.assert_allclose(back["time"], UTC + 5 + 0.1 * k, rtol=0, atol=1e-3)
+    expected: dict[str, Any] = {
+        "mag_x": 100.0 * (93 + k),
+        "mag_z": -35_000.0,
+        "mag2_y": 40_000.0,
+        "roll": 1.0,
+        "pitch": -5.0,
+    }
+    expected |= {"heading": k, "latitude": 45.0, "battery_current": 0.1 * k, "battery2_current": 0.5}
+    for name, values in expected.items():
+        np.testing.assert_allclose(back[name], np.broadcast_to(values, 30), rtol=1e-6, err_msg=name)
+    assert (back.attrs["bytes_skipped"], "time_reference" in back.attrs) == (0, False)
 
 
 def test_the_soft_iron_matrix_is_undone(tmp_path: Path) -> None:
