@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import cos, isfinite, nan, radians, sin
+from importlib.resources import files
+from math import cos, nan, radians, sin
 from typing import Any
 
+from jinja2 import Template
 from nicegui import ui
 
 from magbridge.config import Align, Telemetry
@@ -122,20 +124,15 @@ class SensorPanel:
     def show(self, state: BridgeState, now_s: float) -> None:
         """Show each sensor's total field, its difference from the first sensor, its line and its flags."""
         rows = words.sensor_rows(state, now_s)
+        labels = [state.sensors[number].label for number in rows]
         self._box.set_visibility(bool(rows))
-        if not self._changes.new("rows", rows, self._table):
+        if not self._changes.new("rows", (labels, rows), self._table):
             return
         with self._table:
-            for row in rows:
-                texts = {
-                    "Total field": (row.total, True),
-                    f"Minus {rows[0].name}": (row.difference, row.agrees),
-                    "Line": (row.line, row.is_well),
-                    "Flags": (row.flags or "none", True),
-                }
+            for name, row in zip(labels, rows.values(), strict=True):
                 with ui.column().classes("w-full gap-0"):
-                    ui.label(row.name).classes("font-medium")
-                    show_facts([fact(name) for name in texts], texts)
+                    ui.label(name).classes("font-medium")
+                    show_facts([fact(quantity) for quantity in row], row)
 
 
 class NavigationPanel:
@@ -373,73 +370,19 @@ class LearningPanel:
                 self._state.set(DO, value)
 
 
-RADIUS = 80.0
-"""Radius of the compass circle, in units of the picture, whose width is 200."""
-MAX_BAND_DEG = 180.0
-"""Half width from which the band of the heading is the whole circle, deg."""
-BLUE, GREY = "#3b82f6", "#778599"
-
-
-def current_heading(field: dict[str, Any]) -> tuple[float, float, str] | None:
-    """Return heading and 1-sigma (deg), and "true" or "magnetic"; None if `field` has no heading."""
-    sigma = field.get("heading_sigma", 0.0)
-    if not (isfinite(sigma) and sigma > 0.0):
-        return None
-    true, magnetic = field["heading"], field["magnetic_heading"]
-    if isfinite(true):
-        return true % 360.0, sigma, "true"
-    return (magnetic % 360.0, sigma, "magnetic") if isfinite(magnetic) else None
-
-
-def heading_text(field: dict[str, Any]) -> str:
-    """Return the text of the heading, its reference and its 2-sigma, deg."""
-    found = current_heading(field)
-    if found is None:
-        return "No heading: it needs a boresight and the autopilot's ATTITUDE"
-    heading, sigma, reference = found
-    return f"{round(heading, 1) % 360.0:05.1f}\N{DEGREE SIGN} {reference} ± {2.0 * sigma:.1f}\N{DEGREE SIGN}"
+ROSE_RADIUS = 80.0
+"""Radius of the compass circle in ``rose.svg``, in units of the picture, whose width is 200."""
+ROSE = Template(files("magbridge.monitor").joinpath("rose.svg").read_text(encoding="utf-8"), autoescape=True)
 
 
 def rose_picture(field: dict[str, Any]) -> str:
-    """Return the compass rose as an SVG with a needle and the 2-sigma band of the heading.
-
-    The picture contains only numbers and constant text, so that a sender cannot insert text into the page.
-    """
-    parts = [f'<circle r="{RADIUS}" fill="none" stroke="{GREY}" stroke-width="1.5"/>']
-    for bearing in range(0, 360, 30):
-        inner = RADIUS - (10 if bearing % 90 == 0 else 5)
-        parts.append(_line(bearing, inner, RADIUS, f'stroke="{GREY}"'))
-    for letter, bearing in zip("NESW", range(0, 360, 90), strict=True):
-        x, y = _point(bearing, RADIUS + 12.0)
-        style = f'fill="{GREY}" font-size="15" text-anchor="middle" dominant-baseline="central"'
-        parts.append(f'<text x="{x}" y="{y}" {style}>{letter}</text>')
-    if found := current_heading(field):
-        heading, sigma, _ = found
-        parts.append(_band(heading, min(2.0 * sigma, MAX_BAND_DEG)))
-        parts.append(_line(heading, 0.0, RADIUS - 12.0, f'stroke="{BLUE}" stroke-width="3"'))
-    label = f'role="img" aria-label="Compass rose. {heading_text(field)}"'
-    return f'<svg viewBox="-100 -100 200 200" {label} style="max-width: 14rem">{"".join(parts)}</svg>'
-
-
-def _line(bearing: float, inner: float, outer: float, style: str) -> str:
-    """Return the SVG of a radial line between two radii at a bearing, deg."""
-    (x, y), (u, v) = _point(bearing, inner), _point(bearing, outer)
-    return f'<line x1="{x}" y1="{y}" x2="{u}" y2="{v}" {style}/>'
-
-
-def _band(heading: float, half: float) -> str:
-    """Return the SVG of the sector of `half` deg on either side of the heading, deg."""
-    style = f'fill="{BLUE}" fill-opacity="0.25"'
-    if half >= MAX_BAND_DEG:
-        return f'<circle r="{RADIUS}" {style}/>'
-    (x, y), (u, v) = _point(heading - half, RADIUS), _point(heading + half, RADIUS)
-    return f'<path d="M 0 0 L {x} {y} A {RADIUS} {RADIUS} 0 {int(half > 90.0)} 1 {u} {v} Z" {style}/>'
-
-
-def _point(bearing: float, radius: float) -> tuple[float, float]:
-    """Return x (right) and y (down) of a point at a bearing, deg clockwise from the top."""
-    angle = radians(bearing)
-    return round(radius * sin(angle), 2), round(-radius * cos(angle), 2)
+    """Return the compass rose as an SVG with a needle and the 2-sigma band of the heading."""
+    heading, sigma, _ = words.current_heading(field) or (None, 0.0, "")
+    half = radians(2.0 * sigma)
+    # the right end of the band, in a picture that is rotated to the heading
+    x, y = round(ROSE_RADIUS * sin(half), 2), round(-ROSE_RADIUS * cos(half), 2)
+    label = words.heading_text(field)
+    return ROSE.render(heading=heading, half_width=2.0 * sigma, x=x, y=y, label=label)
 
 
 class CompassRose:
@@ -456,5 +399,5 @@ class CompassRose:
         picture = rose_picture(state.field)
         if self._changes.new("rose", picture):
             self._picture.set_content(picture)
-            self._text.set_text(heading_text(state.field))
+            self._text.set_text(words.heading_text(state.field))
         self.box.style(slanted("no field" in words.silence(state, now_s)))

@@ -8,7 +8,6 @@ such requests. On any other address, the whole network can reach the page, so a 
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from hmac import compare_digest
 from http.cookies import CookieError, SimpleCookie
@@ -48,15 +47,7 @@ MAX_COOKIE_CHARACTERS = 4096
 
 def is_loopback(host: str) -> bool:
     """Return True if only this computer can reach a server at the address `host`."""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def new_token() -> str:
-    """Return a random token of 128 bits from the operating system, in characters that a URL may contain."""
-    return secrets.token_urlsafe(16)
+    return host == "localhost" or (_is_address(host) and ip_address(host).is_loopback)
 
 
 class Guard:
@@ -106,7 +97,7 @@ class Guard:
         host = headers.get("host", "")
         if not self._is_this_page(host):
             return 421, "not a name of this page: use its address"
-        if "origin" in headers and not _same_place(headers["origin"], host):
+        if "origin" in headers and _parts(headers["origin"]) != _parts(f"//{host}"):
             return 403, "asked for by another site"
         site, mode = headers.get("sec-fetch-site", "none"), headers.get("sec-fetch-mode", "")
         link = mode == "navigate" and headers.get("sec-fetch-dest") == "document" and scope["path"] == "/"
@@ -163,11 +154,6 @@ async def _answer(send: Send, status: int, text: bytes, **headers: str) -> None:
 def _same(secret: str, expected: str) -> bool:
     """Compare two secrets in a time that is independent of where they differ."""
     return compare_digest(secret.encode("utf-8", "replace"), expected.encode("utf-8", "replace"))
-
-
-def _same_place(origin: str, host: str) -> bool:
-    there, here = _parts(origin), _parts(f"//{host}")
-    return there is not None and there == here
 
 
 def _parts(url: str) -> tuple[str, int | None] | None:

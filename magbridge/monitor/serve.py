@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import socket
 import sys
 from contextlib import suppress
@@ -16,7 +17,7 @@ from magbridge.errors import PortError
 from magbridge.monitor.charts import read_background
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.page import Page
-from magbridge.monitor.security import Guard, is_loopback, new_token
+from magbridge.monitor.security import Guard, is_loopback
 
 
 def serve(
@@ -43,13 +44,12 @@ def serve(
     ipv6 = ":" in host
     family, place = (socket.AF_INET6, f"[{host}]:{port}") if ipv6 else (socket.AF_INET, f"{host}:{port}")
     try:
-        socket.create_server(
-            (host, port), family=family
-        ).close()  # fail here, because the web server would only log the error
+        # fail here, because the web server would only log the error
+        socket.create_server((host, port), family=family).close()
     except OSError as error:
         raise PortError(place, error.strerror or str(error)) from error
     station.start()
-    token = "" if is_loopback(host) else new_token()
+    token = "" if is_loopback(host) else secrets.token_urlsafe(16)  # 128 random bits
     address = f"http://{place}" + (f"/?token={token}" if token else "")
     print(f"listening on {link}; the page is {address}", file=sys.stderr)
     if token:
@@ -58,12 +58,5 @@ def serve(
     app.add_middleware(Guard, host=host, port=port, token=token)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}
     with suppress(KeyboardInterrupt):  # Ctrl-C ends the server
-        ui.run(
-            partial(Page, station, background),
-            host=host,
-            port=port,
-            show=show,
-            reload=False,
-            dark=None,
-            **options,
-        )
+        page = partial(Page, station, background)
+        ui.run(page, host=host, port=port, show=show, reload=False, dark=None, **options)

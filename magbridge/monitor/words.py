@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from enum import IntEnum
 from math import exp, hypot, isfinite, nan, sqrt
-from typing import Any, NamedTuple
+from typing import Any
 
 from magbridge.calibration.scalar import DISAGREEMENT_SIGMA
 from magbridge.field.geodesy import worse_axis
@@ -94,46 +94,55 @@ def measured(state: BridgeState) -> dict[str, tuple[str, str]]:
     return shown
 
 
-class SensorRow(NamedTuple):
-    """Texts about one of several sensors; `agrees` is False if `difference` is significant."""
-
-    name: str
-    total: str
-    """Total field ± 2 sigma, nT."""
-    difference: str
-    """Total field minus the first sensor's total field, ± 2 sigma, nT; a dash for the first sensor."""
-    agrees: bool
-    line: str
-    is_well: bool
-    """`line`, `is_well`: State of the sensor's port with its sample rate, and True if samples arrive."""
-    flags: str
+def current_heading(field: dict[str, Any]) -> tuple[float, float, str] | None:
+    """Return heading and 1-sigma (deg), and "true" or "magnetic"; None if `field` has no heading."""
+    sigma = field.get("heading_sigma", 0.0)
+    if not (isfinite(sigma) and sigma > 0.0):
+        return None
+    true, magnetic = field["heading"], field["magnetic_heading"]
+    if isfinite(true):
+        return true % 360.0, sigma, "true"
+    return (magnetic % 360.0, sigma, "magnetic") if isfinite(magnetic) else None
 
 
-def sensor_rows(state: BridgeState, now_s: float) -> list[SensorRow]:
-    """Return a row for each sensor of a bridge with several sensors; an empty list for a single sensor."""
+def heading_text(field: dict[str, Any]) -> str:
+    """Return the text of the heading, its reference and its 2-sigma, deg."""
+    found = current_heading(field)
+    if found is None:
+        return "No heading: it needs a boresight and the autopilot's ATTITUDE"
+    heading, sigma, reference = found
+    return f"{round(heading, 1) % 360.0:05.1f}\N{DEGREE SIGN} {reference} ± {2.0 * sigma:.1f}\N{DEGREE SIGN}"
+
+
+def sensor_rows(state: BridgeState, now_s: float) -> dict[int, dict[str, tuple[str, bool]]]:
+    """Return the items of each of several sensors: number -> name -> text, and True if it is normal.
+
+    The items are the total field, its difference from the first sensor's total field (both with 2 sigma, nT;
+    significant differences are not normal), the state of the port with the sample rate, and the flags.
+    """
     if len(state.sensors) < 2:
-        return []
+        return {}
     first = next(iter(state.sensors.values()))
-    rows = []
+    rows = {}
     for sensor in state.sensors.values():
         get, report = sensor.field.get, sensor.report.get
-        two_sigma = 2.0 * get("total_field_sigma", nan)
-        total = " ".join(_number(get("total_field", nan), ".2f", two_sigma)).strip()
+        total = _number(get("total_field", nan), ".2f", 2.0 * get("total_field_sigma", nan))
         value, sigma = (nan, nan) if sensor is first else sensor.difference(first)
         line = report("state", MAG_PORT_STATE.OK)
         is_late = _late(sensor.sampled, sensor.interval, now_s)
         text = "no samples" if is_late and line == MAG_PORT_STATE.OK else _word(MAG_PORT_STATE, line)
-        rows.append(
-            SensorRow(
-                sensor.label,
-                total,
+        rows[sensor.number] = {
+            "Total field": (" ".join(total).strip(), True),
+            f"Minus {first.label}": (
                 " ".join(_number(value, "+.2f", 2.0 * sigma)).strip(),
                 not abs(value) > DISAGREEMENT_SIGMA * sigma,
+            ),
+            "Line": (
                 f"{text}, {_figure(report('sample_rate', nan), '.2f', 'Hz')}",
                 line == MAG_PORT_STATE.OK and not is_late,
-                Quality(get("flags", 0)).names(),
-            )
-        )
+            ),
+            "Flags": (Quality(get("flags", 0)).names() or "none", True),
+        }
     return rows
 
 
@@ -251,13 +260,14 @@ def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
         text, _ = health(state, now_s)[line]
         if state.status and not starting and text in {"silent", "lost", "failed"}:
             wrong[line] = f"{line}: {text}"
-    for row, sensor in zip(sensor_rows(state, now_s), state.sensors.values(), strict=False):
-        if not sensor.number or starting:  # the first sensor is covered above
+    for number, row in sensor_rows(state, now_s).items():
+        if not number or starting:  # the first sensor is covered above
             continue
-        if not row.is_well:
-            wrong[f"sensor {sensor.number}"] = f"Sensor {row.name}: {row.line.split(',')[0]}"
-        for name in set(row.flags.split()) - ROUTINE:
-            wrong[f"sensor {sensor.number} {name}"] = f"Sensor {row.name}: {FLAG_TEXTS[name]}"
+        label, (line, is_well) = state.sensors[number].label, row["Line"]
+        if not is_well:
+            wrong[f"sensor {number}"] = f"Sensor {label}: {line.split(',')[0]}"
+        for name in FLAG_TEXTS.keys() & set(row["Flags"][0].split()) - ROUTINE:
+            wrong[f"sensor {number} {name}"] = f"Sensor {label}: {FLAG_TEXTS[name]}"
     if state.navigation.get("state") == MAG_NAVIGATION_STATE.LOST:
         wrong["navigation"] = "The position by the field is lost"
     return wrong

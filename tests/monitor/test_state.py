@@ -20,11 +20,12 @@ from magbridge.monitor.charts import series as track_series
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.link import MAX_BRIDGES, ReceivedBridges
 from magbridge.monitor.page import bundle
-from magbridge.monitor.panels import heading_text, rose_picture
+from magbridge.monitor.panels import rose_picture
 from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
 from magbridge.monitor.words import (
     conditions,
     duration,
+    heading_text,
     health,
     learnt,
     measured,
@@ -72,12 +73,13 @@ def test_the_rose_shows_the_heading_with_its_band(air: Air) -> None:
     assert heading_text(air.state.field).startswith("No heading")
     assert "<path" not in rose_picture(air.state.field)
     air.field(NOW, magnetic_heading=100.0, heading=90.0, heading_sigma=15.0)
-    # 30 deg either side of east: from (80 sin 60, -80 cos 60) to (80 sin 120, -80 cos 120)
-    assert 'd="M 0 0 L 69.28 -40.0 A 80.0 80.0 0 0 1 69.28 40.0 Z"' in rose_picture(air.state.field)
+    # turned to the east, from (-80 sin 30, -80 cos 30) to (80 sin 30, -80 cos 30)
+    assert 'transform="rotate(90.0)"' in rose_picture(air.state.field)
+    assert 'd="M 0 0 L -40.0 -69.28 A 80 80 0 0 1 40.0 -69.28 Z"' in rose_picture(air.state.field)
     assert heading_text(air.state.field) == "090.0\N{DEGREE SIGN} true ± 30.0\N{DEGREE SIGN}"
     air.field(NOW, magnetic_heading=100.0, heading=nan, heading_sigma=120.0)
     assert "100.0\N{DEGREE SIGN} magnetic" in heading_text(air.state.field)
-    assert '<circle r="80.0" fill="#3b82f6"' in rose_picture(air.state.field)
+    assert '<circle r="80" fill="#3b82f6"' in rose_picture(air.state.field)
     air.field(NOW, magnetic_heading=0.0, heading=0.0, heading_sigma=0.0)
     assert heading_text(air.state.field).startswith("No heading")
 
@@ -433,17 +435,18 @@ def test_every_sensor_has_a_row_with_its_disagreement(air: Air) -> None:
     for k in range(8):
         now = NOW + 2.0 * k
         air.field(now, 52_000.0)
-        assert sensor_rows(air.state, now) == [] or k  # one sensor has no row
+        assert sensor_rows(air.state, now) == {} or k  # one sensor has no row
         air.field(now + 0.1, 52_003.0 if k < 7 else 52_300.0, sensor_id=1, flags=Quality.IMPLAUSIBLE)
         air.field(now + 0.1, 52_001.0, sensor_id=2, total_field_sigma=nan)
         air.feed(now, "MAG_SENSOR", sensor_id=0, state=1, name="flux", sample_rate=0.5)
         air.feed(now, "MAG_SENSOR", sensor_id=1, state=1, name="tail", sample_rate=nan)
     state, now = air.state, NOW + 15.0
-    first, tail, third = sensor_rows(state, now)
-    assert (first.name, first.difference, first.agrees, first.line) == ("flux", "–", True, "ok, 0.50 Hz")
-    assert (tail.name, tail.difference, tail.agrees) == ("tail", "+300.00 ± 2.83", False)
-    assert (tail.total, tail.flags) == ("52\u202f300.00 ± 2.00", "implausible")
-    assert (third.name, third.difference, third.agrees) == ("sensor 2", "+1.00", True)
+    assert [sensor.label for sensor in state.sensors.values()] == ["flux", "tail", "sensor 2"]
+    first, tail, third = sensor_rows(state, now).values()
+    assert (first["Minus flux"], first["Line"]) == (("–", True), ("ok, 0.50 Hz", True))
+    assert tail["Minus flux"] == ("+300.00 ± 2.83", False)
+    assert (tail["Total field"][0], tail["Flags"][0]) == ("52\u202f300.00 ± 2.00", "implausible")
+    assert third["Minus flux"] == ("+1.00", True)
     assert state.field["total_field"] == 52_000.0
     assert state.telemetry["Sensor 1: total field, nT"].latest == 52_300.0
     assert conditions(state, now)["sensor 1 implausible"].startswith("Sensor tail: It cannot be")
