@@ -41,7 +41,9 @@ ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code; `arguments` defaults to those of the process."""
     with suppress(ValueError):  # signal handlers can be set on the main thread only
-        _heed_signals()
+        for number in ENDS:
+            if signal.getsignal(number) != signal.SIG_IGN:  # for example, nohup sets SIG_IGN
+                signal.signal(number, _terminated)
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except BrokenPipeError:  # the program that reads the output has ended, such as `| head`
@@ -108,12 +110,6 @@ class _Terminated(SystemExit):
     def __init__(self, number: int) -> None:
         super().__init__()
         self.number = number
-
-
-def _heed_signals() -> None:
-    for number in ENDS:
-        if signal.getsignal(number) != signal.SIG_IGN:  # for example, nohup sets SIG_IGN
-            signal.signal(number, _terminated)
 
 
 def _terminated(number: int, _: object) -> None:

@@ -122,8 +122,7 @@ def _check(config: Path, *, live: bool, json: bool) -> None:
         faults, arriving = _listen(config, quiet=json)
         found += faults
     faults_of = [{"severity": "error" if one.fatal else "warning", "text": one.text} for one in found]
-    for fault in faults_of:
-        cli.complain(f"{fault['severity']}: {fault['text']}")
+    cli.complain_all(f"{fault['severity']}: {fault['text']}" for fault in faults_of)
     warnings = counted(len(found) - errors, "warning")
     facts = {"file": str(config), "would_start": not errors, "findings": faults_of, **arriving}
     cli.print_result(facts, "" if errors else f"{config}: the bridge would start, {warnings}", json)
@@ -343,8 +342,7 @@ def init(
         if fatal and PLACEHOLDER not in text:  # the user still has to fill in a setting
             raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
     found = [one.text for one in findings(output)]
-    for finding in found:
-        cli.complain(finding)
+    cli.complain_all(found)
     sentence = f"{output}: written; next: magbridge run --check --config {output}"
     cli.print_result({"file": str(output), "findings": found}, sentence, json)
 

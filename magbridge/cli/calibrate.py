@@ -284,8 +284,7 @@ def _fit(
         )
         read = (*request.files, *request.reading.sensor_log, *filter(None, [request.truth.base]))
         data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
-        for unused in unused_logs(logs, data):
-            cli.complain(unused.text)
+        cli.complain_all(unused_logs(logs, data))
         data = unfiltered(data, model.filter_cutoff) if model.filter_cutoff else data
         if model.position_sigma:
             if not (data.lacks_rock and model.method in ("auto", "survey")):
@@ -300,9 +299,7 @@ def _fit(
             found, remarks = _fitted(logs, data, model, site_bias=site_bias, **options)
             worth = {}
     refused = not (found.supported or request.force)
-    warnings = [warning.text for warning in found.warnings[refused:]]
-    for line in (*warnings, *remarks, *_undeclared_columns(deployment, data, found)):
-        cli.complain(line)
+    cli.complain_all((*found.warnings[refused:], *remarks, *_undeclared_columns(deployment, data, found)))
     return found, data, worth
 
 

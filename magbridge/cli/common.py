@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +17,7 @@ import msgspec
 from cyclopts import App, Parameter, Token
 
 import magbridge as mb
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, DataError, FormatError, OutOfRange, WrongUse
 from magbridge.files import existing
 from magbridge.logs import Options, suffixes
@@ -295,6 +296,12 @@ def complain(sentence: str, code: int = 0) -> int:
     return code
 
 
+def complain_all(messages: Iterable[str | Diagnostic]) -> None:
+    """Print messages to stderr, one line each."""
+    for message in messages:
+        complain(message if isinstance(message, str) else message.text)
+
+
 MAX_NAMED_LOSSES = 5
 """Largest number of skipped parts of a log that are reported one by one; the others are counted."""
 
@@ -333,19 +340,24 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
     """Report skipped content of logs on stderr, from the attributes of a deployment or of its pieces."""
     from magbridge.logs.deployment import COUNTERS, GUESSED_ATTRIBUTE, named_losses, noted, passed_over
 
-    for guess in dict.fromkeys(str(attrs.get(GUESSED_ATTRIBUTE, "")) for attrs in pieces):
-        if guess:
-            complain(f"guessed: {guess}")
+    guesses = dict.fromkeys(str(attrs.get(GUESSED_ATTRIBUTE, "")) for attrs in pieces)
+    complain_all(f"guessed: {guess}" for guess in guesses if guess)
     if counts := passed_over(*pieces):
         losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
         complain(f"in the logs: {losses}")
-    for note in dict.fromkeys(noted(*pieces)):
-        complain(note)
     lines = named_losses(*pieces)
-    for line in lines[:MAX_NAMED_LOSSES]:
-        complain(line)
+    complain_all([*dict.fromkeys(noted(*pieces)), *lines[:MAX_NAMED_LOSSES]])
     if len(lines) > MAX_NAMED_LOSSES:
         complain(f"and in {counted(len(lines) - MAX_NAMED_LOSSES, 'place')} more")
+
+
+def read_apart(files: Sequence[Path], reading: ReadingOptions) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
+    """Return the logs `files` and the sensor logs of `reading`, and the logs with sensor logs combined."""
+    from magbridge.logs.merge import combine
+
+    logs = [mb.read(path, options=reading.without_sensor_logs) for path in (*files, *reading.sensor_log)]
+    named = [False] * len(files) + [True] * len(reading.sensor_log)
+    return logs, combine(logs, named, reading.clock_offset)
 
 
 def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:
@@ -393,20 +405,19 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
         )
     offered = [*movers(deployment), *conditions(deployment)]
     taken, offers = best_parameters(deployment, offered, **options)
-    for line in lines(offers) or [
-        f"--parameter {AUTO}: none of {' '.join(offered) or 'its columns'} moves the field"
-    ]:
-        complain(line)
+    none = f"--parameter {AUTO}: none of {' '.join(offered) or 'its columns'} moves the field"
+    complain_all(lines(offers) or [none])
     return taken
 
 
 def note_missing(calibration: mb.Calibration, deployment: xr.Dataset) -> None:
     """Warn on stderr of columns that the calibration needs but the log does not have."""
-    for name in calibration.channels:
-        if name not in deployment:
-            lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
-            remedy = f"name the log's own column with --column {name}=THEIRS"
-            complain(f"{lacking}: every sample is flagged, with a wider sigma; {remedy}")
+    complain_all(
+        f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs: every sample is "
+        f"flagged, with a wider sigma; name the log's own column with --column {name}=THEIRS"
+        for name in calibration.channels
+        if name not in deployment
+    )
 
 
 def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
@@ -414,15 +425,6 @@ def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
     for log in logs if grid else ():
         if "reference_field" in log and log["reference_field"].notnull().all():
             complain(f"{log.attrs['source']}: has reference_field in every row, so --grid {grid} is not used")
-
-
-def note_no_date(deployment: xr.Dataset) -> None:
-    """Warn on stderr if no anomaly can be computed because the log has no date."""
-    from magbridge.columns import counts_from_boot
-
-    if counts_from_boot(deployment):
-        source = deployment.attrs["source"]
-        complain(f"{source}: its times count from the boot, so no anomaly is written; give --date YYYY-MM-DD")
 
 
 def note_settings(*pieces: Mapping[str, Any]) -> None:

@@ -12,7 +12,7 @@ from cyclopts import Parameter, validators
 
 import magbridge as mb
 from magbridge.cli import common as cli
-from magbridge.columns import CHANNELS, CORRECTED
+from magbridge.columns import CHANNELS, CORRECTED, counts_from_boot
 from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.progress import track
 from magbridge.records import Quality
@@ -78,8 +78,7 @@ def correct(
     from magbridge.logs import Writer, read_chunks
 
     known, settings = _known(calibration, config)
-    for warning in cli.warnings_of(known, source):
-        cli.complain(warning)
+    cli.complain_all(cli.warnings_of(known, source))
     if save is not None and not learn:
         raise WrongUse(
             "--save: expected --learn with it, because it writes the learned calibration; add --learn"
@@ -186,7 +185,9 @@ def _corrected(
     for part in parts:
         if correction is None:
             cli.note_missing(known, part)
-            cli.note_no_date(part)
+            if counts_from_boot(part):
+                lack = "its times count from the boot, so no anomaly is written; give --date YYYY-MM-DD"
+                cli.complain(f"{part.attrs['source']}: {lack}")
             correction = mb.Correction(known, learner=_learner(known, part, learn) if learn else None)
         if not whole:
             cli.refuse_unsuited(known, part)
@@ -212,12 +213,10 @@ def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learne
 
 def _notify(correction: mb.Correction) -> None:
     """Print the messages about quality flags and learning to stderr, and delete them."""
-    for text in correction.notices:
-        cli.complain(text)
+    cli.complain_all(correction.notices)
     correction.notices.clear()
     if correction.learner is not None:
-        for notice in correction.learner.notices:
-            cli.complain(f"{notice.text}, {notice.date}")
+        cli.complain_all(f"{notice.text}, {notice.date}" for notice in correction.learner.notices)
         correction.learner.notices.clear()
 
 
@@ -371,8 +370,7 @@ def export(
     from magbridge.files import atomic_path, new_folder
 
     known = mb.load(calibration)
-    for warning in cli.warnings_of(known, calibration):
-        cli.complain(warning)
+    cli.complain_all(cli.warnings_of(known, calibration))
     if cutoff_hz := known.sensor.filter_cutoff:
         cli.complain(f"{calibration}: no export undoes the sensor's filter of {cutoff_hz:g} Hz")
     texts: dict[Path, str] = {}
@@ -403,12 +401,10 @@ def _autopilot(
     if ardupilot is None and px4 is None:
         return {}
     compass, texts = export_compass.compass_of(known), dict[Path, str]()
-    for lost in compass.lost:
-        cli.complain(f"{file}: the autopilot's model cannot hold {lost}")
+    cli.complain_all(f"{file}: the autopilot's model cannot hold {lost}" for lost in compass.lost)
     if ardupilot is not None:
         texts[ardupilot], warnings = export_compass.ardupilot(compass, number)
-        for warning in warnings:
-            cli.complain(warning)
+        cli.complain_all(warnings)
     if px4 is not None:
         texts[px4] = export_compass.px4(compass, number)
     return texts
@@ -441,9 +437,6 @@ def _seaglider(file: Path, known: mb.Calibration, nt_per_count: float, dip: floa
             f"{file}: the file cannot hold {what}: heading error {cost.rms:.2f} deg RMS, up to "
             f"{cost.largest:.2f} deg, at the ends of the range (dip {dip:g} deg)"
         )
-    for effect in known.effects:
-        cli.complain(
-            f"{file}: the file cannot hold the effect {effect.kind} of {' '.join(effect.channels())}"
-        )
-    cli.complain(f"{file}: the file cannot hold uncertainties and flags")
+    lost = [f"the effect {effect.kind} of {' '.join(effect.channels())}" for effect in known.effects]
+    cli.complain_all(f"{file}: the file cannot hold {one}" for one in (*lost, "uncertainties and flags"))
     return text

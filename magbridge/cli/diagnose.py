@@ -58,14 +58,10 @@ def diagnose(
     cli.logs_to_read(files, output / "calibration.json", calibration, grid)
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
-    from magbridge.logs.merge import combine
 
     known = mb.load(calibration)
     with waiting("reading") as step:
-        logs = [mb.read(path, options=reading.without_sensor_logs) for path in files]
-        logs += [mb.read(path, options=reading.without_sensor_logs) for path in reading.sensor_log]
-        named = [False] * len(files) + [True] * len(reading.sensor_log)
-        combined = combine(logs, named, reading.clock_offset)
+        logs, combined = cli.read_apart(files, reading)
         own = [path for path in files if digest(path) in known.inputs.values()]
         own_logs = [log for path, log in zip(files, logs, strict=False) if path in own]
         if len(combined) < len(logs):
@@ -76,19 +72,11 @@ def diagnose(
         others = [path for path in training_logs if path not in files]
         remarks += [f"{path}: {ITSELF}" for path in own]
         remarks += [remark for log in logs for remark in _suspect(log)]
-        for remark in remarks:
-            cli.complain(remark)
+        cli.complain_all(remarks)
+        training = [*own_logs, *(mb.read(path, options=reading.without_sensor_logs) for path in others)]
+        anomalies = mb.read_grid(grid) if grid else None
         found = examine(
-            logs,
-            known,
-            output,
-            training_logs=[
-                *own_logs,
-                *(mb.read(path, options=reading.without_sensor_logs) for path in others),
-            ],
-            grid=mb.read_grid(grid) if grid else None,
-            progress=step,
-            remarks=remarks,
+            logs, known, output, training_logs=training, grid=anomalies, progress=step, remarks=remarks
         )
     facts = findings(found, remarks)
     lines = summary(facts, "" if own else found.diagnosis.problem.survey.parts)

@@ -96,8 +96,7 @@ def add(
             new, lines = new + count, lines + notes
         for start, calibration in calibrations:
             given += add_calibration(there, vehicle, this, start, calibration)
-    for line in lines:
-        cli.complain(line)
+    cli.complain_all(lines)
     cli.print_result(
         {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines},
         f"{there.name}: {counted(added, 'vehicle')}, {counted(new, 'log')} and "
@@ -173,8 +172,7 @@ def process(
         with client_of(scheduler, workers, memory) as client:
             for lines in track(run(there, todo, client), "deployments", len(todo), in_lines=True):
                 failures += lines
-                for line in lines:
-                    cli.complain(line)
+                cli.complain_all(lines)
         with waiting("learning"):
             remember(there)
     result = {"deployments": len(every), "processed": len(todo), "failures": failures}
@@ -198,8 +196,7 @@ def status(*, catalogue: Where = HERE, json: cli.Json = False) -> None:
 
     there = open_catalogue(catalogue)
     found = of(there)
-    for line in found["failures"]:
-        cli.complain(line)
+    cli.complain_all(found["failures"])
     rows = "\n".join(
         f"  {one['vehicle']}: {counted(one['deployments'], 'deployment')}, {counted(one['logs'], 'log')}, "
         f"{one['calibrated']} calibrated, {one['failed']} failed, {one['new']} new"

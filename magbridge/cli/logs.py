@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from math import inf
@@ -44,14 +43,11 @@ def info(*files: Path, reading: cli.ReadingOptions = cli.AS_THEY_SAY, json: cli.
     from magbridge.logs.access import without_companions
     from magbridge.logs.deployment import join
     from magbridge.logs.info import info as facts_of
-    from magbridge.logs.merge import combine
 
-    logs = {}
     with waiting("reading"):
-        for file in without_companions(list(dict.fromkeys((*files, *reading.sensor_log)))):
-            logs[str(file)] = mb.read(file, options=reading.without_sensor_logs)
-        named = [Path(name) in reading.sensor_log for name in logs]
-        combined = combine(list(logs.values()), named, reading.clock_offset)
+        apart = without_companions([file for file in dict.fromkeys(files) if file not in reading.sensor_log])
+        read, combined = cli.read_apart(apart, reading)
+        logs = {str(file): log for file, log in zip((*apart, *reading.sensor_log), read, strict=True)}
         if len(combined) < len(logs):
             names = [Path(name).name for name in logs]
             listed = " and ".join(names) if len(names) <= MAX_LISTED_LOGS else f"{len(names)} logs"
@@ -78,8 +74,7 @@ def _show(file: str, facts: dict[str, Any]) -> None:
         console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
     console.print(_columns(facts, meanings=console.width >= WIDE_TERMINAL))
     console.print(_uses(facts))
-    for hint in facts["hints"]:
-        cli.complain(f"{file}: {hint}")
+    cli.complain_all(f"{file}: {hint}" for hint in facts["hints"])
 
 
 def summary(facts: dict[str, Any]) -> str:
@@ -87,7 +82,10 @@ def summary(facts: dict[str, Any]) -> str:
     if not facts["rows"]:
         return "no rows"
     boot = facts["references"]["time_reference"] == "boot"
-    first, last = (f"{facts[end]:.1f} s" if boot else _utc(facts[end]) for end in ("start", "end"))
+    first, last = (
+        f"{facts[end]:.1f} s" if boot else f"{datetime.fromtimestamp(facts[end], UTC):%Y-%m-%d %H:%M:%S} UTC"
+        for end in ("start", "end")
+    )
     rate = f", {facts['rate_hz']:.4g} Hz" if facts["rate_hz"] else ""
     gaps = ""
     if facts["gaps"]:
@@ -95,17 +93,10 @@ def summary(facts: dict[str, Any]) -> str:
     return f"{counted(facts['rows'], 'row')}, {first} to {last}{rate}{gaps}"
 
 
-def _utc(time: float) -> str:
-    return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M:%S} UTC"
-
-
 def _columns(facts: dict[str, Any], *, meanings: bool) -> Table:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     from magbridge.columns import CHANNEL_TIMES
 
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = _table()
     for name in ("column", "unit"):
         table.add_column(name, overflow="fold")
     for name in ("known", "lowest", "highest", "changes every"):
@@ -127,13 +118,17 @@ def _columns(facts: dict[str, Any], *, meanings: bool) -> Table:
 
 
 def _uses(facts: dict[str, Any]) -> Table:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table("command", "could use it?", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table = _table("command", "could use it?")
     for name, lacks in facts["uses"].items():
         table.add_row(name, f"lacks {'; and '.join(lacks)}" if lacks else "yes")
     return table
+
+
+def _table(*names: str) -> Table:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    return Table(*names, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
 
 
 def _plain(text: str) -> str:
@@ -167,10 +162,11 @@ def convert(
     if metadata and output.suffix.lower() != ".nc":
         raise WrongUse(f"--metadata: expected a netCDF (.nc) to write, got {output}")
 
-    from magbridge.logs import Writer, read_chunks
+    from magbridge.logs import Writer, og, read_chunks
 
     rows, pieces = 0, []
-    with Writer(output, _og(metadata), og1=True) if metadata else Writer(output) as writer:
+    complete = partial(og.complete, metadata=og.read_metadata(metadata)) if metadata else None
+    with Writer(output, complete, og1=True) if complete else Writer(output) as writer:
         for part in track(read_chunks(files, options=reading.options), "reading"):
             pieces.append(part.attrs)
             if heading_reference:
@@ -182,13 +178,6 @@ def convert(
     cli.print_result(
         {"file": str(output), "rows": rows, "columns": names}, f"{output}: {counted(rows, 'row')}", json
     )
-
-
-def _og(metadata: Path) -> Callable[[Path], None]:
-    """Return a function that completes a netCDF file to the format OG1.0 with the given metadata."""
-    from magbridge.logs.og import complete, read_metadata
-
-    return partial(complete, metadata=read_metadata(metadata))
 
 
 @cli.command("simulate SCENARIO -o FILE [OPTIONS]")

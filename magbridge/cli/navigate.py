@@ -93,8 +93,7 @@ def navigate(
 
         draw_navigation(track, grid, plot)
     write(track, output)
-    for finding in track.attrs["findings"].splitlines():
-        cli.complain(finding)
+    cli.complain_all(track.attrs["findings"].splitlines())
     facts, summary = _judged(track)
     cli.print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
@@ -132,8 +131,7 @@ def _corrected(
     from magbridge.rows import correct_rows
 
     deployment = cli.read_log(files, reading, heading_reference, CHANNELS)
-    for warning in cli.warnings_of(known, calibration):
-        cli.complain(warning)
+    cli.complain_all(cli.warnings_of(known, calibration))
     cli.note_missing(known, deployment)
     cli.note_settings(deployment.attrs)
     cli.refuse_unsuited(known, deployment)

@@ -134,8 +134,7 @@ def survey(
             done = _scalar_survey(logs, scalar, correction, reading)
         else:
             done = make(_samples(logs, correction, reading))
-    for warning in done.warnings:
-        cli.complain(warning.text)
+    cli.complain_all(done.warnings)
     if products.predict:
         _predict(done, products.predict, output)
     else:
@@ -197,8 +196,7 @@ def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: cl
         if {"latitude", "longitude"} <= set(log.variables) and (holes := int((~placed(log)).sum())):
             cli.complain(f"{log.attrs['source']}: {counted(holes, 'sample')} without a position: left out")
     for path, one in zip(correction.calibration, known, strict=True):
-        for line in cli.warnings_of(one, path):
-            cli.complain(line)
+        cli.complain_all(cli.warnings_of(one, path))
     if raw and not known:
         found = _calibrated(raw, correction, strict=reading.strict)
         known = [found.calibration if found.creep is None else found.creep.calibration]
@@ -224,8 +222,7 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
     if not found.supported and data.lacks_rock and found.calibration.method == "auto":
         with suppress(CalibrationError):  # a map must not attribute the crustal field to the vehicle
             found = mb.fit(data, "survey", order=order, **options)
-    for warning in found.warnings:
-        cli.complain(warning.text)
+    cli.complain_all(found.warnings)
     if strict and not found.supported:
         raise DataError(
             f"{together.attrs['source']}: the survey does not support a calibration, for the reasons "
@@ -310,7 +307,6 @@ def plan(
             result = flights.facts(found, known), flights.summary(found, known)
         else:
             proposed = survey_patterns.survey_plan(known, deployment, parameter, hours=survey, roll=roll)
-            for line in proposed[0].open:
-                cli.complain(line)
+            cli.complain_all(proposed[0].open)
             result = survey_patterns.facts(proposed), survey_patterns.summary(proposed)
     cli.print_result(*result, json)

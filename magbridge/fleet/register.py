@@ -319,34 +319,30 @@ def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> 
 
 def status(catalogue: Catalogue) -> dict[str, Any]:
     """Return the counts of each vehicle, the vehicles of each sensor, and the failures, for JSON."""
-    every = {job.name: job for job in jobs(catalogue)}
-    done = catalogue.rows("done")
-    new = {job.name for job in new_jobs(catalogue, list(every.values()))}
-    counts = {row["vehicle"]: Counter[str]() for row in catalogue.rows("vehicles", ["vehicle"])}
-    for job in every.values():
-        counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=job.name in new)
-    calibrated = set[str]()
-    for row in current(catalogue, "calibrations", ["vehicle", "supported"]):
-        if row["job"] == GIVEN:
-            counts[row["vehicle"]]["given"] += 1
-        else:
-            calibrated.add(row["job"])
-            counts[row["vehicle"]].update(calibrated=1, unsupported=not row["supported"])
-    finished = {"failed": every.keys() - calibrated - new}
-    for column in ("diagnosed", "mapped"):
-        finished[column] = {row["job"] for row in done if row[column]} & every.keys()
-    for column, names in finished.items():
-        counts_of = Counter(every[name].vehicle["vehicle"] for name in names)
-        for vehicle, number in counts_of.items():
-            counts[vehicle][column] += number
+    every, done = jobs(catalogue), catalogue.rows("done")
+    calibrations = current(catalogue, "calibrations", ["vehicle", "supported"])
+    given = Counter(row["vehicle"] for row in calibrations if row["job"] == GIVEN)
+    own = [row for row in calibrations if row["job"] != GIVEN]
+    names = {
+        "new": {job.name for job in new_jobs(catalogue, every)},
+        "calibrated": {row["job"] for row in own},
+        "unsupported": {row["job"] for row in own if not row["supported"]},
+        **{result: {row["job"] for row in done if row[result]} for result in ("diagnosed", "mapped")},
+    }
+    names["failed"] = {job.name for job in every} - names["calibrated"] - names["new"]
+    counts: dict[str, dict[str, int]] = {}
+    for vehicle in sorted({row["vehicle"] for row in catalogue.rows("vehicles", ["vehicle"])}):
+        mine = [job for job in every if job.vehicle["vehicle"] == vehicle]
+        counts[vehicle] = {result: sum(job.name in known for job in mine) for result, known in names.items()}
+        counts[vehicle] |= {"deployments": len(mine), "logs": sum(len(job.files) for job in mine)}
+        counts[vehicle]["given"] = given[vehicle]
     failures = [row["line"] for row in current(catalogue, "failures")]
     sensors: dict[str, set[str]] = {}
     for row in catalogue.rows("sensors"):
         sensors.setdefault(row["sensor"], set()).add(row["vehicle"])
     return {
         "vehicles": [
-            {"vehicle": name, **{key: one[key] for key in STATUS_COLUMNS}}
-            for name, one in sorted(counts.items())
+            {"vehicle": name, **{key: one[key] for key in STATUS_COLUMNS}} for name, one in counts.items()
         ],
         "sensors": [{"sensor": name, "vehicles": sorted(on)} for name, on in sorted(sensors.items())],
         "failures": failures,

@@ -382,7 +382,7 @@ def rose_picture(field: dict[str, Any]) -> str:
     # the right end of the band, in a picture that is rotated to the heading
     x, y = round(ROSE_RADIUS * sin(half), 2), round(-ROSE_RADIUS * cos(half), 2)
     label = words.heading_text(field)
-    return ROSE.render(heading=heading, half_width=2.0 * sigma, x=x, y=y, label=label)
+    return str(ROSE.render(heading=heading, half_width=2.0 * sigma, x=x, y=y, label=label))
 
 
 class CompassRose:

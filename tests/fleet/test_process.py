@@ -242,12 +242,7 @@ def test_what_is_expected_is_a_calibration(done: Catalogue, tmp_path: Path) -> N
 def test_status_counts(done: Catalogue, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fleet", "status", "--catalogue", str(done.folder), "--json"]) == 0
     one, two = json.loads(capsys.readouterr().out)["vehicles"]
-    assert (one["vehicle"], one["deployments"], one["logs"], one["calibrated"], one["new"]) == (
-        "one",
-        2,
-        2,
-        2,
-        0,
-    )
-    assert type(one["new"]) is int
+    counts = {"deployments": 2, "logs": 2, "calibrated": 2, "new": 0, "failed": 0}
+    assert counts.items() <= one.items()
     assert (two["vehicle"], two["deployments"], two["failed"]) == ("two", 1, 0)
+    assert type(two["new"]) is int
