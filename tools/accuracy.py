@@ -13,6 +13,7 @@ their travel, and the distribution of moments, volumes and iron. "Bound" is the 
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -25,7 +26,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from scipy.optimize import least_squares
-from studies import Column, Row, Study, fraction_within, percentile, study_options
+from studies import Column, Row, Study, fraction_within, percentile
 from study_worlds import METHODS, NOISES, BestFit, Glider, glider, true_field
 
 from magbridge.calibration.fitting.fit import fit
@@ -41,6 +42,8 @@ MASSES = {1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "ballast", 
 TAPE_SIGMA_M = 0.05
 """Standard deviation of the masses' positions measured with a tape, m on an axis."""
 TAPE = "auto, positions to 5 cm"
+PEERS = os.environ.get("MAGBRIDGE_PEERS", "")
+"""Interpreter that has magyc and MAVProxy."""
 COLUMNS = {
     "error / noise: median": Column("ratio", np.median, ".3f"),
     "95 %": Column("ratio", percentile(95), ".3f"),
@@ -154,21 +157,22 @@ def remainder(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
 STUDY = Study(run, ("noise", "masses", "method"), COLUMNS)
 
 
-def main() -> None:
-    parser = study_options(__doc__)
-    parser.add_argument("--seeds", type=int, default=40, help="gliders")
-    parser.add_argument("--masses", type=int, nargs="+", default=[2, 1, 3], choices=sorted(MASSES))
-    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
-    parser.add_argument("--methods", nargs="+", default=["nominal", "cubic", "auto", TAPE])
-    peers = os.environ.get("MAGBRIDGE_PEERS", "")
-    parser.add_argument("--peers", default=peers, help="interpreter that has magyc and MAVProxy")
-    chosen = parser.parse_args()
-    cases = [
-        (seed, noise, count, tuple(chosen.methods), chosen.peers * (count == 2 and noise == chosen.noise[0]))
-        for count, noise, seed in product(chosen.masses, chosen.noise, range(chosen.seeds))
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases; third-party programs run on two masses with the first noise only."""
+    return [
+        (
+            seed,
+            noise,
+            count,
+            tuple(options.methods),
+            options.peers * (count == 2 and noise == options.noise[0]),
+        )
+        for count, noise, seed in product(options.masses, options.noise, range(options.seeds))
     ]
-    STUDY.main(f"{chosen.seeds} random gliders", cases, chosen)
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(
+        __doc__, cases_of, seeds=40, masses=[2, 1, 3], noise=list(NOISES),
+        methods=["nominal", "cubic", "auto", TAPE], peers=PEERS,
+    )  # fmt: skip

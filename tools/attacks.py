@@ -22,10 +22,8 @@ from typing import Any, NamedTuple
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
 
-
-from rich.console import Console
 from rig import Rig
-from studies import table
+from studies import show, table
 
 from magbridge.link.files import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Signing
@@ -241,7 +239,7 @@ def main() -> int:
             finally:
                 rig.close()
                 rig.fluxgate.unplug()
-    Console(width=170).print(shown)
+    show(shown)
     return int(worst > 0)
 
 

@@ -76,15 +76,9 @@ def markdown(results: list[dict[str, Any]]) -> str:
 
 
 def main() -> int:
-    parser = command_line(__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
-    parser.add_argument("--table", type=Path, help="Markdown file to write the table to")
-    parser.add_argument("--factor", type=float, default=1.0, help="multiplies the number of repetitions")
-    chosen = parser.parse_args()
-    if unknown := set(chosen.names) - set(BENCHMARKS):
-        parser.error(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")
+    chosen = command_line(__doc__, BENCHMARKS, table=Path, factor=1.0)
     results = []
-    for name in chosen.names or BENCHMARKS:
+    for name in chosen.names:
         print(f"{name} ...", file=sys.stderr)
         results.append(measure(name, chosen.factor))
     text = markdown(results)

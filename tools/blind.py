@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from studies import Row, Study, study_options
+from studies import Row, Study, command_line
 from study.cases import PARTS, case, plan
 from study.table import lines, plot_confusion, plot_detection
 
@@ -24,19 +24,11 @@ def run(entry: Row) -> list[Row]:
 
 def main() -> None:
     """Run the cases, and write table and plots."""
-    parser = study_options(__doc__)
-    parser.set_defaults(out=Path("study"))
-    parser.add_argument("--cases", type=int, default=800, help="cases of the study, shared among its parts")
-    parser.add_argument("--part", default=",".join(PARTS), help=f"parts to run, of {', '.join(PARTS)}")
-    parser.add_argument("--seed", type=int, default=0, help="draws other vehicles and all else again")
-    options = parser.parse_args()
-    parts = tuple(options.part.split(","))
-    if not set(parts) <= set(PARTS):
-        parser.error(f"--part: {options.part} is not among {', '.join(PARTS)}")
+    options = command_line(__doc__, cases=800, part=",".join(PARTS), seed=0, out=Path("study"), workers=2)
     folder = options.out
     folder.mkdir(parents=True, exist_ok=True)
     options.out = folder / "cases.parquet"
-    cases = [(entry,) for entry in plan(options.cases, parts, options.seed)]
+    cases = [(entry,) for entry in plan(options.cases, tuple(options.part.split(",")), options.seed)]
     kept = Study(run, ("part",), {}).rows(cases, options)
     rows = sorted((json.loads(row) for row in kept["row"]), key=lambda row: row["number"])
     text = "\n".join(lines(rows))

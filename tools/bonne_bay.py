@@ -13,9 +13,11 @@ diagnosed against the true field, the map continued down to the glider, and the 
 
 from __future__ import annotations
 
+import argparse
+import sys
+
 import numpy as np
-from rich.console import Console
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study
 from study.deployment import CHARTS
 from study_worlds import MASSES, METHODS, PAPER, TRIALS, Trials, fly_trials, measure_trials, true_field
 
@@ -112,21 +114,13 @@ DIAGNOSIS = Study(
 )
 
 
-def main() -> None:
-    parser = study_options(__doc__)
-    parser.add_argument("--first", type=int, default=FIRST_SEED, help="number of the first world")
-    parser.add_argument("--seeds", type=int, default=1, help="worlds")
-    parser.add_argument("--at-depth", action="store_true", help="continue the map down to the glider")
-    parser.add_argument("--diagnose", action="store_true", help="diagnose the survey instead")
-    chosen = parser.parse_args()
-    seeds = range(chosen.first, chosen.first + chosen.seeds)
-    if chosen.diagnose:
-        cases = [(seed, reference) for reference in ("true", *CHARTS) for seed in seeds]
-        rows = DIAGNOSIS.rows(cases, chosen)
-        Console(width=150).print(DIAGNOSIS.table(f"{chosen.seeds} worlds, survey at +2 degC", rows))
-        return
-    STUDY.main(f"{chosen.seeds} worlds", [(seed, chosen.at_depth) for seed in seeds], chosen)
+def worlds(options: argparse.Namespace) -> range:
+    """Return the seeds of the worlds."""
+    return range(options.first, options.first + options.seeds)
 
 
 if __name__ == "__main__":
-    main()
+    shown, cases = STUDY, lambda o: [(seed, o.at_depth) for seed in worlds(o)]
+    if "--diagnose" in sys.argv:
+        shown, cases = DIAGNOSIS, lambda o: [(k, name) for name in ("true", *CHARTS) for k in worlds(o)]
+    shown.main(__doc__, cases, first=FIRST_SEED, seeds=1, at_depth=False, diagnose=False)

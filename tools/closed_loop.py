@@ -15,14 +15,16 @@ back, s       time from the return of GPS until the autopilot's position is with
 
 from __future__ import annotations
 
+import argparse
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 from referee import ArduPilot, Autopilot, Px4
 from referee.loop import Passage, Run, sail
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study
 from voyages import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 
 LOST_S, BACK_S = 600.0, 300.0
@@ -115,18 +117,11 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    """Run the cases and print the table."""
-    parser = study_options(__doc__)
-    parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--hours", type=float, default=6.0)
-    parser.add_argument("--maps", type=int, default=len(MAPS))
-    parser.add_argument("--telemetry", nargs="+", choices=STREAMS, default=list(STREAMS))
-    options = parser.parse_args()
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases: every kind of fix and of telemetry, on every map."""
     kinds = product(PAIRS, options.telemetry, MAPS[: options.maps], range(options.runs))
-    cases = [(*pair, streams, kind, seed, options.hours) for pair, streams, kind, seed in kinds]
-    STUDY.main(f"{options.runs} gliders, {options.hours:g} h", cases, options)
+    return [(*pair, streams, kind, seed, options.hours) for pair, streams, kind, seed in kinds]
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(__doc__, cases_of, runs=1, hours=6.0, maps=len(MAPS), telemetry=list(STREAMS))

@@ -9,7 +9,6 @@ flight and navigates, and its optional parts do not catch exceptions.
 
 from __future__ import annotations
 
-import argparse
 import random
 import struct
 import sys
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from small import START, small_bridge
+from studies import command_line
 
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
@@ -213,10 +213,7 @@ def feed(bridge: Pipeline, files: FileServer, event: Event) -> None:
 
 def main() -> None:
     """Feed the events; print the first event that raises an exception."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--events", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
+    given = command_line(__doc__, events=1_000_000, seed=1)
     OptionalParts.propagate = True
     begun, fed, part = time.monotonic(), 0, given.seed
     while fed < given.events:

@@ -1,7 +1,7 @@
 """Put faults of sensor, telemetry and computer into a survey, and count the wrong samples without a flag.
 
     python3 tools/faults.py                      the table: each fault on a simulated survey
-    python3 tools/faults.py --hours 6 spikes     the named faults, on a longer survey
+    python3 tools/faults.py --hours 6 "x stuck"  the named faults, on a longer survey
     python3 tools/faults.py --clean 30           30 days without a fault: false alarms
 
 The glider of ``magbridge demo`` performs calibration spirals and a survey. The bridge processes the survey's
@@ -10,6 +10,7 @@ bytes with a fault in them. A sample is wrong if it has no flag and its error ex
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study
 
 from magbridge.arrays import FloatArray
 from magbridge.bridge.events import Event, StartEvent, standstill
@@ -280,24 +281,14 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    """Simulate the faults, or days without a fault; print the table."""
-    names = (*FAULTS, *STALLS, OTHER)
-    parser = study_options(__doc__)
-    parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(names).replace("%", "%%"))
-    parser.add_argument("--hours", type=float, default=6.0)
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--clean", type=float, default=0.0, metavar="DAYS")
-    parser.add_argument("--first", type=int, default=1000, metavar="SEED", help="of the first clean glider")
-    options = parser.parse_args()
+def cases_of(options: argparse.Namespace) -> list[tuple[str, int, float]]:
+    """Return the cases: the named faults, or days without a fault."""
     if options.clean:
         days = range(options.first, options.first + int(np.ceil(options.clean)))
-        cases = [("none", seed, 24.0) for seed in days]
-    else:
-        chosen = [name for name in names if name in options.names or not options.names]
-        cases = [(name, seed, options.hours) for seed in range(1, options.seeds + 1) for name in chosen]
-    STUDY.main("Faults", cases, options)
+        return [("none", seed, 24.0) for seed in days]
+    return [(name, seed, options.hours) for seed in range(1, options.seeds + 1) for name in options.names]
 
 
 if __name__ == "__main__":
-    main()
+    names = (*FAULTS, *STALLS, OTHER)
+    STUDY.main(__doc__, cases_of, names, hours=6.0, seeds=1, clean=0.0, first=1000)

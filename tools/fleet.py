@@ -13,14 +13,14 @@ all changes are known exactly.
 
 from __future__ import annotations
 
+import argparse
 from itertools import product
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import xarray as xr
-from rich.console import Console
-from studies import Column, Row, Study, in_order, percentile, study_options
+from studies import Column, Row, Study, in_order, percentile, show
 from study_worlds import MASSES, BestFit, Glider
 
 from magbridge.arrays import FloatArray
@@ -149,43 +149,28 @@ def expected(known: Known) -> Calibration:
     )  # fmt: skip
 
 
-def main() -> None:
-    parser = study_options(__doc__)
-    parser.add_argument("--vehicles", type=int, default=12)
-    parser.add_argument("--deployments", type=int, default=8, help="of each vehicle; the last is scored")
-    parser.add_argument("--refit-interval", type=int, default=2, help="deployments of each refit")
-    parser.add_argument("--refit", choices=["usual", "battery"], default="usual")
-    parser.add_argument("--runs", type=int, nargs="+", default=[0, 2, 10])
-    parser.add_argument(
-        "--mounted", action="store_true", help="the fleet has the masses' usual places (drawn: 6 cm off)"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+def cases_of(options: argparse.Namespace) -> list[tuple[Flight, tuple[int, ...], Known]]:
+    """Learn the fleet's prior, print its widths, and return the cases: each vehicle's last deployment."""
     flights = [
         Flight(vehicle, number, options.refit, options.refit_interval, options.seed)
-        for vehicle in range(options.vehicles)
-        for number in range(options.deployments)
+        for vehicle, number in product(range(options.vehicles), range(options.deployments))
     ]
     last = options.deployments - 1
     reported = in_order(lesson, [(one,) for one in flights if one.number < last], options)
     where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
     mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
     fleet = learn_fleet([one for one in reported if isinstance(one, Lesson)], mounted)
+    for error in (one for one in reported if isinstance(one, str)):
+        show(f"not learned from: {error}")
+    widths = zip(FLEET_LEVELS, np.sqrt(np.median(fleet.population.variances.own, axis=1)), strict=True)
+    learned = ", ".join(f"{name} {width:.2g}" for name, width in widths)
+    show(f"learned: median of the physical widths: {learned}")
     refit = f"refit {last // options.refit_interval}"
-    cases = [
+    return [
         (one, tuple(options.runs), fleet.known(f"vehicle {one.vehicle}", refit))
         for one in flights
         if one.number == last
     ]
-    console = Console(width=110)
-    for error in (one for one in reported if isinstance(one, str)):
-        console.print(f"not learned from: {error}")
-    widths = np.sqrt(np.median(fleet.population.variances.own, axis=1))
-    console.print(
-        "learned: median of the physical widths: "
-        + ", ".join(f"{name} {width:.2g}" for name, width in zip(FLEET_LEVELS, widths, strict=True))
-    )
-    STUDY.main(f"{options.vehicles} vehicles, {options.deployments} deployments", cases, options)
 
 
 STUDY = Study(
@@ -201,4 +186,7 @@ STUDY = Study(
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(
+        __doc__, cases_of, vehicles=12, deployments=8, refit_interval=2, refit=("usual", "battery"),
+        runs=[0, 2, 10], mounted=False, seed=0,
+    )  # fmt: skip

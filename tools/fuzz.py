@@ -30,9 +30,8 @@ import grids
 import numpy as np
 import xarray as xr
 from flash import Log
-from rich.console import Console
 from segments import segment
-from studies import command_line, table
+from studies import command_line, show, table
 from ulogs import ulog_of
 
 from magbridge import config, logs
@@ -313,17 +312,13 @@ class Counts:
 
 def main() -> int:
     """Fuzz each target in turn; print the outcomes and return the exit code."""
-    parser = command_line(__doc__)
-    parser.add_argument("targets", nargs="*", help=f"of {' '.join(TARGETS)}; default all")
-    parser.add_argument("--kind", choices=["bytes", "file"], help="all targets of a kind")
-    parser.add_argument("-n", type=int, default=10_000, help="inputs for each")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="for each, at most")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("-o", type=Path, default=Path("fuzz"), help="folder of the inputs that fail")
-    chosen = parser.parse_args()
+    kinds = ["bytes", "file"]
+    chosen = command_line(
+        __doc__, TARGETS, kind=kinds, n=10_000, seconds=float("inf"), seed=0, o=Path("fuzz")
+    )
     shown = table("Fuzzing", "target", "tried", "read", "refused", "faults", "slowest, s", left=("target",))
     faults = 0
-    for name in chosen.targets or [n for n, t in TARGETS.items() if chosen.kind in (None, t.kind)]:
+    for name in (name for name in chosen.names if TARGETS[name].kind in chosen.kind):
         memory = Path("/dev/shm")
         with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as made:
             counts, folder = Counts(chosen.o / name), Path(made)
@@ -336,7 +331,7 @@ def main() -> int:
         faults += counts.found
         numbers = (f"{count:,}" for count in (counts.tried, counts.read, counts.refused, counts.found))
         shown.add_row(name, *numbers, f"{counts.slowest:.2f}")
-    Console().print(shown)
+    show(shown)
     return int(faults > 0)
 
 

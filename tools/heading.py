@@ -11,17 +11,17 @@ is the truth.
 
 from __future__ import annotations
 
-import os
+import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from accuracy import other_methods
+from accuracy import PEERS, other_methods
 from scipy.spatial.transform import Rotation
-from studies import Column, Row, Study, study_options
+from studies import DATA, Column, Row, Study
 from study_worlds import MASSES, glider, measure_trials
 
 import magbridge as mb
@@ -154,11 +154,10 @@ def lagging(known: Observations, log: xr.Dataset) -> Iterator[Row]:
 
 def aircraft() -> Iterator[Row]:
     """Yield the rows of the aircraft: each half of its line is fitted and tested on the other half."""
-    folder = Path(os.environ.get("MAGBRIDGE_REAL_DATA", "../shared/data"))
-    if not (folder / AIRCRAFT).exists():
+    if not (DATA / AIRCRAFT).exists():
         yield {"method": "auto", "failed": "no measured data"}
         return
-    rows = np.loadtxt(folder / AIRCRAFT)[::AIRCRAFT_STEP]
+    rows = np.loadtxt(DATA / AIRCRAFT)[::AIRCRAFT_STEP]
     pitch, roll, heading = rows[:, 4:7].T
     ned = rows[:, 7:10]
     line = Observations(
@@ -197,15 +196,11 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    parser = study_options(__doc__)
-    parser.add_argument("--seeds", type=int, default=6, help="simulated vehicles of each kind")
-    peers = os.environ.get("MAGBRIDGE_PEERS", "")
-    parser.add_argument("--peers", default=peers, help="interpreter that has magyc and MAVProxy")
-    chosen = parser.parse_args()
-    cases = [(name, seed, chosen.peers) for name, seed in product(SIMULATED, range(chosen.seeds))]
-    STUDY.main("Heading, out of sample", [*cases, ("aircraft", 0, "")], chosen)
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases: the simulated vehicles, and the aircraft once."""
+    cases = [(name, seed, options.peers) for name, seed in product(SIMULATED, range(options.seeds))]
+    return [*cases, ("aircraft", 0, "")]
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(__doc__, cases_of, seeds=6, peers=PEERS)

@@ -12,19 +12,17 @@ extended calibration on the later part.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
+import argparse
 import warnings
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from measured import VEHICLES, joined
-from rich.console import Console
-from studies import Column, Row, Study, study_options
+from studies import DATA, Column, Row, Study, show
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -42,6 +40,7 @@ TELEMETRY = {"sensor_temperature": "degC", "payload_current": "A"}
 """Simulated telemetry that is added to every log, with its unit."""
 DELAYS_S = np.geomspace(0.1, 120.0, 40)
 """Clock offsets that are tried to obtain the requested size, s."""
+EFFECTS = "temperature_offset", "current_field", "offset_step", "relay", "clock_offset"
 FOREIGN = ("relay",)
 """Effects that no cause describes: any name is wrong."""
 
@@ -193,33 +192,21 @@ def cell(rows: pd.DataFrame, name: str) -> str:
     return f"{int(rows[name].sum())} of {len(rows)}"
 
 
-def main() -> None:
-    options_of = study_options(__doc__)
-    options_of.add_argument("--data", type=Path, required=True, help="folder of the measured logs")
-    options_of.add_argument("--snr", type=float, default=12.0, help="signal-to-noise ratio of the effects")
-    options_of.add_argument("--seeds", type=int, default=1, help="cases of each effect in each log")
-    options_of.add_argument("--first", type=int, default=0, help="first seed")
-    options = options_of.parse_args()
-    effects = ("temperature_offset", "current_field", "offset_step", "relay", "clock_offset")
-    cases = [
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases: every effect in every vehicle's log."""
+    seeds = range(options.first, options.first + options.seeds)
+    return [
         (vehicle, effect, seed, options.snr, str(options.data))
-        for seed in range(options.first, options.first + options.seeds)
-        for vehicle in VEHICLES
-        for effect in effects
+        for seed, vehicle, effect in product(seeds, VEHICLES, EFFECTS)
     ]
-    rows = STUDY.rows(cases, options)
-    console = Console(width=190)
-    console.print(STUDY.table("Effects hidden in measured logs", rows))
-    own = rows[~rows["effect"].isin(FOREIGN)]
-    foreign = rows[rows["effect"].isin(FOREIGN)]
-    console.print(
-        f"causes: found {cell(own, 'found')}, right first {cell(own, 'right')}, in the set "
-        f"{cell(own, 'in_set')}, alone {cell(own, 'alone')}, a second name {cell(own, 'second')}; foreign "
-        f"with a name {int((foreign['named'] != 'none').sum())} of {len(foreign)}"
-    )
-    worse = rows[(rows["real"] > 1.02)]
-    console.print(f"later part worse than as given by more than 2 %: {len(worse)} of {len(rows)}")
 
 
 if __name__ == "__main__":
-    main()
+    rows = STUDY.main(__doc__, cases_of, data=DATA, snr=12.0, seeds=1, first=0)
+    own, foreign = (rows[rows["effect"].isin(FOREIGN) == is_foreign] for is_foreign in (False, True))
+    show(
+        f"causes: found {cell(own, 'found')}, right first {cell(own, 'right')}, in the set "
+        f"{cell(own, 'in_set')}, alone {cell(own, 'alone')}, a second name {cell(own, 'second')}; foreign "
+        f"with a name {int((foreign['named'] != 'none').sum())} of {len(foreign)}",
+        f"later part worse than as given by more than 2 %: {int((rows['real'] > 1.02).sum())} of {len(rows)}",
+    )

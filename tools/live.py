@@ -17,13 +17,15 @@ false         number of alarms without a change
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
-from typing import NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from magnav_online import online
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study
 from study_worlds import MASSES
 
 from magbridge.arrays import BoolArray, FloatArray
@@ -45,6 +47,7 @@ from magbridge.learning.estimator import Nuisance
 from magbridge.records import Quality, Reading
 from sitl import load, segments, simulate
 from sitl.dataset import channels, side_by_side
+from sitl.inject import direction
 from sitl.mission import CrissCross, Leg, Legs, Spirals
 from sitl.world import Geology
 
@@ -67,12 +70,6 @@ class Published(NamedTuple):
 
 
 # ---- the changes -------------------------------------------------------------------------------------------
-
-
-def direction(rng: np.random.Generator) -> np.ndarray:
-    """Return a random unit vector (3,)."""
-    vector = rng.normal(size=3)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def hours(log: xr.Dataset) -> np.ndarray:
@@ -352,19 +349,11 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    """Run the cases and print the table."""
-    parser = study_options(__doc__)
-    parser.add_argument("--seeds", type=int, default=10, help="gliders")
-    parser.add_argument("--first", type=int, default=0, help="the first glider")
-    parser.add_argument("--hours", type=float, default=12.0, help="of the survey")
-    parser.add_argument("--size", type=float, default=20.0, help="nT of a change, in times its kind's unit")
-    parser.add_argument("--changes", nargs="+", default=list(CHANGES), choices=list(CHANGES))
-    options = parser.parse_args()
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases: every change of every glider."""
     seeds = range(options.first, options.first + options.seeds)
-    cases = [(name, seed, options.hours, options.size) for name in options.changes for seed in seeds]
-    STUDY.main(f"{options.seeds} gliders, {options.hours:g} h, {options.size:g} nT", cases, options)
+    return [(name, seed, options.hours, options.size) for name, seed in product(options.changes, seeds)]
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(__doc__, cases_of, seeds=10, first=0, hours=12.0, size=20.0, changes=list(CHANGES))

@@ -9,14 +9,15 @@ of the survey; *mean* is its mean error, which is not observable; *normalised* i
 
 from __future__ import annotations
 
+import argparse
+import sys
 from itertools import pairwise
 from pathlib import Path
 
 import live
 import numpy as np
 import pandas as pd
-from rich.console import Console
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study
 from study_worlds import MASSES
 
 from magbridge.calibration.model import Parameter
@@ -88,20 +89,13 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
     figure.savefig(file)
 
 
-def main() -> None:
-    """Run the cases, print the table and write the plot."""
-    parser = study_options(__doc__)
-    parser.add_argument("--seeds", type=int, default=4, help="gliders")
-    parser.add_argument("--first", type=int, default=0, help="the first glider")
-    parser.add_argument("--hours", type=float, default=24.0, help="of the survey")
-    parser.add_argument("-o", "--output", type=Path, help="file of the plot")
-    options = parser.parse_args()
-    cases = [(seed, options.hours) for seed in range(options.first, options.first + options.seeds)]
-    rows = STUDY.rows(cases, options).sort_values(["seed", "middle"])
-    Console(width=120).print(STUDY.table(f"{options.seeds} gliders", rows))
-    if options.output is not None:
-        draw(rows, options.output)
+def cases_of(options: argparse.Namespace) -> list[tuple[int, float]]:
+    """Return the cases: the gliders."""
+    return [(seed, options.hours) for seed in range(options.first, options.first + options.seeds)]
 
 
 if __name__ == "__main__":
-    main()
+    # the plot's file is the argument after -o
+    rows = STUDY.main(__doc__, cases_of, seeds=4, first=0, hours=24.0, o=Path)
+    if "-o" in sys.argv:
+        draw(rows, Path(sys.argv[sys.argv.index("-o") + 1]))

@@ -14,10 +14,7 @@ fitted by least squares to the calibration's residuals, with each eighth of the 
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
+import argparse
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -26,10 +23,9 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from accuracy import ask_peers
-from rich.console import Console
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from studies import command_line, table
+from studies import DATA, command_line, show, table
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
@@ -142,9 +138,9 @@ def hold_runs_out(data: Observations, method: str, order: int = 3) -> tuple[Floa
     return error, normalised
 
 
-def show_seaglider(data: Path, console: Console) -> None:
+def show_seaglider(options: argparse.Namespace) -> None:
     """Print the error of each choice of masses, with each dive held out in turn."""
-    log = read(sorted((data / "seaglider_sg167").glob("p*.nc")))
+    log = read(sorted((options.data / "seaglider_sg167").glob("p*.nc")))
     shown = table("Seaglider, each dive held out", "method", "order", "masses", "nT", "normalised error")
     for method, masses, order in SEAGLIDER_CHOICES:
         try:
@@ -153,7 +149,7 @@ def show_seaglider(data: Path, console: Console) -> None:
         except CalibrationError as refusal:
             cells = "refused", str(refusal).partition(";")[0]
         shown.add_row(method, str(order), ", ".join(masses), *cells)
-    console.print(shown)
+    show(shown)
 
 
 # ---- halves of a log ---------------------------------------------------------------------------------------
@@ -250,21 +246,21 @@ def _magfits(
         yield HalfScore(name, rms(error), median, scales=f"{scales[-1]:.2f}-{scales[0]:.2f}")
 
 
-def show_halves(paths: list[Path], peers: str, console: Console) -> None:
+def show_halves(options: argparse.Namespace) -> None:
     """Print a table of all methods for each compass of each log."""
-    for path in paths:
+    for path in options.log:
         for number in [str(one.number) for one in compasses_in(read(path))] or ["0"]:
             shown = table(
                 f"{path.name}, compass {number}",
                 "method", "RMS, nT", "median", "claimed / error", "scales", "parameters",
             )  # fmt: skip
             try:
-                for row in compare_halves(read(path, options=Options(compass=number)), peers):
+                for row in compare_halves(read(path, options=Options(compass=number)), options.peers):
                     numbers = f"{row.rms:.0f}", f"{row.median:.0f}", f"{row.claimed:.2f}"
                     shown.add_row(row.method, *numbers, row.scales, row.note)
             except MagbridgeError as error:
                 shown.add_row(str(error))
-            console.print(shown)
+            show(shown)
 
 
 # ---- diagnosis, with an independent check ------------------------------------------------------------------
@@ -311,7 +307,7 @@ def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
     return fitted, diagnose([joined(vehicle.asked)], fitted.calibration).diagnosis
 
 
-def show_diagnoses(data: Path, console: Console) -> None:
+def show_diagnoses(options: argparse.Namespace) -> None:
     """Print the findings in each vehicle's log, and the errors by Tolles-Lawson's terms."""
     shown = table(
         "Measured logs, nT RMS",
@@ -319,7 +315,7 @@ def show_diagnoses(data: Path, console: Console) -> None:
         "+ eddy",
     )  # fmt: skip
     for name, vehicle in VEHICLES.items():
-        fitted, found = calibrate_and_diagnose(vehicle(data))
+        fitted, found = calibrate_and_diagnose(vehicle(options.data))
         causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
         low, high = found.improvement.interval
         shown.add_row(
@@ -327,15 +323,15 @@ def show_diagnoses(data: Path, console: Console) -> None:
             f"{found.improvement.before:.1f}", f"{found.improvement.after:.1f}", f"{low:.2f}-{high:.2f}",
             *(f"{value:.1f}" for value in check_by_tolles_lawson(found)),
         )  # fmt: skip
-    console.print(shown)
+    show(shown)
 
 
 # ---- an airborne survey ------------------------------------------------------------------------------------
 
 
-def show_survey(data: Path, console: Console) -> None:
+def show_survey(options: argparse.Namespace) -> None:
     """Print the errors of tie lines predicted from the other lines, and the mis-ties of all lines."""
-    samples = read_table(data / "rio_magnetic" / "rio-magnetic.csv.xz")
+    samples = read_table(options.data / "rio_magnetic" / "rio-magnetic.csv.xz")
     done = survey(samples.part(~samples.tie))
     ties = samples.part(samples.tie)
     anomaly, sigma = done.gridded.evaluate(ties.place, ties.depth)
@@ -348,30 +344,23 @@ def show_survey(data: Path, console: Console) -> None:
         "all ties": error,
         f"within {MAX_LINE_DISTANCE_M:.0f} m of a line": error[near],
     }.items():
-        console.print(f"{name}: median error {np.median(np.abs(values)):.1f} nT, RMS {rms(values):.0f}")
-    console.print(f"normalised error: RMS {rms(z):.2f}, median / 0.6745 {1.4826 * np.median(np.abs(z)):.2f}")
-    console.print(
-        f"{len(joint.before)} mis-ties: {rms(joint.before):.1f} nT RMS, {rms(joint.after):.1f} levelled"
-    )
+        show(f"{name}: median error {np.median(np.abs(values)):.1f} nT, RMS {rms(values):.0f}")
+    show(f"normalised error: RMS {rms(z):.2f}, median / 0.6745 {1.4826 * np.median(np.abs(z)):.2f}")
+    show(f"{len(joint.before)} mis-ties: {rms(joint.before):.1f} nT RMS, {rms(joint.after):.1f} levelled")
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("part", choices=["seaglider", "halves", "diagnose", "survey"])
-    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the measured logs")
-    parser.add_argument("--log", type=Path, action="append", default=[], help="for halves; may be repeated")
-    parser.add_argument("--peers", default="", help="for halves: interpreter that has MAVProxy")
-    chosen = parser.parse_args()
+    """Print the tables of one part."""
+    parts = {
+        "seaglider": show_seaglider,
+        "halves": show_halves,
+        "diagnose": show_diagnoses,
+        "survey": show_survey,
+    }
+    chosen = command_line(__doc__, parts, data=DATA, log=[DATA / "ardusub" / "small.tlog"], peers="")
     warnings.simplefilter("ignore")
-    console = Console(width=170)
-    if chosen.part == "seaglider":
-        show_seaglider(chosen.data, console)
-    elif chosen.part == "halves":
-        show_halves(chosen.log or [chosen.data / "ardusub" / "small.tlog"], chosen.peers, console)
-    elif chosen.part == "diagnose":
-        show_diagnoses(chosen.data, console)
-    else:
-        show_survey(chosen.data, console)
+    for name in chosen.names:
+        parts[name](chosen)
 
 
 if __name__ == "__main__":

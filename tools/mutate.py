@@ -30,8 +30,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rich.console import Console
-from studies import command_line, table
+from studies import command_line, show, table
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = {
@@ -190,17 +189,13 @@ def run(module: str, tests: list[str], tree: ast.Module | None, limit: float) ->
 
 def main() -> int:
     """Change each module; print undetected changes and the fraction detected; return the exit code."""
-    parser = command_line(__doc__)
-    parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {' '.join(TESTS)}")
-    parser.add_argument("-n", type=int, default=10, help="changes to each")
-    parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args()
+    chosen = command_line(__doc__, TESTS, n=10, seed=1)
     os.chdir(ROOT)
     for library in LIBRARIES:
         importlib.import_module(library)
     shown = table("Changes", "module", "may be changed", "tried", "seen", left=("module",))
     tried = seen = 0
-    for module in chosen.modules or TESTS:
+    for module in chosen.names:
         tests = [f"tests/{one}" for one in TESTS[module].split() if (ROOT / "tests" / one).exists()]
         whole = ast.parse((ROOT / f"magbridge/{module}.py").read_text())
         count = len(list(changes(whole)))
@@ -218,7 +213,7 @@ def main() -> int:
                 print(f"lives: magbridge/{module}.py:{line}: {what}", flush=True)
         shown.add_row(module, str(count), str(min(chosen.n, count)), str(own))
         tried, seen = tried + min(chosen.n, count), seen + own
-    Console().print(shown)
+    show(shown)
     print(f"{seen} of {tried} seen, {100 * seen / max(tried, 1):.0f} %")
     return 0
 

@@ -30,8 +30,7 @@ from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as with_options
-from rich.console import Console
-from studies import Column, Row, Study, percentile, study_options, table
+from studies import Column, Row, Study, command_line, percentile, show, table
 from voyages import (
     AIRCRAFT,
     GLIDER,
@@ -285,7 +284,7 @@ def cases_of(part: str, options: argparse.Namespace) -> list[tuple[Any, ...]]:
 # ---- speed, and a published flight -------------------------------------------------------------------------
 
 
-def show_speed(console: Console) -> None:
+def show_speed() -> None:
     """Print the processor time of an update, of 100,000 samples, and of a sample after a wide start."""
     grid = synthetic(Map(30, 1500), 3, 40_000.0)
     options = with_options(GLIDER, start_sigma=50.0)
@@ -296,18 +295,16 @@ def show_speed(console: Console) -> None:
     for _ in range(5000):
         tracker.predict(*moved)
         tracker.update(block)
-    console.print(f"one update with its look-up: {1e6 * (clock.process_time() - begun) / 5000:.0f} us")
+    show(f"one update with its look-up: {1e6 * (clock.process_time() - begun) / 5000:.0f} us")
     ds = track_over(grid, options, 5, hours=100_000 / 3600, every=1.0)
     for interval in (options.interval, 0.0):
         begun = clock.process_time()
         navigate(ds, grid, with_options(options, interval=interval), start=PLACE)
-        console.print(f"100,000 samples, interval {interval:.0f} s: {clock.process_time() - begun:.1f} s")
-    console.print(
-        f"wide start: {1e3 * sail(*drawn_track(MAPS[0], 7, 1.0, bias_sigma=1.0)).seconds:.2f} ms a sample"
-    )
+        show(f"100,000 samples, interval {interval:.0f} s: {clock.process_time() - begun:.1f} s")
+    show(f"wide start: {1e3 * sail(*drawn_track(MAPS[0], 7, 1.0, bias_sigma=1.0)).seconds:.2f} ms a sample")
 
 
-def show_magnav(folder: Path, console: Console) -> None:
+def show_magnav(folder: Path) -> None:
     """Print the errors on MagNav.jl's simple example, with its map, magnetometer and inertial track.
 
     The inertial track has an error of 2 m after 100 s. MagNav.jl's filter is not comparable, because it
@@ -336,29 +333,26 @@ def show_magnav(folder: Path, console: Console) -> None:
         bound = position_bound(grid, ds["time"], true[:, 0], true[:, 1], options, 3.0, depth, 1.0)
         cells = [f"{value:.1f}" for value in (*errors, rms(bound.sigma))]
         shown.add_row(f"{start:g}", f"{interval:g}", *cells)
-    console.print(shown)
+    show(shown)
 
 
 def main() -> None:
     """Run the parts, and print their tables."""
-    parser = study_options(__doc__)
-    parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0, help="number of the first run")
-    parser.add_argument("--vehicle", choices=VEHICLES, nargs="+", default=list(VEHICLES), help="of unmapped")
-    parser.add_argument("--part", choices=[*STUDIES, "speed"], action="append")
-    parser.add_argument("--peers", help="a Python interpreter that has Stone Soup")
-    parser.add_argument("--data", type=Path, help="folder of measured data, with magnav_example in it")
-    options = parser.parse_args()
-    console, out = Console(width=190), options.out
-    for part in options.part or [*STUDIES, "speed"]:
+    options = command_line(
+        __doc__, part=[*STUDIES, "speed"], runs=100, first=0, vehicle=list(VEHICLES), peers="", data=Path,
+        out=Path, workers=2,
+    )  # fmt: skip
+    out = options.out
+    for part in options.part:
         if part == "speed":
-            show_speed(console)
+            show_speed()
             continue
         options.out = out and out.with_stem(f"{out.stem}-{part}")
         if cases := cases_of(part, options):
-            STUDIES[part].main(f"{part}, {options.runs} runs", cases, options)
+            study = STUDIES[part]
+            show(study.table(f"{part}, {options.runs} runs", study.rows(cases, options)))
         if part == "peers" and options.data:
-            show_magnav(options.data / "magnav_example", console)
+            show_magnav(options.data / "magnav_example")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ step on, else from the start.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from live import learn
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -285,17 +286,10 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    """Run the cases and print the table."""
-    parser = study_options(__doc__)
-    parser.add_argument("names", nargs="*", metavar="CHANGE", help="; ".join(CHANGES))
-    parser.add_argument("--vehicles", type=int, nargs="+", default=[1, 2, 3, 4])
-    parser.add_argument("--hours", type=float, default=12.0)
-    chosen = parser.parse_args()
-    names = chosen.names or list(CHANGES)
-    cases = [(name, seed, chosen.hours) for name in names for seed in chosen.vehicles]
-    STUDY.main(f"{chosen.hours:g} h", cases, chosen)
+def cases_of(options: argparse.Namespace) -> list[tuple[str, int, float]]:
+    """Return the cases: every change of every vehicle."""
+    return [(name, seed, options.hours) for name in options.names for seed in options.vehicles]
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(__doc__, cases_of, CHANGES, vehicles=[1, 2, 3, 4], hours=12.0)

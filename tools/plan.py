@@ -9,12 +9,14 @@ bank. Each glider is calibrated by `auto` on both sets of runs, and surveys the 
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from msgspec.structs import replace
-from studies import Column, Row, Study, percentile, study_options
+from studies import Column, Row, Study, percentile
 from study_worlds import MASSES, glider
 
 from magbridge.calibration.fitting.fit import fit
@@ -91,18 +93,13 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    parser = study_options(__doc__)
-    parser.add_argument("--seeds", type=int, default=12, help="gliders")
-    parser.add_argument("--noise", type=float, default=1.0, help="nT, white")
-    given = parser.parse_args()
-    scenario = load("random_glider").replace(instrument={"noise_sigma": given.noise})
-    made = plans(scenario, given.noise)
-    cases = [(seed, given.noise, name, *runs) for name, runs in made.items() for seed in range(given.seeds)]
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases, and print the planned runs: pitch, roll and positions of the masses."""
+    made = plans(load("random_glider").replace(instrument={"noise_sigma": options.noise}), options.noise)
     for number, one in enumerate(made["planned"][0], 1):
         print(number, *(f"{value:.2f}" for value in (one.pitch, one.roll, *one.parameters)))
-    STUDY.main(f"{given.seeds} gliders, noise {given.noise:g} nT, ten spirals of 15 minutes", cases, given)
+    return [(k, options.noise, name, *runs) for name, runs in made.items() for k in range(options.seeds)]
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(__doc__, cases_of, seeds=12, noise=1.0)

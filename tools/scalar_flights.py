@@ -11,12 +11,13 @@ half. In the flights ``hidden``, an unlogged source of 3,000 nT is on for 65 s o
 
 from __future__ import annotations
 
+import argparse
 from typing import Any
 
 import numpy as np
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.spatial.transform import Rotation
-from studies import Column, Study, percentile, study_options
+from studies import Column, Study, percentile
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.scalar_fit import adapt_to_log, fit_scalar
@@ -142,19 +143,20 @@ def compensate(seed: int, second: bool, known: bool, hidden: bool) -> list[dict[
     return rows
 
 
-def main() -> None:
-    """Run the flights and print the table."""
-    parser = study_options(__doc__)
-    parser.add_argument("--flights", type=int, default=10)
-    parser.add_argument("--first-seed", type=int, default=100)
-    options = parser.parse_args()
-    cases = [
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases: each half of the flights, with a third as many without a map and with a source."""
+    return [
         (options.first_seed + k, second, kind != "no map", kind == "hidden")
         for kind in ("map", "no map", "hidden")
         for k in range(options.flights if kind == "map" else max(1, options.flights // 3))
         for second in ((True,) if kind == "hidden" else (False, True))
     ]
-    columns = {
+
+
+STUDY = Study(
+    compensate,
+    ("flights", "method"),
+    {
         "RMS, nT": Column("rms"),
         "worst": Column("rms", np.max),
         "about the mean": Column("about_mean"),
@@ -162,9 +164,7 @@ def main() -> None:
         "5 %": Column("standardised", percentile(5)),
         "95 %": Column("standardised", percentile(95)),
         "flagged, %": Column("flagged"),
-    }
-    Study(compensate, ("flights", "method"), columns).main("Scalar compensation", cases, options)
-
-
+    },
+)
 if __name__ == "__main__":
-    main()
+    STUDY.main(__doc__, cases_of, flights=10, first_seed=100)

@@ -10,17 +10,13 @@ causes, so any name for them is wrong.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
+import argparse
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from rich.console import Console
-from studies import Column, Row, Study, study_options
+from studies import Column, Row, Study, show
 from study.ideal import cause_names
 
 from magbridge.arrays import FloatArray
@@ -259,28 +255,21 @@ def reported(name: str, found: Diagnosis, own: Container[str]) -> list[Row]:
     return [row]
 
 
+HEADINGS = {
+    "a name": "name", "right": "right", "in the set": "in_set", "alone": "alone", "a second": "second",
+}  # fmt: skip
+
+
 def study(run: Callable[..., list[Row]], names: Sequence[str], doc: str | None) -> None:
     """Run cases, each of which hides one of `names` (none if empty), and print the counts of the names."""
-    parser = study_options(doc)
-    parser.add_argument("--cases", type=int, default=2 * len(names))
-    parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument("--snr", type=float, default=25.0, help="signal-to-noise of the effects")
-    options = parser.parse_args()
-    numbers = range(options.first, options.first + options.cases)
-    cases = [(number, names[number % len(names)], options.snr) for number in numbers]
-    headings = {
-        "a name": "name",
-        "right": "right",
-        "in the set": "in_set",
-        "alone": "alone",
-        "a second": "second",
-    }
-    columns = {heading: Column(source, np.mean, ".0%") for heading, source in headings.items()}
-    shown = Study(run, ("kind",), columns)
-    rows = shown.rows(cases, options)
-    console = Console(width=120)
-    console.print(shown.table(f"{options.cases} cases", rows))
-    console.print(rows[["hidden", "named"]].to_string())
+
+    def cases_of(options: argparse.Namespace) -> list[tuple[int, str, float]]:
+        numbers = range(options.first, options.first + options.cases)
+        return [(number, names[number % len(names)], options.snr) for number in numbers]
+
+    columns = {heading: Column(source, np.mean, ".0%") for heading, source in HEADINGS.items()}
+    rows = Study(run, ("kind",), columns).main(doc, cases_of, cases=2 * len(names), first=0, snr=25.0)
+    show(rows[["hidden", "named"]].to_string())
 
 
 if __name__ == "__main__":

@@ -140,10 +140,7 @@ def peak() -> int:
 
 
 def main() -> int:
-    parser = command_line(__doc__)
-    parser.add_argument("--minutes", type=float, default=2.0)
-    parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args()
+    chosen = command_line(__doc__, minutes=2.0, seed=1)
     with tempfile.TemporaryDirectory() as name:
         soak = Soak(Path(name), chosen.seed)
         last = round(chosen.minutes * 60_000)

@@ -7,11 +7,8 @@ file are not run again.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import argparse
+import os
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -24,6 +21,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
+from threadpoolctl import threadpool_limits
 
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
@@ -31,14 +29,41 @@ REPORT_EVERY = 10
 """Number of cases between two lines of progress if stderr is not a terminal."""
 
 
-def command_line(doc: str | None) -> argparse.ArgumentParser:
-    """Return a parser whose help begins with a tool's docstring, with its line breaks kept."""
-    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+DATA = Path(os.environ.get("MAGBRIDGE_REAL_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+"""Folder of the logs of real vehicles."""
 
 
-def add_engine(parser: argparse.ArgumentParser) -> None:
-    """Add the option ``--workers``, the number of processes of a study."""
-    parser.add_argument("--workers", type=int, default=2, help="processes")
+def command_line(doc: str | None, names: Collection[str] = (), /, **defaults: Any) -> argparse.Namespace:
+    """Return the options of a tool's command line; the help begins with the tool's docstring.
+
+    Each keyword is an option, and its default gives the type. A list takes several values: of its own, if
+    they are texts. A tuple takes one of its texts, a type has no default, and False is a switch. With `names`
+    the command takes some of them as arguments, all if none is given.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if names:
+        parser.add_argument("names", nargs="*", metavar="NAME", help="; ".join(names).replace("%", "%%"))
+    for name, default in defaults.items():
+        flag = f"--{name.replace('_', '-')}" if len(name) > 1 else f"-{name}"
+        if isinstance(default, bool):
+            parser.add_argument(flag, action="store_true")
+            continue
+        several = isinstance(default, list | tuple)
+        kind = default if isinstance(default, type) else type(default[0] if several else default)
+        parser.add_argument(
+            flag,
+            type=kind,
+            nargs="+" if isinstance(default, list) else None,
+            choices=default if several and kind is str else None,
+            default=None if kind is default else default[0] if isinstance(default, tuple) else default,
+            help="default %(default)s",
+        )
+    options = parser.parse_args()
+    if names:
+        if unknown := set(options.names) - set(names):
+            parser.error(f"no {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+        options.names = [name for name in names if name in options.names or not options.names]
+    return options
 
 
 def table(title: str, *headings: str, left: Collection[str] = ("",)) -> Table:
@@ -54,7 +79,7 @@ def as_done(
 ) -> Iterator[tuple[Any, Future[Any]]]:
     """Run a function on cases (tuples of arguments) in parallel; yield case and future as each finishes."""
     is_terminal = sys.stderr.isatty()
-    with ProcessPoolExecutor(options.workers) as pool:
+    with ProcessPoolExecutor(options.workers, initializer=threadpool_limits, initargs=(1,)) as pool:
         futures = {pool.submit(function, *case): case for case in cases}
         for count, future in enumerate(as_completed(futures), 1):
             yield futures[future], future
@@ -69,9 +94,8 @@ def as_done(
 
 def in_order(function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace) -> list[Any]:
     """Run a function on cases (tuples of arguments) in parallel; return the results in this order."""
-    with ProcessPoolExecutor(options.workers) as pool:
-        futures = [pool.submit(function, *case) for case in cases]
-        return [future.result() for future in futures]
+    done = {id(case): future for case, future in as_done(function, cases, options)}
+    return [done[id(case)].result() for case in cases]
 
 
 @dataclass(frozen=True)
@@ -154,14 +178,25 @@ class Study:
             made.add_row(*map(str, key), str(len(group)), *cells, str(failed) if failed else "")
         return made
 
-    def main(self, title: str, cases: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> None:
-        """Run the cases and print the table."""
-        Console(width=170).print(self.table(title, self.rows(cases, options)))
+    def main(
+        self,
+        doc: str | None,
+        cases_of: Callable[[argparse.Namespace], Sequence[tuple[Any, ...]]],
+        names: Collection[str] = (),
+        /,
+        **defaults: Any,
+    ) -> pd.DataFrame:
+        """Run the cases that `cases_of` makes of the options, print the table, and return the rows.
+
+        The other arguments are those of :func:`command_line`. Each study also has ``--out``, the file of the
+        rows, and ``--workers``, the number of processes.
+        """
+        options = command_line(doc, names, **defaults, out=Path, workers=2)
+        rows = self.rows(cases_of(options), options)
+        show(self.table((doc or "").partition("\n")[0], rows))
+        return rows
 
 
-def study_options(doc: str | None) -> argparse.ArgumentParser:
-    """Return an argument parser with the options that every study has."""
-    parser = command_line(doc)
-    parser.add_argument("--out", type=Path, help="Parquet file of the rows; its cases are not run again")
-    add_engine(parser)
-    return parser
+def show(*parts: Any) -> None:
+    """Print tables and texts, wide enough for a table of many columns."""
+    Console(width=190).print(*parts, sep="\n")

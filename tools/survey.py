@@ -12,6 +12,7 @@ field's amplitude and length. The bound is for an estimator that knows all excep
 
 from __future__ import annotations
 
+import argparse
 import time
 from itertools import product
 from typing import Any
@@ -19,7 +20,7 @@ from typing import Any
 import harmonica as hm
 import numpy as np
 import xarray as xr
-from studies import Column, Row, Study, fraction_within, percentile, study_options
+from studies import Column, Row, Study, fraction_within, percentile
 from study_worlds import MASSES, NOISES, GaussianRock, SurveyBound, drifted, fly_survey, oracle, true_field
 
 from magbridge.arrays import FloatArray
@@ -178,21 +179,14 @@ STUDY = Study(
 )
 
 
-def main() -> None:
-    parser = study_options(__doc__)
-    parser.add_argument("--gliders", type=int, default=10, help="gliders of each kind of survey")
-    parser.add_argument("--hours", type=float, nargs="+", default=[6.0, 12.0])
-    parser.add_argument("--crust", type=float, nargs="+", default=[8.0, 30.0, 60.0], help="nT RMS")
-    parser.add_argument("--length", type=float, nargs="+", default=[500.0, 1000.0, 1500.0], help="m")
-    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
-    parser.add_argument("--drift", type=float, nargs="+", default=[0.0], help="m, position errors")
-    parser.add_argument("--first", type=int, default=0, help="number of the first glider")
-    chosen = parser.parse_args()
-    seeds = range(chosen.first, chosen.first + chosen.gliders)
-    kinds = product(chosen.hours, chosen.crust, chosen.length, chosen.noise, chosen.drift)
-    cases = [(*kind, seed) for kind in kinds for seed in seeds]
-    STUDY.main("surveys that calibrate themselves", cases, chosen)
+def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return the cases: every kind of survey by every glider."""
+    seeds = range(options.first, options.first + options.gliders)
+    return list(product(options.hours, options.crust, options.length, options.noise, options.drift, seeds))
 
 
 if __name__ == "__main__":
-    main()
+    STUDY.main(
+        __doc__, cases_of, gliders=10, first=0, hours=[6.0, 12.0], crust=[8.0, 30.0, 60.0],
+        length=[500.0, 1000.0, 1500.0], noise=list(NOISES), drift=[0.0],
+    )  # fmt: skip

@@ -10,10 +10,6 @@ has the columns of :mod:`second_world`; in a log without a hidden effect, any na
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 from collections.abc import Callable
 
 import numpy as np
