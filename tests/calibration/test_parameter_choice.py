@@ -75,6 +75,14 @@ def test_where_nothing_moves_the_field_nothing_is_taken() -> None:
     assert taken == ()
 
 
+def test_two_masses_that_move_together_with_the_attitude_are_taken() -> None:
+    # one of them alone distorts the scales by more than 0.15
+    log = demo_log()
+    taken, offers = best_parameters(log, movers(log))
+    assert set(taken) == {"battpos", "ballast"}
+    assert offers[-1].left_out < 0.02 * offers[0].without
+
+
 def test_on_the_command_line(tmp_path: Path, command: Command) -> None:
     write(flight(), tmp_path / "flight.csv")
     output = command("calibrate", tmp_path / "flight.csv", "--parameter", "auto", "-o", tmp_path / "cal.json")

@@ -9,7 +9,7 @@ and its log has currents, throttles and servos, most of which are collinear.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -153,7 +153,7 @@ class Offer:
     without: float
     left_out: float
     """`without`, `left_out`: RMS error on held-out parts of fits without and with the column, nT."""
-    taken: bool
+    taken: bool = False
     """True if the column became a parameter."""
 
 
@@ -170,6 +170,19 @@ def best_parameters(
     def screened(names: tuple[str, ...]) -> Observations:
         return observations(deployment, names, grid=grid).thinned(SCREENING_SAMPLES)
 
+    def fitted(names: tuple[str, ...]) -> Fit | None:
+        try:
+            return fit(screened(names), **options)
+        except CalibrationError:  # implausible positions, or too few samples with a value
+            return None
+
+    def most_useful(found: Fit, names: tuple[str, ...], tried: set[str]) -> str | None:
+        data = screened(names)
+        rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
+        columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}
+        explained = worths(found.calibration, data, columns, HINTED)
+        return max(explained, key=explained.__getitem__, default=None)
+
     taken: tuple[str, ...] = ()
     found = fit(screened(taken), **options)
     offers: list[Offer] = []
@@ -177,35 +190,43 @@ def best_parameters(
     # Forward selection: try the column that explains most of the residual; keep it if a new fit predicts
     # held-out parts better, and also later parts from earlier parts.
     while len(taken) < MAX_PARAMETERS and failures < FAILURES:
-        data = screened(taken)
-        rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
         tried = {one.name for one in offers}
-        columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}
-        explained = worths(found.calibration, data, columns, HINTED)
-        name = max(explained, key=explained.__getitem__, default=None)
+        name = most_useful(found, taken, tried)
         if name is None:
             break
-        without = float(found.details["left_out_nT"])
-        try:
-            further = fit(screened((*taken, name)), **options)
-        except CalibrationError:  # implausible positions, or too few samples with a value
-            offers.append(Offer(name, without, np.inf, taken=False))
-            failures += 1
-            continue
-        left = float(further.details["left_out_nT"])
-        worth_it = left < MAX_HELD_OUT_ERROR_RATIO * without and bool(further.calibration.channels)
-        # a parameter must also improve the prediction of later parts of the log
-        if {"forward_nT"} <= found.details.keys() & further.details.keys():
-            forward = further.details["forward_nT"] / found.details["forward_nT"]
-            worth_it = worth_it and forward < MAX_HELD_OUT_ERROR_RATIO
-        # a parameter that correlates with the attitude would distort the scales
-        worth_it = worth_it and _departure(further) <= max(_departure(found), USUAL_DEPARTURE)
-        offers.append(Offer(name, without, left, worth_it))
-        if worth_it:
-            found, taken, failures = further, (*taken, name), 0
+        names, further = (*taken, name), fitted((*taken, name))
+        offers.append(_offer(name, further, found))
+        if further is not None and _is_distorted(further, found) and len(names) < MAX_PARAMETERS:
+            # Of two masses that move together with the attitude, one alone distorts the scales: try both.
+            partner = most_useful(further, names, tried | {name})
+            both = None if partner is None else fitted((*names, partner))
+            good = both is not None and _predicts_better(both, further) and not _is_distorted(both, found)
+            if partner is not None and both is not None and good:
+                offers.append(_offer(partner, both, further))
+                names, further = (*names, partner), both
+        if further is not None and _predicts_better(further, found) and not _is_distorted(further, found):
+            found, taken, failures = further, names, 0
         else:
             failures += 1
-    return taken, offers
+    return taken, [replace(one, taken=one.name in taken) for one in offers]
+
+
+def _offer(name: str, further: Fit | None, found: Fit) -> Offer:
+    """Return the errors of a fit with a further column, next to those of the fit without it."""
+    left_out = np.inf if further is None else float(further.details["left_out_nT"])
+    return Offer(name, float(found.details["left_out_nT"]), left_out)
+
+
+def _predicts_better(further: Fit, found: Fit) -> bool:
+    """Return True if further columns improve the prediction of held-out and of later parts of the log."""
+    known = {"left_out_nT", "forward_nT"} & found.details.keys() & further.details.keys()
+    ratios = [further.details[name] / found.details[name] for name in sorted(known)]
+    return max(ratios) < MAX_HELD_OUT_ERROR_RATIO and bool(further.calibration.channels)
+
+
+def _is_distorted(further: Fit, found: Fit) -> bool:
+    """Return True if further columns, which correlate with the attitude, have taken up part of the scales."""
+    return _departure(further) > max(_departure(found), USUAL_DEPARTURE)
 
 
 def _departure(found: Fit) -> float:
