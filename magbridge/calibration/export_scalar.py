@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from string import Template
 
+import numpy as np
+
 from magbridge.calibration.export_c import hexadecimal, reals, rows
 from magbridge.calibration.scalar import CYCLE_LEVEL_SIGMA_NT, RANGE_MARGIN, ScalarSensor
 
@@ -117,7 +119,9 @@ def scalar_source(sensor: ScalarSensor) -> str:
     size = len(sensor.coefficients) - len(sensor.power_cycles)
     # The terms and one level: those of the other power cycles are left out.
     kept = [*range(size), len(sensor.coefficients) - 1]
-    covariance = [[hexadecimal(sensor.covariance[i][j]) for j in kept] for i in kept]
+    covariance = [
+        [hexadecimal(value) for value in row] for row in sensor.total_covariance[np.ix_(kept, kept)]
+    ]
     channel = [["(real)0", "(real)1", "(real)0", "(real)0"]]
     if sensor.channels:
         channel = []

@@ -122,7 +122,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """Permanent (nT), induced xx yy zz xy xz yz (nT), eddy (nT s, row by row), lag (s), three for each
     channel (nT a swing), then one level for each power cycle (nT)."""
     covariance: tuple[tuple[float, ...], ...]
-    """Covariance of the coefficients."""
+    """Covariance of the coefficients for the prior's widths `prior_sigma`."""
     prior_sigma: tuple[float, ...]
     """1-sigma of each coefficient's prior."""
     noise: ScalarNoise
@@ -135,7 +135,15 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     lever: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Forward, starboard and down from the positions' origin to the scalar sensor, m."""
     slow_variance: float = 0.0
-    """nT^2, variance of the slow noise over the fitted log: the sigma of the corrected field counts it."""
+    """nT^2, variance of the slow noise: the sigma of the corrected field counts it."""
+    width_covariance: tuple[tuple[float, ...], ...] = ()
+    """Covariance of the coefficients that the uncertainty of the prior's widths adds to `covariance`."""
+
+    @property
+    def total_covariance(self) -> FloatArray:
+        """Covariance (m, m) of the coefficients, with that of uncertain widths."""
+        covariance = np.array(self.covariance)
+        return covariance + np.array(self.width_covariance) if self.width_covariance else covariance
 
 
 class ScalarSeries(NamedTuple):
@@ -215,7 +223,7 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
     if series.channels.shape[1] != len(known):
         names = ", ".join(channel.name for channel in known)
         raise CalibrationError(f"expected {len(known)} channels ({names}), got {series.channels.shape[1]}")
-    mean, covariance = np.array(sensor.coefficients), np.array(sensor.covariance)
+    mean, covariance = np.array(sensor.coefficients), sensor.total_covariance
     design = scalar_design(series, known, sensor.reference_field)
     size = design.shape[1]
     level, level_sigma, cross = _level(sensor, series, mean, covariance)

@@ -71,6 +71,8 @@ FILTER_GAP_INTERVALS = 3.0
 MIN_SCALAR_SAMPLES = 100
 NOISE_STARTS_NT = 0.1, 1.0, 10.0
 """Amplitudes of the slow processes from which the search starts: the evidence has several maxima."""
+WIDTH_GRID_SIGMA = np.linspace(-3.0, 3.0, 13)
+"""Grid of the log of a width about its prior's centre, in prior sigmas."""
 START_ITERATIONS, EVIDENCE_ITERATIONS = 5, 25
 """Iterations of the search from each start, and of the search from the best of them."""
 LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
@@ -388,13 +390,7 @@ class _ScalarProblem:
 
 
 def _choose_widths(data: GaussianInformation, family: PriorFamily, log_widths: FloatArray) -> _Posterior:
-    """Maximise the evidence over the widths, given the information of the whitened samples.
-
-    Notes
-    -----
-    With ``B = 1 + W X^T X W``, W the prior's 1-sigma on the diagonal, the posterior mean is ``W B^-1 W X^T
-    y`` and its covariance ``W B^-1 W``.
-    """
+    """Maximise the evidence over the widths, given the information of the whitened samples."""
 
     def downhill(logs: FloatArray) -> tuple[float, FloatArray]:
         value, slope, _ = log_evidence(data, family, logs, 0.0)
@@ -405,10 +401,63 @@ def _choose_widths(data: GaussianInformation, family: PriorFamily, log_widths: F
         options={"maxiter": 60},
     )  # fmt: skip
     sigma = family.widths(found.x)
+    mean, covariance = _coefficients(data, sigma)
+    return _Posterior(found.x, sigma, mean, covariance, float(found.fun), np.empty(0))
+
+
+def _coefficients(data: GaussianInformation, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the posterior mean (m,) and covariance (m, m) of the coefficients for a prior's 1-sigma (m,).
+
+    Notes
+    -----
+    With ``B = 1 + W X^T X W``, W the prior's 1-sigma on the diagonal, the posterior mean is ``W B^-1 W X^T
+    y`` and its covariance ``W B^-1 W``.
+    """
     factor = cho_factor(np.eye(len(sigma)) + sigma[:, None] * data.precision * sigma, lower=True)
     mean = sigma * cho_solve(factor, sigma * data.vector)
-    covariance = sigma[:, None] * cho_solve(factor, np.eye(len(sigma))) * sigma
-    return _Posterior(found.x, sigma, mean, covariance, float(found.fun), np.empty(0))
+    return mean, sigma[:, None] * cho_solve(factor, np.eye(len(sigma))) * sigma
+
+
+def _width_covariance(data: GaussianInformation, family: PriorFamily, log_widths: FloatArray) -> FloatArray:
+    """Return the covariance (m, m) of the coefficients that the uncertainty of the widths adds.
+
+    Notes
+    -----
+    A channel that hardly moved in the fitted log has a width that only its prior limits, so the covariance at
+    the most probable widths is too small. The law of total covariance, ``E[C] + cov[mean] - C(mode)``, is
+    summed over one width after another on a grid of its log, the others at their mode (Rasmussen & Williams
+    2006, section 5.2).
+    """
+    _, at_mode = _coefficients(data, family.widths(log_widths))
+    added = np.zeros_like(at_mode)
+    for index in np.flatnonzero(family.spread):
+        grid = np.tile(log_widths, (len(WIDTH_GRID_SIGMA), 1))
+        grid[:, index] = family.centre[index] + family.spread[index] * WIDTH_GRID_SIGMA
+        log_probability = np.array([log_evidence(data, family, logs, 0.0)[0] for logs in grid])
+        weight = np.exp(log_probability - log_probability.max())
+        weight /= weight.sum()
+        for logs, part in zip(grid, weight.tolist(), strict=True):
+            added += part * (_coefficients(data, family.widths(logs))[1] - at_mode)
+        means = np.array([_coefficients(data, family.widths(logs))[0] for logs in grid])
+        offset = means - weight @ means
+        added += (weight[:, None] * offset).T @ offset
+    # The widths that were chosen are less probable than narrower ones: the sum may be slightly negative.
+    size, axes = np.linalg.eigh(added)
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+
+
+def _marginal(sensor: ScalarSensor, data: GaussianInformation) -> ScalarSensor:
+    """Return the sensor with the covariance that the uncertainty of its prior's widths adds."""
+    prior = np.array(sensor.prior_sigma)
+    family = _sensor_family(sensor)
+    added = _width_covariance(data, family, np.log(prior[family.design.argmax(axis=0)]))
+    return msgspec.structs.replace(sensor, width_covariance=tuple(tuple(row) for row in added.tolist()))
+
+
+def _sensor_family(sensor: ScalarSensor) -> PriorFamily:
+    """Return the prior of a sensor's coefficients."""
+    fixed_lag = sensor.prior_sigma[PLATFORM_TERMS - 1] < 1e-6
+    return _prior_family(sensor.channels, len(sensor.power_cycles), fixed_lag=fixed_lag)
 
 
 def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
@@ -437,17 +486,19 @@ def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
     prior = np.array(sensor.prior_sigma)
     precision = np.linalg.inv(np.array(sensor.covariance))
     moment = precision @ np.array(sensor.coefficients)
-    information = (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor
-    family = _prior_family(tuple(wider), len(sensor.power_cycles), fixed_lag=prior[PLATFORM_TERMS - 1] < 1e-6)
-    start = np.log(prior[family.design.argmax(axis=0)])
-    chosen = _choose_widths(GaussianInformation(information, moment * factor), family, start)
-    return msgspec.structs.replace(
-        sensor,
-        channels=tuple(wider),
+    data = GaussianInformation(
+        (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor, moment * factor
+    )
+    adapted = msgspec.structs.replace(sensor, channels=tuple(wider))
+    family = _sensor_family(adapted)
+    chosen = _choose_widths(data, family, np.log(prior[family.design.argmax(axis=0)]))
+    adapted = msgspec.structs.replace(
+        adapted,
         coefficients=tuple(chosen.mean.tolist()),
         covariance=tuple(tuple(row) for row in chosen.covariance.tolist()),
         prior_sigma=tuple(chosen.prior_sigma.tolist()),
     )
+    return _marginal(adapted, data)
 
 
 def _log_noise_prior(log_noise: FloatArray) -> float:
@@ -589,10 +640,7 @@ def _result(
         name: float(np.std(part.design[:, term] @ state.mean[term])) for name, term in columns.items()
     }
     averaged_white = float(np.exp(state.log_noise[0]))
-    duration = float(part.time[-1] - part.time[0])
     variances = _slow_variances(state.log_noise)[: len(TIME_CONSTANTS_S)]
-    # A process slower than the log is part of its level.
-    slow = float((variances * np.minimum(1.0, duration / np.array(TIME_CONSTANTS_S))).sum())
     sensor = ScalarSensor(
         kind="scalar",
         column=column,
@@ -610,8 +658,10 @@ def _result(
         fitted_from=float(part.time[0]),
         fitted_until=float(part.time[-1]),
         lever=lever,
-        slow_variance=slow,
+        slow_variance=float(variances.sum()),  # a log of another time has other values of all processes
     )  # fmt: skip
+    y, X, _ = part.whiten(state.log_noise)
+    sensor = _marginal(sensor, GaussianInformation(X.T @ X, X.T @ y))
     return ScalarFit(
         sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
         int((~kept).sum()) * problem.averaged, -state.cost,

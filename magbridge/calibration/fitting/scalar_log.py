@@ -187,7 +187,7 @@ def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> 
         name: float(np.nanstd(design[:, columns] @ mean[columns]))
         for name, columns in term_columns(adapted.channels).items()
     }
-    values, vectors = np.linalg.eigh(np.array(adapted.covariance)[:size, :size])
+    values, vectors = np.linalg.eigh(adapted.total_covariance[:size, :size])
     effects = design @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     known = np.isfinite(effects).all(axis=1)
     centred = effects - effects[known].mean(axis=0)  # the level is the survey's own
