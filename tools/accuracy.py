@@ -54,7 +54,7 @@ COLUMNS = {
 
 
 def run(
-    seed: int, noise: str, count: int, methods: tuple[str, ...], peers: str = "", *, oracles: bool = True
+    seed: int, noise: str, count: int, methods: tuple[str, ...], peers: str = "", oracles: bool = True
 ) -> list[Row]:
     """Simulate a glider with `count` moving masses, calibrate by every method, and score on the survey."""
     sigma, memory = NOISES[noise]

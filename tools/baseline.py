@@ -12,32 +12,170 @@ if there is one case). A run takes twenty minutes on two cores. Measured logs co
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
 import json
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import accuracy
+import bonne_bay
+import live
+import measured
+import navigation
 import numpy as np
+import survey
+from studies import DATA, Row, command_line, in_order
+from study.cases import NAMELESS, case, plan
+from study_worlds import NOISES
+from voyages import Map
+
+from magbridge.calibration.fitting.observe import observations
+from magbridge.logs import Options, read
+from study import table
 
 FILE = Path(__file__).with_name("baseline.json")
-REAL = Path(os.environ.get("MAGBRIDGE_REAL_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MIN_STANDARD_ERRORS, MIN_RELATIVE_CHANGE, MIN_RELATIVE_CHANGE_SINGLE = 2.0, 0.01, 0.02
 LOW, HIGH, ONE = "low", "high", "one"
 """Direction in which a figure improves: to a lower value, to a higher value, or towards 1."""
-Figures = dict[str, float]
-Case = Callable[[], Figures]
+
+
+class Part(NamedTuple):
+    """Part of the baseline: a study, its cases, and the rows' columns by the name of their figure.
+
+    The columns `by` of a row precede the names of its figures. Without `columns`, a row is its figures.
+    """
+
+    name: str
+    run: Callable[..., list[Row]]
+    cases: Sequence[tuple[Any, ...]]
+    by: tuple[str, ...] = ()
+    columns: Mapping[str, str] = {}
+
+    def figures(self, case: tuple[Any, ...]) -> dict[str, float]:
+        """Return the figures of a case; a case that fails is the figure "failed cases"."""
+        warnings.simplefilter("ignore")
+        try:
+            rows = self.run(*case)
+        except Exception as error:  # noqa: BLE001 - a case that fails is a figure of its own, the others go on
+            print(f"{self.name}: {case}: {error!r}", file=sys.stderr, flush=True)
+            return {f"{self.name}: failed cases": 1.0}
+        return {
+            ": ".join([self.name, *(row[column] for column in self.by), label]): float(
+                row.get(column, np.nan)
+            )
+            for row in rows
+            for label, column in (self.columns or dict(zip(row, row, strict=True))).items()
+        }
+
+
+# ---- studies whose rows are not the figures yet ------------------------------------------------------------
+
+
+def diagnosis(entry: dict[str, Any]) -> list[Row]:
+    """Hide effects in a deployment and diagnose it; return the figures.
+
+    A name counts as alone if all its alternatives are the same cause, on another series or of the same trace.
+    The step of the offset since the calibration, in worlds with a map, does not count as a false alarm.
+    """
+    row = case(entry)
+    found = float(table.found(row))
+    if not entry["names"]:
+        return [{"false alarms": float(table.is_false_alarm(row))}]
+    if entry["part"] in NAMELESS:
+        return [{"foreign: found": found, "foreign: a name": float(bool(row["found"]))}]
+    figures = {"listed: found": found, "listed: false second name": float(table.has_second(row))}
+    if found:
+        figures["listed: truth among the names"] = float(table.holds(row))
+    if row["theory"] and table.is_nameable(row):
+        figures["listed: named alone, where an ideal detector can"] = float(table.is_right_alone(row))
+    return [figures]
+
+
+def navigated(kind: Map, seed: int) -> list[Row]:
+    """Navigate a glider over a random map; return the row, with the error over its bound."""
+    return [
+        row | {"ratio": row["drms"] / row["bound"]} for row in navigation.run_accuracy(kind, "wide", seed)
+    ]
+
+
+def real_logs() -> list[Row]:
+    """Return the figures of the logs of real vehicles: a Seaglider, an aircraft and an underwater robot."""
+    dives = read(sorted((DATA / "seaglider_sg167").glob("p*.nc")))
+    masses, normalised = measured.hold_runs_out(observations(dives, ("pitchCtl", "vbdCC")), "auto", 3)
+    nominal, _ = measured.hold_runs_out(observations(dives, ()), "nominal", 0)
+    fitted, found = measured.calibrate_and_diagnose(measured.flight(DATA))
+    halves = measured.compare_halves(read(DATA / "ardusub" / "small.tlog", options=Options(compass="0")))
+    figures = {
+        "Seaglider, dives held out: auto, nT": np.sqrt(np.nanmean(masses**2)),
+        "Seaglider, dives held out: nominal, nT": np.sqrt(np.nanmean(nominal**2)),
+        "Seaglider, dives held out: normalised error": np.nanstd(normalised),
+        "aircraft: second half, nT": found.total.before,
+        "aircraft: second half, extended model, nT": found.total.after,
+        "aircraft: smallest scale": fitted.scales[0],
+    }
+    return [figures | {f"ArduSub, second half: {row.method}, nT": row.rms for row in halves}]
+
+
+def replay() -> list[Row]:
+    """Run ``magbridge demo``, a simulated survey through the unmodified bridge; return its figures."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "magbridge", "demo", "--json", "--out", folder]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result = json.loads(done.stdout)
+    return [{f"demo: {name}": value for name, value in result.items() if isinstance(value, int | float)}]
+
+
+ERROR = {"error / noise": "ratio"}
+
+
+def gliders(method: str) -> list[tuple[Any, ...]]:
+    """Return the cases of a method's calibrations, without bounds and other programs."""
+    return [(seed, noise, 2, (method,), "", False) for noise in NOISES for seed in range(20)]
+
+
+BOTH = "noise", "method"
+PARTS = (
+    Part("calibration", accuracy.run, gliders("auto"), BOTH, ERROR | {"normalised error": "sigma"}),
+    Part("calibration", accuracy.run, gliders("cubic"), BOTH, ERROR),
+    Part(
+        "survey", survey.run, [(6.0, 30.0, 1000.0, "1 nT white", 0.0, 1000 + k) for k in range(8)], (),
+        ERROR | {
+            "normalised error without bias": "without_bias", "normalised error": "with_bias",
+            "map error along the track / oracle": "map_along",
+            "map error between the tracks / oracle": "map_between",
+            "map, normalised error between the tracks": "map_between_sigma",
+        },
+    ),
+    Part(
+        "live", live.run,
+        [(change, seed, 6.0, 20.0) for change in live.CHANGES for seed in range(500, 503)], ("change",),
+        {
+            "published error / noise": "published", "normalised error": "sigma",
+            "alarm delay / optimal": "delay", "cause among the candidates": "among", "false alarms": "false",
+        },
+    ),
+    Part("diagnosis", diagnosis, [(entry,) for entry in plan(60)]),
+    Part(
+        "navigation", navigated, [(navigation.MAPS[k], seed) for k in (0, 2) for seed in range(20)], ("map",),
+        {
+            "error / bound": "ratio", "normalised squared error": "nees", "lost": "lost",
+            "valid fraction": "valid",
+        },
+    ),
+    Part(
+        "twin", bonne_bay.run, [(29, False)], ("trial", "method"),
+        {"error on the runs, nT": "runs", "error on the survey, nT": "survey"},
+    ),
+    Part("measured", real_logs, [()] if DATA.is_dir() else []),
+    Part("replay", replay, [()]),
+)  # fmt: skip
+
+
+# ---- the comparison ----------------------------------------------------------------------------------------
 
 
 def goal_of(name: str) -> str:
@@ -45,207 +183,6 @@ def goal_of(name: str) -> str:
     if "normalised" in name:
         return ONE
     return HIGH if any(word in name for word in ("found", "alone", "valid", "among")) else LOW
-
-
-def calibration(noise: str, seed: int) -> Figures:
-    """Calibrate a random glider by the paper's runs; return its figures on a survey."""
-    import accuracy  # noqa: PLC0415
-
-    rows = {row["method"]: row for row in accuracy.run(seed, noise, 2, ("cubic", "auto"), oracles=False)}
-    return {
-        f"{noise}: error / noise": rows["auto"]["ratio"],
-        f"{noise}: normalised error": rows["auto"]["sigma"],
-        f"{noise}: cubic, error / noise": rows["cubic"]["ratio"],
-    }
-
-
-def survey(seed: int) -> Figures:
-    """Calibrate a random glider from its survey only; return the figures of field and map."""
-    import survey as study  # noqa: PLC0415
-
-    row = study.run(6.0, 30.0, 1000.0, "1 nT white", 0.0, seed)[0]
-    return {
-        "error / noise": row["ratio"],
-        "normalised error without bias": row["without_bias"],
-        "normalised error": row["with_bias"],
-        "map error along the track / oracle": row["map_along"],
-        "map error between the tracks / oracle": row["map_between"],
-        "map, normalised error between the tracks": row["map_between_sigma"],
-    }
-
-
-def live(change: str, seed: int) -> Figures:
-    """Change a vehicle after its calibration while the bridge calibrates in flight; return the figures."""
-    import live as study  # noqa: PLC0415
-
-    row = study.run(change, seed, 6.0, 20.0)[0]
-    return {
-        f"{change}: published error / noise": row["published"],
-        f"{change}: normalised error": row["sigma"],
-        f"{change}: alarm delay / optimal": row.get("delay", np.nan),
-        f"{change}: cause among the candidates": row.get("among", np.nan),
-        f"{change}: false alarms": row["false"],
-    }
-
-
-def diagnosis(entry: dict[str, Any]) -> Figures:
-    """Hide effects in a deployment and diagnose it; return the figures.
-
-    A name counts as alone if all its alternatives are the same cause, on another series or of the same trace.
-    The step of the offset since the calibration, in worlds with a map, does not count as a false alarm.
-    """
-    from study import table  # noqa: PLC0415
-    from study.cases import NAMELESS, case  # noqa: PLC0415
-
-    row = case(entry)
-    found = float(table.found(row))
-    if not entry["names"]:
-        return {"false alarms": float(table.is_false_alarm(row))}
-    if entry["part"] in NAMELESS:
-        return {"foreign: found": found, "foreign: a name": float(bool(row["found"]))}
-    figures = {
-        "listed: found": found,
-        "listed: false second name": float(table.has_second(row)),
-    }
-    if found:
-        figures["listed: truth among the names"] = float(table.holds(row))
-    if row["theory"] and table.is_nameable(row):
-        figures["listed: named alone, where an ideal detector can"] = float(table.is_right_alone(row))
-    return figures
-
-
-def navigation(rms: float, length: float, seed: int) -> Figures:
-    """Navigate a glider over a random map; return the figures."""
-    from voyages import Map, drawn_track, sail  # noqa: PLC0415
-
-    kind = Map(rms, length)
-    score = sail(*drawn_track(kind, seed, 1.0)).score()
-    return {
-        f"{kind}: error / bound": score["drms"] / score["bound"],
-        f"{kind}: normalised squared error": score["nees"],
-        f"{kind}: lost": score["lost"],
-        f"{kind}: valid fraction": score["valid"],
-    }
-
-
-def twin(seed: int) -> Figures:
-    """Simulate the paper's trials; return the error of each method on runs and survey."""
-    from study_worlds import METHODS, TRIALS, fly_trials  # noqa: PLC0415
-
-    trials = fly_trials(seed)
-    return {
-        f"{trial}, {method}: error on the {place}, nT": trials.rms(part, trial, method)
-        for trial in TRIALS
-        for method in METHODS
-        for place, part in (("runs", trial), ("survey", "survey"))
-    }
-
-
-def seaglider(data: Path) -> Figures:
-    """Cross-validate the calibration of a real Seaglider over its dives; return the figures."""
-    from measured import hold_runs_out  # noqa: PLC0415
-
-    from magbridge.calibration.fitting.observe import observations  # noqa: PLC0415
-    from magbridge.logs import read  # noqa: PLC0415
-
-    log = read(sorted((data / "seaglider_sg167").glob("p*.nc")))
-    masses, normalised = hold_runs_out(observations(log, ("pitchCtl", "vbdCC")), "auto", 3)
-    nominal, _ = hold_runs_out(observations(log, ()), "nominal", 0)
-    return {
-        "Seaglider, dives held out: auto, nT": float(np.sqrt(np.nanmean(masses**2))),
-        "Seaglider, dives held out: nominal, nT": float(np.sqrt(np.nanmean(nominal**2))),
-        "Seaglider, dives held out: normalised error": float(np.nanstd(normalised)),
-    }
-
-
-def flight(data: Path) -> Figures:
-    """Calibrate an aircraft on the first half of its flight and diagnose the second."""
-    import measured  # noqa: PLC0415
-
-    fitted, found = measured.calibrate_and_diagnose(measured.flight(data))
-    return {
-        "aircraft: second half, nT": found.total.before,
-        "aircraft: second half, extended model, nT": found.total.after,
-        "aircraft: smallest scale": fitted.scales[0],
-    }
-
-
-def ardusub(data: Path) -> Figures:
-    """Fit an underwater robot's compass on the first half of a log and test the second."""
-    from measured import compare_halves  # noqa: PLC0415
-
-    from magbridge.logs import Options, read  # noqa: PLC0415
-
-    log = read(data / "ardusub" / "small.tlog", options=Options(compass="0"))
-    return {f"ArduSub, second half: {row.method}, nT": row.rms for row in compare_halves(log)}
-
-
-def replay() -> Figures:
-    """Run ``magbridge demo``, a simulated survey through the unmodified bridge; return its figures."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "magbridge", "demo", "--json", "--out", folder]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    result = json.loads(done.stdout)
-    return {f"demo: {name}": value for name, value in result.items() if isinstance(value, int | float)}
-
-
-def parts(data: Path) -> dict[str, list[Case]]:
-    """Return the cases of each part."""
-    from live import CHANGES  # noqa: PLC0415
-    from study.cases import plan  # noqa: PLC0415
-
-    measured: list[Case] = (
-        [partial(part, data) for part in (seaglider, flight, ardusub)] if data.is_dir() else []
-    )
-    return {
-        "calibration": [
-            partial(calibration, noise, seed) for noise in ("1 nT white", "5 nT AR(1)") for seed in range(20)
-        ],
-        "survey": [partial(survey, seed) for seed in range(1000, 1008)],
-        "live": [partial(live, change, seed) for change in CHANGES for seed in range(500, 503)],
-        "diagnosis": [partial(diagnosis, entry) for entry in plan(60)],
-        "navigation": [
-            partial(navigation, *kind, seed)
-            for kind in ((60.0, 2000.0), (20.0, 1000.0))
-            for seed in range(20)
-        ],
-        "twin": [partial(twin, 29)],
-        "measured": measured,
-        "replay": [replay],
-    }
-
-
-def run(part: str, case: Case) -> tuple[Figures, float]:
-    """Return the figures of a case and its processor time (s); a failed case returns "failed cases"."""
-    sys.path.insert(0, str(Path(__file__).parent))
-    warnings.simplefilter("ignore")
-    begun = time.process_time()
-    try:
-        figures = {f"{part}: {name}": float(value) for name, value in case().items()}
-    except Exception as error:  # noqa: BLE001 - a case that fails is a figure of its own, the others go on
-        print(f"{part}: {case}: {error!r}", file=sys.stderr, flush=True)
-        figures = {f"{part}: failed cases": 1.0}
-    return figures, time.process_time() - begun
-
-
-def measure(chosen: Sequence[str], data: Path, workers: int) -> dict[str, list[float]]:
-    """Return the values of every figure, case by case."""
-    values: dict[str, list[float]] = {}
-    with ProcessPoolExecutor(workers) as pool:
-        tasks = [
-            (part, pool.submit(run, part, case))
-            for part, cases in parts(data).items()
-            if part in chosen or not chosen
-            for case in cases
-        ]
-        seconds: dict[str, float] = {}
-        for part, task in tasks:
-            figures, used = task.result()
-            seconds[part] = seconds.get(part, 0.0) + used
-            for name, value in figures.items():
-                values.setdefault(name, []).append(float(f"{value:.5g}"))
-    print(", ".join(f"{part} {used:.0f} s" for part, used in seconds.items()), "of processor time")
-    return values
 
 
 def compare(old: dict[str, list[float]], new: dict[str, list[float]]) -> list[str]:
@@ -295,25 +232,23 @@ def describe(values: np.ndarray) -> str:
 
 def main() -> int:
     """Measure, then save or compare; return the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--save", action="store_true", help="write the figures to --file")
-    parser.add_argument("--compare", action="store_true", help="compare the figures with --file")
-    parser.add_argument("--part", action="append", default=[], help="a part; may be repeated")
-    parser.add_argument("--file", type=Path, default=FILE)
-    parser.add_argument("--data", type=Path, default=REAL, help="folder of the measured logs")
-    parser.add_argument("--workers", type=int, default=2)
-    chosen = parser.parse_args()
+    names = list(dict.fromkeys(part.name for part in PARTS))
+    chosen = command_line(__doc__, save=False, compare=False, part=names, file=FILE, workers=2)
+    tasks = [(part, case) for part in PARTS if part.name in chosen.part for case in part.cases]
+    values: dict[str, list[float]] = {}
+    for figures in in_order(Part.figures, tasks, chosen):
+        for name, value in figures.items():
+            values.setdefault(name, []).append(float(f"{value:.5g}"))
     known = json.loads(chosen.file.read_text()) if chosen.file.exists() else {}
-    values = measure(chosen.part, chosen.data, chosen.workers)
     if chosen.save:
-        known |= values
-        lines = [f"{json.dumps(name)}: {json.dumps(figures)}" for name, figures in sorted(known.items())]
+        saved = sorted((known | values).items())
+        lines = [f"{json.dumps(name)}: {json.dumps(figures)}" for name, figures in saved]
         chosen.file.write_text("{\n" + ",\n".join(lines) + "\n}\n")
     if not chosen.compare:
-        for name, figures in values.items():
-            print(f"{name}: {describe(np.array(figures)[np.isfinite(figures)])}")
+        for name, measured_values in values.items():
+            print(f"{name}: {describe(np.array(measured_values)[np.isfinite(measured_values)])}")
         return 0
-    old = {k: v for k, v in known.items() if not chosen.part or k.split(":")[0] in chosen.part}
+    old = {name: figures for name, figures in known.items() if name.partition(":")[0] in chosen.part}
     lines = compare(old, values)
     print(*lines, f"{len(values)} figures, {len(lines)} moved beyond their noise", sep="\n")
     return int(any(not line.startswith("better") for line in lines))
