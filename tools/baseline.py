@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import accuracy
+import blind
 import bonne_bay
 import live
 import measured
@@ -29,7 +30,6 @@ import navigation
 import numpy as np
 import survey
 from studies import DATA, Row, command_line, in_order
-from study.cases import NAMELESS, case, plan
 from study_worlds import NOISES
 from voyages import Map
 
@@ -81,11 +81,11 @@ def diagnosis(entry: dict[str, Any]) -> list[Row]:
     A name counts as alone if all its alternatives are the same cause, on another series or of the same trace.
     The step of the offset since the calibration, in worlds with a map, does not count as a false alarm.
     """
-    row = case(entry)
+    row = blind.case(entry)
     found = float(table.found(row))
     if not entry["names"]:
         return [{"false alarms": float(table.is_false_alarm(row))}]
-    if entry["part"] in NAMELESS:
+    if entry["part"] in table.NAMELESS:
         return [{"foreign: found": found, "foreign: a name": float(bool(row["found"]))}]
     figures = {"listed: found": found, "listed: false second name": float(table.has_second(row))}
     if found:
@@ -158,7 +158,7 @@ PARTS = (
             "alarm delay / optimal": "delay", "cause among the candidates": "among", "false alarms": "false",
         },
     ),
-    Part("diagnosis", diagnosis, [(entry,) for entry in plan(60)]),
+    Part("diagnosis", diagnosis, [(entry,) for entry in blind.plan(60)]),
     Part(
         "navigation", navigated, [(navigation.MAPS[k], seed) for k in (0, 2) for seed in range(20)], ("map",),
         {

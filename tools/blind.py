@@ -10,11 +10,236 @@ are written to the folder ``--out``.
 from __future__ import annotations
 
 import json
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+import xarray as xr
+from foreign import FOREIGN
 from studies import Row, Study, command_line
-from study.cases import PARTS, case, plan
-from study.table import lines, plot_confusion, plot_detection
+from study.deployment import (
+    CHARTS,
+    DAY,
+    FLICKER,
+    GLIDER,
+    LOSSES,
+    NOISES,
+    SEEDS,
+    Background,
+    add_noise,
+    deployment_of,
+    rebuilt,
+)
+from study.ideal import ideal
+from study.table import KNOWN, lines, plot_confusion, plot_detection
+
+from magbridge.arrays import BoolArray
+from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.run import diagnose
+from sitl.dataset import corrected
+from sitl.inject import EFFECTS, HiddenEffect
+
+NAMES = tuple(EFFECTS)
+LADDER = (4.0, 3.0, 5.0, 2.0, 6.0)
+LOUD = (25.0, 100.0, 15.0, 50.0)
+LASTING = (
+    "temperature_offset", "temperature_scale", "current_field", "unmodelled_actuator", "actuator_order",
+    "hysteresis", "eddy_current", "channel_skew", "filter_lag", "clock_offset", "nonlinearity",
+    "pressure_offset", "reference_bias",
+)  # fmt: skip
+"""Causes that persist in another deployment; the others depend on a moment, a place or the range of one
+log."""
+PREDICTED = ("named", "ladder")
+"""Parts of the study for which the ideal detector is computed."""
+STRANGE = ("jettison", "duet", "winch", "mooring")
+"""Foreign effects that were added after the last change of the detector."""
+SEEN = (
+    "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase",
+)  # fmt: skip
+"""Foreign effects that existed before the last improvement of the detector."""
+GOLDEN = 0.6180339887498949
+
+
+class Part(NamedTuple):
+    """Part of the study: its fraction of the cases, and a function that returns its k-th case."""
+
+    share: float
+    entry: Callable[[int], Row]
+
+
+def _null(k: int) -> Row:
+    return {"names": (), "wanted": 0.0, "noise": NOISES[k % len(NOISES)]}
+
+
+def _named(k: int) -> Row:
+    return {"names": (NAMES[k % len(NAMES)],), "wanted": 8.0, "noise": ("white", "ar")[k // len(NAMES) % 2]}
+
+
+def _ladder(k: int) -> Row:
+    return _named(k) | {"wanted": LADDER[k // len(NAMES) % len(LADDER)]}
+
+
+def _loud(k: int) -> Row:
+    return _named(k) | {"wanted": LOUD[k // len(NAMES) % len(LOUD)]}
+
+
+def _unknown(k: int) -> Row:
+    names = (*KNOWN, *(name for name in FOREIGN if name not in STRANGE + SEEN))
+    name = names[k % len(names)]
+    return {"names": (name,), "wanted": 10.0, "noise": "white", "without": name if name in CAUSES else ""}
+
+
+def _foreign(names: tuple[str, ...]) -> Callable[[int], Row]:
+    return lambda k: {
+        "names": (names[k % len(names)],), "wanted": 10.0, "noise": ("white", "ar")[k // len(names) % 2],
+    }  # fmt: skip
+
+
+def _pair(k: int) -> Row:
+    a, b = np.random.default_rng([20131212, k]).choice(len(KNOWN), 2, replace=False)
+    return {"names": (KNOWN[int(a)], KNOWN[int(b)]), "wanted": 10.0, "noise": ("white", "ar")[k % 2]}
+
+
+def _gain(k: int) -> Row:
+    return {"names": (LASTING[k % len(LASTING)],), "wanted": 20.0, "noise": "white"}
+
+
+def _charted(k: int) -> Row:
+    """Return the k-th case like the paper's log: the reference is a map; a third of the cases hide none."""
+    names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
+    return {
+        "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
+        "reference": CHARTS[k // len(LOUD) % len(CHARTS)], "losses": "surfacing",
+    }  # fmt: skip
+
+
+def _flicker(k: int) -> Row:
+    """Return the k-th case in flicker noise; its signal-to-noise refers to white noise of the same RMS."""
+    names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
+    return {"names": names, "wanted": 25.0 * bool(names), "noise": FLICKER}
+
+
+PARTS: dict[str, Part] = {
+    "null": Part(0.18, _null),
+    "named": Part(0.22, _named),
+    "ladder": Part(0.12, _ladder),
+    "loud": Part(0.08, _loud),
+    "unknown": Part(0.1, _unknown),
+    "pair": Part(0.08, _pair),
+    "gain": Part(0.07, _gain),
+    "seen": Part(0.03, _foreign(SEEN)),
+    "foreign": Part(0.04, _foreign(STRANGE)),
+    "charted": Part(0.04, _charted),
+    "flicker": Part(0.04, _flicker),
+}
+
+
+def losses(k: int) -> str:
+    """Return the kind of lost samples in the k-th case of a part: one of four in every third case, else "".
+
+    Multiples of the golden section avoid a coincidence with the cycles of causes, noises and sizes.
+    """
+    place = int(3 * len(LOSSES) * (GOLDEN * k % 1.0))
+    return LOSSES[place] if place < len(LOSSES) else ""
+
+
+def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
+    """Return the entries of the study, with evenly mixed parts; a longer study contains the shorter study.
+
+    Another `seed` hides the same causes at the same signal-to-noise ratios in other vehicles, with other
+    random numbers.
+    """
+    made = []
+    # the last two parts share a range of 100,000 numbers, because a seed has only ten ranges
+    for place, (name, part) in zip((*range(10), 9.5), PARTS.items(), strict=True):
+        count = round(cases * part.share) if name in parts else 0
+        made += [
+            (
+                (k + 0.5) / part.share,
+                {"losses": losses(k)}
+                | part.entry(k)
+                | {"part": name, "number": SEEDS * seed + int(100_000 * place) + k},
+            )
+            for k in range(count)
+        ]
+    return [entry for _, entry in sorted(made, key=lambda item: item[0])]
+
+
+def case(entry: Row) -> Row:
+    """Hide the effects of an entry, diagnose the log, and return the row with the ideal results."""
+    began = time.process_time()
+    number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
+    deployment = deployment_of(number, noise, entry.get("reference", "true"))
+    background = Background.of(deployment, number, noise, entry["losses"])
+    hidden = [background.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
+    whole = hidden[0].ds if len(hidden) == 1 else background.measure(*(one.hidden for one in hidden))
+    ds = background.log(whole)
+    table = {name: cause for name, cause in CAUSES.items() if name != without}
+    judged = diagnose([ds], deployment.calibration, training_logs=deployment.learned, causes=table)
+    result, found = judged.diagnosis, findings(judged)
+    row = entry | {
+        "sizes": [one.hidden.size for one in hidden],
+        "verdict": found["verdict"],
+        "unexplained": found["unexplained"],
+        "found": [
+            [one["cause"], one["channel"], one["signal_to_noise"], [a["cause"] for a in one["alternatives"]]]
+            for one in found["findings"]
+        ],
+        "p_value": result.outcome.p_value,
+        "scores": _scores(found, names, whole),
+        "theory": [],
+    }
+    if entry["part"] in PREDICTED and names != ("outliers",):
+        row["theory"] = [ideal(hidden[0], background, ds, result.outcome.look_elsewhere)]
+    if entry["part"] == "charted":
+        row["gain"] = harm(tuple(one.hidden for one in hidden), background, ds, result)
+    return row | {"seconds": time.process_time() - began}
+
+
+def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
+    """Return (value - truth) / sigma of each parameter of the named cause; positive for too large values."""
+    truth = json.loads(whole.attrs["truth"])
+    own = [f["parameters"] for f in found["findings"] if names == (f["cause"],)]
+    if len(own) != 1:
+        return []
+    return [
+        float(np.sign(truth[name]) * (p["value"] - truth[name]) / p["sigma"])
+        for name, p in own[0].items()
+        if name in truth and p["sigma"]
+    ]
+
+
+def harm(
+    hidden: tuple[HiddenEffect, ...], background: Background, ds: xr.Dataset, result: Diagnosis
+) -> dict[str, float]:
+    """Return mean square errors (nT²) of the calibration ("before") and the extended calibration ("after").
+
+    The errors refer to the true field, on this log and on a log of another day (keys with " elsewhere").
+    """
+    calibration, number = background.deployment.calibration, background.number + 1
+    other = rebuilt(background.deployment, DAY).measure(hidden, number)
+    errors: dict[str, float] = {}
+    for log, where in ((ds, ""), (add_noise(other, background.noise, number), " elsewhere")):
+        truth = log["truth_total_field"].to_numpy()
+        inside = _inside(log, ds, calibration)
+        for name, one in (("before", calibration), ("after", result.calibration)):
+            error = (corrected(log, one).total - truth)[inside]
+            errors[name + where] = float(np.nanmean(error**2))
+    return errors
+
+
+def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> BoolArray:
+    """Return the samples (n,) of a log whose masses are within the ranges of the log `ds`."""
+    inside = np.ones(other.sizes["time"], bool)
+    for parameter in calibration.parameters:
+        known = ds[parameter.name]
+        inside &= ((other[parameter.name] >= known.min()) & (other[parameter.name] <= known.max())).to_numpy()
+    return inside
 
 
 def run(entry: Row) -> list[Row]:

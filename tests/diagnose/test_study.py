@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blind import PARTS, plan
 from scipy.stats import norm
-from study.cases import PARTS, plan
 from study.deployment import CHARTS, LOSSES, MEMORY, charted, drawn, project, whiten
 from study.ideal import SIZES, Draws, Span
 from study.table import is_false_alarm, needed_size

@@ -1,1 +1,1 @@
-"""Parts of the blind study ``tools/blind.py``: deployments, cases, ideal detector and table."""
+"""Parts of the blind study ``tools/blind.py``: deployments, ideal detector and table."""

@@ -16,13 +16,17 @@ from scipy.stats import binomtest, norm
 from studies import fraction
 
 from magbridge.arrays import FloatArray
-from study.cases import KNOWN, NAMELESS
+from magbridge.diagnose.causes import CAUSES
 from study.deployment import CHARTS, NOISES
 from study.ideal import EQUIVALENT, SIZES, cause_names
 
 Row = dict[str, Any]
 Line = tuple[str, str, str]
 """Line of the table: figure, value of an ideal detector, measured value with number of cases."""
+KNOWN = tuple(CAUSES)
+"""Causes in the table of causes; outliers are not among them, because the noise model finds them."""
+NAMELESS = ("unknown", "seen", "foreign")
+"""Parts of the study in which the hidden effect is not a cause of the table."""
 MIN_CHANCE = 0.95
 """Minimum probability of the ideal detector to name only the truth, for a case that must be named."""
 MAX_IDEAL_P_VALUE = 0.1
