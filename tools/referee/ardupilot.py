@@ -33,15 +33,12 @@ GATE = 5.0
 """Gate of the position innovation, sigmas: EK3_POS_I_GATE 500, AP_NavEKF3.cpp."""
 ATTITUDE, VELOCITY_HORIZ, POS_HORIZ_ABS, CONST_POS_MODE = 1, 2, 16, 128
 """Bits of EKF_STATUS_REPORT.flags."""
-UNHEALTHY = 0.3
-"""Time without data after which visual odometry is unhealthy, s: AP_VisualOdom_Backend.cpp, healthy()."""
 
 
 class ArduPilot(Autopilot):
     """Emulated Plane (or glider) with airspeed, or a Rover without.
 
     Its source set is switched to external navigation when GPS is lost, as a user or a script does.
-    `internal_errors` counts NaN values where the firmware expects a number.
     """
 
     STACK = MAV_AUTOPILOT.ARDUPILOTMEGA
@@ -51,15 +48,9 @@ class ArduPilot(Autopilot):
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
-        self.internal_errors = 0
-        self._visual_us = self._fused_us = -(10**12)  # latest odometry, latest fused one
+        self._fused_us = -(10**12)
         self._reset_counter: int | None = None
         self._takes[spec("ODOMETRY").id] = self._odometry
-
-    @property
-    def healthy(self) -> bool:
-        """True if the latest visual odometry is at most `UNHEALTHY` old."""
-        return (self._now_us - self._visual_us) * 1e-6 < UNHEALTHY
 
     @property
     def aiding(self) -> bool:
@@ -93,11 +84,6 @@ class ArduPilot(Autopilot):
         self._resets += 1
         return MAV_RESULT.ACCEPTED
 
-    @property
-    def can_arm(self) -> bool:
-        """True if the autopilot passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
-        return self.healthy
-
     def _status(self, truth: Truth) -> bytes:  # noqa: ARG002 - as the other messages
         # AP_NavEKF3_Outputs.cpp, send_status_report: without aiding the position is held
         flags = ATTITUDE | (VELOCITY_HORIZ | POS_HORIZ_ABS if self.aiding else CONST_POS_MODE)
@@ -110,12 +96,9 @@ class ArduPilot(Autopilot):
         covariance, sigma = message["pose_covariance"], 0.0
         if not isnan(covariance[0]):
             sigma = (covariance[0] ** 2 + covariance[6] ** 2 + covariance[11] ** 2) ** (1 / 3)
-            angle = covariance[15] + covariance[18] + covariance[20]
-            # AP_Math.cpp, constrain_value: NaN is an internal error, and becomes the middle of the range
-            self.internal_errors += isnan(sigma) or isnan(angle)
+            # AP_Math.cpp, constrain_value: NaN becomes the middle of the range
             sigma = 50.0 if isnan(sigma) else sigma
         # AP_VisualOdom_MAV.cpp, handle_pose_estimate
-        self._visual_us = self._now_us
         if message["quality"] < VISO_QUAL_MIN:
             return "dropped: quality"
         sigma = min(max(sigma, VISO_NOISE), 100.0)

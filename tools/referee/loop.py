@@ -16,7 +16,6 @@ from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.link.component import Component
 from magbridge.link.estimates import FIX_MESSAGES
-from magbridge.link.telemetry import needed_rates
 from magbridge.navigate import NavigationOptions
 from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth
@@ -141,19 +140,10 @@ def sail(
     kind: str,
     make: Callable[[tuple[float, float, float], int], Autopilot],
     seed: int = 0,
-    *,
-    step_s: float = 1.0,
-    requests: bool = False,
 ) -> tuple[Run, Autopilot, NavigationService]:
-    """Run bridge and autopilot (from ``make(origin, start_us)``) over a passage, with fixes of one `kind`.
-
-    The autopilot sends telemetry at most every `step_s`; with `requests`, the bridge requests its rates.
-    """
+    """Run bridge and autopilot (from ``make(origin, start_us)``) over a passage, with fixes of one `kind`."""
     start_us = round(passage.time[0] * 1e6) // 4 * 4
-    needed = needed_rates(1, attitude=True, navigation=True) if requests else None
-    component = Component(
-        Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us, streams=needed
-    )
+    component = Component(Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us)
     navigation = NavigationService(grid, options, FIX_MESSAGES[kind], component)
     origin = float(passage.latitude[0]), float(passage.longitude[0]), 3.0
     autopilot = make(origin, start_us)
@@ -162,7 +152,7 @@ def sail(
     answers = b""
     columns = passage.time.tolist(), passage.total_field.tolist(), passage.sigma.tolist()
     samples = deque(zip(*columns, strict=True))
-    for seconds, truth in truths(passage, seed, step_s):
+    for seconds, truth in truths(passage, seed):
         now_us = start_us + round(seconds * SECOND_US) // 4 * 4
         for when_us, corrected in due(samples, now_us - 1):
             navigation.sample(when_us, corrected)
@@ -209,20 +199,20 @@ def own_error(navigation: NavigationService, now_us: int, truth: Truth) -> float
     return hypot(*separation(*truth.place, *offset(*navigator.reckoned(now_us), north, east)))
 
 
-def truths(passage: Passage, seed: int, step_s: float = 1.0) -> Iterator[tuple[float, Truth]]:
-    """Yield time and true state of the vehicle every `step_s` seconds, interpolated between the samples."""
+def truths(passage: Passage, seed: int) -> Iterator[tuple[float, Truth]]:
+    """Yield time and true state of the vehicle every second, interpolated between the samples."""
     rng = np.random.default_rng(seed)
     time, every = passage.time, float(passage.time[1] - passage.time[0])
     heading = np.degrees(np.arctan2(passage.velocity[:, 1], passage.velocity[:, 0])) % 360.0
     speed = np.hypot(*passage.velocity.T)
-    seconds = np.arange(0.0, time[-1] - time[0], step_s)
+    seconds = np.arange(0.0, time[-1] - time[0])
     latitude = np.interp(seconds, time - time[0], passage.latitude)
     longitude = np.interp(seconds, time - time[0], passage.longitude)
-    noise = rng.normal(size=(int(seconds[-1]) + 1, 2)) * GPS_SIGMA  # constant over each second
+    noise = rng.normal(size=(len(seconds), 2)) * GPS_SIGMA
     for k, second in enumerate(seconds.tolist()):
         place = float(latitude[k]), float(longitude[k])
         i = int(second / every)
         measured = passage.receiver(second, place) if passage.gps(second) else None
-        gps = offset(*measured[0], *noise[int(second)].tolist()) if measured else None
+        gps = offset(*measured[0], *noise[k].tolist()) if measured else None
         accuracy = measured[1] if measured else GPS_SIGMA
         yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps, accuracy)

@@ -32,22 +32,15 @@ DEFAULT_ACCURACY = 50.0
 
 
 class Px4(Autopilot):
-    """Emulated PX4 plane in the air, with EKF2_AGP0_CTRL 1 and EKF2_AGP0_ID `AGP0_ID`.
-
-    Parameters
-    ----------
-    replaces_claim : bool
-        True for versions up to 1.16: EXTERNAL_POSITION_ESTIMATE replaces the variance instead of fusing it.
-    """
+    """Emulated PX4 plane in the air, with EKF2_AGP0_CTRL 1 and EKF2_AGP0_ID `AGP0_ID`."""
 
     STACK = MAV_AUTOPILOT.PX4
     STATUS = "ESTIMATOR_STATUS"
     WALK = 2.5e-3
     """Spectral density of the wind's random walk, (m/s)²/s: EKF2_WIND_NSD is 0.05 m/s²/√Hz."""
 
-    def __init__(self, *args: Any, replaces_claim: bool = False, **settings: Any) -> None:
+    def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
-        self._replaces = replaces_claim
         self._pushed_us = self._fused_us = -(10**12)
         self._takes[spec("GLOBAL_POSITION_SENSOR").id] = self._sensor
         self._takes[spec("ODOMETRY").id] = self._odometry
@@ -76,8 +69,6 @@ class Px4(Autopilot):
         if aided or accuracy < 1.0 or self.filter.distance(place, variance) > EXTERNAL_GATE:
             self.filter.reset(place, variance)
             self.filter.wind = 0.0, 0.0
-        elif self._replaces:
-            self.filter.force(place, variance)
         else:  # bbf32a537e, December 2025: full move of the position, but the variance of a fused one
             before = self.filter.pp
             self.filter.force(place, variance)
