@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
-from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from magbridge.arrays import FloatArray
@@ -305,7 +304,7 @@ class BestFit:
 
 
 class SurveyBound:
-    """Least errors after a calibration from a survey only: of the field on another survey, and of the map.
+    """Least error of the field on another survey after a calibration from a survey only.
 
     Vehicle and crustal field are estimated from a `survey` of n samples at `place` (n, 2), m. `crust` are
     amplitude (nT) and length (m) of a Gaussian field with a Gaussian covariance, which are known; `noise` is
@@ -314,8 +313,8 @@ class SurveyBound:
     Notes
     -----
     As :class:`BestFit`, with crustal field and bias in the covariance K of the magnitudes:
-    :math:`P = (I + G^T K^{-1} G)^{-1}`. The map is the posterior of a Gaussian field whose data have the
-    covariance :math:`K + G G^T`. Neighbouring samples are averaged: :data:`MAX_COVARIANCE_SAMPLES` remain.
+    :math:`P = (I + G^T K^{-1} G)^{-1}`. Neighbouring samples are averaged: :data:`MAX_COVARIANCE_SAMPLES`
+    remain.
     """
 
     def __init__(
@@ -331,7 +330,7 @@ class SurveyBound:
         g, floor = _sensitivity(vehicle, survey, self._sigma)
         step = -(-len(g) // MAX_COVARIANCE_SAMPLES)
         n = len(g) // step
-        g, self._place, floor = (
+        g, place, floor = (
             one[: n * step].reshape(n, step, -1).mean(axis=1) for one in (g, place, floor[:, None])
         )
 
@@ -342,7 +341,7 @@ class SurveyBound:
         R = alike(n, step)
         np.fill_diagonal(R, alike(step, 1).mean())
         self._G = g * self._scale
-        self._K = floor * floor.T * R + self._alike(self._place, self._place) + MAIN_FIELD_SIGMA_NT**2
+        self._K = floor * floor.T * R + self._alike(place) + MAIN_FIELD_SIGMA_NT**2
 
     def of_field(self, other: xr.Dataset) -> float:
         """Return the least RMS error without bias on another survey, over the noise floor."""
@@ -351,25 +350,10 @@ class SurveyBound:
         P = np.linalg.inv(G.T @ np.linalg.solve(self._K, G) + np.eye(len(self._scale)))
         return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (floor**2).sum()))
 
-    def data_covariance(self, *, vehicle_known: bool) -> FloatArray:
-        """Return the covariance (n, n), nT², of the magnitudes by crustal field, bias, noise and vehicle."""
-        return np.asarray(self._K if vehicle_known else self._K + self._G @ self._G.T)
-
-    def of_map(self, at: FloatArray, apart_from: int, *, vehicle_known: bool) -> FloatArray:
-        """Return the least 1-sigma error (m,), nT, of the map at places (m, 2), m.
-
-        The error is relative to the mean error at the first `apart_from` places.
-        """
-        K = self.data_covariance(vehicle_known=vehicle_known)
-        C = self._alike(at, self._place)
-        S = self._alike(at, at) - C @ cho_solve(cho_factor(K), C.T)
-        level = S[:apart_from].mean(axis=0)
-        return np.asarray(np.sqrt(np.diag(S) - 2.0 * level + level[:apart_from].mean()))
-
-    def _alike(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Return the crustal field's covariance (n, m), nT², between places (n, 2) and (m, 2), m."""
+    def _alike(self, place: FloatArray) -> FloatArray:
+        """Return the crustal field's covariance (n, n), nT², between places (n, 2), m."""
         size, length = self._crust
-        return np.asarray(size**2 * np.exp(-0.5 * cdist(a, b, "sqeuclidean") / length**2))
+        return np.asarray(size**2 * np.exp(-0.5 * cdist(place, place, "sqeuclidean") / length**2))
 
 
 def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:

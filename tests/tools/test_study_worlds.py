@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from study_worlds import TRIALS, BestFit, SurveyBound, Trials, fly_trials
+from study_worlds import TRIALS, BestFit, Trials, fly_trials
 
-from magbridge.estimation.residual import rms
 from sitl import Twin, load, segments, simulate
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle
@@ -80,24 +79,3 @@ def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: p
     expected = 25.0 * (1 + np.einsum("ni,ij,nj->n", v, np.linalg.inv(u.T @ u), v))
     np.testing.assert_allclose(best.floor, 5.0)
     np.testing.assert_allclose(best.bound**2, expected, rtol=1e-6)
-
-
-def test_a_best_map_s_error_is_its_bound(short_flight: tuple[Vehicle, xr.Dataset, xr.Dataset]) -> None:
-    """On average over crustal fields, vehicles and noise; it is less if the vehicle is known."""
-    vehicle, _, survey = short_flight
-    few, rng = survey.isel(time=slice(0, None, 9)), np.random.default_rng(2)
-    place = np.cumsum(rng.normal(0.0, 60.0, (few.sizes["time"], 2)), axis=0)
-    at = place[::4] + rng.normal(0.0, 200.0, place[::4].shape)
-    best = SurveyBound(vehicle, few, place, (30.0, 500.0), (1.0, 0.0))
-    n, m = len(place), len(at)
-    every = np.concatenate([place, at])
-    S = 900.0 * np.exp(-0.5 * ((every[:, None] - every) ** 2).sum(axis=2) / 500.0**2)
-    root = np.linalg.cholesky(S + 1e-6 * np.eye(n + m))
-    read = np.linalg.cholesky(best.data_covariance(vehicle_known=False) - S[:n, :n])  # level, vehicle, noise
-    weights = np.linalg.solve(best.data_covariance(vehicle_known=False), S[:n, n:]).T
-    rock = root @ rng.normal(size=(n + m, 6000))
-    error = weights @ (rock[:n] + read @ rng.normal(size=(n, 6000))) - rock[n:]
-    error -= error[:20].mean(axis=0)
-    bound = best.of_map(at, 20, vehicle_known=False)
-    assert rms(error) == pytest.approx(rms(bound), rel=0.015)
-    assert (best.of_map(at, 20, vehicle_known=True) < bound).all()
