@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
+from contextlib import redirect_stdout
+from importlib.util import module_from_spec, spec_from_file_location
+from io import StringIO
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,11 +17,12 @@ from typing import Any
 # BLAS threads slow such narrow matrices down, more so if several pytest workers run
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import pymavlink
 import pytest
-from benchmarks.peer import classes
-from commands import Command
 from hypothesis import settings
+from pymavlink.generator import mavgen
 
+from magbridge import mavlink
 from magbridge.parts import OptionalParts
 
 # generate the same examples in every run, and fail none because the machine is busy
@@ -76,16 +82,17 @@ def cases() -> Path:
 @pytest.fixture(scope="session")
 def peer() -> ModuleType:
     """Return the message classes that pymavlink's mavgen generates from the project's XML dialect."""
-    return classes()
-
-
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Change to an empty folder and return it."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str], here: Path) -> Command:
-    return Command(capsys)
+    with tempfile.TemporaryDirectory() as name, redirect_stdout(StringIO()):
+        folder = Path(name)
+        shutil.copy(Path(mavlink.__file__).with_name("magbridge.xml"), folder)
+        for included in ("common", "standard", "minimal"):
+            shutil.copy(Path(pymavlink.__file__).parent / "dialects" / "v20" / f"{included}.xml", folder)
+        options = mavgen.Opts(str(folder / "peer"), wire_protocol="2.0", language="Python3")
+        if not mavgen.mavgen(options, [str(folder / "magbridge.xml")]):
+            raise RuntimeError("mavgen refused magbridge.xml")
+        place = spec_from_file_location("peer", folder / "peer.py")
+        assert place is not None
+        assert place.loader is not None
+        module = module_from_spec(place)
+        place.loader.exec_module(module)
+    return module
