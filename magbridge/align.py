@@ -149,8 +149,6 @@ class Sample(msgspec.Struct, frozen=True, gc=False):
 
     reading: Reading
     """Reading as the instrument sent it."""
-    reading_us: int
-    """Time of the host's clock at the reading's ``device_time``, µs."""
     time_us: int
     """Common time of all channels, corrected for the filter's delay, µs."""
     field: Vector
@@ -247,7 +245,7 @@ class Aligner:
         sigma = variance**0.5 if variance else 0.0
         # the two low bits of a time belong to the log
         time_of_all_us = sample_us - sample_us % 4
-        return Sample(reading, time_us, time_of_all_us, field, values, age, quality | more, sigma, spans)
+        return Sample(reading, time_of_all_us, field, values, age, quality | more, sigma, spans)
 
     def _parameters(
         self, sample_us: int, undated: bool

@@ -73,7 +73,7 @@ class Channel(IntEnum):
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
-    """One measurement of the three channels, as the instrument sent it."""
+    """One measurement of the three channels, as the instrument sent it, and its time on the host's clock."""
 
     field: Vector
     """Field, nT, sensor axes, uncorrected; (total field, 0, 0) of a scalar instrument."""
@@ -92,6 +92,12 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     """Number of times that the instrument was powered on."""
     saturated: bool = False
     """A channel was at the end of its range."""
+    time_us: int = 0
+    """Time of `device_time` on the host's clock, µs since 1970 UTC, a multiple of 4; 0 until it is known."""
+    missing: int = 0
+    """Number of readings missing immediately before this reading."""
+    restarted: bool = False
+    """True if the instrument's clock restarted, because the instrument was powered on again."""
 
 
 class Corrected(msgspec.Struct, frozen=True, gc=False):

@@ -38,7 +38,6 @@ from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver
-from magbridge.sensors.clock import Stamp
 from magbridge.version import __version__
 
 if TYPE_CHECKING:
@@ -204,8 +203,8 @@ class Pipeline:
         if channel is SENSOR:
             recorder.sensor(time_us, data, event.sensor_id)
             if (stream := self._by_id.get(event.sensor_id)) is not None:
-                for reading, stamp in stream.receive(data, time_us):
-                    self._sample(stream, reading, stamp)
+                for reading in stream.receive(data, time_us):
+                    self._sample(stream, reading)
         elif channel is LINK:
             self._receive_link(data, time_us)
         elif data:
@@ -232,14 +231,14 @@ class Pipeline:
         for stream in self.streams:
             stream.correction.aligner.late_since_us = since_us
 
-    def _sample(self, stream: SensorStream, reading: Reading, stamp: Stamp) -> None:
+    def _sample(self, stream: SensorStream, reading: Reading) -> None:
         position, main = self._position, self.streams[0]
         if isinstance(self._correction, Correction):
             self._correction.is_learning = not self._changes.is_overloaded
-        utc_us = stamp.time_us + self.component.codec.utc_offset_us
-        main_field = self._parts.call("position", nan, position.main_field, stamp.time_us, utc_us)
+        utc_us = reading.time_us + self.component.codec.utc_offset_us
+        main_field = self._parts.call("position", nan, position.main_field, reading.time_us, utc_us)
         place, depth = position.place_and_depth
-        for sample, corrected in stream.correct(reading, stamp, main_field, place, depth):
+        for sample, corrected in stream.correct(reading, main_field, place, depth):
             self._process(stream, sample, corrected)
         if self._comparisons and stream is main:
             for other in self.streams[1:]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING, Final
@@ -26,7 +26,7 @@ from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Corrected, Reading, Vector
 from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver, is_scalar, open_driver
-from magbridge.sensors.clock import DeviceClock, Stamp
+from magbridge.sensors.clock import DeviceClock
 
 if TYPE_CHECKING:
     from magbridge.learning import Learner
@@ -305,32 +305,27 @@ class SensorStream:
         self.overload_rate = Rate(OVERLOAD_HZ)
         self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
 
-    def receive(self, data: bytes, time_us: int) -> Iterable[tuple[Reading, Stamp]]:
+    def receive(self, data: bytes, time_us: int) -> list[Reading]:
         """Parse bytes received at `time_us` (µs); return the completed readings with their times."""
         readings = self.driver.feed(data)
         if not readings:
             self.line.on_unparsed(data, time_us)
-            return ()
+            return []
         self.line.on_reading(time_us)
-        return zip(readings, self.clock.stamp(readings, time_us), strict=True)
+        return self.clock.stamp(readings, time_us)
 
     def correct(
-        self,
-        reading: Reading,
-        stamp: Stamp,
-        main_field: float,
-        position: tuple[float, float] | None,
-        depth: float,
+        self, reading: Reading, main_field: float, position: tuple[float, float] | None, depth: float
     ) -> list[tuple[Sample, Corrected]]:
         """Correct a reading; return the completed samples, each with its corrected field.
 
-        `reading`, `stamp`: reading and its time from :meth:`receive`.
+        `reading`: reading from :meth:`receive`.
         `main_field`: magnitude of the main field, nT; NaN if unknown.
         `position`: latitude and longitude, deg; None if unknown.
         `depth`: depth below the sea, m; NaN if unknown.
         """
-        correction, time_us = self.correction, stamp.time_us
-        restarted, missing = stamp.restarted, stamp.missing
+        correction, time_us = self.correction, reading.time_us
+        restarted, missing = reading.restarted, reading.missing
         self.samples += 1
         self.lost += missing
         self._times.append(time_us)

@@ -159,7 +159,7 @@ def to_integer(value: float) -> int:
     return int(value) if isfinite(value) else -1
 
 
-HEARTBEAT_SPEC = spec("HEARTBEAT")
+HEARTBEAT_SPEC, STATUS = spec("HEARTBEAT"), spec("MAG_STATUS")
 ALIVE, CRITICAL = (
     HEARTBEAT_SPEC.payload(
         type=MAV_TYPE.ONBOARD_CONTROLLER,
@@ -210,8 +210,7 @@ class Reports:
         """Send MAG_STATUS, then the messages of `more`; return True."""
         codec, vehicle = self._component.codec, self._component.vehicle
         clock = vehicle.clock
-        self._outbox.send(
-            "MAG_STATUS",
+        payload = STATUS.payload(
             time_usec=codec.utc_us,
             vehicle_clock_offset=(
                 round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0
@@ -228,6 +227,7 @@ class Reports:
             autopilot_state=vehicle.state,
             **{"sample_rate": nan, "sensor_clock_drift": nan} | self._condition(),
         )
+        self._outbox.put(STATUS, payload)
         for send in self.more:
             send()
         return True

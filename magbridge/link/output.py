@@ -63,7 +63,6 @@ class Timers:
     def __init__(self) -> None:
         self._deadlines: dict[str, int] = {}
         self._actions: dict[str, tuple[int, Callable[[int], object]]] = {}  # period in µs, and action
-        self._next = ""
         self.next_deadline = FOREVER
 
     def every(self, name: str, period_us: int, action: Callable[[int], object], first_us: int) -> None:
@@ -76,8 +75,7 @@ class Timers:
 
     def cancel(self, name: str) -> None:
         """Remove the timer `name`, if it exists."""
-        self._deadlines.pop(name, None)
-        if name == self._next:
+        if self._deadlines.pop(name, None) == self.next_deadline:
             self._find_next()
 
     def delay(self, name: str, delay_us: int) -> None:
@@ -87,9 +85,12 @@ class Timers:
             self._find_next()
 
     def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
-        """Fire all timers that are due up to `t_us` (µs); call ``begin(deadline)`` before each action."""
-        while self.next_deadline <= t_us:
-            name, deadline = self._next, self.next_deadline
+        """Fire all timers that are due up to `t_us` (µs); call ``begin(deadline)`` before each action.
+
+        Of equal deadlines, the timer that was set first fires first.
+        """
+        while (deadline := self.next_deadline) <= t_us:
+            name = next(name for name, due_us in self._deadlines.items() if due_us == deadline)
             period, action = self._actions[name]
             if period:
                 self._deadlines[name] = deadline + period
@@ -100,14 +101,13 @@ class Timers:
             action(deadline)
 
     def _set(self, name: str, deadline: int, period: int, action: Callable[[int], object]) -> None:
+        before = self._deadlines.get(name)
         self._deadlines[name], self._actions[name] = deadline, (period, action)
-        if name == self._next or deadline <= self.next_deadline:
+        if before == self.next_deadline or deadline < self.next_deadline:
             self._find_next()
 
     def _find_next(self) -> None:
-        """Find the next timer and its deadline; of equal deadlines, the timer that was set first is next."""
-        self._next = min(self._deadlines, key=self._deadlines.__getitem__, default="")
-        self.next_deadline = self._deadlines.get(self._next, FOREVER)
+        self.next_deadline = min(self._deadlines.values(), default=FOREVER)
 
 
 def period_us(hertz: float) -> int:

@@ -126,7 +126,7 @@ class Publisher:
         x_count, y_count, z_count = counts or NO_COUNTS
         x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
-            max(sample.reading_us + self._codec.utc_offset_us, 0), (sequence or 0) & MASK,
+            max(reading.time_us + self._codec.utc_offset_us, 0), (sequence or 0) & MASK,
             x, y, z, x_count, y_count, z_count,
             round(x_late * 1e6), round(y_late * 1e6), round(z_late * 1e6),
             reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, self._sensor_id, flags,

@@ -12,7 +12,7 @@ from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.vehicle import VehicleClock
-from magbridge.mavlink import Message, Source, Spec, by_id, spec
+from magbridge.mavlink import Message, Source, Spec, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.mavlink.messages import MESSAGE_IDS, Field, split_index
 from magbridge.wording import suggestion
@@ -172,22 +172,29 @@ MAX_VALID_SPEED_M_S: Final = 1e4
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """Largest magnitudes of latitude and longitude, 1e-7 deg."""
 
-REQUIRED: dict[int, dict[str, float]] = by_id(
+DISTANCE_AND_SPEED = dict.fromkeys("xyz", MAX_DISTANCE_M) | dict.fromkeys(
+    ("vx", "vy", "vz"), MAX_VALID_SPEED_M_S
+)
+
+
+def limits(**of: dict[str, float]) -> dict[int, list[tuple[Field, float]]]:
+    """Return fields with their largest valid magnitudes, by message id, from both by name."""
+    return {
+        spec(name).id: [(spec(name).fields[field], largest) for field, largest in fields.items()]
+        for name, fields in of.items()
+    }
+
+
+REQUIRED: Final = limits(
     ATTITUDE={"roll": MAX_ANGLE_RAD, "pitch": MAX_ANGLE_RAD, "yaw": MAX_ANGLE_RAD},
     GLOBAL_POSITION_INT={"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
     GPS_RAW_INT={"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
     GPS_GLOBAL_ORIGIN={"latitude": LATITUDE_E7, "longitude": LONGITUDE_E7},
 )
 """Message id -> fields that must not be NaN, with their largest valid magnitudes."""
-LIMITED: dict[int, dict[str, float]] = by_id(
-    LOCAL_POSITION_NED={
-        **dict.fromkeys(("x", "y", "z"), MAX_DISTANCE_M),
-        **dict.fromkeys(("vx", "vy", "vz"), MAX_VALID_SPEED_M_S),
-    },
-    ODOMETRY={
-        **dict.fromkeys(("x", "y", "z"), MAX_DISTANCE_M),
-        **dict.fromkeys(("vx", "vy", "vz"), MAX_VALID_SPEED_M_S),
-    },
+LIMITED: Final = limits(
+    LOCAL_POSITION_NED=DISTANCE_AND_SPEED,
+    ODOMETRY=DISTANCE_AND_SPEED,
     VFR_HUD={"airspeed": MAX_VALID_SPEED_M_S, "groundspeed": MAX_VALID_SPEED_M_S},
 )
 """Message id -> fields that may be NaN (unknown), with their largest valid magnitudes."""
@@ -197,14 +204,11 @@ ODOMETRY: Final = spec("ODOMETRY").id
 
 def is_possible(message: Message) -> bool:
     """Return False if a used field of a message is infinite, out of range, or NaN without permission."""
-    for name, largest in REQUIRED.get(message.id, {}).items():
-        if not abs(message[name]) <= largest:  # also NaN
+    for field, largest in REQUIRED.get(message.id, ()):
+        if not abs(field.get(message.payload)) <= largest:  # also NaN
             return False
-    limits = LIMITED.get(message.id)
-    if limits is None:
-        return True
-    for name, largest in limits.items():
-        value = message[name]
+    for field, largest in LIMITED.get(message.id, ()):
+        value = field.get(message.payload)
         if not (isnan(value) or abs(value) <= largest):
             return False
     if message.id == ODOMETRY:

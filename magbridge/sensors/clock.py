@@ -16,12 +16,14 @@ from collections.abc import Sequence
 from math import inf, isnan, nan
 from typing import Final
 
-import msgspec
+from msgspec.structs import replace
 
 from magbridge.records import MAX_DEVICE_TIME_S, Reading
 from magbridge.sensors import Driver
 
-__all__ = ["DeviceClock", "Stamp"]
+__all__ = [
+    "DeviceClock",
+]
 
 FIRST_BLOCK_READINGS: Final = 8
 """Number of readings in the first blocks."""
@@ -160,19 +162,6 @@ KEEP_PHASE: Final = 3
 """Most missing readings in a row without a restart of the line; beyond, the instrument may have stopped."""
 
 
-class Stamp(msgspec.Struct, frozen=True, gc=False):
-    """Time at which a reading was taken."""
-
-    time_us: int
-    """Time, µs since 1970 UTC, a multiple of 4, increasing unless `stepped`."""
-    restarted: bool = False
-    """True if the instrument's clock restarted, because the instrument was powered on again."""
-    stepped: bool = False
-    """True if one of the two clocks was set, so that the relation between them is estimated again."""
-    missing: int = 0
-    """Number of readings missing immediately before this reading."""
-
-
 class DeviceClock:
     """Estimator of the times of an instrument's readings on the host's clock.
 
@@ -180,6 +169,8 @@ class DeviceClock:
     `sequence_modulo`: value at which the instrument's count of readings wraps to 0; 0 if it never wraps.
     `period`: time between the readings of an instrument without a clock, s; 0 if not steady, so that each
         reading gets the time of its arrival.
+    `stepped`: True if one of the two clocks was set before the last reading, so that the relation between
+        the clocks is estimated again.
     """
 
     def __init__(self, *, time_modulo: float = 0.0, sequence_modulo: int = 0, period: float = 0.0) -> None:
@@ -194,6 +185,7 @@ class DeviceClock:
         self._zero = self._turned = self._device_time = 0.0
         self._count = 0
         self._arrival_us = self._out_us = 0
+        self.stepped = False
 
     @classmethod
     def for_driver(cls, driver: Driver) -> DeviceClock:
@@ -207,17 +199,15 @@ class DeviceClock:
         """Rate of the host's clock minus the instrument's, µs/s."""
         return self._floor.slope
 
-    def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Stamp]:
-        """Return the times of the readings of one chunk, which arrived at `arrival_us` (µs).
+    def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Reading]:
+        """Return the readings of one chunk, which arrived at `arrival_us` (µs), with their host times.
 
-        Only the last reading updates the line, because the earlier readings waited for the last one. Readings
-        that queued up during a stall of the host may come in several chunks; only the last chunk then ends
-        with a reading without delay.
+        The times increase, except after a step of a clock. Only the last reading updates the line, because
+        the earlier readings waited for the last one. Readings that queued up during a stall of the host may
+        come in several chunks; only the last chunk then ends with a reading without delay.
         """
         last = len(readings) - 1
-        if not last:
-            return [self.update(readings[0].device_time, arrival_us, readings[0].sequence)]
-        stamps = []
+        stamped = []
         for index, reading in enumerate(readings):
             waited = 0.0
             if index < last:
@@ -226,21 +216,17 @@ class DeviceClock:
                     waited = (last - index) * self._period
                 elif not 0.0 <= waited < 60.0:  # a restart or a wrap between the two readings
                     waited = 0.0
-            arrived_us = arrival_us - int(waited * 1e6)
-            stamps.append(self.update(reading.device_time, arrived_us, reading.sequence, index == last))
-        return stamps
+            stamped.append(self.update(reading, arrival_us - int(waited * 1e6), index == last))
+        return stamped
 
-    def update(
-        self, device_time: float, arrival_us: int, sequence: int | None = None, informative: bool = True
-    ) -> Stamp:
-        """Return the time at which a reading was taken.
+    def update(self, reading: Reading, arrival_us: int, informative: bool = True) -> Reading:
+        """Return a reading with its time on the host's clock.
 
-        `device_time`: time of the reading on the instrument's clock, s; NaN without a clock.
         `arrival_us`: time of arrival on the host's clock, µs.
-        `sequence`: the instrument's count of readings; None without a count.
         `informative`: True if the reading updates the relation between the clocks; False for a reading that
             waited for a later one.
         """
+        device_time, sequence = reading.device_time, reading.sequence
         if not abs(device_time) < MAX_DEVICE_TIME_S:
             device_time = nan
         timed = not isnan(device_time)
@@ -263,8 +249,8 @@ class DeviceClock:
         out_us = int(time_us) & ~3
         if out_us <= self._out_us and not stepped:
             out_us = self._out_us + 4
-        self._out_us = out_us
-        return Stamp(out_us, restarted, stepped, 0 if restarted else missing)
+        self._out_us, self.stepped = out_us, stepped
+        return replace(reading, time_us=out_us, missing=0 if restarted else missing, restarted=restarted)
 
     def _missing(self, sequence: int | None, arrival_us: int) -> int:
         """Return the number of readings missing before the one with number `sequence`.

@@ -25,7 +25,7 @@ from magbridge.correction import Correction
 from magbridge.mavlink import Codec, Message
 from magbridge.one_time import OneTime
 from magbridge.parts import OptionalParts
-from magbridge.records import Channel
+from magbridge.records import Channel, Reading
 from magbridge.sensors.clock import DeviceClock
 
 KEY = bytes(range(1, 33))
@@ -208,7 +208,7 @@ def test_zero_counts_of_channels_sampled_in_turn() -> None:
 @pytest.mark.parametrize("device_time", [1e308, -1e308, float("inf"), 1e300])
 def test_an_absurd_device_time_dates_a_reading_by_its_arrival(device_time: float) -> None:
     clock = DeviceClock()
-    clock.update(10.0, START)
-    stamp = clock.update(device_time, START + 1_000_000)
-    assert stamp.time_us == pytest.approx(START + 1_000_000, abs=4)
-    assert clock.update(nan, START + 2_000_000).time_us == pytest.approx(START + 2_000_000, abs=4)
+    for number, time in enumerate((10.0, device_time, nan)):
+        arrival_us = START + number * 1_000_000
+        reading = clock.update(Reading((0.0, 0.0, 0.0), device_time=time), arrival_us)
+        assert reading.time_us == pytest.approx(arrival_us, abs=4)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from line import Line, MakeLine
+from msgspec.structs import replace
 
 from magbridge.align import Sample
 from magbridge.link.output import FOREVER, Announcer, Outbox, Rate, Timers
@@ -33,7 +34,8 @@ CORRECTED = Corrected(
 
 
 def sample(t_us: int = START, reading: Reading = READING, age: float = nan) -> Sample:
-    return Sample(reading, t_us + 4000, t_us, reading.field, (), age, 0, 0.0, ())
+    dated = replace(reading, time_us=t_us + 4000)
+    return Sample(dated, t_us, reading.field, (), age, 0, 0.0, ())
 
 
 def publish(link: Line, one: Sample, corrected: Corrected = CORRECTED, anomaly: float = nan) -> list[Any]:
