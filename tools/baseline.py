@@ -30,12 +30,12 @@ import navigation
 import numpy as np
 import survey
 from studies import DATA, Row, command_line, in_order
+from study import table
 from study_worlds import NOISES
 from voyages import Map
 
 from magbridge.calibration.fitting.observe import observations
 from magbridge.logs import Options, read
-from study import table
 
 FILE = Path(__file__).with_name("baseline.json")
 MIN_STANDARD_ERRORS, MIN_RELATIVE_CHANGE, MIN_RELATIVE_CHANGE_SINGLE = 2.0, 0.01, 0.02

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from blind import case
+from study import deployment
 from study.deployment import GLIDER, LOSSES
 from study.ideal import cause_names
 from study.table import is_worse, sets
@@ -25,7 +26,6 @@ from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
-from study import deployment
 
 SAFE = 0.97
 """Ideal probability that the set holds the truth, from which the set must hold it."""

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 from scipy.special import chdtrc
+from study.deployment import Background, Injected, compare, project, whiten
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import CAUSES
@@ -30,7 +31,6 @@ from magbridge.diagnose.evidence import FALSE_ALARM_RATE, ODDS, log_bayes, one_s
 from magbridge.diagnose.joint import Statistic
 from magbridge.diagnose.problem import pose
 from magbridge.diagnose.survey import load_survey
-from study.deployment import Background, Injected, compare, project, whiten
 
 DRAWS = 400
 SIZES = np.linspace(1.0, 12.0, 45)

@@ -14,11 +14,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binomtest, norm
 from studies import fraction
+from study.deployment import CHARTS, NOISES
+from study.ideal import EQUIVALENT, SIZES, cause_names
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import CAUSES
-from study.deployment import CHARTS, NOISES
-from study.ideal import EQUIVALENT, SIZES, cause_names
 
 Row = dict[str, Any]
 Line = tuple[str, str, str]
