@@ -330,9 +330,9 @@ class Pipeline:
                 )  # fmt: skip
                 continue
             if message.id == Position.MESSAGE:
-                self._locate(message, time_us)
+                self._use_position(message, time_us)
             elif message.id == ATTITUDE_ID and self._is_autopilot(message):
-                self._parts.call("direction check", None, self._turn, message, time_us)
+                self._parts.call("direction check", None, self._use_attitude, message, time_us)
             if self.heading is not None and message.id in HEADING_INPUTS and self._is_autopilot(message):
                 self.heading.receive(message, time_us)
             if self.navigation is not None:
@@ -344,7 +344,7 @@ class Pipeline:
         """Return True if the autopilot sent `message`."""
         return message.component == self._config.link.autopilot
 
-    def _locate(self, message: Message, time_us: int) -> None:
+    def _use_position(self, message: Message, time_us: int) -> None:
         """Use a position of the autopilot; ignore the position of another component and report it once."""
         if self._is_autopilot(message):
             self._parts.call("position", None, self._position.update, message, time_us)
@@ -354,7 +354,7 @@ class Pipeline:
                 f"position of component {message.component} ignored", MAV_SEVERITY.WARNING
             )
 
-    def _turn(self, message: Message, time_us: int) -> None:
+    def _use_attitude(self, message: Message, time_us: int) -> None:
         """Pass the vehicle's attitude and the main field to the check of the measured field's direction."""
         if self._direction is not None:
             utc_us = time_us + self.component.codec.utc_offset_us
@@ -481,8 +481,8 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after_event: C
     """
     for event in edge.events(lambda: pipeline.deadline):
         sent = pipeline.feed(event)
-        if pipeline.component.genuine:
-            edge.credit(pipeline.component.genuine)
+        if pipeline.component.signed_frames:
+            edge.credit(pipeline.component.signed_frames)
         if sent:
             edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
         for stream in pipeline.streams:

@@ -26,17 +26,17 @@ from magbridge.mavlink.messages import SIGNATURE, V2, is_signed
 
 __all__ = ["PEER_READ_BYTES", "READ_BYTES", "PacedPort", "Peer", "Peers", "Port", "cut"]
 
-TIMEOUT = 30.0
+PEER_SILENCE_S = 30.0
 """Time after its last valid frame for which the bridge sends to a peer, s."""
-ANSWERED = 8
+MAX_RECEIVERS = 8
 """Most peers to which the bridge sends: the autopilot's peer, then the peers that came first."""
 MAX_PARSED_PEERS = 64
 """Most peers that have a parser."""
 PEER_READ_BYTES = 8192
 """Most bytes of one peer, except the autopilot's, that are parsed before the sensors are read."""
-STRANGERS = 8192
+UNKNOWN_READ_BYTES = 8192
 """Most bytes of all peers without a valid frame together that are parsed before the sensors are read."""
-LOOK = 1.0
+SELECTION_INTERVAL_S = 1.0
 """Time between two updates of the list of peers to which the bridge sends, s."""
 
 
@@ -45,17 +45,18 @@ class Peer:
 
     `address`: address or descriptor by which the port identifies the peer.
     `codec`: parser of the peer's bytes.
-    `genuine`, `pilot`: times of its last valid frame, and of its last frame of the autopilot; s, monotonic.
-    `since`: time of its first valid frame, without a later silence of `TIMEOUT`; s, monotonic.
-    `share`: number of bytes received since the bytes of all peers were last drained.
+    `valid_s`, `autopilot_s`: times of its last valid frame, and of its last frame of the autopilot; s,
+        monotonic.
+    `first_valid_s`: time of its first valid frame, without a later silence of `PEER_SILENCE_S`; s, monotonic.
+    `unread`: number of bytes received since the bytes of all peers were last drained.
     """
 
-    __slots__ = ("address", "codec", "genuine", "pilot", "share", "since")
+    __slots__ = ("address", "autopilot_s", "codec", "first_valid_s", "unread", "valid_s")
 
     def __init__(self, address: Hashable) -> None:
         self.address, self.codec = address, Codec(0, 0)
-        self.genuine = self.pilot = self.since = -inf
-        self.share = 0
+        self.valid_s = self.autopilot_s = self.first_valid_s = -inf
+        self.unread = 0
 
 
 class Peers:
@@ -74,16 +75,16 @@ class Peers:
         self, autopilot: tuple[int, int] | None = None, *, budget: float = inf, signed: bool = False
     ) -> None:
         self._autopilot, self._signed = autopilot, signed
-        self._budget = self._purse = budget
-        self._paid = time.monotonic()
+        self._budget = self._allowance = budget
+        self._allowance_s = time.monotonic()
         self._peers: dict[Hashable, Peer] = {}
         self._frames: list[bytes] = []
-        self._stray: list[bytes] = []
-        self._authors: dict[bytes, Peer] = {}
+        self._other_bytes: list[bytes] = []
+        self._unconfirmed: dict[bytes, Peer] = {}
         self._routes: dict[tuple[int, int], Peer] = {}  # at most 65,536
-        self._strangers = 0
-        self._answered: list[Peer] = []
-        self._look = 0.0
+        self._unknown_bytes = 0
+        self._receivers: list[Peer] = []
+        self._selection_s = 0.0
         self._reported: set[str] = set()
         self.ignored = self.withheld = 0
         self.notices: deque[str] = deque(maxlen=8)
@@ -92,64 +93,66 @@ class Peers:
         """Process bytes from the peer at `address`."""
         peer, now = self._peers.get(address), time.monotonic()
         if peer is None:
-            peer = self._meet(address)
-        known = now - peer.genuine < TIMEOUT
-        peer.share += len(data)
-        self._strangers += 0 if known else len(data)
-        if now - peer.pilot > TIMEOUT and (
-            peer.share > PEER_READ_BYTES or (not known and self._strangers > STRANGERS)
+            peer = self._add(address)
+        known = now - peer.valid_s < PEER_SILENCE_S
+        peer.unread += len(data)
+        self._unknown_bytes += 0 if known else len(data)
+        if now - peer.autopilot_s > PEER_SILENCE_S and (
+            peer.unread > PEER_READ_BYTES or (not known and self._unknown_bytes > UNKNOWN_READ_BYTES)
         ):
             self.ignored += len(data)
             return
         for message in peer.codec.parse(data):
             if message.id == BAD_DATA:
-                self._stray.append(message.frame)
+                self._other_bytes.append(message.frame)
                 continue
             self._frames.append(message.frame)
             if self._signed:
-                self._authors.setdefault(message.frame, peer)
+                self._unconfirmed.setdefault(message.frame, peer)
             elif message.known:
-                self._prove(peer, message.frame, now)
+                self._record_valid(peer, message.frame, now)
 
     def drain(self) -> bytes:
         """Return the bytes received since the last call: first the frames, then bytes outside of frames."""
-        data = b"".join(self._frames + self._stray)
-        self._frames, self._stray, self._strangers = [], [], 0
+        data = b"".join(self._frames + self._other_bytes)
+        self._frames, self._other_bytes, self._unknown_bytes = [], [], 0
         for peer in self._peers.values():
-            peer.share = 0
+            peer.unread = 0
         return data
 
     def credit(self, frames: Iterable[bytes]) -> None:
         """Count `frames` of the last :meth:`drain` as valid for their senders: the key signed them."""
         now = time.monotonic()
         for frame in frames:
-            if peer := self._authors.get(frame):
-                self._prove(peer, frame, now)
-        self._authors.clear()
+            if peer := self._unconfirmed.get(frame):
+                self._record_valid(peer, frame, now)
+        self._unconfirmed.clear()
 
     def forget(self, address: Hashable) -> None:
         """Remove a peer that has left."""
         self._peers.pop(address, None)
-        self._look = 0.0
+        self._selection_s = 0.0
 
     def is_known(self, address: Hashable) -> bool:
-        """Return True if the peer at `address` has sent a valid frame within `TIMEOUT`."""
+        """Return True if the peer at `address` has sent a valid frame within `PEER_SILENCE_S`."""
         peer = self._peers.get(address)
-        return peer is not None and time.monotonic() - peer.genuine < TIMEOUT
+        return peer is not None and time.monotonic() - peer.valid_s < PEER_SILENCE_S
 
-    def answered(self) -> list[Peer]:
+    def receivers(self) -> list[Peer]:
         """Return the peers to which the bridge sends, in the order of sending."""
         now = time.monotonic()
-        if now < self._look:
-            return self._answered
-        self._look = now + LOOK
-        valid = [peer for peer in self._peers.values() if now - peer.genuine < TIMEOUT]
-        valid.sort(key=lambda peer: (now - peer.pilot > TIMEOUT, peer.since))
-        self._answered = valid[:ANSWERED]
-        pilots = sum(now - peer.pilot < TIMEOUT for peer in valid)
-        self._notify(f"more than {ANSWERED} peers: the others are not answered", len(valid) > ANSWERED)
-        self._notify("the autopilot sends from several addresses", pilots > 1)
-        return self._answered
+        if now < self._selection_s:
+            return self._receivers
+        self._selection_s = now + SELECTION_INTERVAL_S
+        valid = [peer for peer in self._peers.values() if now - peer.valid_s < PEER_SILENCE_S]
+        valid.sort(key=lambda peer: (now - peer.autopilot_s > PEER_SILENCE_S, peer.first_valid_s))
+        self._receivers = valid[:MAX_RECEIVERS]
+        autopilots = sum(now - peer.autopilot_s < PEER_SILENCE_S for peer in valid)
+        self._notify(
+            f"more than {MAX_RECEIVERS} peers: the others are not answered", len(valid) > MAX_RECEIVERS
+        )
+        self._notify("the autopilot sends from several addresses", autopilots > 1)
+        return self._receivers
 
     def affords(self, peer: Peer | None, size: int) -> bool:
         """Return True if the budget allows to send `size` bytes to a peer, and subtract them from the budget.
@@ -157,39 +160,42 @@ class Peers:
         `peer`: the peer, or None for a peer that has sent nothing.
         """
         now = time.monotonic()
-        if self._budget == inf or (peer is not None and now - peer.pilot < TIMEOUT):
+        if self._budget == inf or (peer is not None and now - peer.autopilot_s < PEER_SILENCE_S):
             return True
-        self._purse = min(self._purse + (now - self._paid) * self._budget, self._budget)  # of a second
-        self._paid = now
-        if size > self._purse:
+        self._allowance = min(
+            self._allowance + (now - self._allowance_s) * self._budget, self._budget
+        )  # of a second
+        self._allowance_s = now
+        if size > self._allowance:
             self.withheld += size
             self._notify(f"others get {self._budget / 1e3:g} kB/s in all: link.max_other_peers_rate", True)
             return False
-        self._purse -= size
+        self._allowance -= size
         return True
 
     def route(self, sender: tuple[int, int]) -> Peer | None:
         """Return the peer that last sent frames of a system and component; None if it gets none."""
         peer = self._routes.get(sender)
-        return peer if peer in self.answered() else None
+        return peer if peer in self.receivers() else None
 
-    def _meet(self, address: Hashable) -> Peer:
+    def _add(self, address: Hashable) -> Peer:
         if len(self._peers) >= MAX_PARSED_PEERS:
-            least = min(self._peers.values(), key=lambda peer: (peer.pilot, peer.genuine))
+            least = min(self._peers.values(), key=lambda peer: (peer.autopilot_s, peer.valid_s))
             del self._peers[least.address]
         peer = self._peers[address] = Peer(address)
         return peer
 
-    def _prove(self, peer: Peer, frame: bytes, now_s: float) -> None:
-        if now_s - peer.genuine > TIMEOUT:
-            peer.since, self._look = now_s, 0.0
-        peer.genuine = now_s
-        who = (frame[5], frame[6]) if frame[0] == V2 else (frame[3], frame[4])
-        self._routes[who] = peer
-        if who == self._autopilot:
-            if now_s - peer.pilot > TIMEOUT:
-                self._look = 0.0
-            peer.pilot = now_s
+    def _record_valid(self, peer: Peer, frame: bytes, now_s: float) -> None:
+        """Count a valid frame of a peer at `now_s`, and store the peer as the route to the frame's sender."""
+        if now_s - peer.valid_s > PEER_SILENCE_S:
+            peer.first_valid_s, self._selection_s = now_s, 0.0
+        peer.valid_s = now_s
+        sender = (frame[5], frame[6]) if frame[0] == V2 else (frame[3], frame[4])
+        self._routes[sender] = peer
+        if sender == self._autopilot:
+            if now_s - peer.autopilot_s > PEER_SILENCE_S:
+                self._selection_s = 0.0
+            peer.autopilot_s = now_s
 
     def _notify(self, text: str, holds: bool) -> None:
         """Add `text` to the notices once, when the condition `holds` becomes true."""
@@ -290,7 +296,7 @@ class Port(ABC):
     def _receivers(self) -> list[tuple[Any, Peer | None]]:
         """Return address and peer of each receiver, in the order of sending."""
         assert self._peers is not None
-        return [(peer.address, peer) for peer in self._peers.answered()]
+        return [(peer.address, peer) for peer in self._peers.receivers()]
 
     @abstractmethod
     def _send(self, data: bytes, address: Any) -> None:

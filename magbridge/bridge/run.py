@@ -103,7 +103,8 @@ class Keeper:
         except (FormatError, OSError):  # the bridge starts without the stored state
             self._kept, self._spoilt = StoredState(), True
         self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
-        self._saved_us = self._retry_us = self._revision = 0
+        self._saved_us = self._next_try_us = 0
+        self._saved_revision: int | None = 0
         self._learned = kept_path(config)
 
     def attach(self, edge: LiveEdge) -> None:
@@ -123,18 +124,19 @@ class Keeper:
         kept = self._kept
         return StartEvent(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
 
-    def look(self, pipeline: Pipeline, time_us: int) -> None:
+    def save_changes(self, pipeline: Pipeline, time_us: int) -> None:
         """Save a new learned calibration, changed parameters, and, every `STAMP_INTERVAL_US`, time stamps."""
         learning, path = pipeline.learning, self._learned
         if learning is not None and path is not None and (why := keep(learning, path)):
             self._notify(events.notice(why))
         revision = pipeline.component.parameters.revision
-        due = self._key is not None and time_us - self._saved_us > STAMP_INTERVAL_US
-        if time_us < self._retry_us or (revision == self._revision and not due):
+        are_stamps_due = self._key is not None and time_us - self._saved_us > STAMP_INTERVAL_US
+        if time_us < self._next_try_us or (revision == self._saved_revision and not are_stamps_due):
             return
-        self._revision, self._saved_us, self._retry_us = revision, time_us, time_us + SAVE_US
-        if not self.save(pipeline):
-            self._revision, self._retry_us = -1, time_us + STAMP_INTERVAL_US
+        is_saved = self.save(pipeline)
+        self._saved_revision = revision if is_saved else None  # None: the same parameters are tried again
+        self._saved_us = time_us
+        self._next_try_us = time_us + (SAVE_US if is_saved else STAMP_INTERVAL_US)
 
     def save(self, pipeline: Pipeline, *, last: bool = False) -> bool:
         """Write the state if it has changed; return False if this fails, so that the old file remains.
@@ -160,7 +162,7 @@ SWITCH = 0.0005
 """Python's switch interval, s: the time that another thread can delay the bridge. The default is 5 ms."""
 NOTICE_PAUSE = 0.2
 """Time between two checks for texts to print, s."""
-LOG_LOOK_US = 1_000_000
+LOG_CHECK_US = 1_000_000
 """Time between two checks of the log, µs."""
 
 
@@ -295,9 +297,9 @@ class Upkeep:
         self.files = FileServer(
             component.metadata, folder, lambda: 1e3 * self._parameters["MB_FILE_RATE"], edge.notify
         )
-        self._revision = -1
+        self._beginning_revision: int | None = None
         self._reported = ("", 0)
-        self._look_us = 0
+        self._log_check_us = 0
 
     def finish_event(self, time_us: int) -> None:
         """Run the tasks that are due after an event at `time_us` (µs)."""
@@ -307,17 +309,17 @@ class Upkeep:
             station, messages = self.files.drain()
             if messages:
                 self._edge.answer(station, self._pipeline.interleaved(messages))
-        self._keeper.look(self._pipeline, time_us)
-        if self._log is not None and time_us >= self._look_us:
-            self._look_us = time_us + LOG_LOOK_US
-            self._look_at_log(self._log)
+        self._keeper.save_changes(self._pipeline, time_us)
+        if self._log is not None and time_us >= self._log_check_us:
+            self._log_check_us = time_us + LOG_CHECK_US
+            self._check_log(self._log)
         if self._sentences is not None and self._pipeline.heading is not None:
             self._sentences.send(self._pipeline.heading.nmea, time_us)
 
-    def _look_at_log(self, log: TlogWriter) -> None:
+    def _check_log(self, log: TlogWriter) -> None:
         """Report failures, recoveries and losses of the log; update the first records of its next file."""
-        if self._parameters.revision != self._revision:
-            self._revision = self._parameters.revision
+        if self._parameters.revision != self._beginning_revision:
+            self._beginning_revision = self._parameters.revision
             log.beginning = self._pipeline.beginning(self._parameters.changed())
         state = log.failure, log.lost
         if state != self._reported:
@@ -399,7 +401,7 @@ class FileServer:
                         return
                     self._begin(request)
                 if self._under_way:
-                    self._turn()
+                    self._prepare_replies()
         finally:
             self._ftp.close()
 
@@ -436,7 +438,7 @@ class FileServer:
                     self._reported.add(text)
                     self._notify(events.notice(text[:50]))
 
-    def _turn(self) -> None:
+    def _prepare_replies(self) -> None:
         """Prepare a batch of replies, one per station in turn, and pause for the time that sending takes."""
         rate, size = self._rate(), 0
         if rate <= 0:

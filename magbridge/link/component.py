@@ -300,7 +300,7 @@ class Component:
     `streams`: needed rates of telemetry, see :func:`needed_rates`.
     `outbox`: messages to send.
     `received`: all received bytes as frames for the log; the bridge empties the list.
-    `genuine`: the signed frames of the last :meth:`receive` that were accepted.
+    `signed_frames`: the signed frames of the last :meth:`receive` that were accepted.
     `file_requests`: requests for files; the bridge takes them out and replies.
     `metadata`: contents of the files that describe the parameters, by path.
     `authority`, `parameters`, `parameter_service`, `message_rates`, `announcer`, `vehicle`, `publisher`,
@@ -328,7 +328,7 @@ class Component:
         self._frame_log = FrameLogWriter(link.system, link.component)
         self.outbox, self.timers = Outbox(self.codec), Timers()
         self.received: list[bytes] = []
-        self.genuine: list[bytes] = []
+        self.signed_frames: list[bytes] = []
         self._whole = link.shared
         self._refusals_reported = 0
         self.announcer = Announcer(self.outbox, self.timers)
@@ -409,7 +409,7 @@ class Component:
         messages = self.codec.parse(data, final=self._whole)
         self.received += self._frame_log.frames(messages, self.codec.pending)
         if self.codec.signing is not None:
-            self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
+            self.signed_frames = [one.frame for one in messages if one.known and is_signed(one.frame)]
             self._report_clock(self.codec.signing)
         for message in messages:
             if not message.known:

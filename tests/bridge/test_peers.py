@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from magbridge.bridge.links import CONNECTIONS, open_link
-from magbridge.bridge.port import ANSWERED, MAX_PARSED_PEERS, PEER_READ_BYTES, Peers, Port
+from magbridge.bridge.port import MAX_PARSED_PEERS, MAX_RECEIVERS, PEER_READ_BYTES, Peers, Port
 from magbridge.mavlink import Codec
 
 PILOT = (1, 1)
@@ -123,9 +123,9 @@ def test_strangers_never_take_the_autopilot_s_place(first: bool) -> None:
             one.sendto(beat(1 if one is autopilot else 99), place)
         receive(port, 41 * len(beat()))
         reached = answered(everyone, port)
-        assert len(reached) == ANSWERED
+        assert len(reached) == MAX_RECEIVERS
         assert 0 in reached
-        assert port.notice() == f"more than {ANSWERED} peers: the others are not answered"
+        assert port.notice() == f"more than {MAX_RECEIVERS} peers: the others are not answered"
         assert port.notice() == ""
 
 
@@ -133,7 +133,7 @@ def test_two_senders_as_the_autopilot_are_reported() -> None:
     both = Peers(PILOT)
     for who in "ab":
         both.receive(who, beat())
-    assert [one.address for one in both.answered()] == ["a", "b"]
+    assert [one.address for one in both.receivers()] == ["a", "b"]
     assert list(both.notices) == ["the autopilot sends from several addresses"]
 
 
@@ -142,9 +142,9 @@ def test_a_peer_that_falls_silent_is_no_longer_answered(monkeypatch: pytest.Monk
     monkeypatch.setattr("magbridge.bridge.port.time.monotonic", lambda: now[0])
     both = Peers(PILOT)
     both.receive("station", beat(190, 255))
-    assert [one.address for one in both.answered()] == ["station"]
+    assert [one.address for one in both.receivers()] == ["station"]
     now[0] += 31.0
-    assert both.answered() == []
+    assert both.receivers() == []
     assert not both.is_known("station")
 
 

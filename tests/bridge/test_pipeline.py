@@ -122,10 +122,10 @@ def test_a_flood_of_parameters_is_kept_once_a_second(tmp_path: Path) -> None:
     on_disk = []
     for k, value in enumerate(values):
         assert pipeline.component.parameters.set("MB_GAP_FACTOR", value)
-        keeper.look(pipeline, START + k * SAVE_US // 5)
+        keeper.save_changes(pipeline, START + k * SAVE_US // 5)
         on_disk.append(kept(file).parameters["MB_GAP_FACTOR"])
     assert on_disk == 5 * [values[0]] + 5 * [values[5]]
-    keeper.look(pipeline, START + 2 * SAVE_US)
+    keeper.save_changes(pipeline, START + 2 * SAVE_US)
     assert kept(file).parameters["MB_GAP_FACTOR"] == values[-1]
 
 
