@@ -14,7 +14,7 @@ from importlib import import_module
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli.common import FailedResult, app, complain, print_error
+from magbridge.cli.common import FailedResult, app, complain, print_result
 from magbridge.errors import MagbridgeError, MissingExtra
 
 __all__ = ["app", "main", "report_error"]
@@ -64,7 +64,7 @@ def report_error(error: Exception, *, as_json: bool = False) -> int:
     """Print an error that ends a command, also as JSON if `as_json`, and return the exit code."""
     sentence, code = _explained(error)
     if as_json and not isinstance(error, FailedResult):
-        print_error(sentence, code)
+        print_result({"error": " ".join(sentence.split()), "exit_code": code}, "", as_json=True)
     return complain(sentence, code)
 
 
@@ -121,15 +121,6 @@ def _no_handle(error: BaseException) -> str:
     reason: BaseException | None = error
     while reason is not None:
         if os.strerror(errno.EMFILE) in str(reason) or getattr(reason, "errno", None) == errno.EMFILE:
-            return f"too many open files: the limit of this process is {_file_limit()}; raise it (ulimit -n)"
+            return "too many open files: this process has reached its limit; raise it (ulimit -n)"
         reason = reason.__cause__ or reason.__context__
     return ""
-
-
-def _file_limit() -> str:
-    """Return the largest allowed number of open files of the process, as text."""
-    try:
-        from resource import RLIMIT_NOFILE, getrlimit
-    except ImportError:  # Windows
-        return "reached"
-    return str(getrlimit(RLIMIT_NOFILE)[0])

@@ -320,21 +320,22 @@ def init(
     from magbridge.bridge.check import findings
     from magbridge.bridge.init import PLACEHOLDER, Answers, bridge_toml
     from magbridge.files import atomic_path
+    from magbridge.sensors.options import driver_names
 
     known = mb.load(calibration) if calibration else None
     asks = not json and sys.stdin.isatty() and sys.stdout.isatty()
-    driver = driver or _ask("1. Which sensor?", _drivers_help(), "digitizer", asks, "--driver")
+    names = f"drivers: {', '.join(driver_names())} (magbridge drivers NAME: its options)"
+    driver = driver or _ask("1. Which sensor?", names, "digitizer", asks, "--driver")
     port = port or _ask("2. On which port?", _ports_listed(), "/dev/ttyUSB*", asks, "--port")
     default = "udpout:127.0.0.1:14550"
     link = link or _ask("3. Where is the autopilot or the ground station?", "", default, asks, "--link")
     number = system or _system(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))
-    names = parameter
-    if not names and known is None and asks:
+    if not parameter and known is None and asks:
         hint = "as: battpos [in], ballast [cm3]; none: press Enter"
-        names = tuple(name.strip() for name in _ask("5. Which masses move?", hint, "", asks, "").split(","))
-        names = tuple(name for name in names if name)
+        masses = _ask("5. Which masses move?", hint, "", asks, "").split(",")
+        parameter = tuple(name.strip() for name in masses if name.strip())
     options, file = _options(option, driver), _relative(calibration, output)
-    answers = Answers(driver, port, baudrate, link, number, names, options, file)
+    answers = Answers(driver, port, baudrate, link, number, parameter, options, file)
     text = bridge_toml(answers, known)
     with atomic_path(output) as path:
         path.write_text(text, encoding="utf-8")
@@ -343,8 +344,8 @@ def init(
             raise WrongUse(f"{fatal[0].replace(str(path), str(output))}: nothing is written")
     found = [one.text for one in findings(output)]
     cli.complain_all(found)
-    sentence = f"{output}: written; next: magbridge run --check --config {output}"
-    cli.print_result({"file": str(output), "findings": found}, sentence, json)
+    sentence = f"written; next: magbridge run --check --config {output}"
+    cli.print_result({"findings": found}, sentence, json, output)
 
 
 def _relative(file: Path | None, output: Path) -> str | None:
@@ -375,12 +376,6 @@ def _system(answer: str) -> int:
     if not (answer.isdecimal() and 1 <= int(answer) <= 255):
         raise WrongUse(f"system id: expected a number from 1 to 255, got {answer!r}; nothing is written")
     return int(answer)
-
-
-def _drivers_help() -> str:
-    from magbridge.sensors.options import driver_names
-
-    return f"drivers: {', '.join(driver_names())} (magbridge drivers NAME: its options)"
 
 
 def _ports_listed() -> str:

@@ -275,19 +275,19 @@ class FailedResult(DataError):
         super().__init__(sentence)
 
 
-def print_result(result: Mapping[str, Any], sentence: str, as_json: bool) -> None:
-    """Print the result to stdout: as one JSON object if `as_json`, else the text `sentence`."""
+def print_result(result: Mapping[str, Any], sentence: str, as_json: bool, file: Path | None = None) -> None:
+    """Print the result to stdout: as one JSON object if `as_json`, else the text `sentence`.
+
+    Both begin with the written `file` if it is given.
+    """
     from magbridge.arrays import plain
 
+    if file is not None:
+        result, sentence = {"file": str(file), **result}, f"{file}: {sentence}"
     if as_json:
         print(msgspec.json.encode(result, enc_hook=plain).decode())
     elif sentence:
         print(sentence)
-
-
-def print_error(sentence: str, code: int) -> None:
-    """Print the JSON object of a failed command: its error message and its exit code."""
-    print(msgspec.json.encode({"error": " ".join(sentence.split()), "exit_code": code}).decode())
 
 
 def complain(sentence: str, code: int = 0) -> int:

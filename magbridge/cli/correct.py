@@ -109,7 +109,7 @@ def correct(
     facts, summary = tally.facts(), tally.summary()
     if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
-    cli.print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+    cli.print_result(facts, summary, json, output)
 
 
 def _scalar_too(

@@ -84,25 +84,21 @@ def add(
     if vehicle and (parameter or serial):
         added += add_vehicle(there, vehicle, Vehicle(parameters=parameter, serial=serial, sensor=sensor))
     with waiting("reading"):
+        this = Deployment(deployment, (), refit, "" if parameter else sensor)
+        parts = [(vehicle, this, logs)] if logs else []
         for file, named in plans.items():
             for name, one in named.items():
                 added += add_vehicle(there, name, one)
-                for part in one.deployment:
-                    count, notes = add_logs(there, name, part, logs_of(file, part))
-                    new, lines = new + count, lines + notes
-        this = Deployment(deployment, (), refit, "" if parameter else sensor)
-        if logs:
-            count, notes = add_logs(there, vehicle, this, logs)
+                parts += [(name, part, logs_of(file, part)) for part in one.deployment]
+        for name, part, paths in parts:
+            count, notes = add_logs(there, name, part, paths)
             new, lines = new + count, lines + notes
         for start, calibration in calibrations:
             given += add_calibration(there, vehicle, this, start, calibration)
     cli.complain_all(lines)
-    cli.print_result(
-        {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines},
-        f"{there.name}: {counted(added, 'vehicle')}, {counted(new, 'log')} and "
-        f"{counted(given, 'calibration')} added",
-        json,
-    )
+    facts = {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines}
+    text = f"{counted(added, 'vehicle')}, {counted(new, 'log')} and {counted(given, 'calibration')} added"
+    cli.print_result(facts, f"{there.name}: {text}", json)
 
 
 def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
@@ -176,12 +172,10 @@ def process(
         with waiting("learning"):
             remember(there)
     result = {"deployments": len(every), "processed": len(todo), "failures": failures}
-    cli.print_result(
-        result,
-        f"{there.name}: {counted(len(every), 'deployment')}, {len(todo)} of them new; "
-        f"{counted(len(failures), 'failure')}",
-        json,
+    text = (
+        f"{counted(len(every), 'deployment')}, {len(todo)} of them new; {counted(len(failures), 'failure')}"
     )
+    cli.print_result(result, f"{there.name}: {text}", json)
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
         raise cli.FailedResult(
             f"{there.name}: none of {len(todo)} deployments could be calibrated; see the lines above"
@@ -197,14 +191,13 @@ def status(*, catalogue: Where = HERE, json: cli.Json = False) -> None:
     there = open_catalogue(catalogue)
     found = of(there)
     cli.complain_all(found["failures"])
-    rows = "\n".join(
+    rows = [
         f"  {one['vehicle']}: {counted(one['deployments'], 'deployment')}, {counted(one['logs'], 'log')}, "
         f"{one['calibrated']} calibrated, {one['failed']} failed, {one['new']} new"
         for one in found["vehicles"]
-    )
-    cli.print_result(
-        found, f"{there.name}: {counted(len(found['vehicles']), 'vehicle')}\n{rows}".rstrip(), json
-    )
+    ]
+    title = f"{there.name}: {counted(len(rows), 'vehicle')}"
+    cli.print_result(found, "\n".join([title, *rows]), json)
 
 
 @fleet.command
@@ -275,11 +268,8 @@ def export(
     mb.save(calibration, output)
     count = sum(one.vehicle == vehicle for one in learnt.lessons)
     others = len(learnt.lessons) - count
-    cli.print_result(
-        {"file": str(output), "vehicle": vehicle, "deployments": count},
-        f"{output}: as {counted(count, 'deployment')} of {vehicle} and {others} of its fleet predict",
-        json,
-    )
+    text = f"as {counted(count, 'deployment')} of {vehicle} and {others} of its fleet predict"
+    cli.print_result({"vehicle": vehicle, "deployments": count}, text, json, output)
 
 
 def _lines(facts_of: dict[str, dict[str, Any]]) -> list[str]:

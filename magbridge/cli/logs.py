@@ -175,9 +175,7 @@ def convert(
             rows += part.sizes["time"]
             names = [str(name) for name in part.data_vars]
     cli.note_losses(*pieces)
-    cli.print_result(
-        {"file": str(output), "rows": rows, "columns": names}, f"{output}: {counted(rows, 'row')}", json
-    )
+    cli.print_result({"rows": rows, "columns": names}, counted(rows, "row"), json, output)
 
 
 @cli.command("simulate SCENARIO -o FILE [OPTIONS]")
@@ -239,9 +237,7 @@ def simulate(
     if map_output is not None:
         Twin.draw(chosen, seed).anomaly_map().save(map_output)
     rows = deployment.sizes["time"]
-    cli.print_result(
-        {"file": str(output), "rows": rows, "seed": seed}, f"{output}: {counted(rows, 'row')}", json
-    )
+    cli.print_result({"rows": rows, "seed": seed}, counted(rows, "row"), json, output)
 
 
 @cli.command("map GRID... -o grid.nc [OPTIONS]")
@@ -295,5 +291,4 @@ def map(  # noqa: A001 - the command's name
     if plot:
         draw_steps(steps, plot)
     titles = [step.title for step in steps]
-    facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
-    cli.print_result(facts, f"{output}: {', '.join(titles)}", json)
+    cli.print_result({"steps": titles, "rms_nT": result.rms}, ", ".join(titles), json, output)

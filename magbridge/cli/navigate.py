@@ -94,8 +94,7 @@ def navigate(
         draw_navigation(track, grid, plot)
     write(track, output)
     cli.complain_all(track.attrs["findings"].splitlines())
-    facts, summary = _judged(track)
-    cli.print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+    cli.print_result(*_judged(track), json, output)
 
 
 def _options_for(deployment: xr.Dataset, known: mb.Calibration | None) -> NavigationOptions:
@@ -193,7 +192,7 @@ def _bound(
         from magbridge.navigate.draw import draw_bound
 
         draw_bound(best, grid, plot)
-    cli.print_result({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
+    cli.print_result(result.attrs, result.attrs["findings"], json, output)
 
 
 def _sample_interval(plan: xr.Dataset, calibration: mb.Calibration | None) -> float:

@@ -182,36 +182,19 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class AlarmGroup:
-    """Alarms that have one cause, the newest first."""
+    """Alarms that have one cause."""
 
     cause: str
-    alarms: tuple[Alarm, ...]
-
-    @property
-    def text(self) -> str:
-        """Texts of the alarms, joined by semicolons; texts of active alarms come first."""
-        ordered = sorted(self.alarms, key=lambda alarm: not alarm.active)
-        return "; ".join(dict.fromkeys(alarm.text for alarm in ordered))
-
-    @property
-    def active(self) -> bool:
-        """True if at least one alarm of the group is active."""
-        return any(alarm.active for alarm in self.alarms)
-
-    @property
-    def acknowledged(self) -> bool:
-        """True if a user has acknowledged all alarms of the group."""
-        return all(alarm.acknowledged for alarm in self.alarms)
-
-    @property
-    def started_s(self) -> float:
-        """Time at which the newest alarm of the group began, s of the receiver's clock."""
-        return self.alarms[0].since
-
-    @property
-    def count(self) -> int:
-        """Number of times that the most frequent alarm of the group has begun."""
-        return max(alarm.count for alarm in self.alarms)
+    text: str
+    """Texts of the alarms, joined by semicolons; texts of active alarms come first."""
+    active: bool
+    """True if at least one alarm of the group is active."""
+    acknowledged: bool
+    """True if a user has acknowledged all alarms of the group."""
+    started_s: float
+    """Time at which the newest alarm of the group began, s of the receiver's clock."""
+    count: int
+    """Number of times that the most frequent alarm of the group has begun."""
 
 
 class Alarms:
@@ -230,7 +213,17 @@ class Alarms:
         found: dict[str, list[Alarm]] = {}
         for alarm in self:
             found.setdefault(alarm.cause, []).append(alarm)
-        return [AlarmGroup(cause, tuple(alarms)) for cause, alarms in found.items()]
+        return [
+            AlarmGroup(
+                cause,
+                "; ".join(dict.fromkeys(one.text for one in sorted(alarms, key=lambda one: not one.active))),
+                any(one.active for one in alarms),
+                all(one.acknowledged for one in alarms),
+                alarms[0].since,
+                max(one.count for one in alarms),
+            )
+            for cause, alarms in found.items()
+        ]
 
     @property
     def unseen(self) -> int:

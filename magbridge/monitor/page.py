@@ -6,6 +6,7 @@ import csv
 import json
 import platform
 import time
+from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from io import BytesIO, StringIO
@@ -51,40 +52,32 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
         "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
         "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
     }
-    files = {
-        "about.json": json.dumps(about, indent=1, ensure_ascii=False),
-        "texts.csv": _table(
-            ["time", "severity", "text"],
-            [[utc(received.time), received.severity, received.text] for received in state.texts],
-        ),
-        "alarms.csv": _table(
-            ["since", "last", "active", "acknowledged", "count", "alarm"],
-            [
-                [utc(one.since), utc(one.last), one.active, one.acknowledged, one.count, one.text]
+    tables: dict[str, list[Sequence[Any]]] = {
+        "texts": [
+            ("time", "severity", "text"),
+            *((utc(received.time), received.severity, received.text) for received in state.texts),
+        ],
+        "alarms": [
+            ("since", "last", "active", "acknowledged", "count", "alarm"),
+            *(
+                (utc(one.since), utc(one.last), one.active, one.acknowledged, one.count, one.text)
                 for one in state.alarms
-            ],
-        ),
-        "parameters.csv": _table(
-            ["name", "value", "error"],
-            [[name, repr(one.value), one.error] for name, one in sorted(state.parameters.items())],
-        ),
-        "samples.csv": _table(
-            list(spec("MAG_FIELD").fields), [list(sample.values()) for sample in state.samples]
-        ),
+            ),
+        ],
+        "parameters": [
+            ("name", "value", "error"),
+            *((name, repr(one.value), one.error) for name, one in sorted(state.parameters.items())),
+        ],
+        "samples": [list(spec("MAG_FIELD").fields), *(list(sample.values()) for sample in state.samples)],
     }
     held = BytesIO()
     with ZipFile(held, "w", ZIP_DEFLATED) as archive:
-        for name, text in files.items():
-            archive.writestr(name, text)
+        archive.writestr("about.json", json.dumps(about, indent=1, ensure_ascii=False))
+        for name, rows in tables.items():
+            text = StringIO()
+            csv.writer(text, lineterminator="\n").writerows(rows)
+            archive.writestr(f"{name}.csv", text.getvalue())
     return held.getvalue()
-
-
-def _table(names: list[str], rows: list[list[Any]]) -> str:
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 SCRIPT = files("magbridge.monitor").joinpath("page.js").read_text(encoding="utf-8")

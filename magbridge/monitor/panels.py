@@ -285,9 +285,7 @@ class AlarmPanel:
         if state.alarms.unseen and self.sound and now_s - self._sounded >= REPEAT:
             self._sounded = now_s
             ui.run_javascript("magbridge.beep()")
-        if not self._changes.new(
-            "alarms", [(a.cause, a.text, a.active, a.acknowledged, a.count) for a in alarms]
-        ):
+        if not self._changes.new("alarms", alarms):
             return
         unseen = [alarm.text for alarm in alarms if not alarm.acknowledged]
         self._spoken.set_text(f"Alarm: {unseen[0]}" if unseen else "")

@@ -190,7 +190,7 @@ def test_alarms_of_one_cause_are_one_group() -> None:
     alarms = Alarms()
     alarms.announce("text: hmr2300 lost: unplugged", "hmr2300 lost: unplugged", 1.0)
     alarms.update({"gap": "Samples are missing", "Sensor": "Sensor: lost", "Log": "Log: failed"}, 2.0)
-    assert {group.cause: len(group.alarms) for group in alarms.groups} == {"sensor": 3, "log": 1}
+    assert [group.cause for group in alarms.groups] == ["sensor", "log"]
     assert alarms.unseen == 2
     sensor = next(group for group in alarms.groups if group.cause == "sensor")
     assert sensor.text == "Samples are missing; Sensor: lost; hmr2300 lost: unplugged"
