@@ -65,16 +65,6 @@ def test_delays_that_differ_from_reading_to_reading() -> None:
     np.testing.assert_allclose(sample.field, 30.0 * 4.1, atol=1e-6)
 
 
-def test_a_track_is_stale_after_its_greatest_age() -> None:
-    aligner = Aligner((BATTERY,), Align())
-    track = aligner.by_name["battpos"]
-    assert track.stale(START)
-    aligner.telemetry("battpos", START, 0.3)
-    limit = round(BATTERY.max_age * SECOND)
-    assert not track.stale(START + limit)
-    assert track.stale(START + limit + 4)
-
-
 def test_telemetry_is_looked_up_at_the_sample_s_time() -> None:
     aligner = Aligner((BATTERY,), Align(filter_delay=2.0, moving_rate=10.0))
     for k in range(8):
@@ -115,6 +105,8 @@ def test_before_the_first_telemetry_its_age_is_the_time_until_then() -> None:
     sample = aligner.reading(reading(), START + 2 * SECOND)
     assert sample.values == (0.3,)
     assert sample.age == pytest.approx(3.0)
+    assert flags(sample) == {"late_join"}
+    assert flags(aligner.reading(reading(), START + 6 * SECOND)) == set()
 
 
 def test_nan_telemetry_keeps_the_last_value_but_flags() -> None:
@@ -156,13 +148,6 @@ def test_out_of_order_telemetry_is_ignored_and_of_several_at_once_the_newest_cou
     aligner.telemetry("battpos", START, 0.9)
     aligner.telemetry("battpos", START + SECOND, 0.9)
     assert aligner.reading(reading(), START + 2 * SECOND).values == (0.9,)
-
-
-def test_a_sample_from_before_all_telemetry_is_a_late_join() -> None:
-    aligner = Aligner((BATTERY,), Align(filter_delay=5.0))
-    aligner.telemetry("battpos", START, 0.3)
-    assert flags(aligner.reading(reading(), START + 2 * SECOND)) == {"late_join"}
-    assert flags(aligner.reading(reading(), START + 6 * SECOND)) == set()
 
 
 @pytest.mark.parametrize("dated", [True, False])

@@ -119,6 +119,10 @@ class Catalogue(ABC):
         keyed = {_key(row): {name: row[name] for name in CATALOGUE_TABLES[table]} for row in rows}
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0
 
+    def add_tables(self, tables: Mapping[str, Iterable[Row]]) -> int:
+        """Add rows to several tables (name -> rows) as :meth:`add`, and return the number of new rows."""
+        return sum(self.add(table, rows) for table, rows in tables.items())
+
     def compact(self) -> None:  # noqa: B027  most need not
         """Merge small files if the catalogue consists of files; else do nothing."""
 

@@ -87,8 +87,9 @@ REFERENCE_FIELD_NT = 50_000.0
 class Lesson(NamedTuple):
     """Information about the coefficients of one deployment from its own data, without a prior.
 
-    `time` is the start of the deployment, s since 1970, and `noise` the 1-sigma of a sample, nT. For the
-    other fields see :class:`.Known`.
+    `time` is the start of the deployment, s since 1970, `noise` the 1-sigma of a sample, nT, `inputs` the
+    SHA-256 of the logs. `given` is True for a calibration that was made elsewhere. For the other fields see
+    :class:`.Known`.
     """
 
     vehicle: str
@@ -100,6 +101,9 @@ class Lesson(NamedTuple):
     field: float
     noise: float
     information: GaussianInformation
+    inputs: frozenset[str] = frozenset()
+    sensor: str = ""
+    given: bool = False
 
     def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> GaussianInformation:
         """Return the information about z, which has q elements.

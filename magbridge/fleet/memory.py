@@ -37,15 +37,6 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import Fit
 
 
-class _Taught(NamedTuple):
-    """Training record of a deployment, SHA-256 of its logs, sensor, and True if calibrated elsewhere."""
-
-    lesson: Lesson
-    inputs: frozenset[str]
-    sensor: str
-    given: bool
-
-
 def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> list[Lesson]:
     """Return the training records of all vehicles with the same masses and order as the vehicle `like`.
 
@@ -61,18 +52,17 @@ def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> 
         for row in current(catalogue, "calibrations")
         if row["precision"] and kinds.get(row["vehicle"]) == kinds[like]
     ]
-    taught = sorted(map(_taught, rows), key=lambda one: (one.lesson.time, one.lesson.deployment))
-    here = frozenset[str]().union(*(one.inputs for one in taught if not one.given))
-    newest = {(one.lesson.vehicle, one.lesson.refit): one.sensor for one in taught if one.sensor}
+    every = sorted(map(_lesson, rows), key=lambda one: (one.time, one.deployment))
+    here = frozenset[str]().union(*(one.inputs for one in every if not one.given))
+    newest = {(one.vehicle, one.refit): one.sensor for one in every if one.sensor}
     found = []
-    for one in taught:
+    for one in every:
         if one.inputs & set(excluded) or (one.given and one.inputs & here):
             continue
-        of = one.lesson.vehicle, one.lesson.refit
-        if one.sensor != newest.get(of, one.sensor) and one.sensor:  # another sensor is as good as a refit
-            found.append(one.lesson._replace(refit=f"{one.lesson.refit}, {one.sensor}"))
+        if one.sensor and one.sensor != newest[one.vehicle, one.refit]:  # as good as a refit
+            found.append(one._replace(refit=f"{one.refit}, {one.sensor}"))
         else:
-            found.append(one.lesson)
+            found.append(one)
     return found
 
 
@@ -180,15 +170,14 @@ def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting
     return sha256(msgspec.json.encode((each, where), order="sorted")).hexdigest()[:32]
 
 
-def _taught(row: Row) -> _Taught:
+def _lesson(row: Row) -> Lesson:
     """Return the training record in a row of the table ``calibrations``."""
     calibration = decode_calibration(row["calibration"].encode(), f"calibration of {row['deployment']}")
-    term = calibration.terms[0]
-    lesson = Lesson(
+    return Lesson(
         row["vehicle"], row["refit"], row["deployment"], row["start"], calibration.parameters,
-        term.exponents, calibration.reference.field, calibration.noise.sensor, unpacked(row),
+        calibration.terms[0].exponents, calibration.reference.field, calibration.noise.sensor, unpacked(row),
+        frozenset(calibration.inputs.values()), row["sensor"], row["job"] == GIVEN,
     )  # fmt: skip
-    return _Taught(lesson, frozenset(calibration.inputs.values()), row["sensor"], row["job"] == GIVEN)
 
 
 MAX_VARIANCE_FRACTION = 0.25

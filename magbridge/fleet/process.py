@@ -277,15 +277,13 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[l
         try:
             done = future.result()
         except KilledWorker:
-            line = f"{job.vehicle['vehicle']} {job.deployment}: its workers were killed (out of memory?)"
-            done = Done({}, line)
+            done = Done({}, f"{_named(job)}: its workers were killed (out of memory?)")
         except CancelledError as error:
             raise PortError(
                 address, "the dask scheduler was lost; run magbridge fleet process again to do the rest"
             ) from error
         future.release()
-        for table, rows in done.tables.items():
-            catalogue.add(table, rows)
+        catalogue.add_tables(done.tables)
         lines = [row["line"] for row in done.tables.get("failures", ())]
         if done.hindrance:
             lines.append(done.hindrance)

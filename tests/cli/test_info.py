@@ -91,11 +91,6 @@ def test_what_moves_the_field_is_not_a_state_of_the_vehicle() -> None:
     assert movers(made("log", START + np.arange(9.0), columns, names)) == ["pump", "mast"]
 
 
-def test_info_of_nothing_is_one_line(command: Command) -> None:
-    assert "expected a file, there is none" in command.refuses("info", "none.csv")
-    assert "expected at least one FILE" in command("info", code=2).err
-
-
 def test_columns_are_declared_on_the_command_line(command: Command) -> None:
     Path("theirs.csv").write_text("Zeit;Fx [uT];Fy [uT];Fz [uT]\n2022-05-04T12:00:00Z;30,0;5,0;45,0\n")
     columns = [f"--column=mag_{axis}=F{axis} [uT]" for axis in "xyz"]
@@ -262,21 +257,6 @@ def test_a_wrong_option_is_one_object(name: tuple[str, ...], command: Command) -
     """The output is one JSON object even if the command line cannot be parsed."""
     output = command(*name, "--no-such-option", "--json", code=2)
     assert only_object(output.out) == {"error": output.err.removeprefix("magbridge: ")[:-1], "exit_code": 2}
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *("convert no -o x.nc", "correct no --calibration no -o x.nc", "calibrate no -o x.json", "info no"),
-        *("survey no -o x.nc", "replay no", "plan --calibration no --mission no", "export no --c x"),
-        *("run --check --config no", "map no -o x.nc", "navigate no --calibration no -o x.nc"),
-        *("diagnose no --calibration no -o x", "fleet status --catalogue no", "simulate no.toml -o x.nc"),
-    ],
-)
-def test_a_missing_file_is_one_object(arguments: str, here: Path, command: Command) -> None:
-    output = command(*arguments.split(), "--json", code=1)
-    assert only_object(output.out) == {"error": output.err.removeprefix("magbridge: ")[:-1], "exit_code": 1}
-    assert list(here.iterdir()) == []
 
 
 def test_a_bridge_that_would_not_start_is_described_once(command: Command) -> None:

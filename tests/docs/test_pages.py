@@ -32,9 +32,7 @@ def test_the_layers_are_those_that_import_linter_checks() -> None:
 def test_every_place_exists() -> None:
     places = re.findall(r"`([\w/]+(?:\.py|\.xml|/))`", PAGE)
     assert len(places) > 20
-    assert not [
-        one for one in places if not any((root / one).exists() for root in (ROOT, ROOT / "magbridge"))
-    ]
+    assert not [one for one in places if not ((ROOT / one).exists() or (ROOT / "magbridge" / one).exists())]
 
 
 def test_every_central_type_is_in_its_module() -> None:
@@ -107,11 +105,3 @@ def test_a_page_of_many_tools_names_one_next_to_every_table(page: str) -> None:
         section = text[text.rindex("\n## ", 0, table.start()) : table.start()]
         first = next(row for row in table[0].splitlines()[2:] if FIGURE.search(row))
         assert commands(section + first), first
-
-
-def test_the_examination_finds_what_is_missing() -> None:
-    assert commands("see `python3 tools/nowhere.py --size 3`") == [(ROOT / "tools/nowhere.py", ["--size"])]
-    assert commands("see `faults.py \\\n  --hours 3` and `turns.py`") == [
-        (ROOT / "tools/faults.py", ["--hours"])
-    ]
-    assert len(FIGURE.findall("| 1.04 | 3 % | 12 nT | 7 m | 8 months | 11 |")) == SOME

@@ -18,7 +18,6 @@ from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import catalogue as room
-from magbridge.fleet.catalogue import FolderCatalogue
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.learn import shape_groups, shapes_of
 from magbridge.fleet.memory import fleet_of, lessons
@@ -216,18 +215,18 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def catalogue(tmp_path: Path) -> FolderCatalogue:
-    catalogue = FolderCatalogue(tmp_path / "fleet", create=True)
+def catalogue(tmp_path: Path) -> Catalogue:
+    catalogue = Catalogue(tmp_path / "fleet", create=True)
     add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
     return catalogue
 
 
-def add(catalogue: FolderCatalogue, cal: Path, *more: str) -> int:
+def add(catalogue: Catalogue, cal: Path, *more: str) -> int:
     of = "--vehicle", "comet", "--deployment", "may", "--catalogue", catalogue.name
     return main(["fleet", "add", str(cal), *of, *more])
 
 
-def test_it_teaches_what_its_data_determined(catalogue: FolderCatalogue, made: tuple[Path, Path]) -> None:
+def test_it_teaches_what_its_data_determined(catalogue: Catalogue, made: tuple[Path, Path]) -> None:
     log, cal = made
     assert add(catalogue, cal, "--date", "2026-05-01") == 0
     assert add(catalogue, cal, "--date", "2026-05-01") == 0
@@ -240,8 +239,7 @@ def test_it_teaches_what_its_data_determined(catalogue: FolderCatalogue, made: t
     # the same data calibrated here, too, count once
     add_logs(catalogue, "comet", Deployment("may", ()), [log])
     (job,) = jobs(catalogue)
-    for table, rows in work(job, catalogue.results).tables.items():
-        catalogue.add(table, rows)
+    catalogue.add_tables(work(job, catalogue.results).tables)
     assert len(catalogue.rows("calibrations")) == 2
     (own,) = lessons(catalogue, "comet")
     # the fleet learns the information of its data, in the directions that these determine
@@ -252,7 +250,7 @@ def test_it_teaches_what_its_data_determined(catalogue: FolderCatalogue, made: t
 
 
 def test_what_does_not_fit_is_a_line(
-    catalogue: FolderCatalogue, made: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    catalogue: Catalogue, made: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, cal = made
 

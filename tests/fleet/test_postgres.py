@@ -46,10 +46,8 @@ def test_it_says_what_a_folder_says(url: str, flown: Path, tmp_path: Path) -> No
         catalogue = open_catalogue(where, tmp_path / "results")
         job = jobs(catalogue)[0]
         for _ in range(2):  # the second time, nothing is new
-            added = [
-                catalogue.add(table, rows) for table, rows in work(job, catalogue.results).tables.items()
-            ]
-        assert not any(added)
+            added = catalogue.add_tables(work(job, catalogue.results).tables)
+        assert not added
         catalogue.add("done", [{**job.mark, "diagnosed": False, "mapped": True}])
         both.append(catalogue)
     for table in CATALOGUE_TABLES:
@@ -67,8 +65,7 @@ def test_the_commands_know_it(
     assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", url]) == 0
     catalogue = open_catalogue(url, tmp_path)
     for job in jobs(catalogue):
-        for table, rows in work(job, catalogue.results).tables.items():
-            catalogue.add(table, rows)
+        catalogue.add_tables(work(job, catalogue.results).tables)
     capsys.readouterr()
     assert main(["fleet", "status", "--catalogue", url, "--json"]) == 0
     assert [one["calibrated"] for one in json.loads(capsys.readouterr().out)["vehicles"]] == [2, 1]

@@ -48,14 +48,11 @@ def test_killed_and_begun_again_is_the_same(done: Catalogue, flown: Path, tmp_pa
     again = catalogue_of(tmp_path, flown)
     for turn in range(3):  # each time killed after one deployment, the last just before it was marked as done
         job = new_jobs(again, jobs(again))[0]
-        tables = work(job, again.results).tables
-        for table, rows in tables.items():
-            again.add(table, rows)
+        again.add_tables(work(job, again.results).tables)
         if turn < 2:
             again.add("done", [{**job.mark, "diagnosed": False, "mapped": False}])
     (left,) = new_jobs(again, jobs(again))
-    for table, rows in work(left, again.results).tables.items():
-        assert again.add(table, rows) == 0
+    assert again.add_tables(work(left, again.results).tables) == 0
     again.add("done", [{**left.mark, "diagnosed": False, "mapped": False}])
     assert content(again) == content(done)
 
@@ -92,8 +89,7 @@ def test_a_failure_is_tried_again_when_asked(flown: Path, tmp_path: Path) -> Non
     assert not new_jobs(catalogue, every)
     (again,) = new_jobs(catalogue, every, retry=True)
     assert (again.name, again.attempt) == (job.name, 2)
-    for table, rows in work(again, catalogue.results).tables.items():
-        catalogue.add(table, rows)
+    catalogue.add_tables(work(again, catalogue.results).tables)
     assert not current(catalogue, "calibrations")  # killed before it was done
     catalogue.add("done", [{**again.mark, "diagnosed": False, "mapped": False}])
     assert [row["attempt"] for row in current(catalogue, "calibrations")] == [2]
@@ -111,8 +107,7 @@ def test_which_sensor_flew_where_is_on_record(flown: Path, tmp_path: Path) -> No
     for job in jobs(catalogue):
         tables = work(job, catalogue.results).tables
         lines += [row["line"] for row in tables.pop("failures", [])]
-        for table, rows in tables.items():
-            catalogue.add(table, rows)
+        catalogue.add_tables(tables)
     assert lines[0].endswith("2.nc: expected a log of sensor 'HMR 1', which comet d2 carries, got 'HMR 2'")
     assert {row["sensor"] for row in catalogue.rows("sensors")} == {"HMR 1", "HMR 2"}
     # another sensor is as good as a refit
@@ -170,8 +165,7 @@ def test_a_change_is_dated_and_reported(
             write(changed, log)
         add_logs(catalogue, "comet", Deployment(f"d{number}", (), "spring"), [log])
     for job in jobs(catalogue):
-        for table, rows in work(job, tmp_path / "results").tables.items():
-            catalogue.add(table, rows)
+        catalogue.add_tables(work(job, tmp_path / "results").tables)
     place, page = str(catalogue.folder), tmp_path / "page.html"
     assert main(["fleet", "show", "comet", "--catalogue", place, "--html", str(page)]) == 0
     reported = capsys.readouterr().out.splitlines()

@@ -309,19 +309,13 @@ def test_a_bug_report_holds_what_was_seen(air: Air) -> None:
     assert tables["alarms.csv"][1][-1] == 'sensor lost: "unplugged", again'
 
 
-def test_a_long_text_is_put_together(air: Air) -> None:
-    air.field(NOW)
-    for piece, text in enumerate(("a" * 50, "b" * 50, "c")):
-        air.feed(NOW + piece, "STATUSTEXT", severity=4, text=text, id=9, chunk_seq=piece)
-    air.feed(NOW + 3, "STATUSTEXT", severity=6, text="short")
-    assert [texts.text for texts in air.state.texts] == ["short", "a" * 50 + "b" * 50 + "c"]
-    assert air.state.texts[1].time == NOW + 2
-
-
-def test_a_long_text_is_one_alarm(air: Air) -> None:
+def test_a_long_text_is_put_together_and_one_alarm(air: Air) -> None:
     air.field(NOW)
     for piece, text in enumerate(("a" * 50, "b" * 50, "c")):
         air.feed(NOW + piece, "STATUSTEXT", severity=3, text=text, id=9, chunk_seq=piece)
+    air.feed(NOW + 3, "STATUSTEXT", severity=6, text="short")
+    assert [texts.text for texts in air.state.texts] == ["short", "a" * 50 + "b" * 50 + "c"]
+    assert air.state.texts[1].time == NOW + 2
     assert [alarm.text for alarm in air.state.alarms] == ["a" * 50 + "b" * 50 + "c"]
 
 
@@ -410,10 +404,7 @@ def test_what_is_learned_is_shown_in_words(air: Air) -> None:
     shown = {name: text for name, (text, _) in learnt(air.state).items()}
     assert shown["State"] == "learned"
     assert shown["Published"] == "00000abc; the first is 00000def"
-    assert (shown["Error of prediction, first"], shown["Error of prediction, published"]) == (
-        "15.25 nT",
-        "1.50 nT",
-    )
+    assert [shown[f"Error of prediction, {one}"] for one in ("first", "published")] == ["15.25 nT", "1.50 nT"]
     assert shown["Not explained"] == "12 nT since 28 May 20:26 UTC"
     assert shown["Causes that fit"] == "offset step, temperature offset"
     air.feed(NOW, "MAG_LEARNING", alarm_since=2**64 - 1, alarm_amplitude=nan, causes=0xFFFF, state=9)
