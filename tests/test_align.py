@@ -29,19 +29,6 @@ def flags(sample: Sample) -> set[str]:
     return set(Quality(sample.quality).names().split())
 
 
-def test_multiplexed_channels_of_a_ramp_come_out_equal() -> None:
-    """A field that grows steadily reads the same on three channels once they share a time."""
-    aligner = Aligner((), Align())
-    delays = (0.0, 0.9, 1.8)
-    for k in range(5):
-        t = 4.0 * k
-        field = tuple(10.0 * (t + delay) for delay in delays)
-        sample = aligner.reading(Reading(field, channel_delay=delays), START + round(t * SECOND))  # type: ignore[arg-type]
-        if k:
-            np.testing.assert_allclose(sample.field, 10.0 * t, atol=1e-9)
-        assert sample.time_us == START + round(t * SECOND)
-
-
 @given(st.tuples(*[st.floats(0, 2)] * 3), st.floats(-1e3, 1e3), st.floats(-50, 50), st.floats(0.0, 3.0))
 def test_any_order_of_channels_and_any_filter_delay(
     delays: tuple[float, float, float], level: float, slope: float, filter_delay: float

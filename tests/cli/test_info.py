@@ -14,6 +14,7 @@ from cyclopts import App
 from small import bridge_text
 
 from magbridge.cli.common import app
+from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment as made
 from magbridge.logs.info import USES, info, movers
@@ -60,26 +61,29 @@ def test_seconds_too_few_to_be_since_1970_count_from_a_start() -> None:
     assert any("--date says when it was" in hint for hint in facts["hints"])
 
 
-def test_info_knows_a_field_in_another_unit() -> None:
-    axes = {"mag_x": [30.0, 30.0], "mag_y": [5.0, 5.0], "mag_z": [45.0, 45.0]}
-    (hint,) = [line for line in info(made("log", [START, START + 1], axes))["hints"] if "length" in line]
-    assert "54.31 nT (median); in uT it would be the Earth's" in hint
-
-
-def test_a_field_that_is_the_earths_in_no_unit() -> None:
-    axes = {key: [68000.0, 68000.0] for key in ("mag_x", "mag_y", "mag_z")}
-    (hint,) = [line for line in info(made("log", [START, START + 1], axes))["hints"] if "length" in line]
-    assert hint == "the vector's length is 1.178e+05 nT (median)"
-
-
-def test_a_depth_that_counts_upwards_is_questioned() -> None:
-    hints = info(made("log", [START, START + 1], {"depth": np.array([-12.0, np.nan])}))["hints"]
-    assert "depth is -12 m (median): if it counts upwards, scale = -1 in columns.toml" in hints
-
-
-def test_a_vector_that_is_never_known_has_no_length() -> None:
-    unknown = dict.fromkeys(("mag_x", "mag_y", "mag_z"), np.full(2, np.nan))
-    assert not any("length" in hint for hint in info(made("log", [START, START + 1], unknown))["hints"])
+@pytest.mark.parametrize(
+    ("columns", "about", "hint"),
+    [
+        (
+            {"mag_x": 30.0, "mag_y": 5.0, "mag_z": 45.0},
+            "length",
+            "54.31 nT (median); in uT it would be the Earth's",
+        ),
+        (dict.fromkeys(CHANNELS, 68_000.0), "length", "the vector's length is 1.178e+05 nT (median)"),
+        (dict.fromkeys(CHANNELS, np.nan), "length", ""),
+        (
+            {"depth": -12.0},
+            "depth",
+            "depth is -12 m (median): if it counts upwards, scale = -1 in columns.toml",
+        ),
+    ],
+    ids=["another unit", "no unit", "never known", "upwards"],
+)
+def test_implausible_values_are_questioned(columns: dict[str, float], about: str, hint: str) -> None:
+    log = made("log", [START, START + 1], {name: np.full(2, value) for name, value in columns.items()})
+    found = [line for line in info(log)["hints"] if about in line and "never known" not in line]
+    assert len(found) == bool(hint)
+    assert all(hint in line for line in found)
 
 
 def test_what_moves_the_field_is_not_a_state_of_the_vehicle() -> None:
