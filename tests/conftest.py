@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pymavlink
 import pytest
+from commands import Command
 from hypothesis import settings
 from pymavlink.generator import mavgen
 
@@ -77,6 +78,18 @@ def cases() -> Path:
     if not folder.is_dir():
         pytest.skip("no failing inputs in ../shared/cases")
     return folder
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Change to an empty folder and return it."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], here: Path) -> Command:
+    return Command(capsys)
 
 
 @pytest.fixture(scope="session")
