@@ -27,66 +27,44 @@ def draw(survey: xr.Dataset, nominal: FloatArray, samples: xr.Dataset, path: Pat
     `nominal` (n,) is the survey's total field (nT) as the nominal calibration, one ellipsoid, corrects it.
     `samples` are the values received over the link.
     """
-    hours = _hours(survey["time"], survey)
-    received = _hours(samples["time"], survey)
+    hours, received = (
+        (time.to_numpy() - float(survey["time"][0])) / 3600.0 for time in (survey["time"], samples["time"])
+    )
     truth = survey["truth_total_field"].to_numpy()
-    raw = np.linalg.norm(channels(survey), axis=1)
-    style: dict[Any, Any] = {
-        "font.size": 9,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.titlelocation": "left",
-    }
-    with mpl.rc_context(style):
-        figure, panels = plt.subplots(
+    total, sigma = samples["total_field"].to_numpy(), samples["sigma"].to_numpy()
+    style: dict[Any, Any] = {"font.size": 9, "axes.spines.top": False, "axes.titlelocation": "left"}
+    with mpl.rc_context(style | {"axes.spines.right": False}):
+        figure, (masses, raw, levels, errors) = plt.subplots(
             4, 1, figsize=(10, 10), sharex=True, height_ratios=(1, 1.4, 1.6, 1.6), layout="constrained"
         )
-        _masses(panels[0], hours, survey)
-        _levels(
-            panels[1], "What the fluxgate reads", (hours, raw, RAW, "raw |H|"), (hours, truth, TRUE, "true")
-        )
-        total, sigma = samples["total_field"].to_numpy(), samples["sigma"].to_numpy()
-        panels[2].fill_between(
-            received,
-            total - 2 * sigma,
-            total + 2 * sigma,
-            color=CORRECTED,
-            alpha=0.2,
-            lw=0,
-            label="its 2 sigma",
-        )
-        _levels(
-            panels[2],
-            "What a ground station receives",
-            (received, total, CORRECTED, "corrected"),
-            (hours, truth, TRUE, "true"),
-        )
-        _errors(panels[3], hours, nominal - truth, received, samples)
-        panels[-1].set_xlabel("hours since the survey began")
+        _masses(masses, hours, survey)
+        raw.plot(hours, np.linalg.norm(channels(survey), axis=1), color=RAW, lw=1.4, label="raw |H|")
+        _finish(raw, "What the fluxgate reads", hours, truth)
+        low, high = total - 2 * sigma, total + 2 * sigma
+        levels.fill_between(received, low, high, color=CORRECTED, alpha=0.2, lw=0, label="its 2 sigma")
+        levels.plot(received, total, color=CORRECTED, lw=1.4, label="corrected")
+        _finish(levels, "What a ground station receives", hours, truth)
+        _errors(errors, hours, nominal - truth, received, samples)
+        errors.set_xlabel("hours since the survey began")
         with atomic_path(path) as temporary:
             figure.savefig(temporary, dpi=130)
         plt.close(figure)
 
 
-def _hours(time: xr.DataArray, survey: xr.Dataset) -> FloatArray:
-    return (time.to_numpy() - float(survey["time"][0])) / 3600.0
-
-
 def _masses(axes: Axes, hours: FloatArray, survey: xr.Dataset) -> None:
     axes.set_title("What moves: battery and ballast")
     axes.spines["right"].set_visible(True)
-    axes.step(hours, survey["battpos"].to_numpy(), color="#5b8a3c", lw=1)
-    axes.set_ylabel("battery, in", color="#5b8a3c")
-    other = axes.twinx()
-    other.step(hours, survey["ballast"].to_numpy(), color="#8a3c6e", lw=1)
-    other.set_ylabel("ballast, cm³", color="#8a3c6e")
+    for one, name, label, colour in (
+        (axes, "battpos", "battery, in", "#5b8a3c"), (axes.twinx(), "ballast", "ballast, cm³", "#8a3c6e"),
+    ):  # fmt: skip
+        one.step(hours, survey[name].to_numpy(), color=colour, lw=1)
+        one.set_ylabel(label, color=colour)
 
 
-def _levels(axes: Axes, title: str, *lines: tuple[FloatArray, FloatArray, str, str]) -> None:
-    axes.set_title(title)
-    for x, y, colour, label in lines:
-        axes.plot(x, y, color=colour, lw=1.0 if colour == TRUE else 1.4, label=label)
-    axes.set_ylabel("total field, nT")
+def _finish(axes: Axes, title: str, hours: FloatArray, truth: FloatArray) -> None:
+    """Add the true field, title and legend to a panel of total fields."""
+    axes.plot(hours, truth, color=TRUE, lw=1.0, label="true")
+    axes.set(title=title, ylabel="total field, nT")
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.legend(loc="upper right", frameon=False, ncols=3)
     axes.margins(y=0.15)

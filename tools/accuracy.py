@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from scipy.optimize import least_squares
-from studies import Column, Row, Study, fraction_within, percentile
+from studies import Column, Row, Study, consistent, percentile
 from study_worlds import METHODS, NOISES, BestFit, Glider, glider, true_field
 
 from magbridge.calibration.fitting.fit import fit
@@ -49,7 +49,7 @@ COLUMNS = {
     "95 %": Column("ratio", percentile(95), ".3f"),
     "maximum": Column("ratio", np.max, ".3f"),
     "normalised error: median": Column("sigma"),
-    "0.8 to 1.25": Column("sigma", fraction_within(0.8, 1.25), ".0%"),
+    "0.8 to 1.25": Column("sigma", consistent, ".0%"),
 }
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from foreign import FOREIGN
+from effects import EFFECTS, FOREIGN
 from studies import Row, Study, command_line
 from study.deployment import (
     CHARTS,
@@ -42,7 +42,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
-from sitl.inject import EFFECTS, HiddenEffect
+from sitl.inject import HiddenEffect
 
 NAMES = tuple(EFFECTS)
 LADDER = (4.0, 3.0, 5.0, 2.0, 6.0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from sitl.inject import Array, Effect, Generator, Scene, direction, jump, neighbours, wires, SWING
+from sitl.inject import SWING, Array, Effect, Generator, Scene, direction, jump, neighbours, wires
 from sitl.instrument import rotation
 from sitl.signals import autoregressive, first_order
 from sitl.world import MU_0_OVER_4_PI, dipole_field
@@ -46,7 +46,7 @@ def soaked(surface: Array, step: float, lag: float) -> Array:
     return np.asarray((weights / weights.sum()) @ np.array(parts))
 
 
-# ---- the instrument: heat, shocks, age; its converter, filter, clock and range ------------------------------
+# ---- the instrument: heat, shocks, age; its converter, filter, clock and range -----------------------------
 
 
 def _warmer(scene: Scene, rng: Generator) -> Array:
@@ -132,7 +132,7 @@ def bit_flips(scene: Scene, size: float, rng: Generator) -> None:
     scene.bend.append(bend)
 
 
-# ---- the surroundings: the Earth's field, the map of it, machines -------------------------------------------
+# ---- the surroundings: the Earth's field, the map of it, machines ------------------------------------------
 
 
 def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
@@ -173,7 +173,7 @@ def hum(scene: Scene, size: float, rng: Generator) -> None:
     scene.field = scene.field + size * (np.outer(np.cos(phase), a) + np.outer(np.sin(phase + 0.3), 0.5 * b))
 
 
-# ---- the vehicle: iron that moves, remembers or is strained, conductors -------------------------------------
+# ---- the vehicle: iron that moves, remembers or is strained, conductors ------------------------------------
 
 
 def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
@@ -252,7 +252,7 @@ EFFECTS: dict[str, Effect] = {
 """Function that adds the effect of each cause, by the cause's public name."""
 
 
-# ---- foreign effects ----------------------------------------------------------------------------------------
+# ---- foreign effects ---------------------------------------------------------------------------------------
 
 
 def relay(scene: Scene, size: float, rng: Generator) -> None:

@@ -33,7 +33,7 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.fleet.hierarchy import FLEET_LEVELS
 from magbridge.fleet.learn import Lesson, learn_fleet
-from sitl import Twin, load, segments, simulate
+from sitl import load, segments, simulate
 from sitl.dataset import at_rest
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
 
@@ -81,7 +81,6 @@ class Flight(NamedTuple):
         scenario = load("random_glider").replace(vehicle=vehicle, masses=MASSES)
         seed = OFFSET * (1 + self.seed) + 1000 * self.vehicle + self.number
         parts = segments(simulate(scenario, seed))
-        assert isinstance(Twin.draw(scenario, seed).vehicle, Vehicle)
         return at_rest(parts["calibration"], MASSES), at_rest(parts["survey"], MASSES), vehicle
 
     def widths(self) -> FloatArray:

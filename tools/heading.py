@@ -59,14 +59,9 @@ def run(name: str, seed: int, peers: str) -> list[Row]:
     return [{"data": name, "seed": seed, "failed": ""} | row for row in rows]
 
 
-def difference_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a - b, deg, wrapped to -180 to 180."""
-    return np.asarray((a - b + 180.0) % 360.0 - 180.0)
-
-
 def score(method: str, heading: np.ndarray, sigma: np.ndarray | float, truth: np.ndarray) -> Row:
     """Return the row of a method: its heading and sigma (n,) against the true heading (n,), deg."""
-    error = difference_deg(heading, truth)
+    error = (heading - truth + 180.0) % 360.0 - 180.0
     good = np.isfinite(error)
     error, stated = error[good], np.broadcast_to(sigma, truth.shape)[good]
     return {"method": method, "rms": rms(error), "stated": rms(stated), "normalised": rms(error / stated)}
@@ -108,7 +103,11 @@ def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
     blind = learned.drop_vars("heading")
     data = mb.observations(blind, MASSES)
     if name == "gliders, filter":
-        yield from lagging(data, survey)
+        for method, fitted in (
+            ("auto, lag ignored", data),
+            ("auto, lag undone", unfiltered(data, CUTOFF_HZ)),
+        ):
+            yield published(method, mb.fit(fitted).calibration, survey)
         return
     known = mb.fit(data).calibration
     yield published("auto", known, survey)
@@ -144,12 +143,6 @@ def after_pairs(
             yield {"method": f"auto, boresight of {pairs} pairs", "failed": "no boresight"}
             continue
         yield published(f"auto, boresight of {pairs} pairs", replace(known, boresight=boresight), survey)
-
-
-def lagging(known: Observations, log: xr.Dataset) -> Iterator[Row]:
-    """Yield the rows of a vehicle with an anti-alias filter, without and with the correction of its lag."""
-    for method, data in (("auto, lag ignored", known), ("auto, lag undone", unfiltered(known, CUTOFF_HZ))):
-        yield published(method, mb.fit(data).calibration, log)
 
 
 def aircraft() -> Iterator[Row]:

@@ -51,15 +51,7 @@ TESTS = {
 """Test files that must detect a change to each module."""
 SLOWER = 5.0
 """Factor on the tests' normal duration after which a change counts as detected, because the tests hang."""
-LIBRARIES = (
-    "msgspec",
-    "numpy",
-    "pytest",
-    "scipy.linalg",
-    "scipy.optimize",
-    "scipy.stats",
-    "xarray",
-)
+LIBRARIES = ("msgspec", "numpy", "pytest", "scipy.linalg", "scipy.optimize", "scipy.stats", "xarray")
 OTHER: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt,
     ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
@@ -78,7 +70,9 @@ def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str]]:
             skipped.update(ast.walk(node.annotation) if node.annotation else ())
         if isinstance(node, ast.FunctionDef):
             skipped.update(ast.walk(node.returns) if node.returns else ())
-        if isinstance(node, ast.JoinedStr) or _is_name_list(node) or _is_for_types(node):
+        names = isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
+        types = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+        if isinstance(node, ast.JoinedStr) or names or types:
             skipped.update(ast.walk(node))
     for node in ast.walk(tree):
         if node in skipped:
@@ -101,14 +95,6 @@ def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str]]:
                 | ast.Assign(targets=[ast.Attribute()])
             ):
                 yield node, "statement"
-
-
-def _is_name_list(node: ast.AST) -> bool:
-    return isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
-
-
-def _is_for_types(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
 
 
 def change(tree: ast.Module, number: int, rng: random.Random) -> tuple[int, str]:

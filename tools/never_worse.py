@@ -186,12 +186,12 @@ def glider_track(
     )
 
 
-def as_log(track: Track, field: FloatArray, unit: str = "in") -> xr.Dataset:
+def as_log(track: Track, field: FloatArray) -> xr.Dataset:
     """Return the log of a track, with the readings `field` (n, 3), nT, and all telemetry."""
     columns: dict[str, Any] = {
         f"mag_{axis}": ("time", field[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")
     }
-    columns |= {name: ("time", values, {"units": unit}) for name, values in track.masses.items()}
+    columns |= {name: ("time", values, {"units": "in"}) for name, values in track.masses.items()}
     columns |= {name: ("time", getattr(track, name)) for name in ("latitude", "longitude", "depth")}
     columns["sensor_temperature"] = "time", track.temperature
     return xr.Dataset(columns, coords={"time": track.time})
@@ -209,46 +209,20 @@ def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray) -> Calibration:
 # ---- the study ---------------------------------------------------------------------------------------------
 
 
-Change = Callable[[Track, FloatArray], FloatArray]
-
-
 def seconds(track: Track) -> FloatArray:
     """Return the time since the middle of the survey (n,), s."""
     return np.asarray(track.time - track.time[len(track.time) // 2])
 
 
-def none(track: Track, direction: FloatArray) -> FloatArray:
-    """Return a zero field (n, 3): no change."""
-    return np.zeros((len(track.time), 3)) * direction
-
-
-def step(track: Track, direction: FloatArray) -> FloatArray:
-    """Return an offset step (n, 3) of 60 nT in the middle of the survey."""
-    return np.asarray(60.0 * (seconds(track) >= 0.0)[:, None] * direction)
-
-
-def drift(track: Track, direction: FloatArray) -> FloatArray:
-    """Return an offset (n, 3) that drifts by 60 nT over the survey."""
-    return np.asarray(60.0 * np.linspace(0.0, 1.0, len(track.time))[:, None] * direction)
-
-
-def temperature(track: Track, direction: FloatArray) -> FloatArray:
-    """Return an offset (n, 3) of 1 nT/degC."""
-    return np.asarray((track.temperature - 10.0)[:, None] * direction)
-
-
-def current(track: Track, direction: FloatArray) -> FloatArray:
-    """Return the field (n, 3) of a pump without telemetry: 20 nT in two of every ten minutes."""
-    return np.asarray(20.0 * ((track.time % 600.0) < 120.0)[:, None] * direction)
-
-
-CHANGES: dict[str, Change] = {
-    "none": none,
-    "offset step of 60 nT": step,
-    "offset drift": drift,
-    "temperature": temperature,
-    "current without telemetry": current,
+CHANGES: dict[str, Callable[[Track], np.ndarray]] = {
+    "none": lambda track: np.zeros(len(track.time)),
+    "offset step of 60 nT": lambda track: 60.0 * (seconds(track) >= 0.0),
+    "offset drift": lambda track: 60.0 * np.linspace(0.0, 1.0, len(track.time)),
+    "temperature": lambda track: track.temperature - 10.0,
+    "current without telemetry": lambda track: 20.0 * (track.time % 600.0 < 120.0),
 }
+"""Functions that return a hidden field (n,), nT, along a random direction: a step in the middle of the
+survey, a drift over all of it, 1 nT/degC, and a pump that is on in two of every ten minutes."""
 
 
 def run(name: str, seed: int, hours: float) -> list[Row]:
@@ -261,7 +235,7 @@ def run(name: str, seed: int, hours: float) -> list[Row]:
     field, truth = vehicle.field(track, anomaly, track.masses)
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    field = field + CHANGES[name](track, direction) + rng.normal(0.0, 1.0, field.shape)
+    field = field + np.outer(CHANGES[name](track), direction) + rng.normal(0.0, 1.0, field.shape)
     log = as_log(track, field)
     fixed, learned = (learn(one, calibration, log, age_s=0.0) for one in (None, Learner(calibration)))
     moving = fixed.quality & 0b101 != 0

@@ -95,14 +95,13 @@ def _magyc(name: str) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
 METHODS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
     "MAVProxy magfit": magfit,
     "MAVProxy magfit, motors": partial(magfit, motors=True),
-    "magyc magfactor3": _magyc("magfactor3"),
-    "magyc twostep_hi": _magyc("twostep_hi"),
-    "magyc twostep_hsi": _magyc("twostep_hsi"),
-    "magyc ellipsoid_fit": _magyc("ellipsoid_fit"),
-    "magyc magyc_ls": _magyc("magyc_ls"),
-    "magyc magyc_nls": _magyc("magyc_nls"),
-    "magyc magyc_bfg": _magyc("magyc_bfg"),
-}
+    **{
+        f"magyc {name}": _magyc(name)
+        for name in (
+            "magfactor3", "twostep_hi", "twostep_hsi", "ellipsoid_fit", "magyc_ls", "magyc_nls", "magyc_bfg",
+        )
+    },
+}  # fmt: skip
 """Functions that take the data and return the corrected field (n, 3), nT, by name."""
 
 

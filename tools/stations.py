@@ -16,13 +16,7 @@ import venv
 from pathlib import Path
 
 PEERS = Path(__file__).resolve().parents[1] / ".peers"
-PYTHON = (
-    "MAVProxy==1.8.75",
-    "mavsdk==4.1.0",
-    "pymavlink==2.4.50",
-    "pyserial==3.5",
-    "lxml==6.1.3",
-)
+PYTHON = ("MAVProxy==1.8.75", "mavsdk==4.1.0", "pymavlink==2.4.50", "pyserial==3.5", "lxml==6.1.3")
 NODE = ("node-mavlink@2.3.0",)
 
 

@@ -134,9 +134,9 @@ def percentile(per_cent: float) -> Statistic:
     return lambda values: float(np.percentile(values, per_cent))
 
 
-def fraction_within(low: float, high: float) -> Statistic:
-    """Return the function that computes the fraction of values (n,) between two limits."""
-    return lambda values: float(np.mean((values > low) & (values < high)))
+def consistent(values: np.ndarray) -> float:
+    """Return the fraction of normalised errors (n,) between 0.8 and 1.25."""
+    return float(np.mean((values > 0.8) & (values < 1.25)))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from typing import Any
 import harmonica as hm
 import numpy as np
 import xarray as xr
-from studies import Column, Row, Study, fraction_within, percentile
+from studies import Column, Row, Study, consistent, percentile
 from study_worlds import MASSES, NOISES, GaussianRock, SurveyBound, drifted, fly_survey, oracle, true_field
 
 from magbridge.arrays import FloatArray
@@ -110,18 +110,13 @@ def score_map(twin: Twin, done: Result, size: float, length: float) -> Row:
     true = crust.anomaly(places + shift)
     anomaly, sigma = done.gridded.evaluate(places)
     known = _oracle_map(twin, done, places, size, length, crust.anomaly(place + shift))
-    ours, ideal, peer = (
-        _about_track_mean(one - true) for one in (anomaly, known, _equivalent_sources(done, places, length))
-    )
+    errors = (one - true for one in (anomaly, known, _equivalent_sources(done, places, length)))
+    ours, ideal, peer = (error - error[:PLACES].mean() for error in errors)
     row: Row = {"peer": rms(peer) / rms(ours)}
     for name, half in (("along", slice(PLACES)), ("between", slice(PLACES, None))):
         row[f"map_{name}"] = rms(ours[half]) / rms(ideal[half])
         row[f"map_{name}_sigma"] = rms((ours / sigma)[half])
     return row
-
-
-def _about_track_mean(error: FloatArray) -> FloatArray:
-    return np.asarray(error - error[:PLACES].mean())
 
 
 def _oracle_map(
@@ -163,7 +158,7 @@ STUDY = Study(
         "bound": Column("bound"),
         "ten runs": Column("runs"),
         "normalised, without bias": Column("without_bias"),
-        "0.8 to 1.25": Column("without_bias", fraction_within(0.8, 1.25), ".0%"),
+        "0.8 to 1.25": Column("without_bias", consistent, ".0%"),
         "bias / its sigma": Column("bias", rms),
         "map / oracle: along": Column("map_along"),
         "between": Column("map_between"),

@@ -122,10 +122,6 @@ def _soaked(log: Log, seconds: float) -> FloatArray:
     return np.asarray(y - y[0])
 
 
-def _bent(x: FloatArray) -> FloatArray:
-    return np.asarray(x + 0.01 * x * x)
-
-
 def _hours(log: Log) -> FloatArray:
     return np.asarray((log.columns["time"] - log.columns["time"][0]) / 3600.0)
 
@@ -170,7 +166,7 @@ def _step(log: Log, rng: np.random.Generator) -> FloatArray:
 
 
 OWN: dict[str, Effect] = {
-    "temperature_offset": lambda _v, log, rng: _along(_bent(_soaked(log, 900.0)), rng),
+    "temperature_offset": lambda _v, log, rng: _along((x := _soaked(log, 900.0)) + 0.01 * x * x, rng),
     "temperature_scale": lambda v, log, rng: v.reads(log) * _soaked(log, 400.0)[:, None] * rng.normal(size=3),
     "hysteresis": lambda _v, log, rng: _along(_bouc_wen(log), rng),
     "actuator_order": lambda _v, log, rng: _along(np.cos(log.columns["battpos"] / 3.0), rng),

@@ -13,8 +13,61 @@ from magbridge.bridge.devices import BusPort, sensor_port
 from magbridge.config import load
 from magbridge.errors import ConfigError, PortError
 from magbridge.records import Reading
+from magbridge.sensors import rm3100
 from magbridge.sensors.rm3100 import Rm3100, Rm3100Options
-from sitl.fluxgate import Rm3100Registers
+from sitl.fluxgate import results
+
+
+class Rm3100Registers:
+    """Emulated register map of an RM3100 in a `field` (nT) at its coils.
+
+    If it `is_frozen`, no measurement completes until the registers are written again. If it `has_failed`, the
+    bus does not answer; if it `is_absent`, an SPI bus reads zeros. `broken_axes` (bits 4 to 6) are the coils
+    that fail the self-test.
+    """
+
+    def __init__(self) -> None:
+        self.field = (20_000.0, -1_000.0, 45_000.0)
+        self.is_frozen = self.has_failed = self.is_absent = False
+        self.broken_axes = 0
+        self.configured = 0
+        self._registers = bytearray(0x37)
+        self._registers[0x36] = rm3100.REVISION
+        self._ready = False
+
+    def read(self, register: int, count: int) -> bytes:
+        """Return the `count` bytes that start at `register`."""
+        self._fail()
+        if self.is_absent:
+            return bytes(count)
+        if register == rm3100.STATUS:
+            is_measuring = self._registers[rm3100.CMM] & 1 or self._ready
+            self._registers[rm3100.STATUS] = 0x80 if is_measuring and not self.is_frozen else 0
+        if register == rm3100.RESULTS:
+            cycles = int.from_bytes(self._registers[4:6], "big")
+            step = Rm3100Options(cycle_count=cycles).nt_per_count
+            self._registers[0x24:0x2D] = results(Reading(self.field), step)
+            self._ready = False
+        return bytes(self._registers[register : register + count])
+
+    def write(self, register: int, data: bytes) -> None:
+        """Write bytes that start at `register`, and perform the action that they trigger."""
+        self._fail()
+        self._registers[register : register + len(data)] = data
+        if register == rm3100.POLL:
+            self._ready = True
+            if self._registers[rm3100.BIST] & 0x80:
+                self._registers[rm3100.BIST] = 0x80 | (0x70 & ~self.broken_axes)
+        elif register == rm3100.CYCLE_COUNTS:
+            self.is_frozen = False
+            self.configured += 1
+
+    def close(self) -> None:
+        """Do nothing: there is no bus to release."""
+
+    def _fail(self) -> None:
+        if self.has_failed:
+            raise OSError(121, "Remote I/O error")
 
 
 def driver(**options: object) -> Rm3100:

@@ -7,18 +7,18 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import foreign
+import effects
 import numpy as np
 import pytest
 import xarray as xr
-from foreign import FOREIGN
+from effects import EFFECTS, FOREIGN, soaked
 
 import sitl.inject
 from magbridge.columns import CHANNELS
 from magbridge.errors import ConfigError, WrongUse
 from sitl import Twin, load, segments, simulate
 from sitl.dataset import channels
-from sitl.inject import EFFECTS, HiddenEffect, disturb, soaked
+from sitl.inject import HiddenEffect, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.scenario import SCENARIOS, Scenario
 from sitl.trajectory import Track
@@ -87,7 +87,7 @@ def imported(path: Path) -> list[str]:
 
 def test_it_knows_nothing_of_the_detector() -> None:
     """The injector nothing of the whole package, the simulation below it nothing of a diagnosis."""
-    own, other = Path(sitl.inject.__file__), Path(foreign.__file__)
+    own, other = Path(sitl.inject.__file__), Path(effects.__file__)
     for path in (*own.parent.rglob("*.py"), other):
         forbidden = "magbridge" if path in (own, other) else "magbridge.diagnose"
         assert not [name for name in imported(path) if name.startswith(forbidden)], path
@@ -100,7 +100,8 @@ def test_a_filter_shows_a_turning_field_as_it_was(flight: Flight) -> None:
     still = {name: np.full_like(values, values[0]) for name, values in track.parameters.items()}
     track = replace(track, parameters=still, roll=0.0 * track.roll, pitch=0.0 * track.pitch)
     turning, late = (replace(track, heading=rate * (track.elapsed - t)) for t in (0.0, delay))
-    filtered = channels(disturb(twin, (HiddenEffect("filter_lag", delay, 11),), turning, when, 3))
+    lag = (HiddenEffect("filter_lag", delay, 11),)
+    filtered = channels(disturb(twin, lag, turning, when, 3, EFFECTS))
     np.testing.assert_allclose(filtered[1:], channels(disturb(twin, (), late, when, 3))[1:], atol=0.2)
 
 
@@ -209,7 +210,7 @@ def test_an_unknown_effect_is_one_line(tmp_path: Path) -> None:
     """The error message names the key and the known effects."""
     text = (SCENARIOS / "bolt.toml").read_text(encoding="utf-8").replace("offset_step", "gremlin")
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"hidden.effect: expected one of temperature_offset.* not gremlin"):
+    with pytest.raises(ConfigError, match=r"hidden.effect: expected one of offset_step.* not gremlin"):
         load(tmp_path / "mine.toml")
 
 

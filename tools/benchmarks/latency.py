@@ -151,12 +151,7 @@ def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
     return rows
 
 
-def play(
-    running: Running,
-    feed: Feed,
-    hertz: int,
-    sequences: Callable[[bytes], list[int]],
-) -> Sent:
+def play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]) -> Sent:
     """Send readings and telemetry for `SECONDS`; match the datagrams to the frames by sequence number."""
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     received: list[tuple[float, bytes]] = []

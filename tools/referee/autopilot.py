@@ -43,10 +43,7 @@ class PositionFilter:
         The position integrates a random walk of density q: ``Q = q [[dt³/3, dt²/2], [dt²/2, dt]]``.
         """
         self.velocity = motion[0] + self.wind[0], motion[1] + self.wind[1]
-        self.position = (
-            self.position[0] + self.velocity[0] * dt,
-            self.position[1] + self.velocity[1] * dt,
-        )
+        self.position = (self.position[0] + self.velocity[0] * dt, self.position[1] + self.velocity[1] * dt)
         q = self._walk
         self.pp += (2.0 * self.pw + self.ww * dt) * dt + q * dt**3 / 3.0
         self.pw += self.ww * dt + q * dt**2 / 2.0

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
-from foreign import FOREIGN
+from effects import EFFECTS, FOREIGN
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.correct import regressors
@@ -23,7 +23,7 @@ from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate
-from sitl.inject import EFFECTS, HiddenEffect, disturb
+from sitl.inject import HiddenEffect, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.signals import correlated, first_order
 from sitl.trajectory import Track
