@@ -435,10 +435,11 @@ class LiveEdge:
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield events until :meth:`stop`; yield an empty event when the time ``deadline()`` (µs) passes."""
-        turned_us = self._clock.now_us()
-        look_us = turned_us + CLOCK_CHECK_INTERVAL_US
+        before_us = self._clock.now_us()
+        check_us = before_us + CLOCK_CHECK_INTERVAL_US
         while not self._stopping:
-            wait = (min(deadline(), look_us) - self._clock.now_us()) * 1e-6
+            # the checks need no wake-up of their own while events arrive
+            wait = min(deadline() - self._clock.now_us(), CLOCK_CHECK_INTERVAL_US) * 1e-6
             lines = {fd: number for number, port in self._ports.items() for fd in port.fds()}
             full = [number for number, port in self._ports.items() if port.waiting]
             blocked = [fd for number in full for fd in self._ports[number].blocked()]
@@ -453,21 +454,21 @@ class LiveEdge:
                 os.read(self._woken, 4096)
             while not self._changes.empty():  # the event that a port opened comes before its data
                 yield Event(now_us, Channel.STATE, self._changes.get())
-            if held := now_us - turned_us > STANDSTILL_US:
-                yield Event(now_us, Channel.STATE, standstill(now_us, now_us - turned_us))
-            turned_us = now_us
+            if held := now_us - before_us > STANDSTILL_US:
+                yield Event(now_us, Channel.STATE, standstill(now_us, now_us - before_us))
+            before_us = now_us
             for fd in ready:
                 if fd != self._woken and (data := self._waiting(lines[fd], fd, held)):
                     channel, sensor_id = source_of(lines[fd])
                     yield Event(now_us, channel, data, sensor_id)
-            if now_us >= look_us:
-                look_us = now_us + CLOCK_CHECK_INTERVAL_US
-                for state in self._look(now_us):
+            if now_us >= check_us:
+                check_us = now_us + CLOCK_CHECK_INTERVAL_US
+                for state in self._check(now_us):
                     yield Event(now_us, Channel.STATE, state)
             if now_us >= deadline():
                 yield Event(now_us, Channel.STATE, b"")
 
-    def _look(self, now_us: int) -> Iterator[bytes]:
+    def _check(self, now_us: int) -> Iterator[bytes]:
         """Yield state frames about a step of the host's clock, a notice of the link, and a slow link."""
         if step_us := self._clock.step_us():
             yield clock_step(now_us, step_us)
@@ -487,7 +488,7 @@ class LiveEdge:
         try:
             port.write(data)
         except PortError as error:
-            self._lost(number, error)
+            self._report(number, error.reason)
 
     def answer(self, sender: tuple[int, int], data: bytes) -> None:
         """Send `data` over the link, only to the peer of one system and component."""
@@ -496,7 +497,7 @@ class LiveEdge:
             if link.is_open:
                 link.write_to(sender, data)
         except PortError as error:
-            self._lost(Channel.LINK, error)
+            self._report(Channel.LINK, error.reason)
 
     def credit(self, frames: list[bytes]) -> None:
         """Pass the frames that were signed with the key to the link, which then replies to their senders."""
@@ -507,7 +508,7 @@ class LiveEdge:
         try:
             self._ports[number].flush()
         except PortError as error:
-            self._lost(number, error)
+            self._report(number, error.reason)
 
     def notify(self, state: bytes) -> None:
         """Add an event with a state frame; any thread may call this method."""
@@ -538,7 +539,7 @@ class LiveEdge:
         try:
             return port.read()
         except PortError as error:
-            self._lost(number, error)
+            self._report(number, error.reason)
             return b""
 
     def _waiting(self, number: int, fd: int, held: bool) -> bytes:
@@ -565,9 +566,6 @@ class LiveEdge:
             return False
         self._overrun, self._slow_us = overrun, now_us + SLOW_US
         return True
-
-    def _lost(self, number: int, error: PortError) -> None:
-        self._report(number, error.reason)
 
     def _report(self, number: int, reason: str) -> None:
         """Add an event that a port is not open because of `reason`, or, without a reason, that it opened."""
