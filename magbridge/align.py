@@ -210,14 +210,13 @@ class Aligner:
             since_us = self.late_since_us if guessed else 0
             track.update(time_us, value, self.settings.moving_rate, since_us)
 
-    def reading(self, reading: Reading, time_us: int, *, restarted: bool = False, missing: int = 0) -> Sample:
+    def reading(self, reading: Reading, time_us: int) -> Sample:
         """Return the sample that results from a reading and the telemetry.
 
-        `time_us` (µs) is the host's time of ``reading.device_time``. If `restarted`, the instrument was
-        powered on again. `missing` is the number of readings lost just before this one.
+        `time_us` (µs) is the host's time of ``reading.device_time``.
         """
         settings = self.settings
-        cycle, delay = reading.power_cycle, reading.channel_delay
+        cycle, delay, restarted = reading.power_cycle, reading.channel_delay, reading.restarted
         if cycle is not None:
             if self.power_cycle is None:
                 self.power_cycle = cycle
@@ -226,7 +225,7 @@ class Aligner:
         quality, measured = 0, reading.field
         field, first = self.channels.bring(measured, delay, time_us)
         variance = self.channels.variance
-        if self._is_gap(time_us) or missing:
+        if self._is_gap(time_us) or reading.missing:
             quality |= GAP
         x, y, z = measured
         if isfinite(x + y + z):

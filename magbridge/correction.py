@@ -125,23 +125,21 @@ class Correction:
         reading: Reading,
         time_us: int,
         *,
-        restarted: bool = False,
-        missing: int = 0,
         main_field: float = nan,
         position: tuple[float, float] | None = None,
         depth: float = nan,
     ) -> tuple[Sample, Corrected]:
         """Align and correct one reading, and check the result; return the aligned and the corrected sample.
 
-        For `reading` to `missing` see :meth:`magbridge.align.Aligner.reading`. `main_field` is the total main
-        field (nT) at the sample, `position` its latitude and longitude (deg), `depth` is in m; NaN or None if
+        `time_us` (µs) is the host's time of ``reading.device_time``. `main_field` is the total main field
+        (nT) at the sample, `position` its latitude and longitude (deg), `depth` is in m; NaN or None if
         unknown.
         """
         if self.learner is not None and self.learner.calibration is not self.corrector.calibration:
             self._use(self.learner.calibration)
         if self._wants_temperature and isfinite(reading.temperature):  # a reading may lack it
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
-        sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
+        sample = self.aligner.reading(reading, time_us)
         (F, sigma, x, y, z, sx, sy, sz), quality = self.corrector.numbers(
             sample.time_us, sample.field, sample.values, sample.quality
         )
@@ -162,7 +160,7 @@ class Correction:
             turned += more
         if self.learner is not None and self.is_learning:
             flags, variance = parts.call(
-                "learning", (0, 0.0), self._learn, sample, quality, main_field, position, restarted
+                "learning", (0, 0.0), self._learn, sample, quality, main_field, position
             )
             quality |= flags
             judged += variance
@@ -256,11 +254,10 @@ class Correction:
         quality: int,
         main_field: float,
         position: tuple[float, float] | None,
-        restarted: bool,
     ) -> tuple[int, float]:
         """Update the learner with the sample; return the flags and the variance (nT^2) that it adds."""
         assert self.learner is not None
-        if restarted:
+        if sample.reading.restarted:
             self.learner.restarted()
         self.learner.sample(
             sample.time_us,

@@ -90,14 +90,11 @@ class ScalarCorrection:
         self,
         reading: Reading,
         time_us: int,
-        *,
-        restarted: bool = False,
-        missing: int = 0,
         main_field: float = nan,
         position: tuple[float, float] | None = None,
     ) -> None:
         """Record one reading; parameters as for :meth:`magbridge.correction.Correction.reading`."""
-        sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
+        sample = self.aligner.reading(reading, time_us)
         self._pending.append(PendingReading(sample, main_field, position))
 
     def samples(self, now_us: int) -> list[tuple[Sample, Corrected]]:

@@ -172,7 +172,7 @@ def test_gap_and_missing_readings() -> None:
     times = [0, 4, 8, 12, 24, 28]
     gaps = ["gap" in flags(aligner.reading(reading(), START + t * SECOND)) for t in times]
     assert gaps == [False, False, False, False, True, False]
-    assert "gap" in flags(aligner.reading(reading(), START + 32 * SECOND, missing=1))
+    assert "gap" in flags(aligner.reading(reading(missing=1), START + 32 * SECOND))
 
 
 def test_a_slower_sampling_rate_is_one_gap_and_then_the_new_period() -> None:

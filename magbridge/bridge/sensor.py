@@ -325,21 +325,15 @@ class SensorStream:
         `depth`: depth below the sea, m; NaN if unknown.
         """
         correction, time_us = self.correction, reading.time_us
-        restarted, missing = reading.restarted, reading.missing
         self.samples += 1
-        self.lost += missing
+        self.lost += reading.missing
         self._times.append(time_us)
         self.line.read(reading.field, time_us)
         if isinstance(correction, Correction):
             return [
-                correction.reading(
-                    reading, time_us, restarted=restarted, missing=missing, main_field=main_field,
-                    position=position, depth=depth,
-                )
-            ]  # fmt: skip
-        correction.reading(
-            reading, time_us, restarted=restarted, missing=missing, main_field=main_field, position=position
-        )
+                correction.reading(reading, time_us, main_field=main_field, position=position, depth=depth)
+            ]
+        correction.reading(reading, time_us, main_field, position)
         return self.complete()
 
     def complete(self) -> list[tuple[Sample, Corrected]]:
