@@ -133,6 +133,7 @@ def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Comma
     moved = np.interp(time, glider["time"], glider["battpos"])
     field[:, 0] += 300.0 + 80.0 * moved
     axes = dict(zip(("mag_x", "mag_y", "mag_z"), field.T, strict=True))
+    axes["reference_field"] = np.full(len(time), np.hypot(17_000.0, 47_000.0))
     sensor = tmp_path / "fluxgate.csv"
     logs.write(deployment(sensor, time, axes), sensor)
     log = logs.read([sensor, *flight])
