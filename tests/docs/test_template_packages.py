@@ -25,20 +25,20 @@ TEMPLATES = sorted(path.parent for path in ROOT.glob("examples/*/pyproject.toml"
 def install(template: Path, folder: Path) -> None:
     """Install a template as pip would: its module and its entry points."""
     project = tomllib.loads((template / "pyproject.toml").read_text())["project"]
-    info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
-    groups = project["entry-points"]
-    (info / "entry_points.txt").write_text(
-        "".join(
-            f"[{group}]\n" + "".join(f"{name} = {target}\n" for name, target in points.items())
-            for group, points in groups.items()
-        )
-    )
+    declare(folder, project["name"], project["entry-points"])
     for module in template.glob("*.py"):
         (folder / module.name).write_text(module.read_text())
+
+
+def declare(folder: Path, name: str, groups: dict[str, dict[str, str]]) -> None:
+    """Write the metadata of an installed package with its entry points: group -> name -> object."""
+    info = folder / f"{name.replace('-', '_')}-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
+    lines = []
+    for group, points in groups.items():
+        lines += [f"[{group}]", *(f"{point} = {target}" for point, target in points.items())]
+    (info / "entry_points.txt").write_text("\n".join(lines))
 
 
 def magbridge(folder: Path, *arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
@@ -111,10 +111,7 @@ def test_a_record_that_is_none_is_named(installed: Path) -> None:
     ids=["import", "raises", "yields", "lacks"],
 )
 def test_a_faulty_format_is_one_line_and_harms_nothing_else(text: str, fault: str, tmp_path: Path) -> None:
-    info = tmp_path / "faulty-1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[magbridge.formats]\nodd = faulty\n")
+    declare(tmp_path, "faulty", {"magbridge.formats": {"odd": "faulty"}})
     (tmp_path / "faulty.py").write_text(text)
     (tmp_path / "log.odd").write_text("x")
     output = magbridge(tmp_path, "convert", tmp_path / "log.odd", "-o", tmp_path / "log.csv", code=1).stderr
@@ -146,10 +143,7 @@ def test_the_cause_is_put_forward_found_and_explained(
 
 
 def test_a_cause_that_is_none_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    info = tmp_path / "odd-1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[magbridge.causes]\nodd = oddly:NOTHING\n")
+    declare(tmp_path, "odd", {"magbridge.causes": {"odd": "oddly:NOTHING"}})
     (tmp_path / "oddly.py").write_text("NOTHING = 1\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(PluginError, match="cause 'odd': oddly:NOTHING is no Cause"):

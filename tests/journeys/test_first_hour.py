@@ -8,9 +8,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
-import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +16,13 @@ import theirs
 import xarray as xr
 from pages import blocks
 from small import polynomial
+from station import free, get
 
 from magbridge import logs
 from magbridge.calibration.file import load, save
 from magbridge.calibration.model import Calibration, Parameter
 
-from .conftest import Walk
+from .conftest import SHOWN, Walk
 
 
 def right(file: str, within: float) -> None:
@@ -110,8 +108,8 @@ def test_an_integrator_attaches_a_bridge(walk: Walk, here: Path, calibration: Ca
 
 def test_an_operator_opens_the_page(here: Path) -> None:
     pytest.importorskip("nicegui")
-    (shown,) = {tuple(words) for words in _shown("monitor")}
-    ports = [_free(socket.SOCK_DGRAM), _free(socket.SOCK_STREAM)]
+    (shown,) = {words for words in SHOWN if words[:2] == ("magbridge", "monitor")}
+    ports = [free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)]
     words = [word.replace("0.0.0.0:14550", f"127.0.0.1:{ports[0]}") for word in shown[1:]]
     page = subprocess.Popen(
         [sys.executable, "-m", "magbridge", *words, "--port", str(ports[1])],
@@ -120,36 +118,11 @@ def test_an_operator_opens_the_page(here: Path) -> None:
         text=True,
     )
     try:
-        text = _fetched(f"http://127.0.0.1:{ports[1]}/", page)
-        assert "magbridge" in text
+        assert "magbridge" in get(f"http://127.0.0.1:{ports[1]}/")
     finally:
         page.terminate()
         _, output = page.communicate(timeout=20)
     assert "Traceback" not in output
-
-
-def _shown(command: str) -> Iterator[list[str]]:
-    from pages import commands  # noqa: PLC0415 - the name is a fixture's elsewhere
-
-    for block in blocks("sh"):
-        yield from (words for words in commands(block) if words[:2] == ["magbridge", command])
-
-
-def _free(kind: socket.SocketKind) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _fetched(url: str, page: subprocess.Popen[str]) -> str:
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline and page.poll() is None:
-        try:
-            with urllib.request.urlopen(url, timeout=5) as answer:
-                return str(answer.read().decode())
-        except OSError:
-            time.sleep(0.1)
-    raise AssertionError(f"no page at {url}")
 
 
 def test_a_surveyor_without_calibration_runs(walk: Walk, here: Path) -> None:

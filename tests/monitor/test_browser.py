@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shutil
 import socket
 import threading
 import time
@@ -21,9 +20,6 @@ from magbridge.mavlink import Codec
 from magbridge.records import Quality
 
 pytest.importorskip("nicegui")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 FLAGS = int(Quality.STALE_TELEMETRY | Quality.GAP)
 PATIENCE = 20_000
@@ -77,14 +73,6 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         finally:
             stop.set()
             sender.join()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as player:
-        opened = player.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield opened
-        opened.close()
 
 
 def visit(browser: Any, url: str, width: str = "desktop", scheme: str = "light") -> Any:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import shutil
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import count, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 pytest.importorskip("nicegui")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
 PATIENCE = 30_000
 """Time limit for the page on a busy computer, ms."""
 HZ = 20
@@ -88,15 +85,13 @@ def press(button: Locator, answer: Locator) -> None:
     pytest.fail("no answer")
 
 
-def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], clock: Path) -> None:
+def test_an_alarm_is_shown_accepted_and_forgotten(
+    flying: tuple[Rig, Turning], clock: Path, browser: Any
+) -> None:
     """Onset, amplitude, causes and both predictions are shown; each button acts on the bridge."""
     rig, field = flying
-    with (
-        served(clock, url=rig.url.replace("udpin", "udpout")) as (address, _),
-        playwright.sync_playwright() as player,
-    ):
+    with served(clock, url=rig.url.replace("udpin", "udpout")) as (address, _):
         get(address)
-        browser = player.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.set_default_timeout(PATIENCE)
         page.goto(address)
@@ -123,7 +118,7 @@ def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], c
         press(panel.get_by_role("button", name="Forget"), confirm)
         press(confirm.get_by_role("button", name="Forget"), page.get_by_text("learning: all forgotten"))
         panel.get_by_text(re.compile("the first$")).wait_for()
-        browser.close()
+        page.close()
     texts = {text.partition(" learned calibration")[0] for text in rig.texts()}
     announced = (
         "MB_LEARN_CMD = 1, set by 255:190",
