@@ -230,19 +230,18 @@ def results(reading: Reading, nt_per_count: float) -> bytes:
     return b"".join(count.to_bytes(3, "big", signed=True) for count in counts)
 
 
-# ---- TIO device of either generation, with samples of 32-bit floats like the VMR's -------------------------
+# ---- TIO device with samples of 32-bit floats like the VMR's -----------------------------------------------
 
 
 FLOAT32 = 0x42
-STREAM = {1: 0, 2: 1}
-"""Generation of the protocol: number of the stream that has the field."""
 
 
 class TwinleafEncoder(Encoder):
-    """Emulated TIO device; set `generation` to 1 before the first reading for the older protocol."""
+    """Emulated TIO device with the protocol of the second generation."""
 
     Options = TwinleafOptions
-    generation = 2
+    stream = 1
+    """Number of the stream that has the field."""
 
     def power_on(self) -> None:
         """Begin a new session, which the device describes before its first reading."""
@@ -262,12 +261,8 @@ class TwinleafEncoder(Encoder):
         values = [clip(value, limit) / NT_PER_UNIT[self._unit] for value in reading.field]
         if self.options.temperature:
             values.append(reading.temperature)
-        if self.generation == 1:
-            header = (number % tio.WRAP_1).to_bytes(4, "little")
-        else:
-            header = (number % tio.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
-        samples = header + b"".join(pack("<f", value) for value in values)
-        packet = self._slip(tio.STREAM_TYPE + STREAM[self.generation], samples)
+        samples = self._header(number) + b"".join(pack("<f", value) for value in values)
+        packet = self._slip(tio.STREAM_TYPE + self.stream, samples)
         if self._described:
             return packet
         self._described = True
@@ -287,41 +282,33 @@ class TwinleafEncoder(Encoder):
             number, size = tio.RPC_HEADER.unpack_from(payload)
             method = payload[4 : 4 + size % 0x8000]
             reply = number.to_bytes(2, "little")
-            if method == b"dev.metadata" and self.generation == 2:
-                records = b"".join(bytes([kind, len(record)]) + record for kind, record in self._records())
-                answers += self._slip(tio.RPC_REPLY, reply + records)
-            elif method == b"data.send_all" and self.generation == 1:
-                answers += self._describe() + self._slip(tio.RPC_REPLY, reply)
-            else:
-                not_found = (2).to_bytes(2, "little")
-                answers += self._slip(tio.RPC_ERROR, reply + not_found)
+            not_found = self._slip(tio.RPC_ERROR, reply + (2).to_bytes(2, "little"))
+            answers += self._answer(method, reply) or not_found
         return answers
+
+    def _answer(self, method: bytes, reply: bytes) -> bytes:
+        """Return the answer to a request, whose payload begins with `reply`; empty for an unknown request."""
+        if method != b"dev.metadata":
+            return b""
+        records = b"".join(bytes([kind, len(record)]) + record for kind, record in self._records())
+        return self._slip(tio.RPC_REPLY, reply + records)
+
+    def _header(self, number: int) -> bytes:
+        """Return the header of the sample `number`."""
+        return (number % tio.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
 
     def _slip(self, kind: int, payload: bytes) -> bytes:
         return tio.slip(tio.pack(kind, payload, self._routing))
 
     def _describe(self) -> bytes:
         """Return the packets that describe the contents of a sample."""
-        if self.generation == 2:
-            return b"".join(
-                self._slip(tio.METADATA, bytes([kind, 0]) + record) for kind, record in self._records()
-            )
-        numerator, denominator = self._rate.denominator * 1_000_000, self._rate.numerator
-        name = self._columns[0].partition(".")[0]
-        axes = ",".join(column.rpartition(".")[2] for column in self._columns[:3])
-        sources = [(f"{name}\t{axes}\t{name}\t{self._unit}", 3)]
-        sources += [(f"{column}\t\t{column}\tC", 1) for column in self._columns[3:]]
-        packets = self._slip(tio.TIMEBASE, tio.TIMEBASE_HEADER.pack(0, numerator, denominator) + bytes(16))
-        components = b""
-        for number, (text, channels) in enumerate(sources):
-            header = tio.SOURCE_HEADER.pack(number, channels, FLOAT32)
-            packets += self._slip(tio.SOURCE, header + text.encode())
-            components += tio.COMPONENT.pack(number)
-        return packets + self._slip(tio.STREAM, tio.STREAM_HEADER.pack(0, 0, 1, len(sources)) + components)
+        return b"".join(
+            self._slip(tio.METADATA, bytes([kind, 0]) + record) for kind, record in self._records()
+        )
 
     def _records(self) -> list[tuple[int, bytes]]:
-        """Return the metadata records of generation 2, each with its type."""
-        session, stream = self.power_cycle, STREAM[2]
+        """Return the metadata records, each with its type."""
+        session, stream = self.power_cycle, self.stream
         rate, decimation = self._rate.numerator, self._rate.denominator
         segment = tio.SEGMENT_HEADER.pack(stream, session % 256, 0, rate, decimation)
         records = [

@@ -123,7 +123,8 @@ def _play(survey: xr.Dataset, config: Path, master: int, router: _Router, stop: 
             if event.channel is Channel.SENSOR:
                 os.write(master, event.data)
             elif event.channel is Channel.LINK:
-                router.from_autopilot(event.data)
+                router.send(0, event.data)
+                router.send(1, event.data)
             os.read(master, 4096)  # commands to the fluxgate
 
 
@@ -157,14 +158,10 @@ class _Router:
                 side = self._sockets.index(one)
                 with suppress(OSError):
                     data, self._peers[side] = one.recvfrom(65536)
-                    self._send(1 - side, data)
+                    self.send(1 - side, data)
 
-    def from_autopilot(self, data: bytes) -> None:
-        """Send the autopilot's bytes to the bridge and to the ground station."""
-        for side in (0, 1):
-            self._send(side, data)
-
-    def _send(self, side: int, data: bytes) -> None:
+    def send(self, side: int, data: bytes) -> None:
+        """Send bytes to the bridge (side 0) or to the ground station (1), if its address is known."""
         peer = self._peers[side]
         if peer is not None:
             self._sockets[side].sendto(data, peer)

@@ -136,21 +136,17 @@ class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
             side = 1.0 if (yo // self.yos_per_leg) % 2 else -1.0
             pitch = float(np.copysign(rng.normal(*self.pitch), k % 2 - 0.5))
             low, high = limits["battpos"].low, limits["battpos"].high
-            battery = _battery(pitch) + rng.normal(0, self.battery_spread)
-            made.append(
-                Leg(
-                    duration=self.duration,
-                    pitch=pitch,
-                    roll=float(rng.normal(*self.roll)),
-                    heading=(self.axis + back + side * self.zigzag) % 360,
-                    parameters=other_channels(rng, limits)
-                    | {
-                        "battpos": float(np.clip(battery, low, high)),
-                        "ballast": float(np.copysign(200, pitch)),
-                    },
-                    segment=self.segment,
-                )
+            battery = np.clip(_battery(pitch) + rng.normal(0, self.battery_spread), low, high)
+            known = {"battpos": float(battery), "ballast": float(np.copysign(200, pitch))}
+            leg = Leg(
+                duration=self.duration,
+                pitch=pitch,
+                roll=float(rng.normal(*self.roll)),
+                heading=(self.axis + back + side * self.zigzag) % 360,
+                parameters=other_channels(rng, limits) | known,
+                segment=self.segment,
             )
+            made.append(leg)
         return made
 
 

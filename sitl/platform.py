@@ -146,16 +146,15 @@ def draw_vehicle(rng: np.random.Generator, masses: Sequence[str] = ("battpos", "
     return Vehicle(
         hard_iron=_vector(rng.normal(0, HARD_IRON, 3)),
         soft_iron=(_vector(iron[0]), _vector(iron[1]), _vector(iron[2])),
-        mass={name: _draw_mass(rng, MOUNTINGS[name]) for name in masses},
-    )
-
-
-def _draw_mass(rng: np.random.Generator, mounting: Mounting) -> Mass:
-    return Mass(
-        at=_vector(np.asarray(mounting.at) + rng.normal(0, PLACE_SPREAD)),
-        travel=mounting.travel,
-        moment=_vector(rng.normal(0, MOMENT, 3)),
-        volume=_vector(np.array(VOLUME) * np.exp(rng.normal(0, VOLUME_SPREAD, 3))),
+        mass={
+            name: Mass(
+                at=_vector(np.asarray(MOUNTINGS[name].at) + rng.normal(0, PLACE_SPREAD)),
+                travel=MOUNTINGS[name].travel,
+                moment=_vector(rng.normal(0, MOMENT, 3)),
+                volume=_vector(np.array(VOLUME) * np.exp(rng.normal(0, VOLUME_SPREAD, 3))),
+            )
+            for name in masses
+        },
     )
 
 

@@ -125,18 +125,13 @@ def load(path: str | Path) -> Scenario:
         if name not in MOUNTINGS:
             raise ConfigError(path, "masses", one_of(name, MOUNTINGS))
     if scenario.hidden:
-        _check_hidden(scenario.hidden, path)
+        from sitl.inject import EFFECTS  # noqa: PLC0415 - the effects simulate scenarios
+
+        for effect in (one.effect for one in scenario.hidden if one.effect not in EFFECTS):
+            raise ConfigError(path, "hidden.effect", one_of(effect, EFFECTS))
     if scenario.calibration is None:
         return scenario
     calibration = path.parent / scenario.calibration
     if not calibration.is_file():
         raise ConfigError(path, "calibration", f"no such file: {calibration}")
     return scenario.replace(calibration=str(calibration))
-
-
-def _check_hidden(hidden: tuple[Hidden, ...], path: Path) -> None:
-    from sitl.inject import EFFECTS  # noqa: PLC0415 - the effects simulate scenarios
-
-    for one in hidden:
-        if one.effect not in EFFECTS:
-            raise ConfigError(path, "hidden.effect", one_of(one.effect, EFFECTS))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -93,13 +93,22 @@ class Recorded:
         """Yield the bridge's inputs; add its outputs to `published`."""
         frame_log = FrameLogReader()
         time_us = self.start.time_us
-        inputs = (record for record in self._records() if not self._went_out(record) and _is_event(record))
+        inputs = (
+            record
+            for record in self._records()
+            if not self._went_out(record)
+            # other records may separate two pieces of one input
+            and (record.channel != Channel.STATE or record.message.id not in NOT_EVENTS)
+        )
         for (time_us, channel, sensor_id), group in groupby(inputs, _event_key):
             if channel == Channel.STATE:
                 for record in group:
                     yield Event(time_us, Channel.STATE, record.frame)
             elif channel == Channel.SENSOR:
-                yield Event(time_us, Channel.SENSOR, _sensor_bytes(group), sensor_id)
+                # the log may have split the bytes of one time into several records
+                messages = (record.message for record in group)
+                data = b"".join(message["data"][: message["length"]] for message in messages)
+                yield Event(time_us, Channel.SENSOR, data, sensor_id)
             elif data := b"".join(frame_log.data(record.frame) for record in group):
                 yield Event(time_us, Channel.LINK, data)
         # timers that fired after the last input
@@ -118,14 +127,3 @@ def _event_key(record: TlogRecord) -> tuple[int, int, int]:
     """Return time (µs), channel and sensor id of the event that a record belongs to."""
     sensor_id = record.message["sensor_id"] if record.channel == Channel.SENSOR else 0
     return record.time_us, record.channel, sensor_id
-
-
-def _is_event(record: TlogRecord) -> bool:
-    """Return True if a record is an input; other records may separate two pieces of one input."""
-    return record.channel != Channel.STATE or record.message.id not in NOT_EVENTS
-
-
-def _sensor_bytes(records: Iterable[TlogRecord]) -> bytes:
-    """Return the sensor bytes of one time, which the log may have split into several records."""
-    messages = (record.message for record in records)
-    return b"".join(message["data"][: message["length"]] for message in messages)

@@ -15,6 +15,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from old_twinleaf import open_old_twinleaf
 
 from magbridge.errors import ConfigError
 from magbridge.records import Reading
@@ -46,9 +47,8 @@ FIELDS = st.tuples(*[st.floats(-150_000, 150_000)] * 3)
 
 def instrument(case: str) -> tuple[Driver, Encoder]:
     name, options = CASES[case]
-    encoder = open_encoder(name, options, rate=10.0)
-    if case == "twinleaf 1":
-        encoder.generation = 1  # type: ignore[attr-defined]
+    old = case == "twinleaf 1"
+    encoder = open_old_twinleaf(options, 10.0) if old else open_encoder(name, options, rate=10.0)
     driver = open_driver(name, options)
     for command in driver.start():
         driver.feed(encoder.feed(command))
