@@ -20,7 +20,7 @@ import numpy as np
 from small import START, small_bridge
 from studies import command_line
 
-from magbridge.bridge.events import Event, StartEvent
+from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.run import FileServer
 from magbridge.calibration.model import Boresight, Parameter
@@ -110,7 +110,7 @@ def make_bridge(folder: Path, seed: int = 0) -> Pipeline:
     battery = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
     more = CONFIG.format(**VARIANTS[seed % len(VARIANTS)])
     publish = "MAG_FIELD", "MAG_RAW", "MAG_NAVIGATION", "HIGHRES_IMU"
-    return small_bridge(folder, StartEvent(START), battery, publish, more, boresight=BORESIGHT)
+    return small_bridge(folder, publish, battery=battery, more=more, boresight=BORESIGHT)
 
 
 def _number(code: str, rng: random.Random) -> float | int:

@@ -19,6 +19,8 @@ from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import load
 
 START = 1_780_000_000_000_000
+BEGIN = StartEvent(START)
+BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
 ASCII_OPTIONS = 'columns = ["x", "y", "z", "temperature", "time", "sequence"]'
 
 
@@ -91,9 +93,9 @@ def write_bridge(folder: Path, known: Calibration, /, **settings: Any) -> Path:
 
 def small_bridge(
     folder: Path,
-    start: StartEvent,
-    battery: Parameter,
-    publish: Sequence[str],
+    publish: Sequence[str] = ("MAG_FIELD",),
+    start: StartEvent = BEGIN,
+    battery: Parameter = BATTERY,
     more: str = "",
     boresight: Boresight | None = None,
 ) -> Pipeline:

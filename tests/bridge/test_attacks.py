@@ -13,14 +13,12 @@ import pytest
 from attacks import ALLOWED, ATTACKS, Attack, run
 from checks import replays
 from extremes import events, feed, make_bridge
+from fed import FedBridge, named
 from rig import Rig
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.position import Position
 from magbridge.bridge.run import FileServer
-from magbridge.calibration.model import Parameter
 from magbridge.correction import Correction
 from magbridge.mavlink import Codec, Message
 from magbridge.one_time import OneTime
@@ -151,50 +149,38 @@ def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
     assert reports == ["the position jumps farther than the vehicle can move"]
 
 
-def bridge_of(folder: Path) -> Pipeline:
-    return small_bridge(
-        folder, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"]
-    )
-
-
-def sent(bridge: Pipeline, second: int) -> list[Message]:
-    line = b"1000 2000 50000 4 %d %d\n" % (second, second)
-    frames = bridge.feed(Event(START + second * 1_000_000, Channel.SENSOR, line))
-    ear = Codec(0, 0)
-    return [message for _, frame in frames for message in ear.parse(frame)]
+def sent(bridge: FedBridge, second: int) -> list[Message]:
+    return bridge.feed(second, Channel.SENSOR, b"1000 2000 50000 4 %d %d\n" % (second, second))
 
 
 def test_the_position_of_another_component_is_ignored_and_reported(tmp_path: Path) -> None:
-    bridge = bridge_of(tmp_path)
-    bridge.feed(Event(START, Channel.LINK, global_position(lat=495_000_000, lon=-579_000_000)))
-    (before,) = (message for message in sent(bridge, 1) if message.name == "MAG_FIELD")
-    bridge.feed(Event(START + 1, Channel.LINK, global_position(25, lat=505_000_000, lon=-579_000_000)))
-    messages = sent(bridge, 2)
-    (after,) = (message for message in messages if message.name == "MAG_FIELD")
+    bridge = FedBridge(small_bridge(tmp_path))
+    bridge.feed(0.0, Channel.LINK, global_position(lat=495_000_000, lon=-579_000_000))
+    (before,) = named(sent(bridge, 1), "MAG_FIELD")
+    bridge.feed(1.0, Channel.LINK, global_position(25, lat=505_000_000, lon=-579_000_000))
+    (after,) = named(sent(bridge, 2), "MAG_FIELD")
     assert after["anomaly"] == pytest.approx(before["anomaly"], abs=0.1)
-    assert "position of component 25 ignored" in [text for _, text in bridge.component.announcer.texts]
+    assert "position of component 25 ignored" in bridge.texts
 
 
 def test_a_part_that_raises_is_switched_off_and_the_sample_is_published(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bridge = bridge_of(tmp_path)
+    bridge = FedBridge(small_bridge(tmp_path))
     monkeypatch.setattr(OptionalParts, "propagate", False)
 
     def fail(*_: object, **__: object) -> float:
         raise ZeroDivisionError("made for this test")
 
-    correction = bridge.streams[0].correction
+    correction = bridge.bridge.streams[0].correction
     assert isinstance(correction, Correction)
     assert correction.health is not None
-    health = correction.health
-    monkeypatch.setattr(health, "check", fail)
+    monkeypatch.setattr(correction.health, "check", fail)
     for second in (1, 2, 3):
-        assert [message.name for message in sent(bridge, second)].count("MAG_FIELD") == 1
-    texts = [text for _, text in bridge.component.announcer.texts]
+        assert len(named(sent(bridge, second), "MAG_FIELD")) == 1
     expected = "plausibility check is off after an internal error: ZeroDivisionError: made for this test"
-    assert texts.count(expected) == 1
-    assert list(bridge._correction.parts.failures) == ["plausibility check"]
+    assert "".join(bridge.texts).count(expected) == 1
+    assert list(correction.parts.failures) == ["plausibility check"]
 
 
 def test_zero_counts_of_channels_sampled_in_turn() -> None:

@@ -13,7 +13,6 @@ from magbridge import logs
 from magbridge.bridge import events
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import load as load_calibration
-from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.columns import CORRECTED
 from magbridge.correction import Correction
@@ -25,7 +24,6 @@ from magbridge.rows import correct_rows
 
 KEPT = {"MB_AGE_BATTPOS": 3.0, "MB_SETTLE_TIME": 4.0, "MB_STALE_GROW": 20.0}
 """Parameters that an earlier run set over the link."""
-BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("suffix", ["nc", "csv", "tlog"])
@@ -33,7 +31,7 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
     tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The correction repeats neither rejected values nor the rate of a message."""
-    pipeline = small_bridge(tmp_path, StartEvent(START), BATTERY, ["MAG_FIELD"])
+    pipeline = small_bridge(tmp_path)
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
     asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
@@ -56,7 +54,7 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
 def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, precision: float) -> None:
     """Telemetry arrives every few seconds, is missing for a minute once, and is unknown once."""
     rng = np.random.default_rng(1)
-    pipeline = small_bridge(tmp_path, StartEvent(START, KEPT), BATTERY, ["MAG_FIELD"])
+    pipeline = small_bridge(tmp_path, start=StartEvent(START, KEPT))
     autopilot = Codec(1, 1)
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(400):
@@ -86,7 +84,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
 
 def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
     """The rows of a log do not show that the bridge paused for 5 s while the mass moved."""
-    pipeline = small_bridge(tmp_path, StartEvent(START), BATTERY, ["MAG_FIELD"])
+    pipeline = small_bridge(tmp_path)
     autopilot = Codec(1, 1)
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(20):

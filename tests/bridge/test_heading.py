@@ -15,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small import aligned, polynomial, write_bridge
+from fed import fed, named
+from small import START, aligned, polynomial, write_bridge
 
 from magbridge.bridge.check import findings
 from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline, set_up
+from magbridge.bridge.pipeline import set_up
 from magbridge.config import load
 from magbridge.errors import ConfigError
 from magbridge.field.igrf import igrf
@@ -27,7 +28,6 @@ from magbridge.link.estimates import NO_ATTITUDE, nmea_sentences
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel
 
-START = 1_780_000_000_000_000
 PLACE = (49.5, -57.9)
 ROLL, PITCH, YAW = radians(8.0), radians(-20.0), radians(130.0)
 ARDUPILOT, PX4 = 3, 12
@@ -72,14 +72,8 @@ def sample(time_us: int, field: np.ndarray) -> Event:
     return Event(time_us, Channel.SENSOR, line)
 
 
-def fly(bridge: Pipeline, events: list[Event]) -> list[Message]:
-    """Return the messages that the bridge sends."""
-    ear = Codec(0, 0)
-    return [one for event in events for _, frame in bridge.feed(event) for one in ear.parse(frame)]
-
-
 def last(messages: list[Message], name: str) -> Message:
-    return [one for one in messages if one.name == name][-1]
+    return named(messages, name)[-1]
 
 
 def level_flight(stack: int = ARDUPILOT, seconds: int = 3) -> list[Event]:
@@ -92,7 +86,7 @@ def level_flight(stack: int = ARDUPILOT, seconds: int = 3) -> list[Event]:
 
 def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Path) -> None:
     bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
-    messages = fly(bridge, level_flight())
+    messages = fed(bridge, *level_flight())
     field = last(messages, "MAG_FIELD")
     declination = degrees(atan2(MAIN[1], MAIN[0]))
     assert field["heading"] == pytest.approx(130.0, abs=0.05)
@@ -106,12 +100,12 @@ def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Pa
 def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
     bridge = set_up(load(bridge_with(tmp_path, "tilt_sigma = 0.5")), StartEvent(START))
     rng, ratios = np.random.default_rng(4), []
-    fly(bridge, begin())
+    fed(bridge, *begin())
     for tenth in range(400):
         time_us = START + 4_000_000 + 100_000 * tenth
         wrong = rng.normal(size=2) * radians(0.5)
         events = [attitude(time_us - 1000, roll=ROLL + wrong[0], pitch=PITCH + wrong[1], yaw=YAW)]
-        field = last(fly(bridge, [*events, sample(time_us, body_field())]), "MAG_FIELD")
+        field = last(fed(bridge, *[*events, sample(time_us, body_field())]), "MAG_FIELD")
         error = (field["heading"] - 130.0 + 180.0) % 360.0 - 180.0
         ratios.append(error / field["heading_sigma"])
     # the sigma also contains declination and boresight, which do not change here
@@ -120,28 +114,30 @@ def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
 
 def test_no_heading_without_attitude_or_with_an_old_one(tmp_path: Path) -> None:
     bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
-    field = last(fly(bridge, [*begin(), sample(START + 100_000, body_field())]), "MAG_FIELD")
+    field = last(fed(bridge, *[*begin(), sample(START + 100_000, body_field())]), "MAG_FIELD")
     assert field["heading_sigma"] == 0.0
-    known = last(fly(bridge, [attitude(START + 150_000), sample(START + 200_000, body_field())]), "MAG_FIELD")
+    known = last(
+        fed(bridge, *[attitude(START + 150_000), sample(START + 200_000, body_field())]), "MAG_FIELD"
+    )
     assert known["heading_sigma"] > 0.0
-    stale = last(fly(bridge, [sample(START + 2_500_000, body_field())]), "MAG_FIELD")
+    stale = last(fed(bridge, *[sample(START + 2_500_000, body_field())]), "MAG_FIELD")
     assert stale["heading_sigma"] == 0.0
 
 
 def test_a_turning_vehicle_is_levelled_at_the_time_of_the_sample(tmp_path: Path) -> None:
     bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
-    fly(bridge, level_flight())
+    fed(bridge, *level_flight())
     rate, late = radians(30.0), 0.2
     events = [attitude(START + 4_000_000, rollspeed=rate)]
     events.append(sample(START + 4_200_000, body_field(roll=ROLL + rate * late)))
-    field = last(fly(bridge, events), "MAG_FIELD")
+    field = last(fed(bridge, *events), "MAG_FIELD")
     assert field["heading"] == pytest.approx(130.0, abs=0.1)
     assert field["heading_sigma"] > 2.0  # half of an extrapolation by 6 deg is not known
 
 
 def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) -> None:
     bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
-    field = last(fly(bridge, level_flight()[1:]), "MAG_FIELD")
+    field = last(fed(bridge, *level_flight()[1:]), "MAG_FIELD")
     assert field["heading"] != field["heading"]
     assert field["magnetic_heading"] == pytest.approx(130.0 - degrees(atan2(MAIN[1], MAIN[0])), abs=0.05)
 
@@ -151,7 +147,7 @@ def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) ->
 def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stack: int) -> None:
     """ArduPilot takes the cube root of a sum of squares (GCS_Common.cpp), PX4 entry 20 of the covariance."""
     bridge = set_up(load(bridge_with(tmp_path, f'send = "{send}"')), StartEvent(START))
-    messages = fly(bridge, level_flight(stack))
+    messages = fed(bridge, *level_flight(stack))
     message, sigma = last(messages, send.upper()), radians(last(messages, "MAG_FIELD")["heading_sigma"])
     is_odometry = send == "odometry"
     covariance = message["pose_covariance" if is_odometry else "covariance"]
@@ -174,7 +170,7 @@ def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stac
 
 def test_nothing_goes_to_the_autopilot_without_boresight(tmp_path: Path) -> None:
     path = bridge_with(tmp_path, 'send = "odometry"', boresight=False)
-    messages = fly(set_up(load(path), StartEvent(START)), level_flight())
+    messages = fed(set_up(load(path), StartEvent(START)), *level_flight())
     assert not any(one.name == "ODOMETRY" for one in messages)
     assert any("no boresight: no heading is sent" in one.text for one in findings(path))
 
@@ -264,7 +260,7 @@ def test_an_autopilot_that_contradicts_its_sensors_gives_no_good_heading(
     for ratio in (0.1, 5.0):
         bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
         report = Event(START, Channel.LINK, Codec(1, 1).pack(status, **{field: ratio}))
-        sent = fly(bridge, [*begin(), report, *level_flight()])
+        sent = fed(bridge, *[*begin(), report, *level_flight()])
         sigmas.append(last(sent, "MAG_FIELD")["heading_sigma"])
     assert sigmas[0] < 2.0
     assert sigmas[1] > 20.0

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from disks import full_disk
-from turning import bridge, events, named, received
+from fed import named, received
+from turning import bridge, events
 
 from magbridge import logs
 from magbridge.bridge.events import Event

@@ -13,6 +13,7 @@ from math import cos, inf, isfinite, isnan, nan, pi, sin
 from pathlib import Path
 
 import pytest
+from fed import named, received, texts
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, HostClock, StartEvent, clock_step, declarations, standstill
@@ -28,10 +29,6 @@ from sitl.replay.own_log import Recorded, is_own_log, runs
 from sitl.replay.run import agreement, summary
 
 BOOT = START - 77_000_000
-
-
-def bridge(folder: Path, start: StartEvent) -> Pipeline:
-    return small_bridge(folder, start, Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"])
 
 
 def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
@@ -53,7 +50,7 @@ def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
 
 
 def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> None:
-    pipeline = bridge(tmp_path, StartEvent(START, {"MB_GAP_FACTOR": 2.0}))
+    pipeline = small_bridge(tmp_path, start=StartEvent(START, {"MB_GAP_FACTOR": 2.0}))
     folder, aside = tmp_path / "logs", tmp_path / "aside"
     now = {"MB_GAP_FACTOR": 3.0}
     with closing(TlogWriter(folder, beginning=pipeline.beginning(now), max_size=0.05)) as log:
@@ -82,22 +79,22 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
     recorded = Recorded(second)
     assert recorded.start.parameters == now
     assert 15.0 < recorded.late < 45.0
-    again = bridge(tmp_path, recorded.start)
+    again = small_bridge(tmp_path, start=recorded.start)
     published = bytearray(b"".join(f for event in recorded.events() for _, f in again.feed(event)))
     result = agreement(published, recorded)
     assert result["samples"] > 500
     assert result["same_samples"] > 0.9 * result["samples"]
     assert agreement(published, Recorded(first)) == {"late_s": 0.0}
     more = {"files": second, "messages": recorded.messages, "bytes": 1, "seconds": 1.0, "same_config": True}
-    texts = summary(
+    words = summary(
         {"runs": [result | more | {"identical": False, "first_difference": 0, "beyond": 0, "damages": 0}]}
     )
-    assert f"begins {recorded.late:.1f} s into the run" in texts
+    assert f"begins {recorded.late:.1f} s into the run" in words
 
 
 def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
     """After a pause, the sensor's bytes of a second arrive in one read and fill many records."""
-    pipeline = bridge(tmp_path, StartEvent(START))
+    pipeline = small_bridge(tmp_path)
     fed = list(events(pipeline, 0, 60))
     lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
     header = declarations(1, 191, pipeline._config.telemetry, 0.0)
@@ -108,7 +105,7 @@ def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> No
     assert len(files) > 2
     recorded = Recorded(files)
     assert [event.data for event in recorded.events() if event.data] == [lines]
-    again = bridge(tmp_path, recorded.start)
+    again = small_bridge(tmp_path, start=recorded.start)
     assert [frame for event in recorded.events() for frame in again.feed(event)] == sent
 
 
@@ -116,7 +113,7 @@ def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> No
 
 
 def test_a_flood_of_parameters_is_kept_once_a_second(tmp_path: Path) -> None:
-    pipeline = small_bridge(tmp_path, StartEvent(START), Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5), [])
+    pipeline = small_bridge(tmp_path, [])
     keeper, file = Keeper(load(tmp_path / "bridge.toml")), tmp_path / "bridge.parameters.json"
     values = [2.0 + 0.125 * k for k in range(10)]
     on_disk = []
@@ -134,14 +131,14 @@ def test_a_flood_of_parameters_is_kept_once_a_second(tmp_path: Path) -> None:
 
 WILD = ("1e300", "-1e39", "1e20", "99999999999999999999", "3e9", "-32768", "0", "1e-320", "nan", "inf", "x")
 DOUBTFUL = int(Quality.STALE_TELEMETRY | Quality.EXTRAPOLATED | Quality.MOVING)
+BATTERY = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
 TELEMETRY = (-9999.0, 65535.0, 1e9, 1e15, 3.4e38, -3.4e38, nan, inf)
 
 
 @pytest.fixture
 def pipeline(tmp_path: Path) -> Pipeline:
-    battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
     published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "NAMED_VALUE_FLOAT", "DEBUG_VECT"]
-    return small_bridge(tmp_path, StartEvent(START), battery, published)
+    return small_bridge(tmp_path, published, battery=BATTERY)
 
 
 @pytest.mark.parametrize("column", range(6))
@@ -176,15 +173,13 @@ def test_in_the_telemetry(pipeline: Pipeline, value: float) -> None:
 
 def fields(sent: list[tuple[int, bytes]]) -> list[Message]:
     """Return each sent MAG_FIELD."""
-    messages = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
-    return [one for one in messages if one.name == "MAG_FIELD"]
+    return named(received(sent), "MAG_FIELD")
 
 
 def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
     """The clock begins in 1970, and a filter's delay leads to earlier times: one message, no main field."""
-    battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
     published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "DEBUG_VECT"]
-    pipeline = small_bridge(tmp_path, StartEvent(0), battery, published)
+    pipeline = small_bridge(tmp_path, published, StartEvent(0), BATTERY)
     settings = Align(filter_delay=0.5)
     pipeline._correction.aligner.tune(settings, {})
     autopilot = Codec(1, 1)
@@ -198,20 +193,14 @@ def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
     samples = fields(sent)
     assert [one["time_usec"] for one in samples[:3]] == [0, 0, 0]
     assert all(isnan(one["anomaly"]) for one in samples)
-    assert [text for text in texts(sent) if "clock" in text] == [
+    assert [text for text in texts(received(sent)) if "clock" in text] == [
         "host clock was never set: no date, no main field"
     ]
     step = clock_step(3_000_000, START)
     sent = pipeline.feed(Event(3_000_000, Channel.STATE, step)) + pipeline.feed(
         Event(4_000_000, Channel.STATE, b"")
     )
-    assert "host clock is set" in texts(sent)
-
-
-def texts(sent: list[tuple[int, bytes]]) -> list[str]:
-    """Return each sent text."""
-    received = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
-    return [one["text"] for one in received if one.name == "STATUSTEXT"]
+    assert "host clock is set" in texts(received(sent))
 
 
 # ---- the one clock, made of the host's two -----------------------------------------------------------------
@@ -276,26 +265,20 @@ def test_an_overloaded_bridge_omits_only_optional_work(tmp_path: Path) -> None:
             yield from events(pipeline, 20 * second, 20 * (second + 1))
 
     messages = ["MAG_FIELD", "HIGHRES_IMU"]
-    pipeline = small_bridge(
-        tmp_path, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), messages
-    )
-    received = Codec(255, 190)
-    count = {"MAG_FIELD": 0, "HIGHRES_IMU": 0}
-    texts = []
+    pipeline = small_bridge(tmp_path, messages)
     with closing(TlogWriter(tmp_path / "logs")) as log:
         sent = []
         for event in overloaded(pipeline):
             sent += pipeline.feed(event)
             log.extend(pipeline.recorder.drain())
-    for message in received.parse(b"".join(frame for _, frame in sent)):
-        if message.name in count:
-            count[message.name] += 1
-        elif message.name == "STATUSTEXT" and "overload" in message["text"]:
-            texts.append(message["text"].partition(":")[0])
-    assert texts == ["overload", "overload is over"]
-    assert count["MAG_FIELD"] == 800
+    came = received(sent)
+    assert [text.partition(":")[0] for text in texts(came) if "overload" in text] == [
+        "overload",
+        "overload is over",
+    ]
+    assert len(named(came, "MAG_FIELD")) == 800
     # from the 4th stall to 5 s after the last one, a message is sent with every 4th sample
-    assert 600 < count["HIGHRES_IMU"] < 650
+    assert 600 < len(named(came, "HIGHRES_IMU")) < 650
     recorded = Recorded(sorted((tmp_path / "logs").iterdir()))
-    again = small_bridge(tmp_path, recorded.start, Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), messages)
+    again = small_bridge(tmp_path, messages, recorded.start)
     assert [frame for event in recorded.events() for frame in again.feed(event)] == sent

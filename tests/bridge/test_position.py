@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fed import FedBridge, named
 from passages import AIRCRAFT, PLACE, flight, steep_map
 from referee import ArduPilot
 from referee.loop import Receiver, Run, carried_off, frozen, honest, jammed, jumped, sail
 from small import small_bridge
 from vehicle import Bench
 
-from magbridge.bridge.events import Event, StartEvent, clock_step
+from magbridge.bridge.events import clock_step
 from magbridge.bridge.position import Position
-from magbridge.calibration.model import Parameter
 from magbridge.field.geodesy import offset
 from magbridge.field.igrf import igrf, total_field
 from magbridge.mavlink import Codec
@@ -79,19 +79,13 @@ def test_the_field_is_that_of_the_day_to_which_the_clock_was_set() -> None:
 
 
 def test_the_anomaly_follows_when_the_host_s_clock_is_set(tmp_path: Path) -> None:
-    bridge = small_bridge(
-        tmp_path, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"]
-    )
+    bridge = FedBridge(small_bridge(tmp_path))
     place = {"lat": 495_000_000, "lon": -579_000_000}
-    bridge.feed(Event(START, Channel.LINK, Codec(1, 1).pack("GLOBAL_POSITION_INT", **place)))
-    ear, seen = Codec(0, 0), []
+    bridge.feed(0.0, Channel.LINK, Codec(1, 1).pack("GLOBAL_POSITION_INT", **place))
     for second in (1, 3):
-        sent = bridge.feed(
-            Event(START + second * SECOND, Channel.SENSOR, b"1 2 50000 4 %d %d\n" % (second, second))
-        )
-        received = [message for _, frame in sent for message in ear.parse(frame)]
-        seen += [message for message in received if message.name == "MAG_FIELD"]
-        bridge.feed(Event(START + 2 * SECOND, Channel.STATE, clock_step(START, -AGO)))
+        bridge.feed(second, Channel.SENSOR, b"1 2 50000 4 %d %d\n" % (second, second))
+        bridge.feed(2.0, Channel.STATE, clock_step(START, -AGO))
+    seen = named(bridge.messages, "MAG_FIELD")
     then, now = (total_field(-57.9, 49.5, 0.0, t * 1e-6).item() for t in (START - AGO, START))
     change = seen[1]["anomaly"] - seen[0]["anomaly"] - seen[1]["total_field"] + seen[0]["total_field"]
     assert change == pytest.approx(now - then, abs=0.2)

@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from small import START, small_bridge
+from fed import FedBridge, named
+from small import small_bridge
 
 from magbridge.bridge import events
-from magbridge.bridge.events import Event, StartEvent
-from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.sensor import SensorLine
-from magbridge.calibration.model import Parameter
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAG_PORT_NAME
@@ -20,25 +18,12 @@ from magbridge.records import Channel
 LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"
 
 
-class Bench:
-    """Bridge without ports, and the messages that it sent."""
+class Bench(FedBridge):
+    """Bridge whose sensor's port is open, and the x of each MAG_RAW that it sent."""
 
     def __init__(self, folder: Path) -> None:
-        self.bridge: Pipeline = small_bridge(
-            folder, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_RAW"]
-        )
-        self._ear = Codec(0, 0)
-        self.raw: list[float] = []
-        self.texts: list[str] = []
-
-    def feed(self, seconds: float, channel: Channel, data: bytes) -> None:
-        event = Event(START + round(seconds * 1e6), channel, data)
-        for _, frame in self.bridge.feed(event):
-            for message in self._ear.parse(frame):
-                if message.name == "MAG_RAW":
-                    self.raw.append(message["x"])
-                elif message.name == "STATUSTEXT":
-                    self.texts.append(message["text"])
+        super().__init__(small_bridge(folder, ["MAG_RAW"]))
+        self.open(0.0)
 
     def open(self, seconds: float) -> None:
         self.feed(seconds, Channel.STATE, events.port_state(MAG_PORT_NAME.SENSOR))
@@ -46,12 +31,14 @@ class Bench:
     def receive(self, seconds: float, data: bytes) -> None:
         self.feed(seconds, Channel.SENSOR, data)
 
+    @property
+    def raw(self) -> list[float]:
+        return [message["x"] for message in named(self.messages, "MAG_RAW")]
+
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
-    made = Bench(tmp_path)
-    made.open(0.0)
-    return made
+    return Bench(tmp_path)
 
 
 def test_half_a_line_is_not_a_sample(bench: Bench) -> None:

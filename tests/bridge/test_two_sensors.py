@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from devices import open_line
-from small import aligned, polynomial
+from fed import FedBridge, named
+from small import START, aligned, polynomial
 
 from magbridge.bridge import events
 from magbridge.bridge.check import findings
-from magbridge.bridge.events import Event, StartEvent, port_number
+from magbridge.bridge.events import StartEvent, port_number
 from magbridge.bridge.pipeline import set_up
 from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration
@@ -35,7 +36,6 @@ from magbridge.records import Channel, Quality
 from sitl.replay.own_log import Recorded
 from sitl.replay.stage import Stage
 
-START = 1_780_000_000_000_000
 FIELD_NT = 50_000.0
 PATIENCE_S = 60.0
 """Time limit for the bridge to start and publish, s."""
@@ -92,7 +92,7 @@ def calibration(*sensors: ScalarSensor) -> Calibration:
     )
 
 
-class Bench:
+class Bench(FedBridge):
     """Bridge with two sensors, and the messages that it sent."""
 
     def __init__(
@@ -103,17 +103,9 @@ class Bench:
         self.config = folder / "bridge.toml"
         text = CONFIG.format(name=name, columns=columns, settings=settings) + more
         self.config.write_text(text, encoding="utf-8")
-        self.bridge = set_up(load(self.config), StartEvent(START))
-        self.messages: list[Message] = []
-        self._ear = Codec(0, 0)
+        super().__init__(set_up(load(self.config), StartEvent(START)))
         for sensor_id in (0, 1):
             self.feed(0.0, Channel.STATE, events.port_state(port_number(sensor_id)))
-
-    def feed(self, seconds: float, channel: Channel, data: bytes, sensor_id: int = 0) -> None:
-        """Feed one event at a time after the start, s."""
-        event = Event(START + round(seconds * 1e6) // 4 * 4, channel, data, sensor_id)
-        for _, frame in self.bridge.feed(event):
-            self.messages += self._ear.parse(frame)
 
     def vector(self, seconds: float, x: float, y: float, z: float, sensor_id: int = 0) -> None:
         """Send a line of a vector sensor."""
@@ -122,12 +114,7 @@ class Bench:
 
     def field(self, sensor_id: int) -> list[Message]:
         """Return the MAG_FIELDs of a sensor."""
-        fields = [one for one in self.messages if one.name == "MAG_FIELD"]
-        return [one for one in fields if one["sensor_id"] == sensor_id]
-
-    def texts(self) -> str:
-        """Return all STATUSTEXTs."""
-        return "\n".join(text for _, text in self.bridge.component.announcer.texts)
+        return [one for one in named(self.messages, "MAG_FIELD") if one["sensor_id"] == sensor_id]
 
 
 VECTOR = '["x", "y", "z", "time"]', 'calibration = "other.json"'
@@ -147,13 +134,13 @@ def test_each_sensor_has_its_id_its_messages_and_its_state(tmp_path: Path) -> No
         bench.vector(0.5 * k + 0.1, 0.0, 20_000.0, 40_000.0 + k, sensor_id=1)
     assert len(bench.field(0)) == len(bench.field(1)) == 39  # the first line may have been half a line
     assert bench.field(1)[0]["y"] == pytest.approx(20_000.0)
-    states_sent = [one for one in bench.messages if one.name == "MAG_SENSOR"]
+    states_sent = named(bench.messages, "MAG_SENSOR")
     assert {(one["sensor_id"], one["name"], one["state"]) for one in states_sent[-2:]} == {
         (0, "flux", 1),
         (1, "tail", 1),
     }
     assert states_sent[-1]["sample_rate"] == pytest.approx(2.0, rel=0.01)
-    assert "tail sends readings" in bench.texts()
+    assert "tail sends readings" in "\n".join(bench.texts)
 
 
 @pytest.mark.parametrize("wrong", [0, 1])
@@ -167,7 +154,7 @@ def test_a_sensor_that_jumps_is_named_and_its_sigma_grows(tmp_path: Path, wrong:
             x, y, z = attitude(np.array([seconds]))[0] * (1 + offset / FIELD_NT) + random.normal(size=3)
             bench.vector(seconds + 0.02 * sensor_id, x, y, z, sensor_id)
     names = ["flux", "tail"]
-    assert f"{names[wrong]} is wrong: " in bench.texts()
+    assert f"{names[wrong]} is wrong: " in "\n".join(bench.texts)
     last = [bench.field(0)[-1], bench.field(1)[-1]]
     assert last[wrong]["flags"] & Quality.IMPLAUSIBLE
     assert last[wrong]["total_field_sigma"] == pytest.approx(300.0, rel=0.1)
@@ -236,12 +223,10 @@ def test_a_scalar_alone_needs_no_calibration(tmp_path: Path) -> None:
     )
     path.write_text(text, encoding="utf-8")
     assert [fault for fault in findings(path) if fault.fatal] == []
-    bridge = set_up(load(path), StartEvent(START))
-    ear, messages = Codec(0, 0), []
+    bridge = FedBridge(set_up(load(path), StartEvent(START)))
     for k in range(20):
-        event = Event(START + k * 1_000_000, Channel.SENSOR, b"%.4f\n" % (50_000.1234 + 0.1 * (k % 3)))
-        messages += [one for _, frame in bridge.feed(event) for one in ear.parse(frame)]
-    fields = [one for one in messages if one.name == "MAG_FIELD"]
+        bridge.feed(k, Channel.SENSOR, b"%.4f\n" % (50_000.1234 + 0.1 * (k % 3)))
+    fields = named(bridge.messages, "MAG_FIELD")
     assert fields[-1]["total_field"] == pytest.approx(50_000.2234, abs=1e-6)
     assert fields[-1]["total_field_sigma"] == pytest.approx(0.5)
     assert fields[-1]["flags"] == 0

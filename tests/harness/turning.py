@@ -11,10 +11,10 @@ from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import load
 from magbridge.config import load as load_config
-from magbridge.mavlink import Codec, Message
+from magbridge.mavlink import Codec
 from magbridge.records import Channel
 
-__all__ = ["bridge", "events", "named", "received"]
+__all__ = ["bridge", "events"]
 
 PLACE = (49.52, -57.87)
 SAMPLES = 700
@@ -64,13 +64,3 @@ def events(folder: Path) -> list[Event]:
         counts = (round(x / COUNT), round(y / COUNT), round(z / COUNT))
         made.append(Event(time_us, Channel.SENSOR, b"%d %d %d 4.0 %d 7\r\n" % (*counts, k)))
     return made
-
-
-def received(frames: list[tuple[int, bytes]]) -> list[Message]:
-    """Return the messages in a list of (event time in µs, frame)."""
-    return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
-
-
-def named(messages: list[Message], name: str) -> list[Message]:
-    """Return the messages called `name`."""
-    return [message for message in messages if message.name == name]

@@ -11,8 +11,7 @@ import pytest
 from line import Line
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, StartEvent
-from magbridge.calibration.model import Parameter
+from magbridge.bridge.events import Event
 from magbridge.config import Telemetry
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.telemetry import Sources, Stream, StreamRequests, needed_rates
@@ -352,7 +351,7 @@ def test_two_sources_of_one_parameter(
 
 
 def test_another_component_s_value_changes_no_sample(tmp_path: Path) -> None:
-    pipeline = small_bridge(tmp_path, StartEvent(START), Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5), [])
+    pipeline = small_bridge(tmp_path, [])
     for component, value in ((1, 0.25), (99, 9.0)):
         frame = Codec(1, component).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
         pipeline.feed(Event(START + component * 1000, Channel.LINK, frame))
