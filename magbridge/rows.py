@@ -76,9 +76,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     known, tilt = main_fields.tolist(), _angles(deployment, "roll", "pitch")
     fields, values = np.full((len(results), 3), nan), np.full((len(results), len(correction.names)), nan)
     added = np.zeros(len(results))
-    depth = (
-        deployment["depth"].to_numpy().astype(float) if "depth" in deployment else np.full(len(results), nan)
-    )
+    depth = _column(deployment, "depth")
     for row, reading, stamp in _readings(correction, deployment):
         if correction.direction is not None and attitudes is not None:
             correction.direction.expect(*vectors[row].tolist())
@@ -107,12 +105,18 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     )
 
 
+def _column(deployment: xr.Dataset, name: str) -> FloatArray:
+    """Return a column (n,); NaN if the log lacks it."""
+    if name in deployment:
+        return np.asarray(deployment[name].to_numpy().astype(float))
+    return np.full(deployment.sizes["time"], nan)
+
+
 def _angles(deployment: xr.Dataset, *names: str) -> FloatArray | None:
     """Return columns in deg as (n, k) rad; None if the log lacks one."""
     if not set(names) <= set(deployment):
         return None
-    columns = [deployment[name].to_numpy().astype(float) for name in names]
-    return np.asarray(np.radians(np.stack(columns, axis=1)))
+    return np.asarray(np.radians(np.stack([_column(deployment, name) for name in names], axis=1)))
 
 
 def _headings(
@@ -149,19 +153,16 @@ def _headings(
 
 def _places(deployment: xr.Dataset) -> list[tuple[float, float] | None]:
     """Return latitude and longitude of every row, deg; None where they are not known."""
-    if not {"latitude", "longitude"} <= set(deployment):
-        return [None] * deployment.sizes["time"]
-    both = (deployment[name].to_numpy().astype(float).tolist() for name in ("latitude", "longitude"))
+    both = (_column(deployment, name).tolist() for name in ("latitude", "longitude"))
     return [(lat, lon) if isfinite(lat + lon) else None for lat, lon in zip(*both, strict=True)]
 
 
 def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:
     """Return the main field (n,), nT, at every row as a bridge computes it; NaN where it is not known."""
-    n = deployment.sizes["time"]
-    depth = deployment["depth"].to_numpy().astype(float) if "depth" in deployment else np.zeros(n)
+    depth = np.nan_to_num(_column(deployment, "depth"))
     utc_us = np.rint(np.asarray(deployment["time"].to_numpy(), float) * 1e6).astype(np.int64).tolist()
-    found = np.full(n, nan)
-    for row, (place, down) in enumerate(zip(_places(deployment), np.nan_to_num(depth).tolist(), strict=True)):
+    found = np.full(len(depth), nan)
+    for row, (place, down) in enumerate(zip(_places(deployment), depth.tolist(), strict=True)):
         if place is not None:
             found[row] = held.field_at((*place, down), utc_us[row])
     return found
@@ -171,7 +172,7 @@ def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
     """Keep ``late_join`` flags and sigmas that the bridge recorded, because rows do not hold delays."""
     if not {"quality", "total_field_sigma"} <= set(deployment):
         return
-    recorded = np.nan_to_num(deployment["quality"].to_numpy().astype(float)).astype(int)
+    recorded = np.nan_to_num(_column(deployment, "quality")).astype(int)
     late = recorded & Quality.LATE_JOIN != 0
     sigma, quality = CORRECTED.index("total_field_sigma"), CORRECTED.index("quality")
     results[late, quality] = results[late, quality].astype(int) | Quality.LATE_JOIN
@@ -191,13 +192,13 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     """Yield each sample's row, reading and time (µs), after passing the telemetry so far to `correction`."""
 
     def column(name: str) -> list[float]:
-        if name in deployment:
-            return list(deployment[name].to_numpy().astype(float).tolist())
-        return [nan] * deployment.sizes["time"]
+        return list(_column(deployment, name).tolist())
 
     times = np.asarray(deployment["time"].to_numpy(), float)
     stamps = (np.rint(times * 1e6).astype(np.int64) & ~3).tolist()
-    delays = [np.nan_to_num(np.array(column(f"mag_time_{axis}")) - times).round(6).tolist() for axis in "xyz"]
+    delays = [
+        np.nan_to_num(_column(deployment, f"mag_time_{axis}") - times).round(6).tolist() for axis in "xyz"
+    ]
     wanted = [name for name in correction.aligner.by_name if name != TEMPERATURE]
     telemetry = [(name, column(name), column(AGE + name)) for name in wanted]
     cycles = column("power_cycle")

@@ -75,11 +75,13 @@ CATALOGUE_TABLES: dict[str, dict[str, pl.DataType]] = {
 `precision` and `vector` are the information from the data, without a prior (:func:`.packed`). `job` names the
 inputs of a result; only the results of the job's last `attempt` are valid. A table that an older catalogue
 lacks is treated as empty."""
-PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {
-    TEXT: (str,), NUMBER: (float, int, type(None)), COUNT: (int,), TEXTS: (list,), NUMBERS: (list,),
-    PACKED: (bytes,), pl.Boolean(): (bool,),
+COLUMN_TYPES: dict[pl.DataType, tuple[tuple[type, ...], str]] = {
+    TEXT: ((str,), "text"), NUMBER: ((float, int, type(None)), "double precision"),
+    COUNT: ((int,), "bigint"), TEXTS: ((list,), "text[]"), NUMBERS: ((list,), "double precision[]"),
+    PACKED: ((bytes,), "bytea"), pl.Boolean(): ((bool,), "boolean"),
 }  # fmt: skip
-"""Type of a column -> allowed Python types of its values; only numbers may be None (unknown)."""
+"""Type of a column -> allowed Python types of its values, and the type in PostgreSQL; only numbers may be
+None (unknown)."""
 
 
 class Catalogue(ABC):
@@ -101,7 +103,7 @@ class Catalogue(ABC):
         for name in wanted:
             kind = CATALOGUE_TABLES[table][name]
             for row in found:
-                if not isinstance(row[name], PYTHON_TYPES[kind]):
+                if not isinstance(row[name], COLUMN_TYPES[kind][0]):
                     expected = f"table {table}: expected {kind}, got {row[name]!r}"
                     raise FormatError(self.name, expected, column=name)
         return found

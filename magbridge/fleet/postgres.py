@@ -11,28 +11,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import polars as pl
 import psycopg
 from psycopg import sql
 from psycopg.rows import dict_row
 
 from magbridge.errors import FormatError, PortError
-from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, Catalogue, Row
+from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, COLUMN_TYPES, Catalogue, Row
 
 SCHEMA = sql.Identifier("magbridge_fleet")
 CONNECT_TIMEOUT_S = 10
 """Longest time to wait for a connection to the server, s."""
 CREATION_LOCK = 0x6D616762
 """Key of the advisory lock that a process holds while it creates the tables."""
-TYPES: dict[pl.DataType, str] = {
-    pl.String(): "text",
-    pl.Float64(): "double precision",
-    pl.Int64(): "bigint",
-    pl.Boolean(): "boolean",
-    pl.List(pl.String()): "text[]",
-    pl.List(pl.Float64()): "double precision[]",
-    pl.Binary(): "bytea",
-}
 
 
 class PostgresCatalogue(Catalogue):
@@ -112,7 +102,7 @@ class PostgresCatalogue(Catalogue):
         )
         for table, columns in CATALOGUE_TABLES.items():
             typed = [
-                sql.SQL("{} {}").format(sql.Identifier(name), sql.SQL(TYPES[kind]))
+                sql.SQL("{} {}").format(sql.Identifier(name), sql.SQL(COLUMN_TYPES[kind][1]))
                 for name, kind in columns.items()
             ]
             connection.execute(

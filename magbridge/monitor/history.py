@@ -143,20 +143,6 @@ ALARM_CAUSES = {
 """Cause of alarms -> keys of the alarms, and words in STATUSTEXTs, that belong to the cause."""
 
 
-def cause_of(key: str) -> str:
-    """Return the cause of an alarm from its key.
-
-    The cause is a key of :data:`ALARM_CAUSES` if one matches. Else it is the words of a STATUSTEXT before its
-    first colon, or the key itself.
-    """
-    kind, colon, text = key.partition(": ")
-    words = text.split() if colon and kind == "text" else [key]
-    for cause, names in ALARM_CAUSES.items():
-        if any(word in names or word.rstrip(":") in names for word in words):
-            return cause
-    return text.partition(":")[0] if colon else key
-
-
 @dataclass(slots=True)
 class Alarm:
     """Alarm about one condition or message; times are s of the receiver's monotonic clock."""
@@ -176,8 +162,17 @@ class Alarm:
 
     @property
     def cause(self) -> str:
-        """Cause of the alarm, by which the page groups alarms."""
-        return cause_of(self.key)
+        """Cause of the alarm, by which the page groups alarms.
+
+        The cause is a key of :data:`ALARM_CAUSES` if one matches. Else it is the words of a STATUSTEXT before
+        its first colon, or the alarm's key itself.
+        """
+        kind, colon, text = self.key.partition(": ")
+        words = text.split() if colon and kind == "text" else [self.key]
+        for cause, names in ALARM_CAUSES.items():
+            if any(word in names or word.rstrip(":") in names for word in words):
+                return cause
+        return text.partition(":")[0] if colon else self.key
 
 
 @dataclass(frozen=True, slots=True)
