@@ -9,7 +9,7 @@ and its log has currents, throttles and servos, most of which are collinear.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -136,6 +136,8 @@ FAILURES = 2
 """Number of successive rejected columns after which the search ends."""
 MAX_HELD_OUT_ERROR_RATIO = 0.95
 """Largest ratio of held-out errors with and without a column at which the column becomes a parameter."""
+MAX_PRODUCT_OF_RATIOS = 0.25
+"""Largest product of the ratios for held-out and later parts at which later parts may be predicted worse."""
 SCREENING_SAMPLES = 20_000
 """Largest number of samples with which columns are chosen."""
 USUAL_DEPARTURE = 0.15
@@ -153,7 +155,7 @@ class Offer:
     without: float
     left_out: float
     """`without`, `left_out`: RMS error on held-out parts of fits without and with the column, nT."""
-    taken: bool = False
+    taken: bool
     """True if the column became a parameter."""
 
 
@@ -181,47 +183,56 @@ def best_parameters(
         rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
         columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}
         explained = worths(found.calibration, data, columns, HINTED)
-        return max(explained, key=explained.__getitem__, default=None)
+        # The coefficients of a mass that moves with another one may have taken up the other's effect: if no
+        # column explains the residual, fits decide.
+        return max(explained, key=explained.__getitem__, default=next(iter(columns), None))
 
     taken: tuple[str, ...] = ()
     found = fit(screened(taken), **options)
     offers: list[Offer] = []
-    failures = 0
+    failed: set[str] = set()
     # Forward selection: try the column that explains most of the residual; keep it if a new fit predicts
     # held-out parts better, and also later parts from earlier parts.
-    while len(taken) < MAX_PARAMETERS and failures < FAILURES:
-        tried = {one.name for one in offers}
-        name = most_useful(found, taken, tried)
+    while len(taken) < MAX_PARAMETERS and len(failed) < FAILURES:
+        name = most_useful(found, taken, {*taken, *failed})
         if name is None:
             break
-        names, further = (*taken, name), fitted((*taken, name))
-        offers.append(_offer(name, further, found))
-        if further is not None and _is_distorted(further, found) and len(names) < MAX_PARAMETERS:
+        further = fitted((*taken, name))
+        tries = [(name, further, found)]
+        if further is not None and _is_distorted(further, found) and len(taken) + 1 < MAX_PARAMETERS:
             # Of two masses that move together with the attitude, one alone distorts the scales: try both.
-            partner = most_useful(further, names, tried | {name})
-            both = None if partner is None else fitted((*names, partner))
-            good = both is not None and _predicts_better(both, further) and not _is_distorted(both, found)
-            if partner is not None and both is not None and good:
-                offers.append(_offer(partner, both, further))
-                names, further = (*names, partner), both
-        if further is not None and _predicts_better(further, found) and not _is_distorted(further, found):
-            found, taken, failures = further, names, 0
+            partner = most_useful(further, (*taken, name), {*taken, *failed, name})
+            both = None if partner is None else fitted((*taken, name, partner))
+            if partner is not None and both is not None and _predicts_better(both, further):
+                tries.append((partner, both, further))
+        _, last, _ = tries[-1]
+        better = last is not None and _predicts_better(last, found) and not _is_distorted(last, found)
+        offers += [_offer(one, after, before, taken=better) for one, after, before in tries]
+        if better and last is not None:
+            taken, found = (*taken, *(one for one, _, _ in tries)), last
+            failed.clear()
         else:
-            failures += 1
-    return taken, [replace(one, taken=one.name in taken) for one in offers]
+            failed.add(name)
+    return taken, offers
 
 
-def _offer(name: str, further: Fit | None, found: Fit) -> Offer:
+def _offer(name: str, further: Fit | None, found: Fit, *, taken: bool) -> Offer:
     """Return the errors of a fit with a further column, next to those of the fit without it."""
     left_out = np.inf if further is None else float(further.details["left_out_nT"])
-    return Offer(name, float(found.details["left_out_nT"]), left_out)
+    return Offer(name, float(found.details["left_out_nT"]), left_out, taken)
 
 
 def _predicts_better(further: Fit, found: Fit) -> bool:
-    """Return True if further columns improve the prediction of held-out and of later parts of the log."""
+    """Return True if further columns improve the prediction of held-out and of later parts of the log.
+
+    Later parts may be predicted worse if they have positions of a mass that earlier parts lack. They count
+    less if the error of held-out parts falls by a far larger factor.
+    """
     known = {"left_out_nT", "forward_nT"} & found.details.keys() & further.details.keys()
-    ratios = [further.details[name] / found.details[name] for name in sorted(known)]
-    return max(ratios) < MAX_HELD_OUT_ERROR_RATIO and bool(further.calibration.channels)
+    ratios = {name: further.details[name] / found.details[name] for name in known}
+    left_out, forward = ratios["left_out_nT"], ratios.get("forward_nT", 0.0)
+    carries = forward < MAX_HELD_OUT_ERROR_RATIO or left_out * forward < MAX_PRODUCT_OF_RATIOS
+    return left_out < MAX_HELD_OUT_ERROR_RATIO and carries and bool(further.calibration.channels)
 
 
 def _is_distorted(further: Fit, found: Fit) -> bool:
