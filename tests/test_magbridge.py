@@ -69,29 +69,23 @@ RUN_COMMAND = (
 )
 
 
-@pytest.mark.parametrize(
-    ("imports", "heavy"),
-    [
-        ("import magbridge", {"numpy", "msgspec", *ASHORE}),
-        ("import magbridge.bridge.run", ASHORE - {"pymavlink"}),
-        (RUN_COMMAND, {"cyclopts", "magbridge.cli"}),
-        ("from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)", ASHORE),
-        ("from magbridge.cli import main; main(['--help'])", {"numpy", *ASHORE}),
-        ("from magbridge.cli import main; main(['calibrate', 'none', '-o', 'x'])", {"numpy", *ASHORE}),
-        ("from magbridge.field import grid, read, reference", ASHORE),
-        (READ_LOG, {"dask"}),
-    ],
-    ids=[
-        "the package",
-        "the live path",
-        "run",
-        "the main field",
-        "help",
-        "a log that is not there",
-        "maps",
-        "a log",
-    ],
-)
+IMPORTS = {
+    "the package": ("import magbridge", {"numpy", "msgspec", *ASHORE}),
+    "the live path": ("import magbridge.bridge.run", ASHORE - {"pymavlink"}),
+    "run": (RUN_COMMAND, {"cyclopts", "magbridge.cli"}),
+    "the main field": ("from magbridge.field.igrf import igrf; igrf(0, 0, 0, 0)", ASHORE),
+    "help": ("from magbridge.cli import main; main(['--help'])", {"numpy", *ASHORE}),
+    "a log that is not there": (
+        "from magbridge.cli import main; main(['calibrate', 'none', '-o', 'x'])",
+        {"numpy", *ASHORE},
+    ),
+    "maps": ("from magbridge.field import grid, read, reference", ASHORE),
+    "a log": (READ_LOG, {"dask"}),
+}
+"""Name of a part -> code that loads it, and packages that it must not load."""
+
+
+@pytest.mark.parametrize(("imports", "heavy"), IMPORTS.values(), ids=IMPORTS)
 def test_importing_brings_nothing_heavy(imports: str, heavy: set[str]) -> None:
     script = f"{imports}\nimport sys; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -73,15 +73,6 @@ def test_a_command_in_a_sentence_has_the_options_that_it_shows(page: Path) -> No
         assert not [w for w in words if w.startswith("--") and w not in taken | {"--help"}], span
 
 
-@pytest.mark.parametrize("block", SHELL, ids=str)
-def test_a_tool_that_is_called_is_there(block: Block) -> None:
-    for words in commands(block):
-        if words[0].startswith("python") and len(words) > 1 and words[1].startswith("tools/"):
-            text = (ROOT / words[1]).read_text(encoding="utf-8")
-            options = [word for word in words[2:] if word.startswith("--") and word != "--help"]
-            assert not [one for one in options if one not in text and "*arguments" not in text], words
-
-
 @pytest.mark.parametrize("block", blocks("toml"), ids=str)
 def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: Path) -> None:
     file = here / "block.toml"

@@ -11,7 +11,7 @@ from fleets import FLEET, catalogue_of, fly
 
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
 from magbridge.fleet.process import client_of, process
-from magbridge.fleet.register import jobs
+from magbridge.fleet.register import Vehicle, add_vehicle, jobs
 
 
 @pytest.fixture(scope="session")
@@ -34,4 +34,12 @@ def done(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
             assert not failures
             if not number:
                 os.kill(victim, signal.SIGKILL)
+    return catalogue
+
+
+@pytest.fixture
+def catalogue(tmp_path: Path) -> Catalogue:
+    """Return a catalogue with one vehicle, comet, and without logs."""
+    catalogue = Catalogue(tmp_path / "fleet", create=True)
+    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
     return catalogue

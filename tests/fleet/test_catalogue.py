@@ -125,22 +125,21 @@ def test_two_vehicles_of_one_name(empty: Catalogue) -> None:
         vehicles(empty)
 
 
-def test_a_log_that_changed_is_another_version(empty: Catalogue, tmp_path: Path) -> None:
+def test_a_log_that_changed_is_another_version(catalogue: Catalogue, tmp_path: Path) -> None:
     log = fly(tmp_path / "log.nc", 1, 0)
-    add_vehicle(empty, "comet", Vehicle(parameters=("battpos",)))
-    assert add_logs(empty, "comet", MAY, [log]) == (1, [])
-    assert add_logs(empty, "comet", MAY, [log]) == (0, [])
-    first, kept = jobs(empty)[0].name, log.read_bytes()
+    assert add_logs(catalogue, "comet", MAY, [log]) == (1, [])
+    assert add_logs(catalogue, "comet", MAY, [log]) == (0, [])
+    first, kept = jobs(catalogue)[0].name, log.read_bytes()
     fly(log, 1, 1)
-    count, (output,) = add_logs(empty, "comet", MAY, [log])
+    count, (output,) = add_logs(catalogue, "comet", MAY, [log])
     assert count == 1
     assert output.endswith("log.nc: has changed since it was catalogued; its present contents count")
-    (now,) = current_files(empty.rows("files"))
+    (now,) = current_files(catalogue.rows("files"))
     assert now["version"] == 2
-    assert jobs(empty)[0].name != first
+    assert jobs(catalogue)[0].name != first
     log.write_bytes(kept)  # and back
-    add_logs(empty, "comet", MAY, [log])
-    assert jobs(empty)[0].name == first
+    add_logs(catalogue, "comet", MAY, [log])
+    assert jobs(catalogue)[0].name == first
 
 
 @pytest.mark.parametrize("name", ["", "../up", "a\\b", ".hidden", "two\nlines"])
@@ -184,22 +183,20 @@ def test_a_damaged_or_foreign_catalogue_is_one_line(
     value: object,
     kind: type[pl.DataType],
     words: str,
-    empty: Catalogue,
-    tmp_path: Path,
+    catalogue: Catalogue,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    add_vehicle(empty, "comet", Vehicle(parameters=("battpos",)))
-    (path,) = (tmp_path / "fleet" / "vehicles").glob("*.parquet")
+    (path,) = (catalogue.folder / "vehicles").glob("*.parquet")
     table = pl.read_parquet(path)
     table.with_columns(pl.lit(value, dtype=kind()).alias(name)).write_parquet(path)
     for command in ("status", "show", "process"):
-        code = main(["fleet", command, "--catalogue", str(tmp_path / "fleet")])
+        code = main(["fleet", command, "--catalogue", catalogue.name])
         err = capsys.readouterr().err
         assert "Traceback" not in err
         assert code in {0, 1}
         assert all(text.startswith("magbridge: ") for text in err.splitlines())
     with pytest.raises(FormatError, match=words):
-        list(map(masses, vehicles(empty).values()))
+        list(map(masses, vehicles(catalogue).values()))
 
 
 # ---- A calibration made elsewhere: recorded, and learned from once, as far as its data determined it -----
@@ -212,13 +209,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     log, cal = fly(folder / "log.nc", 1, 0, sensor="HMR 1"), folder / "cal.json"
     assert main(["calibrate", str(log), "--parameter", "battpos", "-o", str(cal)]) == 0
     return log, cal
-
-
-@pytest.fixture
-def catalogue(tmp_path: Path) -> Catalogue:
-    catalogue = Catalogue(tmp_path / "fleet", create=True)
-    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
-    return catalogue
 
 
 def add(catalogue: Catalogue, cal: Path, *more: str) -> int:

@@ -57,8 +57,9 @@ def test_killed_and_begun_again_is_the_same(done: Catalogue, flown: Path, tmp_pa
     assert content(again) == content(done)
 
 
-def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(tmp_path: Path) -> None:
-    catalogue = Catalogue(tmp_path / "fleet", create=True)
+def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(
+    catalogue: Catalogue, tmp_path: Path
+) -> None:
     add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",), sensor="HMR 1"))
     logs = [
         fly(tmp_path / "good.nc", 1, 0, sensor="HMR 1"),
@@ -97,8 +98,7 @@ def test_a_failure_is_tried_again_when_asked(flown: Path, tmp_path: Path) -> Non
     assert not new_jobs(catalogue, every, retry=True)
 
 
-def test_which_sensor_flew_where_is_on_record(flown: Path, tmp_path: Path) -> None:
-    catalogue = Catalogue(tmp_path / "fleet", create=True)
+def test_which_sensor_flew_where_is_on_record(catalogue: Catalogue, tmp_path: Path) -> None:
     add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",), sensor="HMR 1"))
     for number, sensor in enumerate(("HMR 1", "HMR 2", "HMR 2")):
         log = fly(tmp_path / f"{number}.nc", 1, number, sensor=sensor)
@@ -114,9 +114,7 @@ def test_which_sensor_flew_where_is_on_record(flown: Path, tmp_path: Path) -> No
     assert [one.refit for one in lessons(catalogue, "comet")] == ["spring, HMR 1", "spring"]
 
 
-def test_what_is_wrong_with_the_moment_is_not_on_record(tmp_path: Path) -> None:
-    catalogue = Catalogue(tmp_path / "fleet", create=True)
-    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
+def test_what_is_wrong_with_the_moment_is_not_on_record(catalogue: Catalogue, tmp_path: Path) -> None:
     log = fly(tmp_path / "log.nc", 1, 0)
     add_logs(catalogue, "comet", MAY, [log])
     (job,) = jobs(catalogue)
@@ -153,10 +151,8 @@ def test_a_full_disk_is_a_line_and_nothing_is_on_record(flown: Path, tmp_path: P
 
 
 def test_a_change_is_dated_and_reported(
-    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    catalogue = Catalogue(tmp_path / "fleet", create=True)
-    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
     for number in range(5):
         log = fly(tmp_path / f"{number}.nc", 1, number)
         if number == 4:  # a magnetised screw
@@ -182,9 +178,8 @@ def test_a_change_is_dated_and_reported(
         assert "src=" not in text
         assert 'href="http' not in text
     assert '<a href="comet.html">' in (pages / "index.html").read_text()
-    (change,) = json.loads((pages / "fleet.json").read_text())["vehicles"]["comet"]["deployments"][4][
-        "changes"
-    ]
+    comet = json.loads((pages / "fleet.json").read_text())["vehicles"]["comet"]
+    (change,) = comet["deployments"][4]["changes"]
     assert change["what"] == "hard iron, y"
     # a finding with its improvement, and the last map
     job, grid = jobs(catalogue)[-1], tmp_path / "results" / "map.nc"
