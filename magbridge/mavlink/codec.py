@@ -180,24 +180,30 @@ class Packer(MAVLink_message):  # type: ignore[misc] # it has no annotations
     """Packer of the frames of one message type.
 
     The method replaces pymavlink's, which makes two header objects and two checksums for each frame; that is
-    half of its time. The frames are equal.
+    half of its time. The frames are equal: the header is pymavlink's with the length and sequence number of
+    each frame.
     """
 
     def __init__(self, layout: Spec, mav: MAVLink) -> None:
         super().__init__(layout.id, layout.name)
         self._extra = bytes((layout.extra,))
+        self._signs = mav.signing.sign_outgoing
         header = self._header
         header.srcSystem, header.srcComponent = mav.srcSystem, mav.srcComponent
-        header.incompat_flags = SIGNED if mav.signing.sign_outgoing else 0
+        header.incompat_flags = SIGNED if self._signs else 0
+        self._begin = bytearray(header.pack())
+        self._checksum, self._initial = x25crc(), x25crc().crc
 
     def pack(self, mav: MAVLink, payload: bytes) -> bytes:
         """Return the frame of a full `payload`, with the sequence number and the signature of `mav`."""
-        header = self._header
         sent = payload.rstrip(b"\0") or payload[:1]  # MAVLink 2 omits the zeros at the end
-        header.mlen, header.seq = len(sent), mav.seq
-        frame: bytes = header.pack() + sent
-        frame += x25crc(frame[1:] + self._extra).crc.to_bytes(2, "little")
-        if not header.incompat_flags:
+        begin, checksum = self._begin, self._checksum
+        begin[1], begin[4] = len(sent), mav.seq
+        frame: bytes = bytes(begin) + sent
+        checksum.crc = self._initial
+        checksum.accumulate(frame[1:] + self._extra)
+        frame += checksum.crc.to_bytes(2, "little")
+        if not self._signs:
             return frame
         self._msgbuf = bytearray(frame)
         self.sign_packet(mav)
