@@ -29,7 +29,7 @@ from magbridge.field.spline import filled
 from magbridge.files import atomic_path
 
 __all__ = [
-    "continue_upward", "continued", "draw_steps", "merge", "prepare", "raised", "smoothed", "surveyed_at",
+    "continued", "draw_steps", "merge", "prepare", "raised", "smoothed", "surveyed_at",
 ]  # fmt: skip
 
 SURE, TERMS = 3, 10
@@ -178,8 +178,13 @@ def prepare(
     lifted = []
     for grid in grids:
         up = level - grid.altitude
+        if up < 0.0:
+            covered = (
+                f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward"
+            )
+            raise OutOfRange("altitude", f"{level:.0f} m", covered)
         if isfinite(up) and up != 0.0:
-            lifted.append(continue_upward(grid, up))
+            lifted.append(continued(grid, -level).grid)
             steps.append(PreparationStep(f"continued {up:+.0f} m: {Path(grid.name).name}", lifted[-1]))
         else:
             lifted.append(grid)
@@ -213,14 +218,6 @@ def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> lis
         grid if isfinite(grid.altitude) else grid.replaced(altitude=altitude)
         for grid, altitude in zip(grids, each, strict=True)
     ]
-
-
-def continue_upward(grid: AnomalyGrid, height: float) -> AnomalyGrid:
-    """Return the grid continued upward by `height` m; holes stay holes. OutOfRange: `height` is negative."""
-    if height < 0.0:
-        covered = f"{grid.name} was surveyed at {grid.altitude:.0f} m: a field can only be continued upward"
-        raise OutOfRange("altitude", f"{grid.altitude + height:.0f} m", covered)
-    return continued(grid, -(grid.altitude + height)).grid
 
 
 def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[AnomalyGrid, float]:

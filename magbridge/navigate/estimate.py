@@ -10,10 +10,10 @@ from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, Innovation, widest
 from magbridge.navigate.deadreckoning import MotionNoise, Step
-from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
+from magbridge.navigate.integrity import ELSEWHERE, IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
-from magbridge.navigate.options import NavigationOptions, any_level
-from magbridge.navigate.record import Jump, NavigationState
+from magbridge.navigate.options import NavigationOptions, wider_level
+from magbridge.navigate.record import Jump, NavigationState, Rival
 
 __all__ = ["Estimate"]
 
@@ -21,8 +21,6 @@ MAX_FIX_DISTANCE_SQUARED = 25.0
 """Largest squared Mahalanobis distance of a fix from the estimate; 4e-6 of right fixes exceed it."""
 MAX_INFORMED_RATIO = 0.8
 """Largest position sigma with which the field counts as informative, over that of dead reckoning alone."""
-MIN_CARRY_OFF_TIME_S = 60.0
-"""Shortest time in which wrong fixes can shift the position unnoticed, s."""
 MIN_SEARCH_RADIUS_M = 300.0
 """Smallest 1-sigma with which the integrity monitor searches around the filter, m."""
 JOIN_SPREAD, SPLIT_SPREAD = 1.2, 1.5
@@ -47,7 +45,8 @@ class Estimate:
     remains possible, and no test rejects the position. For a smoother, `moved` holds F and Q of the last
     prediction, and `jumps` the restarts, which it must not cross. `alone_x` (4,) and `alone` (4, 4) are mean
     and covariance of position and current by dead reckoning alone since the start or the last fix. `options`
-    are the given ones, but with a wider bias once the filter was lost.
+    are the given ones, but with a wider bias once the filter was lost. `rival` is another position of the
+    vehicle, by the test of the GNSS positions; None without one.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -55,6 +54,7 @@ class Estimate:
         self.state = NavigationState.OFF
         self.x, self.P = prior(options)
         self.valid = False
+        self.rival: Rival | None = None
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
         self.time_us, self.travelled, self.motion = 0, 0.0, NO_MOTION_NOISE
@@ -74,6 +74,17 @@ class Estimate:
         self._unique = False  # competing filters that began wider have come to the same place
         self._map_confirmed = False  # the map has described the field
         self._fixed = False  # the place is that of a fix
+
+    @property
+    def position_covariance(self) -> FloatArray:
+        """Covariance (2, 2) of the position, m²; it includes the possibility of the position `rival`."""
+        P = self.P[:2, :2]
+        if self.rival is None:
+            return P
+        # Mixture of N(x, P) and, with probability w, N(y, S), about x: (1 - w) P + w (S + d d'), d = y - x.
+        y, S, w = self.rival
+        d = y - self.x[:2]
+        return np.asarray((1.0 - w) * P + w * (S + np.outer(d, d)))
 
     @property
     def begun(self) -> bool:
@@ -126,21 +137,13 @@ class Estimate:
         self.alone_x = self.x[:4].copy()
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
-    def widen(self, metres: float) -> None:
-        """Widen the position by a 1-sigma of `metres` on each axis, because fused fixes were wrong.
-
-        They also moved the current: its added 1-sigma is `metres` over :data:`MIN_CARRY_OFF_TIME_S`, and at
-        most the prior sigma.
-        """
-        if self._filter is None:
-            return
-        Q = np.zeros_like(self.P)
-        # Wrong fixes moved the position by `metres`, and the current by `metres` over their duration.
-        Q[0, 0] = Q[1, 1] = metres**2
-        Q[2, 2] = Q[3, 3] = min(metres / MIN_CARRY_OFF_TIME_S, self.options.current_sigma) ** 2
-        self._filter.predict(np.eye(len(Q)), Q)
-        self.alone += Q[:4, :4]
-        self._refresh()
+    def replace(self, bank: Bank) -> None:
+        """Replace the filter by one that has not used fixes that were wrong."""
+        x, P = bank.moments()
+        unique = self._unique
+        self._begin(x, P, "a filter without the receiver's positions is likelier")
+        self._unique = unique
+        self.alone_x, self.alone = x[:4].copy(), P[:4, :4].copy()
 
     def update(self, block: Block, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> Innovation:
         """Update with a measurement and return its innovation, NaN off the map.
@@ -287,7 +290,7 @@ class Estimate:
     def _restart_search(self) -> None:
         """Restart with a search around dead reckoning, by the next of SEARCH_SPREADS and an unknown bias."""
         self._log_odds_unmapped, self._map_confirmed, self._lost = 0.0, False, True
-        self.options = any_level(self.options, self.grid)
+        self.options = wider_level(self.options, self.grid.rms)
         self._unmapped = Unmapped(self.grid, self.options)
         x, P = prior(self._claimed)
         x[:4], P[:4, :4] = self.alone_x, self.alone
@@ -313,6 +316,13 @@ class Estimate:
         """True if the field has made the position clearly more precise than dead reckoning alone."""
         return widest(self.P) <= MAX_INFORMED_RATIO * widest(self.alone)
 
+    def _is_contradicted(self) -> bool:
+        """Return True if the vehicle is more likely at the rival's position, which is another place."""
+        if self.rival is None or self.rival[2] < 0.5:
+            return False
+        away = self.rival[0] - self.x[:2]
+        return squared_mahalanobis(away, self.P[:2, :2] + self.rival[1]) > ELSEWHERE
+
     def _tracks_from_fix(self) -> bool:
         """Return True if a fix and the dead reckoning since then are as precise as the map could be."""
         limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
@@ -328,7 +338,7 @@ class Estimate:
             self._monitor = None
         elif not self._filter.is_single and width < JOIN_SPREAD * self._resolution:
             self._filter = self._estimator(self.x, self.P)
-        if self._lost:
+        if self._lost or self._is_contradicted():
             self.state = NavigationState.LOST
         elif not self._compact(width):
             self.state = NavigationState.SEARCHING

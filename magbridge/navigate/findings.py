@@ -177,11 +177,11 @@ def _level(result: xr.Dataset, options: NavigationOptions) -> list[str]:
     bias, sigma = float(last["bias"].mean()), float(last["bias_sigma"].mean())
     if abs(bias) < MAX_BIAS_SIGMA * max(options.bias_sigma, sigma):
         return []
-    sentences = (
+    sentence = (
         f"the measured level differs from the map's by {bias:+.0f} nT, where the calibration allows"
         f" {options.bias_sigma:.1f} nT: the map's main field may be of another epoch, or at another altitude"
     )
-    return [sentences]
+    return [sentence]
 
 
 class _Shift(NamedTuple):

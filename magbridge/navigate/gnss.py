@@ -31,7 +31,8 @@ from magbridge.navigate.bank import Bank
 from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
 from magbridge.navigate.model import Block, prior, transition
-from magbridge.navigate.options import NavigationOptions, any_level
+from magbridge.navigate.options import NavigationOptions, wider_level
+from magbridge.navigate.record import Rival
 
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
@@ -46,13 +47,13 @@ used again; 14 % of right changes exceed it by chance. The limit holds for the s
 change of the current may last."""
 WINDOW_US = 30_000_000
 """Time over which the motion by GNSS is compared with dead reckoning, µs."""
-MEAN_TIME_S = 20.0
-"""Time constant of the mean deviation of positions from the navigator's, s."""
 HOLD_US, LONG_HOLD_US = 20_000_000, 45_000_000
 """Time for which rejected positions must agree with each other before they are used again, µs: if navigator
 or field confirms them, and if neither can."""
 MAX_SIGMA_RATIO = 3.0
 """Largest sigma of a position over the smallest in WINDOW_US: a jammed receiver's claim varies widely."""
+RIVAL_HOLD_US = 5_000_000
+"""Time for which rejected positions must agree with each other before they may be right, µs."""
 MIN_POSITIONS = 3
 """Smallest number of positions that must agree with each other in HOLD_US."""
 OUTAGE_US = 60_000_000
@@ -61,14 +62,21 @@ OUTAGE_SPEED_FRACTION = 0.1
 """1-sigma of the velocity error after an outage, as a fraction of the speed."""
 MIN_FROZEN_M = 10.0
 """Smallest distance that the vehicle must move before an unchanged position counts as frozen, m."""
-UNSEEN_FRACTION = 0.1
-"""Position error, in correlation lengths of the map, that the field test detects only after a while."""
 MAX_GNSS_AGE_US = 10_000_000
 """Largest age of a usable position or integrity report, µs."""
 CORRELATION_TIME_S = 30.0
-"""Correlation time of the errors of successive positions, s."""
-SEPARATION_TIME_S = 120.0
-"""Time for which a comparison filter runs without the positions, before it starts again, s."""
+"""Correlation time of the errors of successive positions that are fused, s."""
+JITTER_TIME_S = 5.0
+"""Correlation time of these errors in the comparison with the field, s: with a longer one, their white part
+would count as evidence against the positions."""
+SEPARATION_TIME_S, SEPARATION_INTERVAL_S = 240.0, 80.0
+"""Time for which a comparison filter runs without the positions, and time from the start of one to the start
+of the next, s: one of them began shortly before a carry-off does."""
+MIN_SEPARATION_S = 20.0
+"""Smallest time without the positions of the filter that replaces the navigator's, s: in less, no test but
+that by the field finds a fault."""
+PRIOR_ODDS_WRONG = 0.05
+"""Odds of wrong positions before the field is compared, while the navigator uses them."""
 RECENT_POSITIONS = 64
 """Number of recent positions, from which the position at a measurement is interpolated."""
 OK_STATE, DETECTED_STATE = 1, 3
@@ -112,64 +120,76 @@ class Prediction(NamedTuple):
     current: FloatArray
     """Velocity error of dead reckoning (2,), m/s."""
     current_sigma: float
-    heading_error: float
-    travelled: float
-    speed: float
+    heading_error: float = 0.0
+    travelled: float = 0.0
+    speed: float = 0.0
     """`current_sigma`, `heading_error`, `travelled`, `speed`: 1-sigma of the current on each axis, and of the
     velocity because of a heading known to be poor, m/s; distance travelled since the start, m; speed, m/s."""
-    turns: float
+    turns: float = 0.0
     """:attr:`MotionNoise.turns` since the start."""
-    lost: bool
-    informed: bool
+    lost: bool = False
+    informed: bool = False
     """`lost`, `informed`: True if the navigator is lost; True if the field has improved its position."""
 
 
 class _Position(NamedTuple):
-    """Tested position: time (µs), m north and east of dead reckoning, its sigma (m), and the state then.
-
-    The state is the navigator's current with its sigma (m/s), and :attr:`MotionNoise.turns`.
-    """
+    """Tested position: time (µs), m north and east of dead reckoning, its sigma (m), and the prediction."""
 
     time_us: int
     north: float
     east: float
     sigma: float
-    current_north: float
-    current_east: float
-    current_sigma: float
-    turns: float
+    then: Prediction
 
 
 class GnssMonitor:
     """Test of GNSS positions, given in order of time.
 
-    `state` is the use of the positions, and `reason` why they are not used. `drift` (m) is the length of the
-    mean deviation of used positions from the navigator's, over 20 s. `evidence` compares the field with the
-    map at the positions.
+    `state` is the use of the positions, and `reason` why they are not used. `evidence` compares the field
+    with the map at the positions. `unaided` is the filter, without recent positions, that replaces the
+    navigator's when the positions cease to be used; None without one.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.state, self.reason = GnssState.NONE, GnssReason.NONE
-        self.drift = 0.0
+        self.unaided: Bank | None = None
         self._grid, self._options = grid, options
         self._history: deque[_Position] = deque()
         self._place: tuple[float, float] | None = None
         self._frozen_from = 0.0  # m travelled when the receiver first sent the present position
         self._since_us = 0  # time since which the positions agree with each other
         self._count = 0  # number of positions since `_since_us`
-        self._chained = True  # no jump since the last position that was used
+        self._jump_count = 0  # since the last position that was used
         self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
         self._change = 0.0  # of the positions over the window against dead reckoning, in its errors
-        self._mean = np.zeros(2)
         self._reported = GnssReason.NONE
         self._reported_us = -MAX_GNSS_AGE_US
         self.evidence = _FieldTest(grid, options)
 
+    def rival(self, time_us: int) -> Rival | None:
+        """Return the position of a filter without the receiver's, or the receiver's if they are not used.
+
+        None without a recent position, or if the position cannot be right.
+        """
+        field, last = self.evidence, self._history[-1] if self._history else None
+        if last is None or time_us - last.time_us > MAX_GNSS_AGE_US:
+            return None
+        if self.state is not GnssState.GOOD:
+            if not self._may_be_right or last.time_us - self._since_us < RIVAL_HOLD_US:
+                return None
+            log_odds = field.log_odds_of_position + min(field.log_odds_of_map, 0.0)
+            place = np.array([last.north, last.east])
+            return Rival(place, last.sigma**2 * np.eye(2), _probability(log_odds))
+        best = field.best_separate
+        if best is None:
+            return None
+        x, P = best.filter.moments()
+        return Rival(x[:2], P[:2, :2], _probability(best.log_odds + log(PRIOR_ODDS_WRONG)))
+
     @property
-    def possible_error(self) -> float:
-        """Error that positions may have had while the navigator still used them, m."""
-        unseen = UNSEEN_FRACTION * self._grid.correlation_length if self.reason is GnssReason.FIELD else 0.0
-        return hypot(self.drift, unseen)
+    def _may_be_right(self) -> bool:
+        """True if the positions have not jumped from right ones to the present ones: no vehicle does."""
+        return self._jump_count != 1
 
     def receive_integrity(self, time_us: int, jamming: int, spoofing: int) -> None:
         """Store the receiver's own report: jamming_state and spoofing_state of GNSS_INTEGRITY."""
@@ -217,28 +237,32 @@ class GnssMonitor:
         # Every test runs on every position, because each has a history. The state then follows from the first
         # that fails: the receiver's report, a frozen position, a jump, the deviation, the field.
         jumped = self._jumps(time_us, offset_m, sigma, prediction)
-        frozen = self._frozen(place, sigma, prediction.travelled)
+        if place != self._place:
+            self._place, self._frozen_from = place, prediction.travelled
+        frozen = prediction.travelled - self._frozen_from > max(MIN_FROZEN_M, 4.0 * sigma)
         self.evidence.move(time_us, offset_m, sigma, restart=jumped)
         away = np.array(offset_m) - prediction.position
-        agrees = self._agrees(away, sigma, prediction)
+        P = prediction.alone if prediction.lost else prediction.covariance
+        agrees = squared_mahalanobis(away, P + sigma**2 * np.eye(2)) <= MAX_DEVIATION_SIGMA**2
         if self.state is GnssState.NONE:
             self.state = GnssState.GOOD
-        if reported := self._receiver_reports(time_us):
-            spoofed = reported is GnssReason.SPOOFING
-            self._set(GnssState.REJECTED if spoofed else GnssState.SUSPECT, reported, time_us)
+        if self._reported and time_us - self._reported_us < MAX_GNSS_AGE_US:
+            spoofed = self._reported is GnssReason.SPOOFING
+            self._set(GnssState.REJECTED if spoofed else GnssState.SUSPECT, self._reported, time_us)
         elif frozen:
             self._set(GnssState.REJECTED, GnssReason.FROZEN, time_us)
         elif jumped:
             self._set(GnssState.REJECTED, GnssReason.JUMP, time_us)
         elif self.state is GnssState.GOOD:
-            self._leave_good(time_us, agrees=agrees, lost=prediction.lost)
+            if not agrees:
+                self._set(GnssState.REJECTED, GnssReason.POSITION, time_us)
+            elif self.evidence.contradicts or (prediction.lost and self.evidence.log_odds_of_map < 0.0):
+                self._set(GnssState.SUSPECT, GnssReason.FIELD, time_us)
         elif self._returns(time_us, agrees, prediction):
-            self.state, self.reason, self._chained = GnssState.GOOD, GnssReason.NONE, True
+            self.state, self.reason, self._jump_count = GnssState.GOOD, GnssReason.NONE, 0
             self._trusted = None
         elif not agrees and prediction.informed:
             self.state = GnssState.REJECTED
-        if self.state is GnssState.GOOD:
-            self._average(time_us, away)
         return self.state
 
     def observe(
@@ -278,61 +302,30 @@ class GnssMonitor:
             # Velocity error of dead reckoning: the current's estimate, its change since, and turns.
             age = max((time_us - known.time_us) * 1e-6, 0.0)
             changed = o.current_sigma * sqrt(min(2.0 * age / o.current_time, 1.0))
-            turned = o.motion_error * sqrt(prediction.turns - known.turns)
-            velocity_error = hypot(known.current_sigma, changed, turned, prediction.heading_error)
+            turned = o.motion_error * sqrt(prediction.turns - known.then.turns)
+            velocity_error = hypot(known.then.current_sigma, changed, turned, prediction.heading_error)
             if seconds * 1e6 > OUTAGE_US:
                 velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * prediction.speed)
             # Two receiver errors, the velocity error over the time, and the random walk add in quadrature.
             error = hypot(sqrt(2.0) * sigma, velocity_error * seconds, o.drift * sqrt(seconds))
-            distance = hypot(
-                offset_m[0] - then.north - known.current_north * seconds,
-                offset_m[1] - then.east - known.current_east * seconds,
-            )
+            moved = np.array(offset_m) - (then.north, then.east) - known.then.current * seconds
+            distance = hypot(*moved.tolist())
             self._change = distance / error  # of the oldest position at last
             jumped |= self._change > MAX_DEVIATION_SIGMA
         if jumped:
             self._trusted = self._trusted or history[0]
             history.clear()
-            self._since_us, self._count, self._chained = time_us, 0, False
-        north, east = prediction.current.tolist()
-        history.append(
-            _Position(time_us, *offset_m, sigma, north, east, prediction.current_sigma, prediction.turns)
-        )
+            self._since_us, self._count, self._jump_count = time_us, 0, self._jump_count + 1
+        history.append(_Position(time_us, *offset_m, sigma, prediction))
         self._count += 1
         return jumped
 
-    def _frozen(self, place: tuple[float, float], sigma: float, travelled: float) -> bool:
-        if place != self._place:
-            self._place, self._frozen_from = place, travelled
-        return travelled - self._frozen_from > max(MIN_FROZEN_M, 4.0 * sigma)
-
-    def _agrees(self, away: FloatArray, sigma: float, prediction: Prediction) -> bool:
-        """Return True if a deviation (2,) from the navigator is within both errors."""
-        P = prediction.alone if prediction.lost else prediction.covariance
-        return squared_mahalanobis(away, P + sigma**2 * np.eye(2)) <= MAX_DEVIATION_SIGMA**2
-
-    def _average(self, time_us: int, away: FloatArray) -> None:
-        """Include a used position's deviation (2,), m, from the navigator in the running mean."""
-        seconds = (time_us - self._history[-2].time_us) * 1e-6 if len(self._history) > 1 else inf
-        # Exponential mean with the time constant MEAN_TIME_S; it starts again after a pause.
-        kept = exp(-seconds / MEAN_TIME_S) if seconds < MEAN_TIME_S else 0.0
-        self._mean = kept * self._mean + (1.0 - kept) * away
-        self.drift = hypot(*self._mean.tolist())
-
-    def _receiver_reports(self, time_us: int) -> GnssReason:
-        return self._reported if time_us - self._reported_us < MAX_GNSS_AGE_US else GnssReason.NONE
-
     # ---- changes of state ----------------------------------------------------------------------------
-
-    def _leave_good(self, time_us: int, *, agrees: bool, lost: bool) -> None:
-        if not agrees:
-            self._set(GnssState.REJECTED, GnssReason.POSITION, time_us)
-        elif self.evidence.contradicts or (lost and self.evidence.log_odds_of_map < 0.0):
-            self._set(GnssState.SUSPECT, GnssReason.FIELD, time_us)
 
     def _set(self, state: GnssState, reason: GnssReason, time_us: int) -> None:
         if self.state is GnssState.GOOD:
             self._since_us, self._count = time_us, 0
+            self.unaided = self.evidence.unaided(by_field=reason is GnssReason.FIELD)
             self.evidence.begin_comparison()
             self._trusted = self._trusted or self._history[0]
         self.state, self.reason = state, reason
@@ -343,21 +336,36 @@ class GnssMonitor:
         # Positions return only after they have agreed with each other for a while.
         if held_us < HOLD_US or self._count < MIN_POSITIONS:
             return False
-        # The field decides first, if the map describes it clearly better or worse at the position.
+        # The field decides first, if the map describes it clearly better at the position.
         field, by_field = self.evidence, self.reason is GnssReason.FIELD
-        if field.favours and field.log_odds_of_map > 0.0:
+        on_the_map = field.log_odds_of_map > 0.0
+        if field.favours and on_the_map and (self._may_be_right or not prediction.lost):
             return True
         # Then the motion since, against dead reckoning: a spoofer's carry-off continues while rejected.
         moves = self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US
         if field.contradicts or field.disfavours or (moves and not by_field):
             return False
-        if field.confirms or by_field:
-            return field.confirms
+        if by_field or (field.describes and self._may_be_right):
+            return field.describes and (not by_field or field.log_odds_of_position >= 0.0)
         # Neither decides: time does. A lost navigator has no position to compare with.
         waited = held_us >= LONG_HOLD_US
         if prediction.lost:
-            return waited and field.log_odds_of_map > 0.0
-        return agrees or (waited and self._chained and not prediction.informed)
+            return waited and on_the_map
+        return agrees or (waited and self._may_be_right and not prediction.informed)
+
+
+def _probability(log_odds: float) -> float:
+    return 1.0 / (1.0 + exp(-log_odds))
+
+
+class _Separate:
+    """Filter that goes on from the navigator's x (6,), P (6, 6) without the receiver's positions.
+
+    `log_odds` is its log-likelihood ratio against the navigator, and `seconds` the time since its start.
+    """
+
+    def __init__(self, bank: Bank) -> None:
+        self.filter, self.log_odds, self.seconds = bank, 0.0, 0.0
 
 
 class _FieldTest:
@@ -370,39 +378,49 @@ class _FieldTest:
     -----
     Both are sums of log-likelihood ratios ``log p(y_k | y_1 .. y_k-1, H1) - log p(y_k | y_1 .. y_k-1, H0)``.
     Under H1 the vehicle is at the receiver's position; the position error is Gauss-Markov with the receiver's
-    sigma and :data:`CORRELATION_TIME_S`. Calibration bias and map error are free states, as in the navigator.
+    sigma and :data:`JITTER_TIME_S`. Calibration bias and map error are free states, as in the navigator.
     Under H0 the vehicle is at the navigator's position, which has not used the receiver's. Both predict each
     measurement from all earlier ones. The first measurement does not count: it determines the bias under H1.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.limit = log(options.alarm_odds)
-        self._grid, self._options = grid, any_level(options, grid)
+        self._grid, self._options = grid, wider_level(options, grid.rms)
         self._claimed = options
         self._time_us = -MAX_GNSS_AGE_US
         self._restart()
 
     def _restart(self) -> None:
         self.log_odds_of_map = self.log_odds_of_position = 0.0
-        self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)
         self._unmapped = Unmapped(self._grid, self._options)
         self._filter: Bank | None = None
-        self._separate: Bank | None = None
-        self._separated_s = self._log_odds_separate = 0.0
+        self._separate: list[_Separate] = []
         self._filtered = np.zeros(2)  # position at the last measurement
         self._positions: deque[tuple[int, float, float]] = deque(maxlen=RECENT_POSITIONS)
         self._sigma = inf
         self._step = Step()  # since the last measurement that was used
 
+    def unaided(self, *, by_field: bool) -> Bank | None:
+        """Return the likeliest filter without recent positions; if not `by_field`, the latest; else None."""
+        clean = [one for one in self._separate if one.seconds >= MIN_SEPARATION_S]
+        best = self.best_separate if by_field else clean[-1] if clean else None
+        return None if best is None else best.filter
+
     @property
     def contradicts(self) -> bool:
         """True if the map contradicts the field at the positions, or a filter without them is more likely."""
-        return self._against >= self.limit or self._log_odds_separate >= self.limit
+        best = self.best_separate
+        return self.log_odds_of_map <= -self.limit or (best is not None and best.log_odds >= self.limit)
 
     @property
-    def confirms(self) -> bool:
-        """True if the map describes the field at the position, and not worse than at the navigator's."""
-        return self.log_odds_of_map >= self.limit and self.log_odds_of_position >= 0.0
+    def best_separate(self) -> _Separate | None:
+        """The likeliest of the filters without the receiver's positions; None if none is running."""
+        return max(self._separate, key=lambda one: one.log_odds, default=None)
+
+    @property
+    def describes(self) -> bool:
+        """True if the map describes the field at the position, at ``alarm_odds``."""
+        return self.log_odds_of_map >= self.limit
 
     @property
     def disfavours(self) -> bool:
@@ -427,27 +445,21 @@ class _FieldTest:
     def begin_comparison(self) -> None:
         """Discard evidence except that against the map: from now on the navigator rejects the positions."""
         self.log_odds_of_map = min(self.log_odds_of_map, 0.0)
-        self.log_odds_of_position = self._log_odds_separate = 0.0
-        self._separate = None
+        self.log_odds_of_position = 0.0
+        self._separate = []
 
     def separate(self, x: FloatArray, P: FloatArray) -> None:
-        """Start a filter without the positions from the navigator's x (6,), P (6, 6), if the last has ended.
+        """Start a filter without the positions from the navigator's x (6,), P (6, 6), if one is due.
 
         Notes
         -----
         Solution separation: the likelihood ratio of this filter against the navigator begins at 1. As long as
         the positions are right, it exceeds c with a probability of at most 1/c in each period (Ville 1939).
         """
-        if self._separate is None or self._separated_s > SEPARATION_TIME_S:
-            self._separate = Bank(self._grid, x, P, inf, self._options.gate)
-            self._separated_s = self._log_odds_separate = 0.0
-
-    def _compare_separate(self, block: Block, step: Step, filter_likelihood: float) -> None:
-        """Add a measurement to the odds of the filter without positions against the navigator with them."""
-        if self._separate is not None:
-            self._separated_s += step.seconds
-            self._separate.predict(*transition(self._claimed, *step))
-            self._log_odds_separate += self._separate.update(block).log_likelihood - filter_likelihood
+        if not self._separate or self._separate[-1].seconds >= SEPARATION_INTERVAL_S:
+            self._separate.append(_Separate(Bank(self._grid, x, P, inf, self._options.gate)))
+        if self._separate[0].seconds > SEPARATION_TIME_S:
+            self._separate.pop(0)
 
     def update(self, block: Block, step: Step, filter_likelihood: float) -> None:
         """Add a measurement to the log odds; `step` is the motion since the previous measurement."""
@@ -455,7 +467,11 @@ class _FieldTest:
         if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US:
             return
         whole, self._step = self._step, Step()
-        self._compare_separate(block, whole, filter_likelihood)
+        F, Q = transition(self._claimed, *whole)
+        for one in self._separate:
+            one.seconds += whole.seconds
+            one.filter.predict(F, Q)
+            one.log_odds += one.filter.update(block).log_likelihood - filter_likelihood
         is_first = self._filter is None
         if self._filter is None:
             x, P = prior(self._options, self._sigma)
@@ -469,7 +485,6 @@ class _FieldTest:
         if not seen.accepted:  # as the filter does: a rejected measurement is never evidence for the map
             unmapped = max(unmapped, seen.log_likelihood)
         # Cumulative sums of log-likelihood ratios, limited so that a change of truth shows soon.
-        self._against = min(max(self._against - seen.log_likelihood + unmapped, 0.0), self.limit)
         self.log_odds_of_map = self._limited(self.log_odds_of_map + seen.log_likelihood - unmapped)
         gained = seen.log_likelihood - filter_likelihood
         self.log_odds_of_position = self._limited(self.log_odds_of_position + gained)
@@ -481,7 +496,7 @@ class _FieldTest:
         position = np.array([np.interp(time_us, times, north), np.interp(time_us, times, east)])
         F, Q = transition(self._options, *step)
         F[:4], Q[:4] = 0.0, 0.0
-        kept = exp(-step.seconds / CORRELATION_TIME_S)
+        kept = exp(-step.seconds / JITTER_TIME_S)
         F[0, 0] = F[1, 1] = kept
         Q[0, 0] = Q[1, 1] = self._sigma**2 * (1.0 - kept * kept)
         bank.x[:2] -= self._filtered[:, None]

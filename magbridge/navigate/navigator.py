@@ -90,19 +90,18 @@ class Navigator:
         self._reckoning.advance(time_us * 1e-6)
         if not estimate.begun:
             # There is no estimate to compare with: only the receiver's own report counts.
-            wide, zero, o = np.eye(2) * 1e12, np.zeros(2), estimate.options
-            nothing = Prediction(
-                zero, wide, wide, zero, o.current_sigma, 0.0, 0.0, 0.0, 0.0, lost=False, informed=False
-            )
+            wide, zero = np.eye(2) * 1e12, np.zeros(2)
+            nothing = Prediction(zero, wide, wide, zero, estimate.options.current_sigma)
             state = monitor.check(time_us, place, (0.0, 0.0), known, nothing)
         else:
             where = self._reckoning
             away = separation(where.latitude, where.longitude, latitude, longitude)
             was_good = monitor.state is GnssState.GOOD
             state = monitor.check(time_us, place, away, known, self._prediction(time_us))
-            # Positions that were fused before the fault was found may have been wrong: widen by their effect.
-            if was_good and state is not GnssState.GOOD:
-                estimate.widen(monitor.possible_error)
+            # Positions that were fused before the fault was found may have been wrong.
+            if was_good and state is not GnssState.GOOD and monitor.unaided is not None:
+                estimate.replace(monitor.unaided)
+            estimate.rival = monitor.rival(time_us)
         if state is not GnssState.GOOD:
             return None
         return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
@@ -203,11 +202,12 @@ class Navigator:
             return None
         F, Q = transition(last.options, max(elapsed, 0.0), 0.0)
         x, P = F @ last.x, F @ last.P @ F.T + Q
+        position = P[:2, :2] + last.position_covariance - last.P[:2, :2]
         # Do not send a position that has become too uncertain since the valid update.
-        if widest(P) > last.options.sigma_limit:
+        if widest(position) > last.options.sigma_limit:
             return None
         place = offset(*self.reckoned(time_us), float(x[0]), float(x[1]))
-        (nn, ne), (_, ee) = P[:2, :2].tolist()
+        (nn, ne), (_, ee) = position.tolist()
         return Reckoned(time_us, *place, nn, ne, ee)
 
     def reckoned(self, time_us: int) -> tuple[float, float]:
@@ -220,9 +220,10 @@ class Navigator:
         seen = now.update(block, where.travelled, where.noise)
         if isfinite(seen.anomaly):
             self.gnss.observe(block, now.step, seen.log_likelihood, now.x, now.P)
+        now.rival = self.gnss.rival(block.time_us)
         north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
-        (nn, ne), (_, ee) = now.P[:2, :2].tolist()
+        (nn, ne), (_, ee) = now.position_covariance.tolist()
         return Record(
             time_us=block.time_us, state=now.state, valid=now.valid, latitude=latitude, longitude=longitude,
             covariance_nn=nn, covariance_ne=ne, covariance_ee=ee, innovation=seen.value,

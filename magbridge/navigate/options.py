@@ -14,7 +14,7 @@ from magbridge.config import NotNegative, Positive
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["NavigationOptions", "any_level", "at_depth", "informed", "lasting_errors", "with_level"]
+__all__ = ["NavigationOptions", "at_depth", "informed", "lasting_errors", "wider_level", "with_level"]
 
 MAX_NOISE_INTERVALS = 3.0
 """Longest correlation time of noise, in update intervals; noise with a longer one counts as a bias."""
@@ -95,31 +95,23 @@ def informed(options: NavigationOptions, calibration: Calibration, sigma: float)
 
 def with_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
     """Return options whose bias has a further uncertainty of `sigma`, nT, but the same driving noise."""
-    return _wider_level(options, hypot(options.bias_sigma, sigma)) if sigma else options
+    return wider_level(options, hypot(options.bias_sigma, sigma)) if sigma else options
 
 
-def any_level(options: NavigationOptions, grid: AnomalyGrid) -> NavigationOptions:
-    """Return options whose bias is at least as uncertain as the map's RMS, with the same driving noise.
-
-    The field's absolute value then carries no information, but its changes do.
-    """
-    return _wider_level(options, grid.rms)
-
-
-def _wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
+def wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
     """Return options whose bias has a 1-sigma of at least `sigma`, nT, and the same driving noise.
+
+    With the map's RMS, the field's absolute value carries no information, but its changes do.
 
     Notes
     -----
-    The driving noise of a Gauss-Markov process is ``2σ²/τ`` (nT²/s). It stays the same if τ rises in
-    proportion to σ².
+    The driving noise of a Gauss-Markov process, ``2σ²/τ`` (nT²/s), stays the same if τ rises with σ².
     """
     o = options
     if o.bias_sigma >= sigma:
         return o
-    return replace(
-        o, bias_sigma=sigma, bias_time=o.bias_time * (sigma / max(o.bias_sigma, 1e-3 * sigma)) ** 2
-    )
+    longer = (sigma / max(o.bias_sigma, 1e-3 * sigma)) ** 2
+    return replace(o, bias_sigma=sigma, bias_time=o.bias_time * longer)
 
 
 NEGLIGIBLE_FRACTION = 0.1

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import msgspec
 
-__all__ = ["Jump", "NavigationState", "Reckoned", "Record"]
+from magbridge.arrays import FloatArray
+
+__all__ = ["Jump", "NavigationState", "Reckoned", "Record", "Rival"]
 
 
 class NavigationState(IntEnum):
@@ -92,3 +94,14 @@ class Jump(NamedTuple):
     east: float
     allowed: float
     cause: str
+
+
+class Rival(NamedTuple):
+    """Position at which the vehicle may be instead of at the navigator's.
+
+    Its position (2,) is in m north and east of dead reckoning, its covariance (2, 2) in m².
+    """
+
+    position: FloatArray
+    covariance: FloatArray
+    probability: float

@@ -364,11 +364,6 @@ class _JointFit:
         raw = crossovers(rows.samples.place, rows.samples.line).misties(rows.raw)
         return samples, self._terms(parts, contribution, rms(raw) if len(raw) else 0.0)
 
-    def _every_sample(self) -> Choice:
-        """Return the field and noise with the autocorrelation of the noise between successive samples."""
-        step = int(np.median(np.diff(self.chosen)))
-        return replace(self.choice, rho=self.choice.rho ** (1.0 / step))
-
     def _terms(self, parts: list[FloatArray], contribution: dict[str, float], misties: float) -> ScalarTerms:
         """Return the estimated terms with their uncertainties and effects."""
         many = len(self.free)
@@ -386,10 +381,12 @@ class _JointFit:
             columns = [_harmonics(heading), *(term.columns for term in terms)]
             after = value - sum(part @ values for part, values in zip(columns, parts, strict=True))
             merit = figure_of_merit(box, raw, after)
+        step = int(np.median(np.diff(self.chosen)))  # the noise of successive samples is correlated more
+        choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
         return ScalarTerms(
             self.rows.column, self.shift, sigma, float(along @ self.shift),
             float(np.sqrt(along @ covariance @ along)), self.speed, not both or bool(known.all()), parts[0],
-            contribution, misties, self._every_sample(), merit, self._findings(parts, contribution),
+            contribution, misties, choice, merit, self._findings(parts, contribution),
         )  # fmt: skip
 
     def _findings(self, parts: list[FloatArray], contribution: dict[str, float]) -> tuple[Diagnostic, ...]:

@@ -289,9 +289,10 @@ def _posterior(
     # Shift of the nodes with 1-sigma of each other unknown: dw/dz times a root of its covariance.
     follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
     w, mean = reduced.field(z), problem.mean_over_samples(choice.field)
+    follow -= (mean @ follow)[None, :] / max(mean.sum(), 1e-9)  # the level is uncertain by itself
     levels = problem.D @ z
     return Posterior(
-        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, _without_level(follow, mean),
+        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, follow,
         reduced.precision, inverse_blocks(reduced.precision, choice.field.edges),
         levels - levels[problem.kept].mean(), float(mean @ w),
     )  # fmt: skip
@@ -403,11 +404,3 @@ def _considered(
     H = all_in.quadratic.precision / widths.sigma**2
     own = np.linalg.solve(H[:q, :q] + family.prior(widths.eta).precision, H[:q, q:])
     return np.asarray(all_in.follow[:, q:] - reduced.follow @ own)
-
-
-def _without_level(follow: FloatArray, mean: FloatArray) -> FloatArray:
-    """Return the uncertain shifts of the coefficients (nodes, r) without their mean over the samples.
-
-    `mean` (nodes,) is the row from the coefficients to the field's mean over the samples.
-    """
-    return np.asarray(follow - (mean @ follow)[None, :] / max(mean.sum(), 1e-9))

@@ -72,7 +72,8 @@ def read_table(path: Path) -> Samples:
     numeric, or there are too few rows.
     """
     table = _table(path)
-    value = _numbers(path, table, _first(path, table, ANOMALY_COLUMNS))
+    names = (name for name in ANOMALY_COLUMNS if name in table)
+    value = _numbers(path, table, next(names, ANOMALY_COLUMNS[0]))
     longitude, latitude, depth = _places(path, table)
     depth = np.zeros(len(value)) if depth is None else depth
     lines = next((name for name in ("line", "line_number", "line_no") if name in table), None)
@@ -199,19 +200,15 @@ def joined(parts: Sequence[Samples]) -> Samples:
         n, r = one.modes.shape
         modes[row : row + n, column : column + r] = one.modes
         row, column = row + n, column + r
+    rho = [one.rho for one in parts if one.rho is not None]
     depth, time, value, tie, weight = (
         np.concatenate([getattr(one, name) for one in parts])
         for name in ("depth", "time", "value", "tie", "weight")
     )
     return Samples(
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
-        _common_rho([one.rho for one in parts]), modes, max(one.level_sigma for one in parts),
+        max(rho) if len(rho) == len(parts) else None, modes, max(one.level_sigma for one in parts),
     )  # fmt: skip
-
-
-def _common_rho(rho: Sequence[float | None]) -> float | None:
-    known = [one for one in rho if one is not None]
-    return max(known) if len(known) == len(rho) else None
 
 
 def _doubtful(corrected: xr.Dataset) -> BoolArray:
@@ -266,13 +263,6 @@ def _places(path: Path, table: pd.DataFrame) -> tuple[FloatArray, FloatArray, Fl
         return longitude, latitude, _numbers(path, table, "depth")
     height = next((name for name in HEIGHT if name in table), None)
     return longitude, latitude, None if height is None else -_numbers(path, table, height)
-
-
-def _first(path: Path, table: pd.DataFrame, names: Sequence[str]) -> str:
-    for name in names:
-        if name in table:
-            return name
-    raise FormatError(path, f"expected a column {names[0]!r}; there are: {' '.join(map(str, table.columns))}")
 
 
 def _numbers(path: Path, table: pd.DataFrame, name: str) -> FloatArray:

@@ -63,22 +63,20 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
     `calibrations` has one for all logs with a vector, or one for each in order. DataError: another number of
     calibrations. FormatError: a log without positions.
     """
-    parts: list[Samples] = []
-    with_vector = [log for log in logs if _has_vector(log)]
-    if with_vector and len(calibrations) not in (1, len(with_vector)):
+    vectors = [set(CHANNELS) <= set(log) for log in logs]
+    many = sum(vectors)
+    if many and len(calibrations) not in (1, many):
         raise DataError(
-            f"{len(with_vector)} logs with mag_x mag_y mag_z, and {len(calibrations)} calibrations: give one "
+            f"{many} logs with mag_x mag_y mag_z, and {len(calibrations)} calibrations: give one "
             "for all, or one for each log in order"
         )
-    waiting = (
-        list(calibrations) if len(calibrations) == len(with_vector) else list(calibrations) * len(with_vector)
+    waiting = iter(calibrations if len(calibrations) == many else [*calibrations] * many)
+    return joined(
+        [
+            from_vector(log, next(waiting)) if vector else corrected_by_others(log)
+            for log, vector in zip(logs, vectors, strict=True)
+        ]
     )
-    for log in logs:
-        if _has_vector(log):
-            parts.append(from_vector(log, waiting.pop(0)))
-        else:
-            parts.append(corrected_by_others(log))
-    return joined(parts)
 
 
 def survey(samples: Samples, start: Choice | None = None) -> Result:
@@ -179,10 +177,6 @@ def _misplaced(samples: Samples, line_ends: IndexArray, found: Gridded) -> Float
         drawn.append(field.basis(samples.place + off[stretch]) @ w - here @ w)
     rough = found.roughness.evaluate(samples.place)[:, None]
     return np.asarray(rough * np.stack(drawn, axis=1) / DRAWN_TRACKS**0.5)
-
-
-def _has_vector(log: xr.Dataset) -> bool:
-    return all(name in log for name in CHANNELS)
 
 
 def facts(result: Result, path: Path) -> dict[str, Any]:

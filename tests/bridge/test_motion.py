@@ -236,7 +236,6 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
         if reports or k > 270:
             assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
-    assert bench.navigation.navigator.gnss.drift < 10.0
 
 
 def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.continuation import (
-    continue_upward,
     continued,
     draw_steps,
     merge,
@@ -36,7 +35,7 @@ def monopole(altitude: float, depth: float = 800.0) -> np.ndarray:
 def test_continuation_is_the_field_at_the_new_height() -> None:
     """The edges of a finite map cost some nT; in its middle half the error is under 2 % of the peak."""
     low, high = AnomalyGrid(LON, LAT, monopole(60.0), altitude=60.0), monopole(260.0)
-    raised = continue_upward(low, 200.0)
+    raised = continued(low, -260.0).grid
     assert raised.altitude == 260.0
     middle = slice(15, -15), slice(20, -20)
     assert np.abs(raised.anomaly - high)[middle].max() < 0.02 * high.max()
@@ -46,7 +45,7 @@ def test_continuation_is_the_field_at_the_new_height() -> None:
 def test_continuation_keeps_a_constant_and_the_holes() -> None:
     values = np.full((61, 81), 7.0)
     values[30, 40] = np.nan
-    raised = continue_upward(AnomalyGrid(LON, LAT, values, altitude=0.0), 100.0)
+    raised = continued(AnomalyGrid(LON, LAT, values, altitude=0.0), -100.0).grid
     assert np.isnan(raised.anomaly).sum() == 1
     np.testing.assert_allclose(raised.anomaly[~np.isnan(values)], 7.0, atol=1e-9)
 
@@ -187,7 +186,7 @@ def test_a_smoothing_error_is_correlated_over_a_quarter_of_its_wavelength_in_the
     rough = AnomalyGrid(LON, LAT, np.random.default_rng(0).normal(size=(61, 81)))
     less, _ = prepare([rough], smooth=2.0)
     assert (rough.sigma_length, less.sigma_length) == (0.0, 500.0)
-    raised = continue_upward(AnomalyGrid(LON, LAT, rough.anomaly, 1.0, 60.0, sigma_length=9.0), 50.0)
+    raised = continued(AnomalyGrid(LON, LAT, rough.anomaly, 1.0, 60.0, sigma_length=9.0), -110.0).grid
     assert raised.sigma_length == 9.0
     write(less, tmp_path / "map.nc")
     assert read_grid(tmp_path / "map.nc").sigma_length == 500.0

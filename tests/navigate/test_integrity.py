@@ -10,7 +10,7 @@ from voyages import OUTSIDE, PLACE, Map, misled, sail, track_over
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import transition
-from magbridge.navigate.options import NavigationOptions, any_level
+from magbridge.navigate.options import NavigationOptions, wider_level
 from magbridge.navigate.record import NavigationState
 
 PERIOD = 700.0
@@ -65,8 +65,8 @@ def test_a_misled_filter_does_not_stand_by_it() -> None:
 
 
 def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: NavigationOptions) -> None:
-    loose = any_level(options, grid)
+    loose = wider_level(options, grid.rms)
     assert loose.bias_sigma == grid.rms
-    assert any_level(loose, grid) == loose
+    assert wider_level(loose, grid.rms) == loose
     wander = [transition(o, 20.0, 7.0)[1][4, 4] for o in (options, loose)]
     assert wander[1] == pytest.approx(wander[0], rel=0.01)

@@ -169,7 +169,7 @@ def sail(
         off = separation(*truth.place, *autopilot.place)
         own, claimed = own_error(navigation, now_us, truth), autopilot.filter.sigma
         navigator = navigation.navigator
-        sigma = float(np.sqrt(0.5 * np.trace(navigator.estimate.P[:2, :2])))
+        sigma = float(np.sqrt(0.5 * np.trace(navigator.estimate.position_covariance)))
         states = float(navigator.estimate.state), sigma, float(navigator.gnss.state)
         rows.append((seconds, own, *off, claimed, navigation.fixing.sent, *states))
     table = np.array(rows)
