@@ -248,7 +248,7 @@ def _departure(found: Fit) -> float:
 def lines(offers: Sequence[Offer]) -> list[str]:
     """Return a message for each column that was tried, with its held-out errors."""
     return [
-        f"--parameter {one.name}: {one.without:.0f} nT on parts left out without it, "
-        f"{one.left_out:.0f} with it: {'taken' if one.taken else 'not worth it'}"
+        f"--parameter {one.name}: {one.without:.3g} nT on parts left out without it, "
+        f"{one.left_out:.3g} with it: {'taken' if one.taken else 'not worth it'}"
         for one in offers
     ]
