@@ -10,8 +10,8 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from magbridge.bridge.sensor import needed_units
 from magbridge.calibration.model import Calibration
-from magbridge.columns import TEMPERATURE
 from magbridge.logs.fields import field_maps
 from magbridge.sensors.options import Option, options_of
 
@@ -48,11 +48,7 @@ def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str
     `calibration`: each of its parameters gets a ``[telemetry]`` table, in the calibration's unit.
     ConfigError: the driver does not exist.
     """
-    units = {}
-    if calibration is not None:
-        units = {
-            name: calibration.units.get(name, "") for name in calibration.channels if name != TEMPERATURE
-        }
+    units = needed_units(calibration) if calibration is not None else {}
     for parameter in answers.parameters:
         name, _, unit = parameter.partition("[")
         units[name.strip()] = unit.rstrip("] ")

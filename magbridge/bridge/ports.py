@@ -15,6 +15,7 @@ import serial
 from serial.tools import list_ports
 
 from magbridge.bridge.check import access
+from magbridge.bridge.sensor import NMEA_SENTENCE
 from magbridge.errors import PortError
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.sensors import DRIVERS, driver_class
@@ -24,7 +25,6 @@ __all__ = ["BAUDRATES", "Recognised", "SerialDevice", "listen", "ports", "recogn
 
 BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
 """Baud rates at which the device is searched, the most common first, bit/s."""
-NMEA_0183 = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
 TEXT_LINE = re.compile(rb"[^\r\n]+[\r\n]")
 TEXT_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
 SHOWN = 60
@@ -155,7 +155,7 @@ def _mavlink(data: bytes) -> Recognised | None:
 
 
 def _nmea(data: bytes) -> Recognised | None:
-    sentences = [line.rstrip().partition(b"*") for line in NMEA_0183.findall(data)]
+    sentences = [line.rstrip().partition(b"*") for line in NMEA_SENTENCE.findall(data)]
     valid = [text for text, _, digits in sentences if int(digits, 16) == nmea_checksum(text)]
     if len(valid) < MIN_RECOGNISED:
         return None
