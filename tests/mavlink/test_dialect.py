@@ -14,7 +14,7 @@ from xml.etree.ElementTree import parse
 import pytest
 from pymavlink.dialects.v20 import all as everything
 
-from magbridge.mavlink import SECRET, Codec, spec
+from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.definitions import write_definitions
 from magbridge.mavlink.messages import MESSAGES, Field
 from magbridge.records import Quality
@@ -79,31 +79,6 @@ def test_every_message_has_the_bytes_that_pymavlink_gives_it(peer: ModuleType, d
             twin.mavlink_version = drawn["mavlink_version"][0]
         assert frame == twin.pack(station), layout.name
         station.seq = codec.sequence
-
-
-def test_every_message_reads_as_pymavlink_reads_it() -> None:
-    rng = random.Random(8)
-    codec = Codec(1, 191)
-    for number in everything.mavlink_map.keys() - SECRET:
-        layout = spec(number)
-        sent = {name: draw(field, rng)[0] for name, field in layout.fields.items()}
-        frame = codec.pack(layout.name, **sent)
-        station = everything.MAVLink(None)
-        (theirs,) = station.parse_buffer(frame)
-        (ours,) = codec.parse(frame)
-        assert ours.name == theirs.get_type()
-        assert ours.frame == frame
-        for name, field in layout.fields.items():
-            if name not in theirs.fieldnames:
-                assert layout.name == "TIMESYNC"  # newer than pymavlink's definitions
-                continue
-            value, expected = ours[name], getattr(theirs, name)
-            if field.code == "s":
-                expected = expected if isinstance(expected, str) else expected.decode()
-            elif field.count:
-                value = list(value)
-            assert value == expected, (layout.name, name)
-        assert ours.fields.keys() == layout.fields.keys()
 
 
 def test_import_is_light() -> None:
