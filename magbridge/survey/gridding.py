@@ -246,9 +246,15 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
         shaken = _considered(problem, choice, reduced, widths, family, every)
 
     # 6. One posterior for each plausible size and length.
+    weighed = replace(weighed, eta=widths.eta)
+
+    def score(choice: Choice) -> float:
+        reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
+        return weighed.score(reduced, choice.field, choice.ratio)
+
     posteriors = [
         _posterior(weight, one, sums, problem, family, widths, shaken)
-        for weight, one in _left_open(choice, sums, replace(weighed, eta=widths.eta))
+        for weight, one in plausible(score, choice)
     ]
     found = Gridded(
         tuple(posteriors), roughness, choice.rho, problem.middle,
@@ -259,16 +265,6 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
         return found
     levelled, kept = samples.value - found.levels, problem.kept
     return replace(found, kriged=kriged(samples.part(kept), levelled[kept], choice.field.length))
-
-
-def _left_open(choice: Choice, sums: SampleSums, weighed: Weighed) -> list[tuple[float, Choice]]:
-    """Return the plausible amplitudes and correlation lengths of the field, each with its weight."""
-
-    def score(choice: Choice) -> float:
-        reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
-        return weighed.score(reduced, choice.field, choice.ratio)
-
-    return plausible(score, choice)
 
 
 def _posterior(

@@ -1,7 +1,8 @@
-"""Test navigation on a map whose altitude is above a diving vehicle."""
+"""Test the options' errors of map and level, and navigation on a map above a diving vehicle."""
 
 from __future__ import annotations
 
+from dataclasses import replace as changed
 from math import hypot
 
 import numpy as np
@@ -10,10 +11,11 @@ import xarray as xr
 from msgspec.structs import replace
 from voyages import GLIDER, Map, dived, sail, synthetic, track_over
 
+from magbridge.calibration.model import Noise, Reference, identity
 from magbridge.cli.navigate import _continued
 from magbridge.field.continuation import continued, smoothed
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.options import NavigationOptions, at_depth, lasting_errors
+from magbridge.navigate.options import NavigationOptions, at_depth, informed, lasting_errors
 
 
 def test_errors_of_the_map_add_up() -> None:
@@ -89,3 +91,14 @@ def test_what_was_smoothed_away_is_a_map_error_that_lasts_and_a_flight_holds_its
     assert not flown["lost"]
     assert flown["drms"] < 2.0 * flown["bound"] < flown["unaided"]
     assert flown["nees"] < 3.0
+
+
+def test_level_is_a_bias_that_lasts() -> None:
+    """It widens the bias, whose changes stay as large as before: 2 sigma²/tau."""
+    plain = changed(identity(), noise=Noise(1.0))
+    levelled = changed(plain, reference=Reference(50_000.0, "IGRF", 0.0, 145.0, 150.0))
+    without = informed(NavigationOptions(), plain, 2.0)
+    known = informed(NavigationOptions(), levelled, (2.0**2 + 150.0**2) ** 0.5)
+    assert known.noise == without.noise
+    assert known.bias_sigma == pytest.approx((without.bias_sigma**2 + 150.0**2) ** 0.5)
+    assert known.bias_sigma**2 / known.bias_time == pytest.approx(without.bias_sigma**2 / without.bias_time)

@@ -12,7 +12,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import NavigationOptions, with_level
-from magbridge.navigate.record import NavigationState
+from magbridge.navigate.record import NavigationState, Rival
 
 HOUR_US = 3_600_000_000
 
@@ -97,3 +97,18 @@ def test_a_search_begins_where_dead_reckoning_since_the_last_fix_is(
             break
     assert estimate.jumps[-1].cause == "the map does not explain the field"
     assert np.linalg.norm(estimate.x[:2] - fix) < 3.0 * sqrt(estimate.alone[0, 0])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6])
+def test_another_position_widens_the_covariance_and_one_that_is_likelier_means_lost(
+    grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]], share: float
+) -> None:
+    estimate = begun(grid, options, measured[0][0], options.start_sigma)
+    for block, metres in measured[:40]:
+        estimate.update(block, metres)
+    P = estimate.P[0, 0]
+    estimate.rival = Rival(estimate.x[:2] + np.array([3000.0, 0.0]), 9.0 * np.eye(2), share)
+    widened = estimate.position_covariance[0, 0]
+    assert widened == pytest.approx((1.0 - share) * P + share * (9.0 + 3000.0**2))
+    estimate.update(*measured[40])
+    assert (estimate.state is NavigationState.LOST) == (share > 0.5)
