@@ -45,6 +45,20 @@ MAX_WAIT_RATIO = 10.0
 """Allowed ratio of elapsed time to allowed processor time; the disk and other processes may be slow."""
 
 
+class Raised(NamedTuple):
+    """Error as the child process sends it: a function that constructs the error, and its arguments."""
+
+    rebuild: Callable[..., BaseException]
+    arguments: tuple[Any, ...]
+
+    @classmethod
+    def from_exception(cls, error: BaseException) -> Raised:
+        """Return an error without its causes, because causes from other packages may not be picklable."""
+        how = error.__reduce__()
+        assert isinstance(how, tuple)
+        return cls(*how[:2])
+
+
 class GuardedJob(NamedTuple):
     """File to read, and a function that reads it and returns an iterable of picklable objects."""
 
@@ -56,8 +70,9 @@ class GuardedJob(NamedTuple):
         """Allowed processor time (s) and memory (bytes), computed from the size of the file."""
         files = self.path.iterdir() if self.path.is_dir() else [self.path]  # a folder holds one log
         size = sum(file.stat().st_size for file in files if file.is_file())
-        seconds = round(BASE_TIME_S + TIME_S_PER_MB * size / 1e6)
-        return seconds, BASE_MEMORY_BYTES + MEMORY_PER_FILE_BYTE * size
+        return round(
+            BASE_TIME_S + TIME_S_PER_MB * size / 1e6
+        ), BASE_MEMORY_BYTES + MEMORY_PER_FILE_BYTE * size
 
 
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
@@ -101,8 +116,8 @@ class Guarded:
             while not self._received[k]:
                 self._receive()
             done, piece = self._received[k].popleft()
-            if isinstance(piece, Exception):
-                raise piece
+            if isinstance(piece, Raised):
+                raise piece.rebuild(*piece.arguments)
             if done:
                 return
             yield piece
@@ -122,7 +137,7 @@ class Guarded:
             done, piece = self._child.receive(job)
         except FormatError as error:
             self.close()
-            done, piece = True, error
+            done, piece = True, Raised.from_exception(error)
         self._received[self._current].append((done, piece))
         self._current += done
         if self._current == len(self._jobs):
@@ -195,7 +210,7 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
 
 
 def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
-    """Read files in the child; send (False, object) for each object, then (True, None) or (True, error)."""
+    """Read files in the child; send (False, object) for each object, then (True, None) or (True, Raised)."""
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # HDF5 and dbdreader print messages
@@ -213,7 +228,7 @@ def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
             except BrokenPipeError:
                 raise
             except (MagbridgeError, OSError) as error:
-                end.send((True, error))
+                end.send((True, Raised.from_exception(error)))
     except BrokenPipeError:  # the parent has stopped reading
         pass
 
