@@ -71,9 +71,8 @@ def test_an_impossible_value_is_not_known() -> None:
     (read,) = checked("log.csv", [(whole, range(1, 301))])
     np.testing.assert_array_equal(read["depth"], np.where(depth < 0, np.nan, 5.0))
     assert passed_over(read.attrs) == {"values_dropped": 3}
-    assert named_losses(read.attrs) == [
-        "log.csv: row 8, column 'depth': expected m, at most 100000, not -1e+300"
-    ]
+    (line,) = named_losses(read.attrs)
+    assert line == "log.csv: row 8, column 'depth': expected m, at most 100000, not -1e+300"
 
 
 @given(time=st.lists(st.integers(0, 9), max_size=12))
@@ -111,13 +110,10 @@ def test_three_bad_files_of_forty(tmp_path: Path) -> None:
     assert whole.sizes["time"] == sum(piece.sizes["time"] for piece in pieces) == 370
     with pytest.raises(FormatError, match=r"000\.csv"):
         logs.read(paths, options=logs.Options(strict=True))
-
-
-def test_no_good_file_is_one_line(tmp_path: Path) -> None:
-    paths = made(tmp_path, 3, (0, 1, 2))
+    bad = [paths[k] for k in (0, 17, 39)]
     for read in (logs.read, lambda paths: list(logs.read_chunks(paths))):
         with pytest.raises(FormatError, match="expected rows after the header"):
-            read(paths)
+            read(bad)
 
 
 def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:

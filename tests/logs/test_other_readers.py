@@ -187,7 +187,7 @@ def test_every_column_of_a_telemetry_log_is_as_pymavlink_reads_it(real_data: Pat
                 {"time": when, **own, **{name: v for name, (t, v) in known.items() if when - t <= MAX_AGE}}
             )
     back = logs.read(path)
-    assert len(rows) == back.sizes["time"]
+    assert (len(rows), back.sizes["time"], back.attrs["damages"]) == (528, 528, 4)
     for name in {name for row in rows for name in row}:
         theirs = [row.get(name, np.nan) for row in rows]
         np.testing.assert_allclose(back[name], theirs, rtol=1e-6, atol=1e-9, err_msg=name)

@@ -43,6 +43,10 @@ class Log:
         frame = self.codecs.setdefault(by, Codec(*by)).pack(message, **fields)
         self.data += pack_record(T0 + round(t * S), channel, frame)
 
+    def ours(self, t: float, message: str, /, channel: int = Channel.SENT, **fields: Any) -> None:
+        """Write a message of the bridge, which it sends unless `channel` is another."""
+        self.write_message(t, message, by=(1, 191), channel=channel, **fields)
+
     def mag(self, t: float, x: int, **fields: Any) -> None:
         self.write_message(t, "RAW_IMU", xmag=x, ymag=10, zmag=-20, temperature=2550, **fields)
 
@@ -127,25 +131,26 @@ def test_without_a_magnetometer_attitude_makes_the_rows(tmp_path: Path) -> None:
 
 def test_a_bridges_own_log(tmp_path: Path) -> None:
     """Reports of the bridge are not telemetry; a correction is in the row of its reading."""
-    log, ours = Log(), (1, 191)
-    log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    log = Log()
+    log.ours(0, "MAG_BRIDGE_START", channel=Channel.STATE)
     for k in range(3):
         time_us = T0 + k * S
         log.write_message(k, "NAMED_VALUE_FLOAT", channel=Channel.LINK, name="battpos", value=k)
         log.mag(k, 9, channel=Channel.LINK)
-        log.write_message(k, "MAG_SENSOR_BYTES", by=ours, channel=Channel.SENSOR, length=1, data=b"x")
-        raw = {"x": 1.5, "y": 2.5, "z": k, "delay_y": 10, "delay_z": 20, "temperature": 4, "supply": np.nan}
-        log.write_message(
-            k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=time_us - 7, power_cycle=2, flags=8, **raw
-        )
+        log.ours(k, "MAG_SENSOR_BYTES", channel=Channel.SENSOR, length=1, data=b"x")
+        raw: dict[str, Any] = {"x": 1.5, "y": 2.5, "z": k, "delay_y": 10, "delay_z": 20, "supply": np.nan}
+        log.ours(k, "MAG_RAW", time_usec=time_us - 7, power_cycle=2, flags=8, temperature=4, **raw)
         if k != 1:
-            field = {"total_field": 50_000.125 + k, "total_field_sigma": 2, "x": 1, "anomaly": np.nan}
+            field: dict[str, Any] = {
+                "total_field": 50_000.125 + k,
+                "total_field_sigma": 2,
+                "x": 1,
+                "anomaly": np.nan,
+            }
             flags = int(Quality.GAP)
-            log.write_message(
-                k, "MAG_FIELD", by=ours, channel=Channel.SENT, time_usec=time_us - 7, flags=flags, **field
-            )
-        log.write_message(k, "NAMED_VALUE_FLOAT", by=ours, channel=Channel.SENT, name="mag", value=50_000)
-        log.write_message(k, "HIGHRES_IMU", by=ours, channel=Channel.SENT, xmag=0.5)
+            log.ours(k, "MAG_FIELD", time_usec=time_us - 7, flags=flags, **field)
+        log.ours(k, "NAMED_VALUE_FLOAT", name="mag", value=50_000)
+        log.ours(k, "HIGHRES_IMU", xmag=0.5)
     back = log.read(tmp_path)
     np.testing.assert_allclose(back["time"], (T0 - 7) / S + np.arange(3.0), rtol=0, atol=1e-6)
     np.testing.assert_allclose(back["mag_time_z"] - back["time"], 20e-6, rtol=0, atol=0.5e-6)
@@ -164,24 +169,20 @@ def test_of_two_components_a_bridges_log_is_read_as_it_was_corrected(
     tmp_path: Path, wanted: int, expected: list[float]
 ) -> None:
     """The autopilot's value from the first on, unless the configuration names another component."""
-    log, ours = Log(), (1, 191)
-    log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    log = Log()
+    log.ours(0, "MAG_BRIDGE_START", channel=Channel.STATE)
     for column, what in (
         ("battpos", {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=battpos"}),
         ("ballast", {"message": "DEBUG_FLOAT_ARRAY", "field": "data[0]", "match": "array_id=7"}),
     ):
-        log.write_message(
-            0, "MAG_COLUMN", by=ours, channel=Channel.STATE, column=column, scale=1, component=wanted, **what
-        )
+        log.ours(0, "MAG_COLUMN", channel=Channel.STATE, column=column, scale=1, component=wanted, **what)
     for k in range(3):
         for component, value in ((99, 7 + k), (1, k)):
             by: dict[str, Any] = {"by": (1, component), "channel": Channel.LINK}
             if k or component != 1:
                 log.write_message(k, "NAMED_VALUE_FLOAT", name="battpos", value=value, **by)
                 log.write_message(k, "DEBUG_FLOAT_ARRAY", array_id=7, data=[value, *[0] * 57], **by)
-        log.write_message(
-            k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S, x=1.0, y=2.0, z=3.0
-        )
+        log.ours(k, "MAG_RAW", time_usec=T0 + k * S, x=1.0, y=2.0, z=3.0)
     back = log.read(tmp_path)
     np.testing.assert_array_equal(back["battpos"], expected)
     np.testing.assert_array_equal(back["ballast"], expected)
@@ -190,17 +191,15 @@ def test_of_two_components_a_bridges_log_is_read_as_it_was_corrected(
 @pytest.mark.parametrize("step", [-3600 * S, 3600 * S, 50 * 31_557_600 * S])
 def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path, step: int) -> None:
     """The stamps of the records continue; published messages are dated by the clock as it is set."""
-    log, ours = Log(), (1, 191)
-    log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    log = Log()
+    log.ours(0, "MAG_BRIDGE_START", channel=Channel.STATE)
     for k in range(6):
         set_us = step if k >= 3 else 0
         if k == 3:
             log.write_message(
                 k, "MAG_CLOCK_STEP", by=(0, 0), channel=Channel.STATE, time_usec=T0 + k * S + step, step=step
             )
-        log.write_message(
-            k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S + set_us, x=k, delay_z=20
-        )
+        log.ours(k, "MAG_RAW", time_usec=T0 + k * S + set_us, x=k, delay_z=20)
     back = log.read(tmp_path)
     np.testing.assert_array_equal(back["time"], [(T0 + step) / S + k for k in range(6)])
     np.testing.assert_array_equal(back["mag_x"], range(6))
@@ -210,7 +209,7 @@ def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path
 
 def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path) -> None:
     log = Log()
-    log.write_message(0, "MAG_BRIDGE_START", by=(1, 191), channel=Channel.STATE)
+    log.ours(0, "MAG_BRIDGE_START", channel=Channel.STATE)
     log.mag(1, 9, channel=Channel.LINK)
     with pytest.raises(FormatError, match=r"log\.tlog: expected MAVLink records with one of MAG_RAW"):
         log.read(tmp_path)
@@ -220,11 +219,8 @@ def test_the_log_says_what_its_parameters_are(tmp_path: Path) -> None:
     """Like a bridge's ``[telemetry]``, the log declares any field of any message, scaled and named."""
     log = Log()
     name: dict[str, Any] = {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=batt"}
-    array: dict[str, Any] = {
-        "message": "DEBUG_FLOAT_ARRAY",
-        "field": "data[3]",
-        "match": "name=masses,array_id=7",
-    }
+    array: dict[str, Any] = {"message": "DEBUG_FLOAT_ARRAY", "field": "data[3]"}
+    array["match"] = "name=masses,array_id=7"
     servo: dict[str, Any] = {"message": "SERVO_OUTPUT_RAW", "field": "servo2_raw"}
     log.write_message(0, "MAG_COLUMN", column="battery_position", unit="in", scale=0.5, offset=1, **name)
     log.write_message(0, "MAG_COLUMN", column="ballast", unit="cc", scale=2, **array)
@@ -244,11 +240,8 @@ def test_the_log_says_what_its_parameters_are(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back["ballast"], [0, 2, 4])
     np.testing.assert_allclose(back["servo2"], [10, 10.1, 10.2])
     np.testing.assert_array_equal(back["servo1"], [1500] * 3)
-    assert [back[name].attrs["units"] for name in ("battery_position", "ballast", "servo2")] == [
-        "in",
-        "cc",
-        "deg",
-    ]
+    units = [back[name].attrs["units"] for name in ("battery_position", "ballast", "servo2")]
+    assert units == ["in", "cc", "deg"]
     assert back.attrs["heading_reference"] == "magnetic"
     assert not {"batt", "other"} & set(back.data_vars)
 
@@ -305,14 +298,8 @@ def test_a_live_log_is_read_back(tmp_path: Path) -> None:
 
 
 def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -> None:
-    servo = Telemetry(
-        message="SERVO_OUTPUT_RAW",
-        field="servo2_raw",
-        match={"port": 0},
-        scale=0.1,
-        offset=-150.0,
-        unit="deg",
-    )
+    scaled: dict[str, Any] = {"scale": 0.1, "offset": -150.0, "unit": "deg"}
+    servo = Telemetry(message="SERVO_OUTPUT_RAW", field="servo2_raw", match={"port": 0}, **scaled)
     codec = Codec(1, 1)
     with closing(TlogWriter(tmp_path, max_size=0.01, header=declarations(1, 191, {"servo2": servo}))) as log:
         for k in range(500):
@@ -335,11 +322,9 @@ def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None
     with closing(TlogWriter(tmp_path, header=declarations(1, 191, {}, nt_per_count))) as log:
         log.extend([(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))])
         for k, (channels, numbers) in enumerate(zip(field, counts.tolist(), strict=True)):
-            values = dict(
-                zip(("x", "y", "z", "count_x", "count_y", "count_z"), (*channels, *numbers), strict=True)
-            )
-            if k == 99:
-                values |= {"count_x": 0, "count_y": 0, "count_z": 0}
+            values = dict(zip("xyz", channels, strict=True))
+            for axis, number in zip("xyz", numbers, strict=True):
+                values[f"count_{axis}"] = 0 if k == 99 else number
             log.extend([(T0 + k * S, Channel.SENT, codec.pack("MAG_RAW", time_usec=T0 + k * S, **values))])
     back = logs.read(sorted(tmp_path.iterdir()))
     for axis, exact in zip("xyz", field.T, strict=True):
@@ -350,14 +335,11 @@ def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None
 
 def test_names_longer_than_ten_letters(tmp_path: Path) -> None:
     """Cut for the message, whole again in the deployment; any MAVLink tool plots the short one."""
-    columns = {
-        name: [float(k)] for k, name in enumerate(("water_temperature", "water_temperatures", "water_temp"))
-    }
+    values = {"water_temperature": 0.0, "water_temperatures": 1.0, "water_temp": 2.0}
+    columns = {name: [value] for name, value in values.items()}
     logs.write(deployment("made", [1.0], columns, {"water_temp": "degC"}), tmp_path / "log.tlog")
     back = logs.read(tmp_path / "log.tlog")
-    assert {name: back[name].item() for name in back.data_vars} == {
-        name: column[0] for name, column in columns.items()
-    }
+    assert {name: back[name].item() for name in back.data_vars} == values
     assert back["water_temp"].attrs["units"] == "degC"
 
 
