@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from magbridge.learning import Learner
 
 __all__ = [
-    "SensorLine", "SensorStream", "needed_units", "open_correction", "open_drivers", "other_calibrations",
-    "unmet",
+    "NMEA_SENTENCE", "SensorLine", "SensorStream", "needed_units", "open_correction", "open_drivers",
+    "other_calibrations", "unmet",
 ]  # fmt: skip
 
 OK: Final = MAG_PORT_STATE.OK

@@ -24,7 +24,7 @@ from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.model import Block, average, block_length, transition
 from magbridge.navigate.options import NavigationOptions
 
-__all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
+__all__ = ["ELSEWHERE", "IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 
 MAX_AGREEING_DISTANCE = 9.0
 """Largest squared Mahalanobis distance of two estimates of the same place."""
