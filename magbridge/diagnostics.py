@@ -77,8 +77,6 @@ FIT_TEXTS = {
     "in the calibration, and the sigma counts the rest",
     "held_out_errors": "held-out parts have errors of {ratio:.1f} times the fit's sigma, so its sigmas "
     "were raised by that: an effect is missing in the model (magbridge diagnose), or in the reference",
-    "order_too_low": "--order is too low: one more raises the log-likelihood by {gain:.0f}, and the sigmas "
-    "do not include the missing terms",
     "unusual_scales": "the fit multiplies the readings by {low:.2f} to {high:.2f}, and anomalies with "
     "them: unless the sensor is that far off, the reference is; fit to runs at one place, or with a better "
     "map (--grid)",

@@ -135,7 +135,7 @@ def drifted(log: xr.Dataset, by: float) -> xr.Dataset:
 # ---- the paper's trials ------------------------------------------------------------------------------------
 
 METHODS: dict[str, dict[str, Any]] = {
-    "nominal": {"axes_fixed": True, "equal_xz": True},
+    "nominal": {"constrained": True},
     "cubic": {},
     "auto": {},
 }

@@ -104,7 +104,7 @@ def test_errors_in_variables_take_the_bias_away() -> None:
         w = h * np.sin(heading) * np.sin(roll) + level * np.cos(roll)
         field = 5e4 * np.column_stack([x, y, w]) + [300.0, -200.0, 500.0] + rng.normal(0, 5, (n, 3))
         data = Observations(field, np.full(n, 5e4), np.empty((n, 0)))
-        _, found, _ = ellipsoid(data, scale_sigma=1e-3, gain_sigma=0.02)
+        _, found, _ = ellipsoid(data)
         off.append((found.coefficients[8] - 500.0) / np.sqrt(found.covariance[8, 8]))
     assert abs(np.mean(off)) < 3.0 / np.sqrt(len(off)) + 0.3
     assert np.std(off) < 1.6
@@ -161,7 +161,7 @@ def test_the_paper_s_signature(glider: Gliders) -> None:
     assert rms_on_survey(by["nominal"].calibration, one) > 20.0
 
 
-def test_an_order_that_is_too_low_is_reported(glider: Gliders) -> None:
+def test_an_order_that_is_too_low_widens_the_sigma(glider: Gliders) -> None:
     """The fit's sigmas are too small because a term is missing; with the usual order they are right."""
     two = glider(0, 2)
     low, usual = fit(two.runs, "auto", 1), fit(two.runs, "auto", 3)
@@ -169,8 +169,6 @@ def test_an_order_that_is_too_low_is_reported(glider: Gliders) -> None:
     assert low.details["left_out_ratio"] > 1.0
     assert ("held_out_errors" in codes(low)) == (low.details["left_out_ratio"] > 1.25)
     assert survey_error(usual.calibration, two)[1] < 1.25
-    assert "order_too_low" in codes(low)
-    assert "order_too_low" not in codes(usual)
 
 
 def test_fits_are_deterministic(glider: Gliders) -> None:
@@ -247,13 +245,13 @@ def test_a_collapsed_fit_is_refused() -> None:
         field * [3.0, 3.0, 3.0] + rng.normal(0, 1, (400, 3)), np.full(400, 5e4), np.empty((400, 0))
     )
     with pytest.raises(CalibrationError, match=r"collapsed: .* there are too few attitudes"):
-        fit(data, "nominal", gain_sigma=1.0)
+        fit(data, "nominal")
 
 
 def test_a_stuck_channel_and_counts_are_named(glider: Gliders) -> None:
     runs = glider(0).runs
-    with pytest.raises(CalibrationError, match=r"a reading counts 6\.\d+ nT, or there are too few attitudes"):
-        fit(replace(runs, field=runs.field / 6.67), "nominal", gain_sigma=1.0)
+    with pytest.raises(CalibrationError, match=r"a reading counts 2\.\d+ nT, or there are too few attitudes"):
+        fit(replace(runs, field=runs.field / 3.0))
     with pytest.raises(CalibrationError, match="mag_y is 43000 in every sample: the channel is stuck"):
         fit(replace(runs, field=runs.field * [1.0, 0.0, 1.0] + [0.0, 43_000.0, 0.0]))
 
@@ -267,7 +265,7 @@ def test_without_parameters_auto_is_one_ellipsoid(glider: Gliders) -> None:
 
 
 def test_nominal_constraints(glider: Gliders) -> None:
-    posed, found, _ = ellipsoid(glider(0).runs, axes_fixed=True, equal_xz=True)
+    posed, found, _ = ellipsoid(glider(0).runs, constrained=True)
     assert found.coefficients[0] == found.coefficients[2]
     assert not found.coefficients[3:6].any()
     assert not found.covariance[3:6].any()

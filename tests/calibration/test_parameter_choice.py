@@ -16,13 +16,11 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.checks import combinations
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observations import Observations, polynomial_samples
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.parameter_choice import best_parameters, lines, undeclared
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
-from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.logs import read, write
@@ -243,17 +241,7 @@ def test_held_out_runs_are_near_the_floor(glider: Gliders) -> None:
     assert np.nanmedian(np.abs(normalised)) < 1.5
 
 
-# ---- Terms that runs determine or not, and the message of the fit ----------------------------------------
-
-
-def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:
-    """Ballast at two positions: its squares and cubes are not distinguishable."""
-    runs = glider(0, 2).runs
-    held = np.array([np.median(runs.parameters[runs.runs == r], axis=0) for r in runs.runs])
-    samples = polynomial_samples(replace(runs, parameters=held), full_order(2, 3))
-    seen = combinations(samples, np.zeros(90), 1.0)
-    assert len(seen) == 63
-    assert (np.diff(seen) >= 0.0).all()
+# ---- The messages of the fit -------------------------------------------------------------------------------
 
 
 def test_readings_that_a_fit_multiplies_are_reported(glider: Gliders) -> None:

@@ -1,4 +1,4 @@
-"""Check a fit: rank, estimable combinations of coefficients, boresight, and warnings about its data."""
+"""Check a fit: its boresight, and warnings about its data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from magbridge.calibration.fitting.uncertainty import apart_from_level, expected
 from magbridge.calibration.model import Calibration
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
@@ -25,8 +24,6 @@ if TYPE_CHECKING:
 
 # ---- What the data determine ----
 
-JACOBIAN_ROWS = 5_000
-"""Largest number of rows of the Jacobian; more rows do not change its rank."""
 MIN_POSITION_STEP_FRACTION = 0.02
 """Smallest distance between two positions of a mass, as a fraction of half its range, and smallest fraction
 of the samples at a position that counts."""
@@ -41,27 +38,6 @@ DIVE_PITCH_DEG = 5.0
 """Smallest absolute pitch of a dive or climb, deg."""
 OPEN = 60.0
 """Smallest gap in the headings that is reported, deg."""
-RANK_TOLERANCE = 1e-9
-"""Fraction of the largest singular value below which one counts as zero."""
-
-
-def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> FloatArray:
-    """Return the 1-sigma of each estimable combination of coefficients, (rank,), nT, ascending.
-
-    The values follow from the data alone, by the singular values of the Jacobian at `coefficients` (9 m,),
-    nT. `sigma`: noise of a sample, nT.
-    """
-    # thin the rows, and scale them so that they carry the information of all
-    step = max(len(samples.field) // JACOBIAN_ROWS, 1)
-    part = samples.part(slice(None, None, step))
-    _, g = residuals(part, coefficients)
-    J = jacobian(part.phi, g) * np.sqrt(step) / sigma
-    # scale the columns to one norm, so that the rank does not depend on the coefficients' units
-    size = np.linalg.norm(J, axis=0)
-    scale = np.where(size > 0.0, size, 1.0)
-    # singular values over the noise: 1 / value is the 1-sigma of a combination of coefficients
-    values = np.linalg.svd(J / scale * np.median(scale), compute_uv=False)
-    return np.asarray(1.0 / values[values > RANK_TOLERANCE * values[0]])
 
 
 def expected_ratio(calibration: Calibration, data: Observations) -> float:
@@ -169,8 +145,6 @@ CHECKS: tuple[Callable[[Calibration, Observations], Iterator[Diagnostic]], ...] 
 
 UNSUPPORTED = 5.0
 """Ratio of expected error and noise above which the data do not support the fit."""
-LIKELIER = 3.0
-"""Smallest gain in log evidence by the next order at which the order is too low (odds of 20:1)."""
 MAX_ERROR_RATIO = 1.25
 """Ratio of held-out errors and their sigmas above which a warning is given."""
 MIN_SIGNAL_TO_NOISE = 3.0
@@ -215,7 +189,6 @@ def judged(found: Fit, data: Observations) -> Fit:
         warnings = (*warnings, *found.open)
     reasons = tuple(warning.text for warning in warnings)
     unsupported = [Diagnostic("unsupported_fit", {"reasons": "; ".join(reasons)})] if reasons else []
-    seen = combinations(found.samples, calibration.coefficients, max(noise, 1e-9))
     return replace(
         found,
         calibration=replace(whole, boresight=calibration.boresight, warnings=reasons),
@@ -226,12 +199,7 @@ def judged(found: Fit, data: Observations) -> Fit:
             *mismatch,
             *_suspicions(found),
         ),
-        details={
-            **found.details,
-            "expected_over_noise": ratio,
-            "rank": len(seen),
-            "combinations_nT": seen.tolist(),
-        },
+        details={**found.details, "expected_over_noise": ratio},
     )
 
 
@@ -282,8 +250,6 @@ def _suspicions(found: Fit) -> Iterator[Diagnostic]:
         yield Diagnostic("ends_left_out", {"samples": counted(ends, "sample")})
     if (ratio := found.details.get("left_out_ratio", 1.0)) > MAX_ERROR_RATIO:
         yield Diagnostic("held_out_errors", {"ratio": ratio})
-    if (gained := found.details.get("next_order", 0.0)) > LIKELIER:
-        yield Diagnostic("order_too_low", {"gain": gained})
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
         yield Diagnostic("unusual_scales", {"low": smallest, "high": largest})

@@ -117,9 +117,9 @@ def fit(
         if method == "auto":
             found = replace(found, open=tuple(left_open(data, UNKNOWN_LENGTH)))
         found = replace(found, open=(*away, *notes, *found.open))
-        if (kept := found.details.pop("flown", None)) is not None:
-            data = data.part(kept)
-            found.details["ends"] = int((~kept).sum())
+        if (flight := found.details.pop("flown", None)) is not None:
+            data = data.part(flight)
+            found.details["ends"] = int((~flight).sum())
         found = found if method == "survey" else _biased(found, bias)
         calibration = replace(found.calibration, conditions=data.conditions())
         return judged(replace(found, calibration=calibration), data)

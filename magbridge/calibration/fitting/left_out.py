@@ -14,7 +14,7 @@ of samples with similar attitude, which test the fit at attitudes outside its da
 the model is incomplete, and all sigmas are too small by the factor R.
 
 This check needs the normal equations only. Two different fits may agree to first order, so a comparison of
-fits repeats each fit without the part (:func:`error_between`).
+fits repeats each fit without the part (:func:`error_between`, :func:`error_forward`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.solve import CoefficientPosterior, thinned_rows
+from magbridge.calibration.fitting.solve import CoefficientPosterior, successive, thinned_rows
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, effective_fraction
-from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
+from magbridge.estimation.optimise import gauss_newton, normal_equations
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
 PARTS, BLOCKS = 10, 4
@@ -63,6 +63,10 @@ class LeftOut:
     """RMS error, nT, that also includes later parts predicted from the earlier parts."""
 
 
+Split = tuple[list[int], int]
+"""Indices of the parts that a prediction uses, and index of the part that it predicts."""
+
+
 def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitudes: bool = False) -> LeftOut:
     """Return the errors of a fit on held-out parts, by linearised predictions from the other parts.
 
@@ -70,48 +74,21 @@ def leave_out(found: CoefficientPosterior, runs: NDArray[np.generic], *, attitud
     log has few runs. `attitudes`: also hold out groups of similar attitude, unless the residuals are so
     correlated that the remaining samples predict the group.
     """
+    # number of independent errors, which the autocorrelation of the noise reduces
+    count = len(found.samples.field) * effective_fraction(*found.noise.shape)
+    parts = _parts(runs)
+    e, s2 = _predicted(found, parts, _all_others(parts))
+    left = _judged(e, s2, count)
     # predict later parts only for fits without positions: new positions would dominate the errors
-    left = _left_out(found, _parts(runs), forward=found.samples.phi.shape[1] == 1)
+    if found.samples.phi.shape[1] == 1:
+        later, later_s2 = _predicted(found, parts, _forward(parts))
+        both = _judged(np.append(e, later), np.append(s2, later_s2), count)
+        left = replace(both, rms=left.rms)
     if attitudes and found.noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:
-        apart = _left_out(found, _alike(found.samples))
+        groups = _alike(found.samples)
+        apart = _judged(*_predicted(found, groups, _all_others(groups)), count)
         left = replace(left, ratio=max(left.ratio, apart.ratio))
     return left
-
-
-def _left_out(found: CoefficientPosterior, parts: list[IndexArray], *, forward: bool = False) -> LeftOut:
-    """Return the errors of `parts` (rows), predicted from all others and, if `forward`, from earlier."""
-    samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
-    c = found.coefficients
-    # Normal equations are sums over samples. Those without a part are the whole minus the part's, and one
-    # Newton step from the common fit gives the coefficients without it: no fit is repeated.
-    normals = [_normal(found, rows) for rows in parts]
-    # at the minimum the whole gradient balances the prior, so the part's own gradient is missing
-    hessian = np.sum([normal.hessian for normal in normals], axis=0)
-    every = max(len(samples.field) // TESTED, 1)
-    counted = np.ones(len(samples.field), bool)
-    if noise.weight is not None and noise.rejected <= ISOLATED * len(counted):
-        counted = noise.weight > 0.0
-    missing = [(k, hessian - normal.hessian, normal.gradient) for k, normal in enumerate(normals)]
-    # forward chaining: part k is predicted from the parts before it
-    if forward:
-        for k in range(1, len(parts)):
-            later = np.sum([normal.gradient for normal in normals[k:]], axis=0)
-            missing.append((k, np.sum([normal.hessian for normal in normals[:k]], axis=0), later))
-    e, s2 = [], []
-    for k, others, lacking in missing:
-        P = covariance_of(others / s2_fit + prior.precision)
-        tested = samples.part(parts[k][counted[parts[k]]][::every])
-        off, g = residuals(tested, c)
-        J = jacobian(tested.phi, g) @ prior.E
-        # prediction error, and its variance: noise plus J P J^T
-        e.append(off + J @ (P @ lacking / s2_fit))
-        s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
-    # number of independent errors, which the autocorrelation of the noise reduces
-    count = len(samples.field) * effective_fraction(*noise.shape)
-    among = _judged(np.concatenate(e[: len(parts)]), np.concatenate(s2[: len(parts)]), count)
-    if not forward:
-        return among
-    return replace(_judged(np.concatenate(e), np.concatenate(s2), count), rms=among.rms)
 
 
 def error_between(found: CoefficientPosterior, runs: NDArray[np.generic]) -> float:
@@ -120,8 +97,8 @@ def error_between(found: CoefficientPosterior, runs: NDArray[np.generic]) -> flo
     `runs` (n,): labels as for :func:`leave_out`. The new fits use the prior and noise of `found`. An outlier
     counts as five robust sigmas.
     """
-    rows = np.arange(len(found.samples.field))
-    return _refitted_error(found, [(np.delete(rows, part), part) for part in _parts(runs)])
+    parts = _parts(runs)
+    return _refitted_error(found, parts, _all_others(parts))
 
 
 def error_forward(found: CoefficientPosterior) -> float:
@@ -132,18 +109,62 @@ def error_forward(found: CoefficientPosterior) -> float:
     coefficients that the beginning of a log does not determine, and later changes of the vehicle.
     """
     parts = np.array_split(thinned_rows(len(found.samples.field)), FORWARD_PARTS)
-    return _refitted_error(found, [(np.concatenate(parts[:k]), parts[k]) for k in range(1, FORWARD_PARTS)])
+    return _refitted_error(found, parts, _forward(parts))
 
 
-def _refitted_error(found: CoefficientPosterior, splits: list[tuple[IndexArray, IndexArray]]) -> float:
-    """Return the RMS error, nT, over all splits, of the second rows predicted by a fit to the first rows."""
+def _all_others(parts: list[IndexArray]) -> list[Split]:
+    """Return splits that predict each part from all others."""
+    return [([j for j in range(len(parts)) if j != k], k) for k in range(len(parts))]
+
+
+def _forward(parts: list[IndexArray]) -> list[Split]:
+    """Return splits that predict each part but the first from the earlier parts."""
+    return [(list(range(k)), k) for k in range(1, len(parts))]
+
+
+def _predicted(
+    found: CoefficientPosterior, parts: list[IndexArray], splits: list[Split]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the errors (m,), nT, of all splits by linearised predictions, and their variances (m,), nT²."""
+    samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
+    c, weight = found.coefficients, found.weighted.weight
+    # Normal equations are sums over samples, so one Newton step from the common fit gives the coefficients of
+    # a fit to some of the parts: no fit is repeated.
+    normals = [
+        normal_equations(
+            successive(samples, rows), c, None if weight is None else weight[rows], *found.weighted.shape
+        ).reduced(prior.E)
+        for rows in parts
+    ]
+    every = max(len(samples.field) // TESTED, 1)
+    counted = np.ones(len(samples.field), bool)
+    if noise.weight is not None and noise.rejected <= ISOLATED * len(counted):
+        counted = noise.weight > 0.0
+    e, s2 = [], []
+    for fitted, k in splits:
+        hessian = np.sum([normals[j].hessian for j in fitted], axis=0)
+        # at the minimum the whole gradient balances the prior, so the other parts' gradients are missing
+        lacking = np.sum([normals[j].gradient for j in range(len(parts)) if j not in fitted], axis=0)
+        P = covariance_of(hessian / s2_fit + prior.precision)
+        tested = samples.part(parts[k][counted[parts[k]]][::every])
+        off, g = residuals(tested, c)
+        J = jacobian(tested.phi, g) @ prior.E
+        # prediction error, and its variance: noise plus J P J^T
+        e.append(off + J @ (P @ lacking / s2_fit))
+        s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
+    return np.concatenate(e), np.concatenate(s2)
+
+
+def _refitted_error(found: CoefficientPosterior, parts: list[IndexArray], splits: list[Split]) -> float:
+    """Return the RMS error, nT, over all splits, by new fits to the parts that a split uses."""
     samples, prior, noise = found.samples, found.prior, found.weighted
     weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
     errors = []
-    for fitted, tested in splits:
-        kept, own = _rows_of(samples, fitted), replace(noise, weight=weight[fitted])
-        again = gauss_newton(kept, prior, own, found.z, steps=REFIT_STEPS)
-        errors.append(residuals_of(samples.part(tested), prior.coefficients(again.z)))
+    for fitted, k in splits:
+        rows = np.sort(np.concatenate([parts[j] for j in fitted]))
+        own = replace(noise, weight=weight[rows])
+        again = gauss_newton(successive(samples, rows), prior, own, found.z, steps=REFIT_STEPS)
+        errors.append(residuals_of(samples.part(parts[k]), prior.coefficients(again.z)))
     e = np.concatenate(errors)
     limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
@@ -185,18 +206,3 @@ def _alike(samples: ResidualSamples) -> list[IndexArray]:
     u = samples.field / np.linalg.norm(samples.field, axis=1)[:, None]
     _, group = kmeans2(u, ATTITUDES, minit="++", rng=np.random.default_rng(1))
     return [rows for k in range(ATTITUDES) if len(rows := np.flatnonzero(group == k))]
-
-
-def _normal(found: CoefficientPosterior, rows: IndexArray) -> NormalEquations:
-    weight = None if found.weighted.weight is None else found.weighted.weight[rows]
-    part = _rows_of(found.samples, rows)
-    normal = normal_equations(part, found.coefficients, weight, *found.weighted.shape)
-    return normal.reduced(found.prior.E)
-
-
-def _rows_of(samples: ResidualSamples, rows: IndexArray) -> ResidualSamples:
-    """Return the samples of `rows`; across a gap in the rows they count as independent."""
-    part = samples.part(rows)
-    part.steps[0] = np.inf
-    part.steps[1:][np.diff(rows) > 1] = np.inf
-    return part

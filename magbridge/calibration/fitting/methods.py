@@ -55,7 +55,6 @@ from magbridge.calibration.fitting.solve import (
     lasting_noise,
     settle,
     starts,
-    thinned,
     with_slow_noise,
 )
 from magbridge.errors import CalibrationError, NoSolutionError
@@ -69,8 +68,6 @@ from magbridge.wording import counted
 
 SHRUNK = 0.15
 """Departure of the middle scale factor from 1 above which a fit is implausible."""
-USUAL = 3
-"""Order that is usually sufficient; a fit of a lower order also computes the gain of the next order."""
 
 
 def fit_auto(
@@ -85,16 +82,14 @@ def fit_auto(
     CalibrationError: no start converged, or the best fit collapsed.
     """
     # 1. coefficients, widths and noise that maximise the evidence, from several starts
-    posed = pose(data, order, vehicle, known)
-    best = best_climb(posed.samples, posed.family)
     # 2. a crash or a launch at an end of the log is not flight: fit again without it
-    kept = flown(best.residual)
-    if not kept.all():
-        found = fit_auto(data.part(kept), order, vehicle=vehicle, known=known)
-        inner = found.details.pop("flown", None)
-        if inner is not None:
-            kept[kept] = inner
-        return replace(found, details={**found.details, "flown": kept})
+    flight = np.ones(len(data), bool)
+    while True:
+        posed = pose(data, order, vehicle, known)
+        best = best_climb(posed.samples, posed.family)
+        if (kept := flown(best.residual)).all():
+            break
+        flight[flight], data = kept, data.part(kept)
     # 3. noise as a slow and a white part, if the residuals show both
     best = with_slow_noise(best)
     check_scales(posed.samples, best.coefficients)
@@ -102,10 +97,10 @@ def fit_auto(
     left = leave_out(best, data.runs, attitudes=True)
     details = {
         "log_evidence": best.log_evidence,
-        "next_order": _gained(data, order, vehicle) if known is None else 0.0,
         "determined": best.widths.determined,
         "outliers": best.noise.rejected,
         "widths_nT": dict(zip(best.family.names, np.exp(best.widths.eta).tolist(), strict=True)),
+        "flown": flight,
     }
     if known is None:
         # always: the choice of parameters compares this error of fits with and without a parameter
@@ -131,6 +126,7 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
     forward = error_forward(one) / found.details["forward_nT"]
     simpler = _nominal(data, posed, one, left)
     simpler.details["forward_nT"] = forward * found.details["forward_nT"]
+    simpler.details["flown"] = found.details["flown"]
     if data.names:  # errors to first order suffice to compare fits that differ by their parameters
         among = left.rms / found.details["left_out_nT"]
         return simpler if among * forward < 1.0 else None
@@ -141,23 +137,6 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
 def _shrinks(found: Fit) -> float:
     """Return the departure of the middle scale factor of A from 1."""
     return abs(0.5 * sum(found.scales) - 1.0)
-
-
-def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
-    """Return the gain in log evidence if the order is raised by one.
-
-    The gain is 0 if the fit has no parameters, its order is at least :data:`USUAL`, or a fit fails.
-    """
-    if not data.names or order >= USUAL:
-        return 0.0
-    scores = []
-    for n in (order, order + 1):
-        posed = pose(data, n, vehicle)
-        try:
-            scores.append(best_climb(thinned(posed.samples), posed.family).log_evidence)
-        except CalibrationError:
-            return 0.0
-    return scores[1] - scores[0]
 
 
 # ---- One ellipsoid ----
@@ -181,12 +160,10 @@ def fit_nominal(
     data: Observations,
     order: int = 0,  # noqa: ARG001  (one ellipsoid has none)
     *,
-    axes_fixed: bool = False,
-    equal_xz: bool = False,
-    gain_sigma: float = GAIN_SIGMA,
+    constrained: bool = False,
 ) -> Fit:
     """Fit one ellipsoid by :func:`ellipsoid`; return the fit, whose calibration has no parameters."""
-    return _nominal(data, *ellipsoid(data, axes_fixed=axes_fixed, equal_xz=equal_xz, gain_sigma=gain_sigma))
+    return _nominal(data, *ellipsoid(data, constrained=constrained))
 
 
 def _nominal(data: Observations, posed: Posed, found: CoefficientPosterior, left: LeftOut) -> Fit:
@@ -201,18 +178,11 @@ def _nominal(data: Observations, posed: Posed, found: CoefficientPosterior, left
 
 
 def ellipsoid(
-    data: Observations,
-    *,
-    axes_fixed: bool = False,
-    equal_xz: bool = False,
-    scale_sigma: float = SOFT_IRON_SIGMA,
-    gain_sigma: float = GAIN_SIGMA,
+    data: Observations, *, constrained: bool = False
 ) -> tuple[Posed, CoefficientPosterior, LeftOut]:
     """Fit one ellipsoid; return its problem, its posterior, and its errors on held-out parts.
 
-    `axes_fixed`: set ``M = I`` (no rotation), as the paper does. `equal_xz`: set ``S_x = S_z``, as the paper
-    does. `scale_sigma`, `gain_sigma`: prior 1-sigma of soft iron, and of the gain common to all axes, as
-    fractions of the field.
+    `constrained`: set ``M = I`` (no rotation) and ``S_x = S_z``, as the paper does.
 
     NoSolutionError: the fit collapsed or did not converge.
     """
@@ -220,17 +190,16 @@ def ellipsoid(
     posed = pose(bare, 0)
     # Constraints of the paper as c = E z: S_x = S_z shares a column, M = I leaves the rotations out
     E = np.eye(9)
-    if equal_xz:
+    if constrained:
         E[2, 0] = 1.0
-    keep = [s for s in range(9) if not (axes_fixed and s in {3, 4, 5}) and not (equal_xz and s == 2)]
-    E = E[:, keep]
+        E = E[:, [0, 1, 6, 7, 8]]
     # a part of the samples chooses the prior and the start
     few = bare.thinned(CHOOSING_SAMPLES)
     best: tuple[CoefficientPosterior, LeftOut] | None = None
     failure: NoSolutionError | None = None
     F_0 = posed.samples.F_0
-    for factor in WIDTH_FACTORS[:1] if axes_fixed or equal_xz else WIDTH_FACTORS:
-        prior = Prior(_precision(E, factor * scale_sigma, factor * gain_sigma) / F_0**2, E)
+    for factor in WIDTH_FACTORS[:1] if constrained else WIDTH_FACTORS:
+        prior = Prior(_precision(E, factor) / F_0**2, E)
         try:
             one = _settled(replace(pose(few, 0).samples, F_0=F_0), prior)
         except NoSolutionError as error:
@@ -276,14 +245,14 @@ def _settled(
     return best
 
 
-def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
+def _precision(E: FloatArray, factor: float) -> FloatArray:
     """Return the prior precision (q, q) of z in ``c = E z``, for coefficients c as fractions of the field.
 
-    `E` (9, q): constraints. `scale_sigma`, `gain_sigma`: 1-sigma of soft iron and of the common gain.
+    `E` (9, q): constraints. `factor`: of the prior widths of soft iron and of the common gain.
     """
     # independent soft iron and hard iron, plus a gain that is common to the three axes
-    covariance = np.diag(np.array([scale_sigma] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
-    covariance[:3, :3] += gain_sigma**2
+    covariance = np.diag(np.array([factor * SOFT_IRON_SIGMA] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
+    covariance[:3, :3] += (factor * GAIN_SIGMA) ** 2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
 
 
@@ -304,7 +273,7 @@ def fit_cubic(data: Observations, order: int = 3) -> Fit:
     size = 9 * len(posed.exponents)
     start = np.zeros(size)
     with suppress(CalibrationError):  # without a nominal fit the start is a sensor without error
-        start[:9] = ellipsoid(data, axes_fixed=True, equal_xz=True)[1].coefficients
+        start[:9] = ellipsoid(data, constrained=True)[1].coefficients
     # white noise: infinite steps; the coefficients take at most half of the degrees of freedom
     alone = replace(samples, steps=np.full(len(data), np.inf))
     noise_of = partial(_noise_of, alone, min(float(size), len(data) / 2))

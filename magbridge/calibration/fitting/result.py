@@ -48,8 +48,8 @@ class Fit:
     warnings: tuple[Diagnostic, ...]
     """Warnings about undetermined quantities and excluded samples."""
     details: dict[str, Any]
-    """Results of the method by name: evidence, prior widths, number of determined coefficients, rank, and the
-    1-sigma of each estimable combination from the data alone (nT)."""
+    """Results of the method by name: evidence, prior widths, number of determined coefficients, held-out
+    errors."""
     samples: ResidualSamples
     """Samples of the fit, for :mod:`.checks`."""
     open: tuple[Diagnostic, ...] = ()

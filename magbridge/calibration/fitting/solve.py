@@ -84,8 +84,6 @@ class Climbed(CoefficientPosterior):
     family: PriorFamily
     widths: Hyperparameters
     """Prior widths (their logarithms eta) and noise that maximise the evidence."""
-    quadratic: GaussianInformation
-    """Quadratic approximation of the samples' cost at the solution."""
     log_evidence: float
     """Natural logarithm of the evidence of all samples."""
 
@@ -228,7 +226,7 @@ def climb(
     spread = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
     objective = 0.5 * solution.normal.cost / noise.sigma**2 + 0.5 * float(z @ prior.precision @ z)
     return Climbed(
-        samples, prior, z, spread, noise, noise, solution.settled, objective, family, widths, quadratic, score
+        samples, prior, z, spread, noise, noise, solution.settled, objective, family, widths, score
     )
 
 
@@ -249,7 +247,8 @@ def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
     NoSolutionError: no start converged.
     """
     # climb from each start with a part of the samples, at narrow and at wide priors; then the best with all
-    few = thinned(samples)
+    n = len(samples.field)
+    few = successive(samples, thinned_rows(n)) if n > ENOUGH else samples
     answers = []
     for start in starts(few):
         z = family.nearest_latent(start)
@@ -313,13 +312,11 @@ def thinned_rows(n: int) -> IndexArray:
     return (first[:, None] + np.arange(BLOCK)).ravel()
 
 
-def thinned(samples: ResidualSamples) -> ResidualSamples:
-    """Return the samples of :func:`thinned_rows`, with which a fit chooses its start."""
-    n = len(samples.field)
-    if n <= ENOUGH:
-        return samples
-    part = samples.part(thinned_rows(n))
-    part.steps[::BLOCK] = np.inf
+def successive(samples: ResidualSamples, rows: IndexArray) -> ResidualSamples:
+    """Return the samples of `rows` (k,), ascending; across a gap in the rows they count as independent."""
+    part = samples.part(rows)
+    part.steps[0] = np.inf
+    part.steps[1:][np.diff(rows) > 1] = np.inf
     return part
 
 
