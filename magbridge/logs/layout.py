@@ -36,6 +36,8 @@ is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE)
 SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
 """Separator that stands for any number of blanks between fields."""
+EMPTY_CELLS = "-", "--", "*", "---"
+"""Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 NMEA_HEADING = "GgaSentence"
 """Heading of the first field whose content may include separators."""
 DECIMAL_COMMA = re.compile(r"[-+]?(\d{1,3}(\.\d{3})+|\d+),\d+([eE][-+]?\d+)?")
@@ -147,7 +149,8 @@ def header_of(
         guesses.append(f"{counted(passed, 'line')} above the headings passed over")
     start = comments + passed
     headings, first = cells(lines[start].lstrip("#% "), separator), start + 1
-    if _are_values(headings) or (comments and _mostly_digits(headings)):
+    known = [cell for cell in headings if cell not in EMPTY_CELLS]
+    if _are_values(headings) or (comments and _mostly_digits(known)):
         first = start
         start, headings = _headings_elsewhere(path, lines, comments, start, separator, declared)
         guesses += [f"headings from the comment in line {start + 1}"] if start < first else []
@@ -179,7 +182,7 @@ def _count(line: str, separator: str) -> int:
 
 def _are_values(row: Sequence[str]) -> bool:
     """Return True if a row holds values: all cells are numbers, or most begin with a digit."""
-    there = [cell for cell in row if cell]
+    there = [cell for cell in row if cell and cell not in EMPTY_CELLS]
     return all(map(CELL_NUMBER.fullmatch, there)) or (there[0][0].isdigit() and _mostly_digits(there))
 
 

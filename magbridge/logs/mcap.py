@@ -145,7 +145,7 @@ class FileWriter:
         for topic in (RAW, FIELD, FLAGS, VEHICLE, OTHER_TOPIC):
             names = [name for name in columns if topic_of(name) == topic]
             if names:
-                described = {name: {key: str(columns[name][key]) for key in ("units", "long_name")}
+                described = {name: {key: str(columns[name].get(key, "")) for key in ("units", "long_name")}
                         for name in names}  # fmt: skip
                 properties = {
                     name: {**NUMBER_SCHEMA, "description": f"{one['units']}, {one['long_name']}"}

@@ -17,13 +17,11 @@ from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, without_invalid
 from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
-from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, Rows, cells
+from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.records import Quality
 from magbridge.wording import counted
 
-EMPTY_CELLS = "-", "--", "*", "---"
-"""Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 UNCLOSED_QUOTE = "expected every quote to be closed in its line"
 
 

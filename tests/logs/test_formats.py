@@ -243,6 +243,20 @@ def test_streams_in_bounded_memory(tmp_path: Path) -> None:
     assert peaks[1] < 1.3 * peaks[0] + 200_000
 
 
+@pytest.mark.parametrize("suffix", [".xyz", ".csv", ".mcap"])
+def test_a_first_row_that_lacks_most_values_is_a_row(suffix: str, tmp_path: Path) -> None:
+    """The columns need not say what they mean, either."""
+    whole = example(20)
+    for name in whole.data_vars:
+        del whole[name].attrs["long_name"]
+        if not str(name).startswith("mag_"):
+            whole[name][0] = np.nan
+    logs.write(whole, tmp_path / f"a{suffix}")
+    back = logs.read(tmp_path / f"a{suffix}")
+    np.testing.assert_allclose(back["mag_x"], whole["mag_x"])
+    assert back["time"][0] == whole["time"][0]
+
+
 def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
     """Foxglove's own reader finds the topics, schemas and messages."""
     reader = pytest.importorskip("mcap.reader")
