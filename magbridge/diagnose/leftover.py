@@ -118,6 +118,36 @@ def amplitude_evidence(problem: Problem, fit: Joint, chosen: Sequence[Hypothesis
     return max(float(np.log(np.mean(odds))), 0.0)
 
 
+def soft_iron_evidence(problem: Problem, fit: Joint, chosen: Sequence[Hypothesis]) -> float:
+    """Return the log evidence of a change of soft iron over the strongest cause, in its place.
+
+    No telemetry confirms a cause that is a function of time alone. Such an offset is known only by its
+    dependence on attitude. The same course in soft iron has the offset's columns, times the direction of the
+    field in the body. Both have coefficients of one common size, so that neither pays for its number. Return
+    minus infinity for a cause of another kind.
+    """
+    model = [one.candidate for one in chosen]
+    k = max(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
+    candidate = model[k]
+    if not candidate.effects or not all(isinstance(effect, TimeEffect) for effect in candidate.effects):
+        return -np.inf
+
+    def changed(rows: slice) -> FloatArray:
+        """Return the columns of a change of soft iron, (m, 3 k)."""
+        direction = problem.jacobian.T[6:, rows] / problem.reference_jacobian[rows]
+        return np.asarray((candidate.columns(rows).T[:, None] * direction).reshape(3 * candidate.size, -1).T)
+
+    # The evidence of each in the place of the cause, which is released; all other causes are projected out
+    columns = [changed, *(one.columns for one in model)]
+    own = slices(model, 3 * candidate.size)[k]
+    alone = information(problem, fit.noise, fit, columns).released(fit, own)
+    iron, offset = (
+        Statistic(alone.matrix[at, at], np.ones((1, at.stop - at.start))).best(alone.score[at]).ratio
+        for at in (slice(0, 3 * candidate.size), own)
+    )
+    return 0.5 * (iron - offset)
+
+
 def _modulated(problem: Problem, effect: Columns) -> Description:
     """Return the description of an effect (m, k), multiplied by half waves over the log."""
     n, several = len(problem), size_of(effect)

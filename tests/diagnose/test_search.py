@@ -191,6 +191,23 @@ def test_a_name_whose_size_varies_in_time_is_not_asserted(waves: int) -> None:
     assert rest is not None
 
 
+@pytest.mark.parametrize("of_iron", [False, True])
+def test_a_step_that_depends_on_attitude_as_soft_iron_does_is_no_offset_step(of_iron: bool) -> None:
+    """Iron that the vehicle has lost takes its induced moment with it."""
+    n, rng = 1000, np.random.default_rng(10)
+    heading, climbs = np.linspace(0.0, 60.0, n), np.sign(np.sin(np.arange(n) / 9.0))
+    directions = np.stack([0.6 * np.cos(heading), 0.6 * np.sin(heading), 0.8 + 0.3 * climbs], axis=1)
+    problem = pose(surveyed(directions, np.linspace(-1.0, 1.0, n)), calibrated(np.zeros(9), 1e-6))
+    after, u = np.arange(n) > 600, problem.survey.field / 5e4
+    change = 3.0 * (u @ [1.0, -1.0, 1.0]) ** 2 if of_iron else u @ [1.0, -1.0, 1.0]
+    problem = replace(problem, residual=change * after + rng.normal(size=n))
+    step = TimeEffect(cause="a", shape="step", start=0.0)
+    name = candidate("a", u * after[:, None], effects=(step,))
+    outcome = search(problem, [name], 1)
+    assert len(outcome.chosen) == 1
+    assert accept(problem, outcome)[0] is not of_iron
+
+
 def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem) -> None:
     """An effect of pressure and pitch together is held; the remainder is the square of the pressure."""
     survey, rows = problem.survey, slice(0, len(problem))
