@@ -117,7 +117,8 @@ def fit(
         if method == "auto":
             found = replace(found, open=tuple(left_open(data, UNKNOWN_LENGTH)))
         found = replace(found, open=(*away, *notes, *found.open))
-        if (flight := found.details.pop("flown", None)) is not None:
+        flight = found.details.pop("flown", None)
+        if flight is not None and not flight.all():
             data = data.part(flight)
             found.details["ends"] = int((~flight).sum())
         found = found if method == "survey" else _biased(found, bias)
