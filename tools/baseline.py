@@ -7,7 +7,7 @@
 Every case has a fixed seed, so old and new figures are compared case by case. A change is significant if its
 mean exceeds both twice its standard error over the cases and one per cent of the figure (two per cent
 if there is one case). A run takes twenty minutes on two cores. Measured logs come from
-``$MAGBRIDGE_REAL_DATA`` or ``--data``; without them, the run omits their part.
+``$MAGBRIDGE_REAL_DATA``; without them, the run omits their part.
 """
 
 from __future__ import annotations
