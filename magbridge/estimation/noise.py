@@ -189,9 +189,13 @@ def samples_per_independent(values: FloatArray, steps: FloatArray) -> float:
     mechanics, section 3). The error of a model lasts as long as a manoeuvre. So the sum corresponds to a
     time that does not depend on the sampling rate, unlike the autocorrelation of neighbours.
     """
-    longest = max(len(values) // 4, 1)
+    # Samples of two runs have no lag: the longest run limits the lags, and memory is linear in the samples.
+    within = np.isfinite(steps)
+    starts = np.union1d([0], np.flatnonzero(~within))
+    span = np.add.reduceat(np.where(within, steps, 0.0), starts).max()
+    longest = int(max(min(len(values) // 4, span + 1), 1))
     # place the samples on their intervals; the gap between runs exceeds the longest lag
-    gaps = np.minimum(np.where(np.isfinite(steps), steps, longest), longest)
+    gaps = np.minimum(np.where(within, steps, longest), longest)
     slot = (np.cumsum(gaps) - gaps[0]).astype(int)
     size = 2 ** int(np.ceil(np.log2(slot[-1] + 1 + longest)))
     grid = np.zeros((size, values.shape[1]))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from magbridge.arrays import FloatArray
-from magbridge.estimation.noise import NoiseModel, estimate_noise, fit_slow_and_white
+from magbridge.estimation.noise import NoiseModel, estimate_noise, fit_slow_and_white, samples_per_independent
 
 N = 4000
 STEPS = np.r_[np.inf, np.ones(N - 1)]
@@ -100,3 +102,15 @@ def test_a_slow_part_is_believed_only_where_it_is_likelier() -> None:
     again = estimate_noise(both, STEPS, 0.0, shape=found.shape)
     assert again.shape == found.shape
     assert again.sigma == pytest.approx(80.0**0.5, rel=0.15)
+
+
+def test_correlation_of_many_runs_needs_memory_that_is_linear_in_the_samples() -> None:
+    runs = 40_000 // 100
+    values = np.vstack([drawn(0.8, seed=k)[:100, None] for k in range(runs)])
+    steps = np.tile(np.r_[np.inf, np.ones(99)], runs)
+    tracemalloc.start()
+    found = samples_per_independent(values, steps)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found == pytest.approx(1.8 / 0.2, rel=0.15)  # (1 + rho) / (1 - rho)
+    assert peak < 60 * values.nbytes
