@@ -21,9 +21,7 @@ from msgspec.structs import replace
 from magbridge.records import MAX_DEVICE_TIME_S, Reading
 from magbridge.sensors import Driver
 
-__all__ = [
-    "DeviceClock",
-]
+__all__ = ["DeviceClock"]
 
 FIRST_BLOCK_READINGS: Final = 8
 """Number of readings in the first blocks."""

@@ -436,10 +436,9 @@ def _width_covariance(data: GaussianInformation, family: PriorFamily, log_widths
         log_probability = np.array([log_evidence(data, family, logs, 0.0)[0] for logs in grid])
         weight = np.exp(log_probability - log_probability.max())
         weight /= weight.sum()
-        for logs, part in zip(grid, weight.tolist(), strict=True):
-            added += part * (_coefficients(data, family.widths(logs))[1] - at_mode)
-        means = np.array([_coefficients(data, family.widths(logs))[0] for logs in grid])
-        offset = means - weight @ means
+        means, covariances = zip(*(_coefficients(data, family.widths(logs)) for logs in grid), strict=True)
+        offset = np.array(means) - weight @ np.array(means)
+        added += np.tensordot(weight, np.array(covariances), 1) - at_mode
         added += (weight[:, None] * offset).T @ offset
     # The widths that were chosen are less probable than narrower ones: the sum may be slightly negative.
     size, axes = np.linalg.eigh(added)
