@@ -19,6 +19,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.figure_of_merit import box_flight, figure_of_merit
 from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.scalar_fit import fit_scalar
 from magbridge.calibration.fitting.uncertainty import Mission, expected_error
 from magbridge.calibration.model import identity
 from magbridge.calibration.planning.plan import (
@@ -31,6 +32,7 @@ from magbridge.calibration.planning.plan import (
     trim_of,
 )
 from magbridge.calibration.planning.survey_patterns import propose
+from magbridge.calibration.scalar import ScalarSeries, correct_scalar
 from magbridge.errors import CalibrationError
 from sitl.mission import TABLE_1
 
@@ -134,6 +136,30 @@ def test_a_flight_without_manoeuvres_and_a_slow_log_do_not_count_as_a_box() -> N
     time, angles, _ = box()
     assert box_flight(time, 0.1 * angles[:, 0], 0.1 * angles[:, 1], np.full(len(time), 20.0)) is None
     assert box_flight(time[::10], *angles[::10].T) is None
+
+
+def test_a_box_that_was_not_fitted_is_within_0_05_nt_of_a_fit_to_it() -> None:
+    earth = np.array([17_000.0, -3_500.0, 51_000.0])
+    time, angles, _ = box()
+    manoeuvres = box_flight(time, *angles.T)
+    assert manoeuvres is not None
+    wander = 0.3 * np.sin(time[:, None] / np.array([13.0, 17.0, 31.0]))
+    u = Rotation.from_euler("ZYX", (angles + wander)[:, ::-1], degrees=True).inv().apply(earth)
+
+    def flown(seed: int) -> ScalarSeries:
+        random = np.random.default_rng(seed)
+        scalar = np.linalg.norm(u + np.array([300.0, -200.0, 100.0]), axis=1)
+        scalar += random.normal(0, 0.02, len(u))
+        known, nothing = np.full(len(u), np.linalg.norm(earth)), np.empty((len(u), 0))
+        vector = u + random.normal(0, 1.0, u.shape)
+        return ScalarSeries(time + 1.6e9, scalar, vector, known, nothing, np.full(len(u), np.nan))
+
+    def merit(fitted: ScalarSeries, tested: ScalarSeries) -> float:
+        after = correct_scalar(fit_scalar(fitted, (), map_known=True).sensor, tested).field
+        before, after = tested.scalar - tested.reference, after - tested.reference
+        return float(figure_of_merit(manoeuvres, before, after)["after_nT"])
+
+    assert merit(flown(1), flown(2)) - merit(flown(2), flown(2)) < 0.05
 
 
 def test_calibrate_prints_the_figure_of_merit(tmp_path: Path, command: Command) -> None:

@@ -1,13 +1,18 @@
 """Test the compensation of a scalar magnetometer: fit half of a simulated flight, correct the other half."""
 
+from itertools import count
+from typing import Any
+
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting import scalar_fit
 from magbridge.calibration.fitting.scalar_fit import ScalarFit, adapt_to_log, fit_scalar
-from magbridge.calibration.scalar import ScalarSeries, correct_scalar, scalar_design
+from magbridge.calibration.scalar import ScalarSeries, correct_scalar, scalar_design, term_columns
 from magbridge.errors import CalibrationError
 
 Halves = tuple[ScalarSeries, ScalarSeries, FloatArray]
@@ -65,6 +70,33 @@ def halves() -> Halves:
 @pytest.fixture(scope="module")
 def fitted(halves: Halves) -> ScalarFit:
     return fit_scalar(halves[0], NAMES, column="scalar", map_known=True)
+
+
+def test_noise_without_a_whitening_filter_is_not_chosen(
+    halves: Halves, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The Riccati equation of extreme noise is ill-conditioned: scipy then raises ValueError."""
+    calls = count()
+
+    def sometimes(*arguments: Any) -> FloatArray:
+        if next(calls) % 7 == 3:
+            raise ValueError("ill-conditioned")
+        return np.asarray(solve_discrete_are(*arguments))
+
+    monkeypatch.setattr(scalar_fit, "solve_discrete_are", sometimes)
+    found = fit_scalar(_part(halves[0], slice(0, 1200)), NAMES, map_known=True)
+    assert found.rms_after < 0.1 * found.rms_before
+
+
+def test_the_width_of_a_channel_that_hardly_moved_adds_to_its_variance(
+    halves: Halves, fitted: ScalarFit
+) -> None:
+    sensor = adapt_to_log(fitted.sensor, halves[1].channels)
+    added = np.diag(sensor.total_covariance) / np.diag(np.array(sensor.covariance)) - 1.0
+    at = term_columns(sensor.channels)
+    assert added.min() >= -1e-9
+    assert added[at["step"]].max() > 0.1  # it moves in the second half only
+    assert added[at["aileron"]].max() < 0.01
 
 
 def test_other_half_beats_least_squares_with_a_true_sigma(halves: Halves, fitted: ScalarFit) -> None:

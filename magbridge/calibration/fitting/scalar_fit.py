@@ -325,9 +325,17 @@ class _ScalarProblem:
             log_det += float(np.log1p(s).sum())
         return both[:, 0], both[:, 1:], log_det
 
-    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> _Posterior:
-        """Return the posterior given the noise, with the widths that maximise the evidence."""
-        y, X, log_det = self.whiten(log_noise)
+    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> _Posterior | None:
+        """Return the posterior given the noise, with the widths that maximise the evidence.
+
+        None if the noise has no stable whitening filter.
+        """
+        try:
+            y, X, log_det = self.whiten(log_noise)
+        except ValueError:  # scipy: the Riccati equation is ill-conditioned
+            return None
+        if not np.isfinite(X).all():
+            return None
         data = GaussianInformation(X.T @ X, X.T @ y, float(y @ y))
         found = _choose_widths(data, self.family, log_widths)
         cost = found.cost + 0.5 * log_det - _log_noise_prior(log_noise)
@@ -344,9 +352,9 @@ class _ScalarProblem:
 
         def cost(log_noise: FloatArray) -> float:
             nonlocal warm, best
-            if not np.isfinite(self.whiten(log_noise)[1]).all():
-                return REFUSED_COST
             state = self.posterior(log_noise, warm)
+            if state is None:
+                return REFUSED_COST
             if best is None or state.cost < best.cost:
                 best, warm = state, state.log_widths
             return state.cost
