@@ -110,12 +110,14 @@ def test_a_bridge_that_signs_is_asked_in_signed_messages(clock: Path, tmp_path: 
 def test_bad_input_is_one_line(command: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
+        with socket.create_server(("127.0.0.1", 0)) as closed:
+            free = str(closed.getsockname()[1])
         for arguments, code, expected in (
             (["udpin:nowhere"], 2, "magbridge monitor: LINK: expected HOST:PORT or [IPV6]:PORT"),
-            (["/dev/nowhere"], 1, "/dev/nowhere: "),
+            (["/dev/nowhere", "--port", free], 1, "/dev/nowhere: "),
             (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
             (["--port", "99999"], 2, "99999"),
-            (["--signing-key", "/nowhere"], 1, "/nowhere: expected a file, there is none"),
+            (["--signing-key", "/nowhere", "--port", free], 1, "/nowhere: expected a file, there is none"),
         ):
             assert expected in command.refuses("monitor", *arguments, code=code)
 
