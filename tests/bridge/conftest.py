@@ -1,4 +1,4 @@
-"""Fixtures of the fault tests: bridges with a simulated sensor and autopilot, and the table of results."""
+"""Fixtures of the fault tests: bridges with a simulated sensor and autopilot, and the record of results."""
 
 from __future__ import annotations
 
@@ -8,28 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from checks import Measured
 from rig import Rig
 
-ROWS: list[tuple[str, str, str, str]] = []
 
+@pytest.fixture
+def measured(request: pytest.FixtureRequest) -> Measured:
+    """Return a function that appends the test's name and what it measured to the file MAGBRIDGE_FAULTS."""
 
-@pytest.fixture(scope="module")
-def table() -> Iterator[Callable[[str, str, str, str], None]]:
-    """Yield a function that adds a row to the table of faults, in the file MAGBRIDGE_FAULTS."""
+    def record(**values: float) -> None:
+        if path := os.environ.get("MAGBRIDGE_FAULTS"):
+            with Path(path).open("a", encoding="utf-8") as file:
+                shown = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+                file.write(f"{request.node.name}: {shown}\n")
 
-    def row(fault: str, meanwhile: str, well: str, lost: str) -> None:
-        ROWS.append((fault, meanwhile, well, lost))
-
-    yield row
-    if path := os.environ.get("MAGBRIDGE_FAULTS"):
-        header = (
-            "fault",
-            "what the bridge publishes meanwhile",
-            "recovers after",
-            "losses, and their counter",
-        )
-        lines = [header, ("---",) * 4, *ROWS]
-        Path(path).write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
+    return record
 
 
 @pytest.fixture(scope="module")

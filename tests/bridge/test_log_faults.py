@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from checks import Row, first_difference
+from checks import Measured, first_difference
 from rig import Rig
 
 from magbridge.logs import read
@@ -60,7 +60,7 @@ def limit(rig: Rig) -> tuple[Callable[[], None], Callable[[], None]]:
     return lambda: allow(rig.logs[-1].stat().st_size + 1000), lambda: allow(resource.RLIM_INFINITY)
 
 
-def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> None:
+def test_disk_full(make_rig: MakeRig, small_disk: Path | None, measured: Measured) -> None:
     rig = make_rig()
     if small_disk is not None:
         rig.config.write_text(rig.config.read_text().replace('"logs"', f'"{small_disk}"'))
@@ -90,15 +90,10 @@ def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> No
     assert first_difference(published[: len(recorded.published)], recorded.published) is None
     texts = next(line for line in rig.texts(mark) if line.startswith("log: ") and "written" not in line)
     assert texts == ("log: No space left on device" if small_disk is not None else "log: File too large")
-    table(
-        "disk full, then space again",
-        f'the field goes on without a flag; STATUSTEXT "{texts}", `log_state` failed',
-        f"{mended:.1f} s, in a new file",
-        f"the log in between: `log_lost` {lost} records; the earlier part can be read to its end",
-    )
+    measured(recovers_s=mended, records_lost=lost)
 
 
-def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
+def test_a_log_that_is_removed(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig()
     rig.start()
     mark = rig.mark
@@ -119,15 +114,8 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
     assert recorded.start.parameters == {"MB_GAP_FACTOR": 3.0}
     restart = agreement(bytearray(published), recorded)
     assert restart["samples"] > 50
-    (texts,) = {line for line in rig.texts(mark) if line.startswith("log: ") and "written" not in line}
-    table(
-        "somebody deletes the log while it is being written",
-        f'the field goes on without a flag; STATUSTEXT "{texts}", `log_state` failed',
-        f"{mended:.1f} s, in a new file",
-        f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; "
-        "the new one lacks the earlier state of the bridge; its replay reports this, and in how many samples "
-        "the field is the same",
-    )
+    assert len({line for line in rig.texts(mark) if line.startswith("log: ") and "written" not in line}) == 1
+    measured(recovers_s=mended, records_lost=rig.status["log_lost"])
 
 
 def set_parameter(rig: Rig) -> None:
@@ -138,7 +126,7 @@ def set_parameter(rig: Rig) -> None:
     rig.until(lambda: rig.of("PARAM_VALUE", mark))
 
 
-def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
+def test_killed_without_warning(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig()
     rig.start()
     set_parameter(rig)
@@ -167,13 +155,7 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
     )
     rig.until(lambda: rig.of("PARAM_VALUE", mark))
     assert rig.of("PARAM_VALUE", mark)[-1]["param_value"] == 3.0
-    table(
-        "`kill -9`, started again",
-        "nothing, then a normal start. Parameters set over the link are kept",
-        f"{back:.1f} s after the start",
-        f"at most the last 50 ms of the log: {len(missing)} messages here; the rest replays to the same "
-        "bytes",
-    )
+    measured(recovers_s=back, messages_lost=len(missing))
 
 
 def test_stopped_by_hand_with_a_log_in_many_files(make_rig: MakeRig) -> None:

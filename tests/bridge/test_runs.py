@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from checks import Row, replays, soon
+from checks import Measured, replays, soon
 from devices import open_line
 from rig import Rig
 
@@ -19,7 +19,7 @@ MakeRig = Callable[..., Rig]
 KEY = bytes(range(32))
 
 
-def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row) -> None:
+def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig("tcp")
     rig.process = rig.spawn(rig.config)
     rig.until(lambda: rig.logs and rig.logs[0].stat().st_size > 500)
@@ -28,12 +28,7 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row
     rig.fluxgate.plug()
     rig.autopilot.up()
     back = rig.until_well()
-    table(
-        "started with neither sensor nor autopilot there",
-        "into the log: both lines lost, with the reasons; it tries to open them every 0.25 s",
-        f"{back:.2f} s after both came",
-        "nothing",
-    )
+    measured(recovers_s=back)
     assert back < soon(3.0)
     replays(rig)
     (log,) = rig.logs
@@ -44,7 +39,7 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row
 
 
 @pytest.mark.parametrize("speaks", [True, False])
-def test_another_device_fits_the_pattern_too(make_rig: MakeRig, table: Row, speaks: bool) -> None:
+def test_another_device_fits_the_pattern_too(make_rig: MakeRig, measured: Measured, speaks: bool) -> None:
     """The pattern also matches a GPS, found before the sensor, and again after the sensor was unplugged."""
     rig = make_rig()
     gps, far = open_line(rig.fluxgate.folder / "ttyUSB0")
@@ -56,13 +51,7 @@ def test_another_device_fits_the_pattern_too(make_rig: MakeRig, table: Row, spea
     rig.until_status(lambda status: status["sensor_state"] != 1)
     rig.fluxgate.plug("ttyUSB2")
     back = rig.until_well()
-    if not speaks:
-        table(
-            "another device, a GPS, fits the sensor's pattern, and is found first",
-            'STATUSTEXT "digitizer is silent", and `sensor_state` silent, until it is left for the next',
-            f"{found:.2f} s after the start (`sensor.timeout` is 0.5 s); unplugged, and back: {back:.2f} s",
-            "nothing; silent, it gets the sensor's start-up commands",
-        )
+    measured(found_s=found, recovers_s=back)
     assert found < soon(5.0)
     assert back < soon(2.0)
     replays(rig)
@@ -70,7 +59,7 @@ def test_another_device_fits_the_pattern_too(make_rig: MakeRig, table: Row, spea
     os.close(far)
 
 
-def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
+def test_tcp_server_gone_and_back(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig("tcp")
     rig.start()
     rig.run(0.3)
@@ -85,18 +74,12 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
     sequences = [message["sequence"] for message in rig.of("MAG_FIELD", mark)]
     lost = next(number for number in sequences if number > last + 20) - last - 1
     assert sequences == sorted(sequences)
-    table(
-        "autopilot link down (TCP: the server closes), up again after 1.2 s",
-        '"link: closed by the other end" in the log, then "link: open" over the link; `stale_telemetry` in '
-        "between",
-        f"{back:.2f} s",
-        f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
-    )
+    measured(recovers_s=back, messages_lost=lost)
     assert back < soon(2.0)
     replays(rig)
 
 
-def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
+def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, measured: Measured) -> None:
     """The line has no reader until the buffer of the operating system is full."""
     rig = make_rig("serial")
     rig.start()
@@ -108,13 +91,7 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
             time.sleep(0.005)
     back = rig.until_well()
     rig.until_reported("bytes not sent so far", mark, 30.0)
-    table(
-        "autopilot's serial line too slow: no reader",
-        "whole messages are dropped, those first that a newer one replaces; "
-        'STATUSTEXT "link: too slow, 1740 bytes not sent so far", again every 10 s',
-        f"{back:.2f} s",
-        "messages to the autopilot, visible in MAG_FIELD's `sequence`; the log has them all",
-    )
+    measured(recovers_s=back)
     assert back < soon(5.0)
     replays(rig)
 
@@ -124,7 +101,7 @@ def texts_in(logs: list[Path], text: str) -> bool:
     return any(text.encode() in path.read_bytes() for path in logs)
 
 
-def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table: Row) -> None:
+def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig("serial")
     rig.start()
     rig.until_answered()
@@ -135,19 +112,13 @@ def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table
     back = rig.until_well()
     rig.until_reported("link: ", mark)  # "open", or that this text itself was not sent
     lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
-    table(
-        "autopilot on a serial line: pulled out, back after 1.0 s",
-        '"link: No such file or directory" in the log, then "link: open" over the link; `stale_telemetry` '
-        "in between",
-        f"{back:.2f} s",
-        f"messages to the autopilot, visible in MAG_FIELD's `sequence` ({lost} here); the log has them all",
-    )
+    measured(recovers_s=back, messages_lost=lost)
     assert back < soon(2.0)
     assert 25 <= lost <= 100 + 50 * rig.machine.seconds(away, time.monotonic())
     replays(rig)
 
 
-def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
+def test_host_clock_set_forward_and_back(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig(stepped=True)
     rig.start()
     mark = rig.mark
@@ -171,17 +142,11 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
     with log.open("rb") as file:
         times = [record.time_us for record in LogReader(file)]
     assert times == sorted(times)
-    table(
-        "host clock set 1 h forward, then 2 h back",
-        f"STATUSTEXT ({noticed:.2f} s after the step), and from then on the published UNIX times follow; no "
-        "flag, because no interval is measured with that clock",
-        "at once",
-        "nothing; samples between the step and the STATUSTEXT carry the old UNIX time",
-    )
+    measured(noticed_s=noticed)
     replays(rig)
 
 
-def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
+def test_forged_signed_packets(make_rig: MakeRig) -> None:
     rig = make_rig(key=KEY)
     rig.start()
     before, mark = rig.fresh_status(), rig.mark
@@ -210,11 +175,4 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
     )
     assert reported == [f"frames of 1:1 refused: {why}" for why in reasons]
     assert all(message.frame[2] & 1 for _, message in rig.received)
-    table(
-        "forged packets: a time stamp far in the future, another key, no signature, a replayed genuine "
-        "packet",
-        "STATUSTEXT once for each reason; the genuine packets that follow are accepted",
-        "at once",
-        f"the forged packets: `link_refused` {len(wrong)}",
-    )
     replays(rig)

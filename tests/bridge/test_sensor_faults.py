@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from checks import NOISE, Row, replays, seconds, soon
+from checks import NOISE, Measured, replays, soon
 from devices import TRUTH
 from rig import OPTIONS, Rig, calibration
 
@@ -27,7 +27,7 @@ from magbridge.records import Quality
 SILENT, LOST = 2, 3
 
 
-def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None:
+def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, measured: Measured) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
     sent = rig.fluxgate.encoder.sequence
@@ -48,17 +48,12 @@ def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None
     came = after["samples"] - before["samples"]
     on_the_way = 10 + 50 * rig.machine.seconds(away, time.monotonic())
     assert came + lost == pytest.approx(rig.fluxgate.encoder.sequence - sent, abs=on_the_way)
-    table(
-        "sensor unplugged in mid-frame, plugged in again",
-        "heartbeat critical, `sensor_state` lost, STATUSTEXT with the reason; first sample back: `gap`",
-        seconds(back),
-        f"the readings in between and one frame: `samples_lost` {lost}, `sensor_bytes_skipped`",
-    )
+    measured(recovers_s=back, samples_lost=lost)
     assert delay < soon(1.5)
     assert back < soon(2.0)
 
 
-def test_sensor_silent(rig: Rig, table: Row) -> None:
+def test_sensor_silent(rig: Rig, measured: Measured) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
     rig.fluxgate.speaks = False
@@ -71,18 +66,12 @@ def test_sensor_silent(rig: Rig, table: Row) -> None:
     lost = rig.fresh_status()["samples_lost"] - before["samples_lost"]
     assert rig.undue_flags(mark) == "gap"
     assert lost > 20
-    table(
-        "sensor silent on an open line",
-        "heartbeat critical, `sensor_state` silent and STATUSTEXT after `sensor.timeout`; the start-up "
-        "commands are repeated every `timeout`",
-        seconds(back),
-        f"what the sensor did not send: `samples_lost` {lost}",
-    )
+    measured(recovers_s=back, samples_lost=lost)
     assert noticed < soon(2.0)
     assert back < soon(1.0)
 
 
-def test_garbage_from_the_sensor(rig: Rig, table: Row) -> None:
+def test_garbage_from_the_sensor(rig: Rig, measured: Measured) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
     rig.fluxgate.write(NOISE[:3000])
@@ -94,17 +83,11 @@ def test_garbage_from_the_sensor(rig: Rig, table: Row) -> None:
     assert 2900 < skipped <= 3000 + 38
     assert lost <= 1
     assert set(rig.undue_flags(mark).split()) <= {"gap"}
-    table(
-        "3,000 bytes of noise from the sensor",
-        f"`{rig.flags(mark) or 'no flag'}` on the next sample",
-        seconds(back),
-        f"the frame hit by the noise: `samples_lost` {lost}, `sensor_frames_bad` {bad}, "
-        f"`sensor_bytes_skipped` {skipped}",
-    )
+    measured(recovers_s=back, samples_lost=lost, frames_bad=bad, bytes_skipped=skipped)
     assert back < soon(0.5)
 
 
-def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
+def test_second_bridge_on_the_same_sensor(rig: Rig) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
@@ -138,16 +121,9 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
     assert after["samples_lost"] == before["samples_lost"]
     assert after["sensor_bytes_skipped"] == before["sensor_bytes_skipped"]
     assert rig.undue_flags(mark) == ""
-    reason = next(text for text in texts if "digitizer lost" in text)
-    table(
-        "a second `magbridge run` on the same serial port",
-        f'the first: no change. The second: heartbeat critical, STATUSTEXT "{reason}"; it waits for the port',
-        "at once; the second tries again every 0.25 s",
-        "nothing",
-    )
 
 
-def test_sensor_back_under_another_name_and_powered_again(rig: Rig, table: Row) -> None:
+def test_sensor_back_under_another_name_and_powered_again(rig: Rig, measured: Measured) -> None:
     rig.until_well()
     mark = rig.mark
     rig.fluxgate.unplug()
@@ -158,13 +134,7 @@ def test_sensor_back_under_another_name_and_powered_again(rig: Rig, table: Row) 
     rig.until_reported("offset suspect", mark)
     sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
     assert sigma > 20
-    table(
-        "sensor unplugged, back under another name after a power cycle",
-        f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the "
-        "run, because its offset may have changed",
-        seconds(back),
-        "the readings in between; their number is unknown, because the sensor's counter started over",
-    )
+    measured(recovers_s=back, sigma_nt=sigma)
     assert back < soon(2.0)
 
 
@@ -191,7 +161,7 @@ LINES = 'columns = ["x", "y", "z"]'
     ],
 )
 def test_a_standstill_just_before_a_mass_moves(
-    make_rig: Callable[..., Rig], table: Row, sensor: tuple[str, str], answers: bool, still: float
+    make_rig: Callable[..., Rig], measured: Measured, sensor: tuple[str, str], answers: bool, still: float
 ) -> None:
     rig = make_rig(sensor=sensor, hz=4.0)
     moved = replace(calibration(tuple(SLOPE.tolist())), sensor=CalibratedSensor(sensor[0]))
@@ -227,11 +197,5 @@ def test_a_standstill_just_before_a_mass_moves(
     flagged = sum(bool(one["flags"] & Quality.LATE_JOIN) for one in samples)
     assert flagged >= (4 if not answers or sensor[0] == "ascii" else 0)
     assert wrong < 4.0  # the sigma grows, too
-    table(
-        f"process stopped for {still} s just before a mass moves; {sensor[0]}, "
-        f"{'with' if answers else 'without'} TIMESYNC",
-        "samples that waited: at their own times, `late_join` where their time or the telemetry's is guessed",
-        seconds(back),
-        f"nothing; {flagged} of {len(samples)} samples flagged",
-    )
+    measured(recovers_s=back, samples=len(samples), samples_flagged=flagged)
     replays(rig)

@@ -11,14 +11,9 @@ from rig import Rig
 
 from magbridge.mavlink import Codec
 
-Row = Callable[[str, str, str, str], None]
-"""Function that adds a row to the table of faults: fault, output meanwhile, recovery time and losses."""
+Measured = Callable[..., None]
+"""Function that records the values that a fault test measured: times in s, losses in messages or bytes."""
 NOISE = np.random.default_rng(1).integers(0, 256, 4000, dtype=np.uint8).tobytes()
-
-
-def seconds(value: float) -> str:
-    """Return a duration (s) as the table of faults prints it."""
-    return f"{value:.2f} s"
 
 
 def soon(limit: float) -> float:
