@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import pty
 import signal
-import socket
 import subprocess
 import sys
+from contextlib import suppress
 from functools import reduce
 from math import atan2, degrees, hypot, nan, radians, sqrt
 from operator import xor
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from devices import serial_line, udp_socket
 from fed import fed, named
 from small import START, aligned, polynomial, write_bridge
 
@@ -206,43 +206,30 @@ def test_a_wrong_nmea_port_is_found_before_anything_is_opened(tmp_path: Path) ->
 
 def test_sentences_and_messages_through_real_sockets(tmp_path: Path) -> None:
     """The running program reads a pty, and sends the heading by MAVLink and by NMEA."""
-    inside, outside = pty.openpty()
-    link, ear = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-    for one in (link, ear):
-        one.bind(("127.0.0.1", 0))
-        one.settimeout(20.0)
-    path = bridge_with(
-        tmp_path, f'send = "odometry"\nnmea = "udp:127.0.0.1:{ear.getsockname()[1]}"',
-        port=os.ttyname(outside), link=f"udpout:127.0.0.1:{link.getsockname()[1]}",
-    )  # fmt: skip
-    process = subprocess.Popen([sys.executable, "-m", "magbridge", "run", "--config", str(path)])
     codec, seen, sentences = Codec(0, 0), set[str](), b""
-    try:
-        _, peer = link.recvfrom(2048)
-        ear.setblocking(False)
-        for step in range(600):
-            for frame in (event.data for event in (*begin(), attitude(START))):
-                link.sendto(frame, peer)
-            os.write(inside, b"%.2f %.2f %.2f %.3f\r\n" % (*body_field().tolist(), 0.05 * step))
+    with serial_line() as (sensor, name), udp_socket(20.0) as link, udp_socket(0.0) as ear:
+        path = bridge_with(
+            tmp_path, f'send = "odometry"\nnmea = "udp:127.0.0.1:{ear.getsockname()[1]}"', port=name,
+            link=f"udpout:127.0.0.1:{link.getsockname()[1]}",
+        )  # fmt: skip
+        process = subprocess.Popen([sys.executable, "-m", "magbridge", "run", "--config", str(path)])
+        try:
+            _, peer = link.recvfrom(2048)
             link.settimeout(0.05)
-            try:
-                while True:
-                    seen |= {one.name for one in codec.parse(link.recv(2048))}
-            except TimeoutError:
-                pass
-            try:
-                sentences += ear.recv(2048)
-            except BlockingIOError:
-                continue
-            if "ODOMETRY" in seen and b"$HCHDT" in sentences:
-                break
-    finally:
-        process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
-        for one in (link, ear):
-            one.close()
-        os.close(inside)
-        os.close(outside)
+            for step in range(600):
+                for event in (*begin(), attitude(START)):
+                    link.sendto(event.data, peer)
+                os.write(sensor, b"%.2f %.2f %.2f %.3f\r\n" % (*body_field().tolist(), 0.05 * step))
+                with suppress(TimeoutError):
+                    while data := link.recv(2048):
+                        seen |= {one.name for one in codec.parse(data)}
+                with suppress(BlockingIOError):
+                    sentences += ear.recv(2048)
+                if "ODOMETRY" in seen and b"$HCHDT" in sentences:
+                    break
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
     assert {"MAG_FIELD", "ATTITUDE_QUATERNION_COV", "ODOMETRY"} <= seen
     heading = float(sentences.split(b"$HCHDT,")[1].split(b",")[0])
     assert heading == pytest.approx(130.0, abs=0.3)

@@ -6,13 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from disks import full_disk
-from fed import named, received
+from fed import logged, named, received
 from turning import bridge, events
 
 from magbridge import logs
@@ -24,28 +23,22 @@ from magbridge.cli import main
 from magbridge.config import load as load_config
 from magbridge.errors import ConfigError
 from magbridge.learning.alarms import CAUSE_UNITS
-from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.enums import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
 from magbridge.records import Channel, Quality
 
+Flight = tuple[Path, Pipeline, list[tuple[int, bytes]]]
+
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, list[tuple[int, bytes]]]:
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Simulate a flight once, with a log."""
     folder = tmp_path_factory.mktemp("flight")
     pipeline = bridge(folder)
-    sent = []
-    with closing(TlogWriter(folder / "logs", header=pipeline.declarations)) as log:
-        for event in events(folder):
-            sent += pipeline.feed(event)
-            log.extend(pipeline.recorder.drain())
-    return folder, pipeline, sent
+    return folder, pipeline, logged(pipeline, events(folder), folder / "logs")
 
 
-def test_what_was_learned_is_announced_and_named_in_every_message(
-    flight: tuple[Path, Pipeline, list[tuple[int, bytes]]],
-) -> None:
+def test_what_was_learned_is_announced_and_named_in_every_message(flight: Flight) -> None:
     """The id in MAG_FIELD and MAG_STATUS changes when the bridge publishes the learned calibration."""
     folder, pipeline, sent = flight
     messages = received(sent)
@@ -64,17 +57,13 @@ def test_what_was_learned_is_announced_and_named_in_every_message(
     assert any(message["text"].startswith("learned ") for message in named(messages, "STATUSTEXT"))
 
 
-def test_the_same_events_give_the_same_bytes(
-    flight: tuple[Path, Pipeline, list[tuple[int, bytes]]], tmp_path: Path
-) -> None:
+def test_the_same_events_give_the_same_bytes(flight: Flight, tmp_path: Path) -> None:
     """A replay with in-flight calibration gives the same bytes."""
     again = bridge(tmp_path)
     assert [one for event in events(tmp_path) for one in again.feed(event)] == flight[2]
 
 
-def test_ashore_it_learns_what_it_learned_live(
-    flight: tuple[Path, Pipeline, list[tuple[int, bytes]]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ashore_it_learns_what_it_learned_live(flight: Flight, capsys: pytest.CaptureFixture[str]) -> None:
     """Offline, the bridge's own log gives the same calibration bit for bit."""
     folder, pipeline, sent = flight
     out, learned = folder / "out.nc", folder / "learned.json"
@@ -155,11 +144,7 @@ def test_the_causes_bits_are_those_of_the_dialect() -> None:
 
 def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     """Without a calibration, the field is flagged until one is published; the log reproduces this."""
-    pipeline, sent = bridge(tmp_path, known=False), []
-    with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
-        for event in events(tmp_path):
-            sent += pipeline.feed(event)
-            log.extend(pipeline.recorder.drain())
+    sent = logged(bridge(tmp_path, known=False), events(tmp_path), tmp_path / "logs")
     fields = named(received(sent), "MAG_FIELD")
     assert int(fields[0]["flags"]) & Quality.UNCALIBRATED
     assert fields[0]["total_field_sigma"] > 1000.0
@@ -168,16 +153,8 @@ def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     assert abs(fields[-1]["total_field"] - 51_900.0) < 2.0 * fields[-1]["total_field_sigma"]
     assert np.std([one["total_field"] for one in fields[-100:]]) < 15.0
     out, log_file = tmp_path / "out.nc", sorted((tmp_path / "logs").iterdir())
-    order = [
-        "correct",
-        *map(str, log_file),
-        "--learn",
-        "--config",
-        str(tmp_path / "bridge.toml"),
-        "-o",
-        str(out),
-    ]
-    assert main(order) == 0
+    order = ["correct", *map(str, log_file), "--learn", "--config", str(tmp_path / "bridge.toml")]
+    assert main([*order, "-o", str(out)]) == 0
     live = np.array([one["total_field"] for one in fields])
     np.testing.assert_array_equal(logs.read(out)["total_field"].to_numpy(), live)
     assert kept_path(load_config(tmp_path / "bridge.toml")) == tmp_path / "cal-learned.json"

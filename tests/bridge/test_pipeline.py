@@ -13,7 +13,7 @@ from math import cos, inf, isfinite, isnan, nan, pi, sin
 from pathlib import Path
 
 import pytest
-from fed import named, received, texts
+from fed import logged, named, received, texts
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, HostClock, StartEvent, clock_step, declarations, standstill
@@ -98,9 +98,8 @@ def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> No
     fed = list(events(pipeline, 0, 60))
     lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
     header = declarations(1, 191, pipeline._config.telemetry, 0.0)
-    with closing(TlogWriter(tmp_path / "logs", header=header, max_size=1e-3)) as log:
-        sent = pipeline.feed(Event(fed[-1].time_us, Channel.SENSOR, lines))
-        log.extend(pipeline.recorder.drain())
+    backlog = [Event(fed[-1].time_us, Channel.SENSOR, lines)]
+    sent = logged(pipeline, backlog, tmp_path / "logs", header=header, max_size=1e-3)
     files = sorted((tmp_path / "logs").iterdir())
     assert len(files) > 2
     recorded = Recorded(files)
@@ -266,11 +265,7 @@ def test_an_overloaded_bridge_omits_only_optional_work(tmp_path: Path) -> None:
 
     messages = ["MAG_FIELD", "HIGHRES_IMU"]
     pipeline = small_bridge(tmp_path, messages)
-    with closing(TlogWriter(tmp_path / "logs")) as log:
-        sent = []
-        for event in overloaded(pipeline):
-            sent += pipeline.feed(event)
-            log.extend(pipeline.recorder.drain())
+    sent = logged(pipeline, overloaded(pipeline), tmp_path / "logs")
     came = received(sent)
     assert [text.partition(":")[0] for text in texts(came) if "overload" in text] == [
         "overload",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import pty
 import select
 import socket
 import statistics
@@ -12,12 +11,13 @@ import sys
 import termios
 import threading
 import time
-import tty
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from checks import soon
+from devices import serial_line, udp_socket
 from standstill import standstill
 
 from magbridge.bridge.devices import SerialPort
@@ -76,20 +76,14 @@ def test_a_slow_reader_loses_whole_messages_and_stalls_no_other() -> None:
 
 
 def test_a_slow_line_loses_whole_messages() -> None:
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    port = open_link(f"serial:{os.ttyname(slave)}", 4_000_000)
-    port.open()
-    frames = [b"%04d" % number * 175 for number in range(2 * MAX_WAITING_MESSAGES)]
-    for frame in frames:
-        port.write(frame)
-    received = b""
-    while port.dropped + len(received) < 700 * len(frames):
-        received += os.read(master, 65536) if select.select([master], [], [], 0.01)[0] else b""
-        port.flush()
-    port.close()
-    os.close(master)
-    os.close(slave)
+    frames, received = [b"%04d" % number * 175 for number in range(2 * MAX_WAITING_MESSAGES)], b""
+    with serial_line() as (master, name), closing(open_link(f"serial:{name}", 4_000_000)) as port:
+        port.open()
+        for frame in frames:
+            port.write(frame)
+        while port.dropped + len(received) < 700 * len(frames):
+            received += os.read(master, 65536) if select.select([master], [], [], 0.01)[0] else b""
+            port.flush()
     assert 0 < port.dropped < 700 * MAX_WAITING_MESSAGES * 1.5
     pieces = [received[i : i + 700] for i in range(0, len(received), 700)]
     assert pieces == [frame for frame in frames if frame in set(pieces)]
@@ -112,32 +106,25 @@ def sample(codec: Codec, count: int) -> bytes:
 def test_a_saturated_line_carries_what_is_new() -> None:
     """Read a pty at half the rate of the writer; measure the age of the data once it has been full."""
     baud, codec, reader = 230_400, Codec(1, 191), Codec(255, 190)
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    port = SerialPort(os.ttyname(slave), baud)
-    port.open()
-    for count in range(200):
-        port.write(sample(codec, count))
     late: list[tuple[float, float]] = []
-    begun = last = time.monotonic()
-    free, count = 0.0, 200
-    while last < begun + 2.0:
-        now = time.monotonic()
-        free, last = min(free + (now - last) * baud / 10, 5000.0), now
-        while (
-            now > begun + (count - 200) * 0.0025
-        ):  # also the samples that were due while the machine was busy
-            port.write(sample(codec, count := count + 1))
-        port.flush()
-        if free > 100 and select.select([master], [], [], 0)[0]:
-            data = os.read(master, int(free))
-            free -= len(data)
-            fields = [one for one in reader.parse(data) if one.name == "MAG_FIELD"]
-            late += [(now, now - one["time_usec"] * 1e-6) for one in fields]
-        time.sleep(0.001)
-    port.close()
-    os.close(master)
-    os.close(slave)
+    with serial_line() as (master, name), closing(SerialPort(name, baud)) as port:
+        port.open()
+        for count in range(200):
+            port.write(sample(codec, count))
+        begun = last = time.monotonic()
+        free, count = 0.0, 200
+        while last < begun + 2.0:
+            now = time.monotonic()
+            free, last = min(free + (now - last) * baud / 10, 5000.0), now
+            while now > begun + (count - 200) * 0.0025:  # also those that were due while the machine was busy
+                port.write(sample(codec, count := count + 1))
+            port.flush()
+            if free > 100 and select.select([master], [], [], 0)[0]:
+                data = os.read(master, int(free))
+                free -= len(data)
+                fields = [one for one in reader.parse(data) if one.name == "MAG_FIELD"]
+                late += [(now, now - one["time_usec"] * 1e-6) for one in fields]
+            time.sleep(0.001)
     assert reader.bytes_skipped == 0
     assert port.overrun > 10_000
     assert statistics.median(age for when, age in late if when > begun + 1.5) < 0.3
@@ -183,22 +170,17 @@ def test_a_backlog_of_a_line_is_read_at_once() -> None:
     """Without a device clock, only the last reading of a backlog shows its time; no reading is lost."""
     driver = open_driver("ascii", {"columns": ["x", "y", "z"], "rate": 100.0})
     clock = DeviceClock.for_driver(driver)
-    master, slave = pty.openpty()
-    tty.setraw(slave)
-    port = SerialPort(os.ttyname(slave), 9600)
-    port.open()
     stamps: list[Reading] = []
-    for count in [1] * 200 + [320] + [1] * 200:  # 3.2 s and 10 kB, as when the bridge stood still
-        os.write(master, b"+20000.000 +1000.000 +40000.000\n" * count)
-        while count > 1 and waiting(slave) < 4095:  # a terminal holds no more; the rest follows as it is read
-            time.sleep(0.001)
-        taken = len(stamps) + count
-        while len(stamps) < taken:
-            assert select.select(port.fds(), [], [], 5.0)[0]
-            stamps += clock.stamp(driver.feed(port.read()), taken * 10_000)
-    port.close()
-    os.close(slave)
-    os.close(master)
+    with serial_line() as (master, name), closing(SerialPort(name, 9600)) as port:
+        port.open()
+        for count in [1] * 200 + [320] + [1] * 200:  # 3.2 s and 10 kB, as when the bridge stood still
+            os.write(master, b"+20000.000 +1000.000 +40000.000\n" * count)
+            while count > 1 and waiting(port.fds()[0]) < 4095:  # a terminal holds no more; the rest follows
+                time.sleep(0.001)
+            taken = len(stamps) + count
+            while len(stamps) < taken:
+                assert select.select(port.fds(), [], [], 5.0)[0]
+                stamps += clock.stamp(driver.feed(port.read()), taken * 10_000)
     assert {stamp.missing for stamp in stamps} == {0}
     assert not clock.stepped
     assert max(abs(stamp.time_us - 10_000 * (k + 1)) for k, stamp in enumerate(stamps)) <= 4
@@ -270,38 +252,24 @@ def test_a_link_by_ipv6_and_by_both(kinds: tuple[str, str], host: str, to: str) 
     there.close()
 
 
+NO_ADDRESSES = (
+    "udpin:14550 tcp:host:http tcp:host:70000 tcp:host:1\N{SUPERSCRIPT TWO} tcp:a..b:5760 udpin:::1:14550 "
+    "udpin:[::g]:14550 udpout:host:0 socket://host rfc2217://host:70000"
+)
+NO_DEVICES = "foo://x serial: f.o://x serial:ttyUSB0 serial:/"
+NO_KINDS = ["udpot:192.0.2.1:14550", "http:example", "nonsense", "ttyUSB0", "192.0.2.1:14550", __file__, ""]
+
+
 @pytest.mark.parametrize(
-    "url",
+    ("url", "expected"),
     [
-        "udpin:14550",
-        "tcp:host:http",
-        "tcp:host:70000",
-        "tcp:host:1\N{SUPERSCRIPT TWO}",
-        "tcp:a..b:5760",
-        "udpin:::1:14550",
-        "udpin:[::g]:14550",
-        "udpout:host:0",
-        "socket://host",
-        "rfc2217://host:70000",
+        *((url, "HOST:PORT") for url in NO_ADDRESSES.split()),
+        *((url, r"link.url: expected a device .*, socket://, rfc2217:// or") for url in NO_DEVICES.split()),
+        *((url, "expected udpin, udpout, tcp, tcpin or a serial device") for url in NO_KINDS),
     ],
 )
-def test_an_address_that_is_none(url: str) -> None:
-    with pytest.raises(ConfigError, match="HOST:PORT"):
-        open_link(url, 0)
-
-
-@pytest.mark.parametrize("url", ["foo://x", "serial:", "f.o://x", "serial:ttyUSB0", "serial:/"])
-def test_a_serial_line_that_is_none(url: str) -> None:
-    with pytest.raises(ConfigError, match=r"link.url: expected a device .*, socket://, rfc2217:// or"):
-        open_link(url, 0)
-
-
-NONE = ["udpot:192.0.2.1:14550", "http:example", "nonsense", "ttyUSB0", "192.0.2.1:14550", __file__, ""]
-
-
-@pytest.mark.parametrize("url", NONE)
-def test_a_kind_of_link_that_is_none(url: str) -> None:
-    with pytest.raises(ConfigError, match="expected udpin, udpout, tcp, tcpin or a serial device"):
+def test_a_url_without_a_valid_kind_address_or_device_is_refused(url: str, expected: str) -> None:
+    with pytest.raises(ConfigError, match=expected):
         open_link(url, 0)
 
 
@@ -323,17 +291,15 @@ class Unresolved(TcpServer):
 
 
 def test_a_link_that_takes_its_time_to_open_holds_up_neither_the_sensor_nor_the_end() -> None:
-    master, slave = pty.openpty()
-    link, sensor = Unresolved("tcpin:", ("", 0), Peers()), SerialPort(os.ttyname(slave), 9600)
-    edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, HostClock())
-    deadline = time.monotonic() + 10.0
-    while not sensor.is_open:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    edge.close()
+    with serial_line() as (_, name):
+        link, sensor = Unresolved("tcpin:", ("", 0), Peers()), SerialPort(name, 9600)
+        edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, HostClock())
+        deadline = time.monotonic() + 10.0
+        while not sensor.is_open:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        edge.close()
     assert (link.asked, sensor.is_open) == (1, False)
-    os.close(slave)
-    os.close(master)
 
 
 def test_an_impatient_user_stops_it_twice() -> None:
@@ -349,8 +315,7 @@ def test_an_impatient_user_stops_it_twice() -> None:
 
 
 def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
-        gone.bind(("127.0.0.1", 0))
+    with udp_socket() as gone:
         port = open_link(f"udpout:127.0.0.1:{gone.getsockname()[1]}", 0)
     port.open()
     for _ in range(20):
@@ -370,14 +335,7 @@ def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pyte
         return look_up(host[0], *rest, **options)
 
     monkeypatch.setattr(socket, "getaddrinfo", resolver)
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as before,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as after,
-    ):
-        before.bind((host[0], 0))
-        after.bind(("127.0.0.2", before.getsockname()[1]))
-        for one in (before, after):
-            one.settimeout(1.0)
+    with udp_socket(1.0) as before, udp_socket(1.0, "127.0.0.2", before.getsockname()[1]) as after:
         port = open_link(f"udpout:topside.local:{before.getsockname()[1]}", 0)
         port.open()
         port.write(b"1")
@@ -412,9 +370,7 @@ def test_what_is_sent_at_once_after_a_standstill_goes_in_datagrams_that_a_networ
     codec, data = Codec(1, 191), b""
     while len(data) < 100_000:
         data += codec.pack("MAG_FIELD", total_field=5e4, latency=1.0)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        peer.bind(("127.0.0.1", 0))
-        peer.settimeout(5)
+    with udp_socket(5.0) as peer:
         peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         port = open_link(f"udpout:127.0.0.1:{peer.getsockname()[1]}", 0)
         port.open()
@@ -431,8 +387,7 @@ def test_what_is_sent_at_once_after_a_standstill_goes_in_datagrams_that_a_networ
 
 def test_datagrams_that_waited_come_at_once() -> None:
     """After a pause, the bridge reads the telemetry before it processes the samples."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        peer.bind(("127.0.0.1", 0))
+    with udp_socket() as peer:
         port = open_link(f"udpout:127.0.0.1:{peer.getsockname()[1]}", 0)
         port.open()
         port.write(b"hello")

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from commands import Command
+from devices import serial_line
 
 from magbridge.bridge.check import findings
 from magbridge.bridge.init import Answers, bridge_toml
@@ -51,23 +52,22 @@ SPEAKERS = {
 @contextmanager
 def speaking(data: bytes) -> Iterator[str]:
     """Yield a pseudo-terminal on which a device sends `data` repeatedly."""
-    master, slave = pty.openpty()
     stop = threading.Event()
 
-    def send_message() -> None:
-        while not stop.wait(0.02):
-            if data:
-                os.write(master, data)
+    with serial_line() as (master, name):
 
-    talker = threading.Thread(target=send_message)
-    talker.start()
-    try:
-        yield os.ttyname(slave)
-    finally:
-        stop.set()
-        talker.join()
-        os.close(master)
-        os.close(slave)
+        def send_message() -> None:
+            while not stop.wait(0.02):
+                if data:
+                    os.write(master, data)
+
+        talker = threading.Thread(target=send_message)
+        talker.start()
+        try:
+            yield name
+        finally:
+            stop.set()
+            talker.join()
 
 
 @pytest.mark.parametrize("who", SPEAKERS)
@@ -98,20 +98,20 @@ def test_ports_as_a_command(command: Command) -> None:
 
 
 def test_a_busy_port_names_the_program_that_holds_it() -> None:
-    master, slave = pty.openpty()
     code = (
         "import serial, sys; line = serial.Serial(sys.argv[1], exclusive=True); print(1, flush=True); input()"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, os.ttyname(slave)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
+    with (
+        serial_line() as (_, name),
+        subprocess.Popen(
+            [sys.executable, "-c", code, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as other,
+    ):
         assert other.stdout is not None
         other.stdout.readline()
         with pytest.raises(PortError) as refused:
-            listen(os.ttyname(slave), (9600,), 0.1)
+            listen(name, (9600,), 0.1)
         other.communicate(b"\n")
-    os.close(master)
-    os.close(slave)
     assert refused.value.reason.startswith("busy: ")
     assert f"(process {other.pid})" in refused.value.reason
 

@@ -6,7 +6,6 @@ the losses. The last test replays the log."""
 from __future__ import annotations
 
 import signal
-import socket
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from checks import NOISE, Measured, replays, soon
-from devices import TRUTH
+from devices import TRUTH, udp_socket
 from rig import OPTIONS, Rig, calibration
 
 from magbridge.calibration.file import save
@@ -90,9 +89,7 @@ def test_garbage_from_the_sensor(rig: Rig, measured: Measured) -> None:
 def test_second_bridge_on_the_same_sensor(rig: Rig) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
-        sink.bind(("127.0.0.1", 0))
-        sink.setblocking(False)
+    with udp_socket(0.0) as sink:
         second = rig.folder / "second"
         second.mkdir()
         config = second / "bridge.toml"

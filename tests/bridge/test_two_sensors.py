@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from devices import open_line
+from devices import open_line, udp_socket
 from fed import FedBridge, named
 from small import START, aligned, polynomial
 
@@ -237,9 +236,7 @@ def test_the_log_of_two_lines_and_a_socket_replays_to_the_same_bytes(tmp_path: P
     save(calibration(), tmp_path / "other.json")
     (tmp_path / "dev").mkdir()
     lines = [open_line(tmp_path / "dev" / name)[0] for name in ("flux", "tail")]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
-        autopilot.bind(("127.0.0.1", 0))
-        autopilot.setblocking(False)
+    with udp_socket(0.0) as autopilot:
         settings = "sigma = 0.2"
         text = CONFIG.format(name="tail", columns='["total_field"]', settings=settings)
         for name in ("flux", "tail"):

@@ -34,6 +34,24 @@ def open_line(name: Path) -> tuple[int, int]:
     return near, far
 
 
+@contextmanager
+def serial_line() -> Iterator[tuple[int, str]]:
+    """Yield the descriptor of one end of a raw pty, and the device name of the other; close both ends."""
+    near, far = pty.openpty()
+    tty.setraw(far)
+    yield near, os.ttyname(far)
+    os.close(near)
+    os.close(far)
+
+
+def udp_socket(timeout_s: float | None = None, host: str = "127.0.0.1", port: int = 0) -> socket.socket:
+    """Return a bound UDP socket; with a timeout of 0 it does not block."""
+    one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    one.bind((host, port))
+    one.settimeout(timeout_s)
+    return one
+
+
 class Fluxgate:
     """Simulated fluxgate on a pty whose device name can change, as that of a USB adapter does.
 

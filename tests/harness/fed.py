@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 from small import START
 
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline
+from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel
 
@@ -30,6 +34,18 @@ def texts(messages: Iterable[Message]) -> list[str]:
 def fed(pipeline: Pipeline, *events: Event) -> list[Message]:
     """Feed events to a bridge; return the messages that it sends."""
     return received([frame for event in events for frame in pipeline.feed(event)])
+
+
+def logged(
+    pipeline: Pipeline, events: Iterable[Event], folder: Path, **options: Any
+) -> list[tuple[int, bytes]]:
+    """Feed events to a bridge that writes the log into a folder; return its frames with their times (µs)."""
+    sent = []
+    with closing(TlogWriter(folder, **{"header": pipeline.declarations, **options})) as log:
+        for event in events:
+            sent += pipeline.feed(event)
+            log.extend(pipeline.recorder.drain())
+    return sent
 
 
 class FedBridge:

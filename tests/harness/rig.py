@@ -7,7 +7,6 @@ in which they occur.
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 import time
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from devices import SENSOR_HZ, TRUTH, TURN, Autopilot, Fluxgate
+from devices import SENSOR_HZ, TRUTH, TURN, Autopilot, Fluxgate, udp_socket
 from small import aligned, polynomial
 from standstill import standstill
 
@@ -109,8 +108,7 @@ class Rig:
         self.folder, self.normal = folder, 0
         self.machine = standstill()
         self.received: list[Received] = []
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
+        with udp_socket() as probe:
             place = f"127.0.0.1:{probe.getsockname()[1]}"
         self.url = f"serial:{folder / 'autopilot'}" if link == "serial" else f"{link}:{place}"
         (folder / "dev").mkdir()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 from collections import Counter
@@ -13,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from devices import TRUTH
+from devices import TRUTH, udp_socket
 from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as version_1
 from rig import Rig
@@ -74,9 +73,7 @@ class Ear:
 
     def __init__(self, system: int) -> None:
         self.codec, self.ear = Codec(system, 190), Codec(0, 0)
-        self.line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.line.bind(("127.0.0.1", 0))
-        self.line.setblocking(False)
+        self.line = udp_socket(0.0)
         self.peer: Any = None
         self.received: list[Message] = []
 
