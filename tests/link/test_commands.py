@@ -36,9 +36,8 @@ def test_request_message(link: Line) -> None:
     assert result(link, received) == ACCEPTED
     assert len(link.only(received, "MAG_STATUS")) == 1
     assert result(link, link.command(REQUEST, FIELD)) == TEMPORARILY_REJECTED  # no sample yet
-    assert result(link, link.command(REQUEST, 24)) == DENIED
-    assert result(link, link.command(REQUEST, nan)) == DENIED
-    assert result(link, link.command(REQUEST, inf)) == DENIED
+    for number in (24, nan, inf):
+        assert result(link, link.command(REQUEST, number)) == DENIED
 
 
 def test_version(link: Line) -> None:
@@ -55,25 +54,29 @@ def test_intervals(link: Line) -> None:
     assert result(link, received) == ACCEPTED
     (value,) = link.only(received, "PARAM_VALUE")  # a parameter changed: stations want to know
     assert (value.param_id, value.param_value) == ("MB_R_HIGHRES_IMU", 10.0)
-    received = link.command(GET, HIGHRES_IMU)
-    assert link.only(received, "MESSAGE_INTERVAL")[0].interval_us == 100_000
+    for asked in ((GET, HIGHRES_IMU), (REQUEST, 244, HIGHRES_IMU)):  # MAVLink deprecates the first
+        received = link.command(*asked)
+        assert result(link, received) == ACCEPTED
+        assert link.only(received, "MESSAGE_INTERVAL")[0].interval_us == 100_000
     assert result(link, link.command(SET, HIGHRES_IMU, -1)) == ACCEPTED
     assert link.only(link.command(GET, HIGHRES_IMU), "MESSAGE_INTERVAL")[0].interval_us == -1
     assert result(link, link.command(SET, HEARTBEAT, 200_000)) == ACCEPTED
     assert len(link.only(link.to(10.05), "HEARTBEAT")) == pytest.approx(50, abs=1)
     assert result(link, link.command(SET, HEARTBEAT, 0)) == ACCEPTED
     assert len(link.only(link.to(20.05), "HEARTBEAT")) == pytest.approx(10, abs=1)
+    for message in (HIGHRES_IMU, STATUS):  # MESSAGE_INTERVAL holds 36 minutes
+        assert result(link, link.command(SET, message, 1e38)) == ACCEPTED
+        assert link.only(link.command(GET, message), "MESSAGE_INTERVAL")[0].interval_us == 0x7FFFFFFF
+    assert link.only(link.command(GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0  # not sent
+    assert result(link, link.command(GET, 70_000)) == DENIED
 
 
 @pytest.mark.parametrize(
     ("message", "interval"),
     [
-        (HEARTBEAT, -1),
-        (HEARTBEAT, 1e9),
-        (FIELD, 10),
-        (FIELD, -2),
-        (FIELD, nan),
-        (24, 1000),
+        *((HEARTBEAT, k) for k in (-1, 1e9)),
+        *((FIELD, k) for k in (10, -2, nan)),
+        (24, 1e3),
         (-1, 0),
         (1e30, 0),
     ],
@@ -84,28 +87,10 @@ def test_intervals_that_are_refused(link: Line, message: float, interval: float)
     assert link.component.parameters.changed() == before
 
 
-@pytest.mark.parametrize("message", [HIGHRES_IMU, STATUS])
-def test_an_interval_of_an_age_is_kept(link: Line, message: int) -> None:
-    """MESSAGE_INTERVAL holds 36 minutes."""
-    assert result(link, link.command(SET, message, 1e38)) == ACCEPTED
-    assert link.only(link.command(GET, message), "MESSAGE_INTERVAL")[0].interval_us == 0x7FFFFFFF
-
-
-def test_an_interval_is_a_message_that_can_be_requested(link: Line) -> None:
-    """MAVLink has deprecated GET_MESSAGE_INTERVAL in favour of this."""
-    assert result(link, link.command(SET, HIGHRES_IMU, 100_000)) == ACCEPTED
-    received = link.command(REQUEST, 244, HIGHRES_IMU)
-    assert result(link, received) == ACCEPTED
-    assert link.only(received, "MESSAGE_INTERVAL")[0].interval_us == 100_000
-
-
-def test_interval_of_a_message_we_do_not_send(link: Line) -> None:
-    assert link.only(link.command(GET, 24), "MESSAGE_INTERVAL")[0].interval_us == 0
-    assert result(link, link.command(GET, 70_000)) == DENIED
-
-
-def test_unknown_commands_are_unsupported_but_not_for_others(link: Line) -> None:
+def test_an_unknown_command_is_unsupported_and_its_sender_is_told_but_not_for_others(link: Line) -> None:
     assert result(link, link.command(400, 1)) == UNSUPPORTED
+    frame = next(frame for _, frame in reversed(link.sent) if frame[7] == 77)
+    assert frame[10 + 8 : 10 + 10] == bytes((255, 190))  # target_system, target_component
     assert link.command(400, 1, target=(1, 1)) == []
     assert link.command(400, 1, target=(2, 191)) == []
 
@@ -123,13 +108,6 @@ def test_command_int(link: Line) -> None:
     link.asked = REQUEST
     received = link.send_message("command_int", 1, 191, 0, REQUEST, 0, 0, STATUS, 0, 0, 0, 0, 0, 0)
     assert result(link, received) == ACCEPTED
-
-
-def test_the_acknowledgement_is_addressed(link: Line) -> None:
-    (ack,) = link.only(link.command(400), "COMMAND_ACK")
-    frame = next(frame for _, frame in reversed(link.sent) if frame[7] == 77)
-    assert ack.result == UNSUPPORTED
-    assert frame[10 + 8 : 10 + 10] == bytes((255, 190))  # target_system, target_component
 
 
 def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Line) -> None:

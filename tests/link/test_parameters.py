@@ -121,13 +121,10 @@ ROWS = [
 ]
 
 
-def test_names_do_not_collide() -> None:
-    assert len(Parameters(ROWS).names) == len(ROWS)
-
-
 @given(st.sampled_from(ROWS), st.floats(width=32))
 def test_what_is_set_reads_back_or_nothing_changes(row: Tunable, value: float) -> None:
     parameters = Parameters(ROWS)
+    assert len(parameters.names) == len(ROWS)  # the names do not collide
     before = parameters[row.name]
     if parameters.set(row.name, value):
         assert real32(parameters[row.name]) == value
@@ -160,14 +157,9 @@ def test_store(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "content",
-    [
-        '{"parameters": {"a": "b"}}',
-        '{"parameters": {"a": 1e300}}',
-        '{"signing_timestamp": -1}',
-        '{"signing_timestamp": 281474976710655}',
-        "",
-    ],
-)
+    ['{"parameters": {"a": "b"}}', '{"parameters": {"a": 1e300}}', '{"signing_timestamp": -1}',
+     '{"signing_timestamp": 281474976710655}', ""],
+)  # fmt: skip
 def test_a_store_that_is_damaged(tmp_path: Path, content: str) -> None:
     path = tmp_path / "parameters.json"
     path.write_text(content)

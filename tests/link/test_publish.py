@@ -59,10 +59,7 @@ def test_raw(line: Line) -> None:
     assert (raw.temperature, raw.power_cycle, raw.sequence) == (12.5, 3, 70_000)
     assert raw.supply != raw.supply  # NaN: not known
     assert raw.flags == 1 | 2 | 4 | 8
-
-
-def test_raw_of_an_instrument_that_says_little(line: Line) -> None:
-    plain = sample(reading=Reading((1.0, 2.0, 3.0)))
+    plain = sample(reading=Reading((1.0, 2.0, 3.0)))  # of an instrument that sends little
     (raw,) = line.only(publish(line, plain), "MAG_RAW")
     assert raw.flags == 0
     assert (raw.count_x, raw.sequence, raw.power_cycle) == (0, 0, 0)
@@ -76,6 +73,9 @@ def test_field(line: Line) -> None:
     assert (field.flags, field.calibration_id, field.sequence) == (CORRECTED.quality, 0xDEADBEEF, 1)
     assert (field.telemetry_age, field.anomaly, field.total_field_sigma) == (0.25, -12.5, 1.5)
     assert field.latency == pytest.approx(0.1)
+    nothing = Corrected(nan, nan, (nan,) * 3, (nan,) * 3, 16)
+    (field,) = line.only(publish(line, sample(), nothing), "MAG_FIELD")
+    assert field.total_field != field.total_field
 
 
 def test_standard_messages(line: Line) -> None:
@@ -115,12 +115,6 @@ def test_the_latest_sample_on_request(line: Line) -> None:
     publish(line, sample())
     received = line.command(512, 105)
     assert [one.get_type() for one in received] == ["HIGHRES_IMU", "COMMAND_ACK"]
-
-
-def test_nan_is_published_as_nan(line: Line) -> None:
-    nothing = Corrected(nan, nan, (nan,) * 3, (nan,) * 3, 16)
-    (field,) = line.only(publish(line, sample(), nothing), "MAG_FIELD")
-    assert field.total_field != field.total_field
 
 
 # ---- Rates, timers and announcements in event time -------------------------------------------------------
@@ -174,20 +168,17 @@ def talker(peer: ModuleType) -> Talker:
     return Talker(peer)
 
 
-def test_short_text(talker: Talker) -> None:
-    talker.announcer.send_statustext("sensor found")
-    (message,) = talker.at(0)
-    assert (message.text, message.id, message.severity) == ("sensor found", 0, 6)
-
-
-@pytest.mark.parametrize("length", [50, 51, 99, 100, 150, 151])
-def test_long_text_in_pieces(talker: Talker, length: int) -> None:
+@pytest.mark.parametrize("length", [12, 50, 51, 99, 100, 150, 151])
+def test_a_text_is_sent_whole_or_in_pieces(talker: Talker, length: int) -> None:
     text = "".join(chr(97 + i % 26) for i in range(length))
     for _ in range(2):
         talker.announcer.send_statustext(text)
         messages = talker.at(0)
         assert "".join(message.text for message in messages) == text
-        if length > 50:
+        assert {message.severity for message in messages} == {6}
+        if length <= 50:
+            assert [message.id for message in messages] == [0]
+        else:
             assert len({message.id for message in messages}) == 1
             assert messages[0].id > 0
             assert [message.chunk_seq for message in messages] == list(range(len(messages)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from math import isnan
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,7 @@ def test_a_text_matches_whole() -> None:
         assert got == [(name, 0.5, NOW) for name in named if name == sent]
 
 
-def test_arrays_and_numeric_match() -> None:
+def test_arrays_numeric_match_and_unknown_values() -> None:
     telemetry = {
         "first": Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[0]"),
         "last": Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator[31]"),
@@ -64,13 +64,10 @@ def test_arrays_and_numeric_match() -> None:
     assert values(telemetry, "BATTERY_STATUS", voltages=cells, id=1) == [("cell", 4.2, NOW)]
     assert values(telemetry, "BATTERY_STATUS", voltages=cells, id=0) == []
     assert values(telemetry, "GPS_STATUS", satellite_snr=bytes(range(20))) == [("cov", 3, NOW)]
-
-
-def test_not_known_is_nan() -> None:
     telemetry = {"i": Telemetry("SYS_STATUS", "current_battery", scale=0.01)}
-    (one,) = values(telemetry, "SYS_STATUS", current_battery=-1)
-    assert isnan(one[1])
-    assert values(telemetry, "SYS_STATUS", current_battery=150)[0][1] == 1.5
+    for current, ampere in ((-1, nan), (150, 1.5)):  # -1: not known
+        ((_, value, _),) = values(telemetry, "SYS_STATUS", current_battery=current)
+        assert value == pytest.approx(ampere, nan_ok=True)
 
 
 def known_clock(offset_us: int) -> VehicleClock:

@@ -35,23 +35,30 @@ def boots(link: Line, codec: Codec, times: Iterable[int]) -> list[str]:
     return texts
 
 
-def test_reboot(link: Line) -> None:
-    times = [*range(100_000, 101_000, 100), *range(500, 1500, 100)]
-    assert boots(link, link.autopilot, times) == ["autopilot 1:1 rebooted"]
-    assert link.component.vehicle.reboots == 1
+END = (1 << 32) - 1000
+BURST = (500_000, 500_010, 500_020, 500_030, 3_000, 3_010, 3_020, 3_030)
+REBOOTED, TWO = ["autopilot 1:1 rebooted"], ["two autopilots send as 1:1"]
 
 
-def test_late_and_repeated_messages_and_a_wrap_are_not_a_reboot(link: Line) -> None:
-    end = (1 << 32) - 1000
-    times = [end, end + 100, end + 100, end - 20_000, end + 200, end - 100, end + 300, *range(0, 1000, 100)]
-    assert boots(link, link.autopilot, times) == []
-    assert link.component.vehicle.reboots == 0
+@pytest.mark.parametrize(
+    ("times", "texts", "reboots"),
+    [
+        ([*range(100_000, 101_000, 100), *range(500, 1500, 100)], REBOOTED, 1),
+        ([*range(3000, 8000, 500), *range(500, 3000, 500)], REBOOTED, 1),
+        ([END + k for k in (0, 100, 100, -20_000, 200, -100, 300)] + [*range(0, 1000, 100)], [], 0),
+        ([boot + 200 * i for i in range(20) for boot in (500_000, 3_000)], TWO, 0),
+    ],
+    ids=["reboot", "soon after a boot", "late, repeated, wrapped", "two autopilots"],
+)
+def test_a_reboot_is_distinguished_from_late_messages_and_from_two_autopilots(
+    link: Line, times: list[int], texts: list[str], reboots: int
+) -> None:
+    assert boots(link, link.autopilot, times) == texts
+    assert link.component.vehicle.reboots == reboots
 
 
-def test_a_reboot_soon_after_a_boot(link: Line) -> None:
-    assert boots(link, link.autopilot, [*range(3000, 8000, 500), *range(500, 3000, 500)]) == [
-        "autopilot 1:1 rebooted"
-    ]
+def test_two_autopilots_in_bursts(link: Line) -> None:
+    assert TWO[0] in boots(link, link.autopilot, [boot + 100 * i for i in range(12) for boot in BURST])
 
 
 def test_telemetry_that_is_sent_long_after_it_was_stamped_is_not_a_reboot(link: Line) -> None:
@@ -67,22 +74,6 @@ def test_telemetry_that_is_sent_long_after_it_was_stamped_is_not_a_reboot(link: 
     assert texts == []
     assert link.component.vehicle.reboots == 0
     assert link.component.vehicle.clock.known
-
-
-def test_two_autopilots_with_one_address(link: Line) -> None:
-    times = [boot for i in range(20) for boot in (500_000 + 200 * i, 3_000 + 200 * i)]
-    texts = boots(link, link.autopilot, times)
-    assert texts[0] == "two autopilots send as 1:1"
-    assert link.component.vehicle.reboots == 0
-
-
-def test_two_autopilots_in_bursts(link: Line) -> None:
-    times = [
-        boot + 100 * i
-        for i in range(12)
-        for boot in (500_000, 500_010, 500_020, 500_030, 3_000, 3_010, 3_020, 3_030)
-    ]
-    assert "two autopilots send as 1:1" in boots(link, link.autopilot, times)
 
 
 def test_a_second_vehicle_is_reported_once_and_ignored(link: Line) -> None:
@@ -108,17 +99,21 @@ def test_another_program_with_our_address(link: Line) -> None:
     assert texts == ["another program sends as 1:191"]
 
 
-def test_lost_frames_are_counted(link: Line) -> None:
+@pytest.mark.parametrize(
+    ("order", "lost"),
+    [
+        ([*range(100), *range(107, 410), *range(405, 600)], 7),
+        (
+            [four + i for four in range(0, 400, 4) for i in (2, 0, 3, 1) if four + i not in (0, 1, 101, 203)],
+            2,
+        ),
+    ],
+    ids=["lost and repeated", "late"],
+)
+def test_lost_frames_are_counted(link: Line, order: list[int], lost: int) -> None:
     frames = [link.autopilot.pack("ATTITUDE", time_boot_ms=i) for i in range(600)]
-    link.give(b"".join(frames[:100] + frames[107:400] + frames[400:410] + frames[405:600]))
-    assert link.component.vehicle.frames_lost == 7
-
-
-def test_late_frames_are_not_lost(link: Line) -> None:
-    frames = [link.autopilot.pack("ATTITUDE", time_boot_ms=i) for i in range(400)]
-    order = [four + i for four in range(0, 400, 4) for i in (2, 0, 3, 1)]
-    link.give(b"".join(frames[i] for i in order if i not in (0, 1, 101, 203)))
-    assert link.component.vehicle.frames_lost == 2
+    link.give(b"".join(frames[i] for i in order))
+    assert link.component.vehicle.frames_lost == lost
 
 
 def test_whose_frames_are_lost_is_reported(link: Line) -> None:
@@ -134,16 +129,8 @@ def test_whose_frames_are_lost_is_reported(link: Line) -> None:
         return [text for text in texts if "frames missing" in text]
 
     reported = ["1:25: over 1% of its frames missing, or for others"]
-    assert [ten_seconds(lost) for lost in (0, 2, 3, 20, 1, 0, 5, 0)] == [
-        [],
-        [],
-        reported,
-        [],
-        [],
-        [],
-        reported,
-        [],
-    ]
+    reports = [ten_seconds(lost) for lost in (0, 2, 3, 20, 1, 0, 5, 0)]
+    assert reports == [[], [], reported, [], [], [], reported, []]
     assert link.component.vehicle.frames_lost == 0, "the autopilot's"
 
 
