@@ -218,8 +218,11 @@ Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Base = Annotated[Path | None, Parameter(name=["--base-station", "--base"])]
 Heading = Annotated[
-    Literal["true", "magnetic"] | None,
-    Parameter(help="What headings refer to. If not given: what the log says, else true north."),
+    Literal["true", "magnetic", "inertial"] | None,
+    Parameter(
+        help="What headings refer to; inertial: true north, by an instrument other than the magnetometer, so "
+        "that a fit may use them. If not given: what the log says, else true north."
+    ),
 ]
 Plot = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Whole = Annotated[int, Parameter(converter=_whole_number)]

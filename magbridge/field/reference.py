@@ -240,18 +240,18 @@ def _interpolated(
 def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> xr.Dataset:
     """Return the deployment with ``heading`` (deg) measured from true north.
 
-    `reference` is the north of the logged headings, "true" or "magnetic"; default: the attribute
-    ``heading_reference``. A deployment without magnetic headings is returned unchanged. FormatError: magnetic
-    headings without a date.
+    `reference` is the north of the logged headings, "true" or "magnetic", or "inertial" for true headings by
+    an instrument other than the magnetometer; default: the attribute ``heading_reference``. FormatError:
+    magnetic headings without a date.
 
     Notes
     -----
     The true heading is the magnetic one plus the IGRF's declination ``D = atan2(B_east, B_north)``. Without
     a position it is NaN.
     """
-    reference = reference or deployment.attrs.get("heading_reference")
+    reference = reference or deployment.attrs.get("heading_reference", "true")
     if reference != "magnetic" or "heading" not in deployment:
-        return deployment
+        return deployment.assign_attrs(heading_reference=reference)
     require_date(deployment)
     # True heading = magnetic heading + declination, D = atan2(B_east, B_north).
     north, east, _ = main_field(deployment).T

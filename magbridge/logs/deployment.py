@@ -90,8 +90,8 @@ def deployment(
         A declared unit that does not fit the column; an unknown ``heading_reference``.
     """
     units, attrs, long_names = units or {}, attrs or {}, long_names or {}
-    if (reference := attrs.get("heading_reference", "true")) not in ("true", "magnetic"):
-        raise FormatError(file, f"heading_reference: expected true or magnetic, not {reference!r}")
+    if (reference := attrs.get("heading_reference", "true")) not in ("true", "magnetic", "inertial"):
+        raise FormatError(file, f"heading_reference: expected true, magnetic or inertial, not {reference!r}")
     variables = {}
     for name, values in {"time": time, **columns}.items():
         unit = units.get(name, "")

@@ -79,7 +79,7 @@ class ColumnMapping(Table, frozen=True):
 
     columns: dict[str, ColumnSource] = msgspec.field(default_factory=dict)
     """Standard name of a column -> its :class:`ColumnSource`."""
-    heading_reference: Literal["true", "magnetic"] | None = None
+    heading_reference: Literal["true", "magnetic", "inertial"] | None = None
     """North to which headings refer."""
     fill_value: float | None = None
     """The number that stands for a missing value."""

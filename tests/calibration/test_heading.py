@@ -21,6 +21,7 @@ from magbridge.calibration.fitting.boresight import (
 )
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.result import Fit
 from magbridge.calibration.fitting.uncertainty import expected_heading_sigma
 from magbridge.calibration.heading import (
     heading,
@@ -29,6 +30,8 @@ from magbridge.calibration.heading import (
     published_covariance,
 )
 from magbridge.calibration.model import Boresight, identity
+from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from sitl import load
 
 NED = np.array([16e3, -5e3, 49e3])
@@ -260,6 +263,34 @@ def test_magnetic_headings_that_are_taken_for_true_are_reported(pitch: float, tu
     # a mounting that is turned by about as much as D, of a glider, leaves no mismatch, and no message
     turned = replace(right, field=Rotation.from_euler("z", 10.0, degrees=True).apply(field))
     assert magnetic_headings(identity(), turned) is None
+
+
+def test_headings_of_another_instrument_determine_what_the_magnitude_leaves_open() -> None:
+    """Small angles of roll and pitch: the magnitude hardly shows the vertical offset, the vector does."""
+    rng, n = np.random.default_rng(4), 1200
+    roll, pitch = rng.normal(0.0, 0.06, n), rng.normal(0.0, 0.04, n)
+    yaw = np.linspace(0.0, 8 * np.pi, n)
+    body, mounted = body_field(roll, pitch, yaw), Rotation.from_rotvec([0.02, -0.03, 0.4])
+    offset = np.array([400.0, -250.0, 900.0])
+    field = mounted.inv().apply(body) @ np.linalg.inv(np.diag([1.01, 0.985, 1.004])).T + offset
+    data = Observations(
+        field + rng.normal(0.0, 20.0, (n, 3)), np.full(n, TOTAL), np.empty((n, 0)),
+        attitude=np.column_stack([roll, pitch, yaw]), reference_ned=np.tile(NED, (n, 1)),
+    )  # fmt: skip
+
+    def vector_error(found: Fit) -> float:
+        vector = correct(found.calibration, field, data.parameters, data.time).vector
+        return rms(np.linalg.norm(vector - body, axis=1))
+
+    magnitude, levelled = fit(data, "nominal"), fit(data, "horizontal")
+    with_headings = fit(replace(data, independent_headings=True), "nominal")
+    assert vector_error(with_headings) < 0.4 * vector_error(magnitude)
+    assert vector_error(levelled) < 0.85 * vector_error(magnitude)
+    assert levelled.calibration.method == "horizontal"
+    known = with_headings.calibration
+    assert np.abs((known.coefficients[6:] - offset) / np.sqrt(np.diag(known.covariance))[6:]).max() < 3.5
+    with pytest.raises(CalibrationError, match="direction: needs roll, pitch and heading"):
+        fit(replace(data, independent_headings=True, attitude=None))
 
 
 def test_a_reversed_channel_gets_no_boresight_and_is_reported() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from magbridge.calibration.file import load
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
+from magbridge.calibration.heading import heading
 from magbridge.field.igrf import igrf
 
 pytestmark = pytest.mark.real
@@ -29,8 +31,9 @@ def line(real_data: Path) -> Observations:
     """Return the columns of the line at 10 Hz: time of day, fluxgate, pitch, roll, heading, IGRF."""
     rows = np.loadtxt(real_data / "magnav_flt1002" / "Flt1002_1002.02.txt")
     return Observations(
-        rows[:, 1:4], np.linalg.norm(rows[:, 7:10], axis=1), np.empty((len(rows), 0)), time=FLOWN + rows[:, 0]
-    )
+        rows[:, 1:4], np.linalg.norm(rows[:, 7:10], axis=1), np.empty((len(rows), 0)),
+        time=FLOWN + rows[:, 0], attitude=np.radians(rows[:, [5, 4, 6]]), reference_ned=rows[:, 7:10],
+    )  # fmt: skip
 
 
 def every(data: Observations, number: int) -> Observations:
@@ -125,3 +128,18 @@ def test_one_compass_is_one_calibration(flight: Path, here: Path, command: Comma
     result = json.loads(command("calibrate", flight, "--compass", "1", "-o", "cal.json", "--json").out)
     np.testing.assert_allclose(result["paper"]["T_nT"], 100 * OFFSETS[1], rtol=0, atol=60)
     assert [path.name for path in here.iterdir()] == ["cal.json"]
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_inertial_headings_in_the_fit_leave_a_quarter_of_a_degree(line: Observations, first: bool) -> None:
+    data = every(line, 10)
+    seen = (np.arange(len(data)) < len(data) // 2) == first
+    known = fit(replace(data.part(seen), independent_headings=True)).calibration
+    other = data.part(~seen)
+    assert other.attitude is not None
+    assert other.reference_ned is not None
+    vector = correct(known, other.field, other.parameters, other.time).vector
+    roll, pitch, truth = other.attitude.T
+    declination = np.degrees(np.arctan2(other.reference_ned[:, 1], other.reference_ned[:, 0]))
+    error = heading(vector, roll, pitch, declination).true - np.degrees(truth)
+    assert np.sqrt(np.mean(((error + 180.0) % 360.0 - 180.0) ** 2)) < 0.26

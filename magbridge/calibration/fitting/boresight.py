@@ -107,21 +107,28 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
     CalibrationError: as for :func:`find_boresight`, which always checks the headings.
     """
     with_headings = find_boresight(calibration, data)
-    if data.attitude is None or data.reference_ned is None or calibration.effects:
+    found = find_tilt_boresight(calibration, data)
+    if found is None:
         return with_headings
-    known = np.asarray(np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1))
-    if known.sum() < MIN_BORESIGHT_SAMPLES:
-        return with_headings
-    vector, ned = _vectors(calibration, data.part(known)), data.reference_ned[known]
-    roll, pitch, _ = data.attitude[known].T
-    # the tilt method needs the magnitude and inclination of the field, but no heading
-    total = np.linalg.norm(ned, axis=1)
-    found = boresight_from_tilt(vector, roll, pitch, total, np.arcsin(ned[:, 2] / total), data.runs[known])
     least_known = np.degrees(np.sqrt(np.diag(found.covariance))).max()
     return with_headings if least_known > MAX_OPEN_ANGLE_DEG else found
 
 
 # ---- From roll and pitch alone ----
+
+
+def find_tilt_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
+    """Return the boresight from roll and pitch alone; None: as for :func:`find_boresight`."""
+    if data.attitude is None or data.reference_ned is None or calibration.effects:
+        return None
+    known = np.asarray(np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1))
+    if known.sum() < MIN_BORESIGHT_SAMPLES:
+        return None
+    vector, ned = _vectors(calibration, data.part(known)), data.reference_ned[known]
+    roll, pitch, _ = data.attitude[known].T
+    # the tilt method needs the magnitude and inclination of the field, but no heading
+    total = np.linalg.norm(ned, axis=1)
+    return boresight_from_tilt(vector, roll, pitch, total, np.arcsin(ned[:, 2] / total), data.runs[known])
 
 
 def boresight_from_tilt(
@@ -184,7 +191,7 @@ def boresight_from_tilt(
         meat += offset * lever @ lever.T
     inverse = np.linalg.inv(N)
     covariance = (inverse @ meat @ inverse)[:3, :3]
-    return _boresight(rotation, covariance, float(np.degrees(np.sqrt(white + offset))))
+    return to_boresight(rotation, covariance, float(np.degrees(np.sqrt(white + offset))))
 
 
 def _tilt_variances(residuals: list[FloatArray], levers: list[FloatArray]) -> tuple[float, float]:
@@ -266,7 +273,12 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     between = np.stack([score[part.runs == label].sum(axis=0) for label in np.unique(part.runs)])
     inverse = np.linalg.inv(np.sum(v * v) * np.eye(3) - v.T @ v)
     spread = between.T @ between * (len(between) / max(len(between) - 1, 1))
-    return _boresight(rotation, inverse @ spread @ inverse + COMPASS_SIGMA**2 * np.eye(3))
+    # errors that all runs share do not scatter: of the headings about the vertical, of the tilt across it
+    down = field_body(attitude, np.broadcast_to([0.0, 0.0, 1.0], attitude.shape)).mean(axis=0)
+    down /= np.linalg.norm(down)
+    tilt_variance = np.radians(RUN_TILT_SIGMA_DEG) ** 2
+    shared = tilt_variance * np.eye(3) + (COMPASS_SIGMA**2 - tilt_variance) * np.outer(down, down)
+    return to_boresight(rotation, inverse @ spread @ inverse + shared)
 
 
 def magnetic_headings(calibration: Calibration, data: Observations) -> Diagnostic | None:
@@ -313,7 +325,7 @@ def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
     return rotation, float(np.degrees(np.median(left)))
 
 
-def _boresight(
+def to_boresight(
     rotation: Rotation, covariance: FloatArray, tilt_sigma: float = DEFAULT_TILT_SIGMA_DEG
 ) -> Boresight:
     """Return the boresight of a rotation; `covariance` (3, 3): rad^2; `tilt_sigma`: deg."""

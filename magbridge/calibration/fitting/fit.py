@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.calibration.fitting.checks import judged
 from magbridge.calibration.fitting.crossings import far_off, jumped, left_open, tells_rock
+from magbridge.calibration.fitting.direction import with_direction
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.calibration.fitting.uncertainty import with_level
@@ -122,6 +123,8 @@ def fit(
             data = data.part(flight)
             found.details["ends"] = int((~flight).sum())
         found = found if method == "survey" else _biased(found, bias)
+        if data.independent_headings and not (found.calibration.effects or found.creep):
+            found = with_direction(found, data, headings=True)
         calibration = replace(found.calibration, conditions=data.conditions())
         return judged(replace(found, calibration=calibration), data)
 

@@ -21,13 +21,8 @@ ellipsoid of all runs. It then fits polynomials to these ellipsoids, each weight
 
     c = argmin sum_r (Phi_r c - c_r)^T Lambda_r (Phi_r c - c_r),   Lambda_r = H_r / sigma_r^2 + P
 
-``horizontal`` (Isezaki 1986, Korenaga 1995) fits the magnitude of the horizontal part of the field and the
-vertical part, which roll and pitch separate at any heading::
-
-    l = R_y(pitch) R_x(roll) B (H_r - T),   |l_xy| = H_h,   l_z = Z
-
-with a full matrix ``B = R A``, A symmetric (polar decomposition). A tilt error of half a degree adds 0.9 % of
-Z to H_h, for example 400 nT of 46,000 nT.
+``horizontal`` (Isezaki 1986, Korenaga 1995) adds the vertical component to ``nominal``, which roll and pitch
+give at any heading (:mod:`.direction`).
 """
 
 from __future__ import annotations
@@ -37,11 +32,9 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.linalg import polar
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.direction import with_direction
 from magbridge.calibration.fitting.left_out import LeftOut, error_between, error_forward, leave_out
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import Known, Posed, Vehicle, pose
@@ -62,7 +55,6 @@ from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, estimate_noise
 from magbridge.estimation.optimise import Solution
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
 from magbridge.estimation.residual import ResidualSamples, residuals_of
-from magbridge.wording import counted
 
 # ---- Polynomials with physical priors ----
 
@@ -359,63 +351,18 @@ def _assembled(
     return assemble(data, posed, found, method)
 
 
-# ---- The horizontal fit ----
-
-MIN_LEVELLED_SAMPLES = 30
-"""Smallest number of samples for the twelve unknowns of the horizontal fit."""
-DIFFERENCE_STEP = 1e-6
-"""Step of B, and of T over the field, for symmetric differences, whose relative error is 1e-9."""
-FIRST_NOISE_FRACTION = 1e-3
-"""Initial value of the noise that attitude errors cause, as a fraction of the field."""
+# ---- The vertical component ----
 
 
 def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
-    """Fit one ellipsoid to the horizontal and vertical parts of the field (method ``horizontal``).
+    """Fit one ellipsoid to the magnitude and to the vertical component of the field (method ``horizontal``).
 
-    CalibrationError: roll and pitch, or the reference's direction, are missing.
+    CalibrationError: roll, pitch or the reference's direction are missing.
     """
     if data.attitude is None or data.reference_ned is None:
         raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")
-    known = np.isfinite(data.attitude[:, :2]).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
-    if known.sum() < MIN_LEVELLED_SAMPLES:
-        raise CalibrationError(
-            f"horizontal: only {counted(int(known.sum()), 'sample')} with roll, pitch and position"
-        )
-    data = data.part(np.asarray(known))
-    assert data.attitude is not None
-    assert data.reference_ned is not None
-    posed = pose(data.without_parameters(), 0)
-    F_0 = posed.samples.F_0
-    # Turn the reading by pitch and roll alone: its horizontal and vertical parts are then those of the Earth.
-    level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
-    horizontal, vertical = np.hypot(*data.reference_ned[:, :2].T), data.reference_ned[:, 2]
-    widths = np.array([SOFT_IRON_SIGMA] * 9 + [WIDE_HARD_IRON_SIGMA] * 3)
-
-    def misfit(x: FloatArray, sigma: float) -> FloatArray:
-        B, T = np.eye(3) + x[:9].reshape(3, 3), F_0 * x[9:]
-        l = level.apply((data.field - T) @ B.T)  # noqa: E741  (the notes' letter)
-        parts = np.concatenate([np.hypot(l[:, 0], l[:, 1]) - horizontal, l[:, 2] - vertical])
-        return np.concatenate([parts / sigma, x / widths])
-
-    # robust least squares, each time with the noise of the previous fit
-    sigma, x = FIRST_NOISE_FRACTION * F_0, np.zeros(12)
-    for _ in range(3):
-        found = least_squares(misfit, x, args=(sigma,), loss="soft_l1", f_scale=3.0)
-        x = found.x
-        sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
-    # covariance of (A, T) from that of (B, T), by symmetric differences
-    steps = DIFFERENCE_STEP * np.eye(12)
-    J = np.array([_ellipsoid_of(x + h, F_0) - _ellipsoid_of(x - h, F_0) for h in steps]).T
-    J /= 2.0 * DIFFERENCE_STEP
-    covariance = J @ np.linalg.inv(found.jac.T @ found.jac) @ J.T
-    return _assembled(data, posed, _ellipsoid_of(x, F_0), covariance, "horizontal")
-
-
-def _ellipsoid_of(x: FloatArray, F_0: float) -> FloatArray:
-    """Return the nine coefficients (nT) of A, from the decomposition ``B = R A``, and of T.
-
-    `x` (12,): ``B - I`` row by row, then T over `F_0`.
-    """
-    _, A = polar(np.eye(3) + x[:9].reshape(3, 3))
-    a = F_0 * (A - np.eye(3))
-    return np.concatenate([a[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], F_0 * x[9:]])
+    # the vertical component is the same at any heading
+    headed = np.column_stack([data.attitude[:, :2], np.zeros(len(data))])
+    data = replace(data, attitude=headed)
+    found = with_direction(fit_nominal(data), data, headings=False)
+    return replace(found, calibration=replace(found.calibration, method="horizontal"))

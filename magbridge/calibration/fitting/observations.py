@@ -56,6 +56,9 @@ class Observations:
     """(n,): Time of the samples, s since 1970 UTC; default: one sample per second."""
     attitude: FloatArray | None = None
     """(n, 3): Roll, pitch and true heading, rad; NaN where unknown."""
+    independent_headings: bool = False
+    """True if another instrument than the magnetometer measured the headings, for example an inertial one. A
+    fit then also uses the direction of the field."""
     reference_ned: FloatArray | None = None
     """(n, 3): Reference field vector, north-east-down, nT."""
     place: FloatArray | None = None

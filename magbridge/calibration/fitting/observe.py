@@ -82,6 +82,7 @@ def observations(
         runs=_runs(ds, time),
         time=time,
         attitude=attitude,
+        independent_headings=ds.attrs.get("heading_reference") == "inertial",
         reference_ned=vector,
         place=place,
         unmapped=unmapped,
