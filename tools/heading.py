@@ -99,6 +99,7 @@ def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
         flown = glider(scenario, seed)
         learned, survey = flown.runs, flown.survey
     offset_deg = RUN_OFFSET_DEG if name == "gliders, tilt offsets" else 0.0
+    level = survey  # without errors of roll and pitch
     learned, survey = (with_tilt_errors(log, rng, offset_deg) for log in (learned, survey))
     blind = learned.drop_vars("heading")
     data = mb.observations(blind, MASSES)
@@ -113,7 +114,7 @@ def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
     yield published("auto", known, survey)
     yield published("nominal", mb.fit(mb.observations(blind, ()), "nominal").calibration, survey)
     if name == "gliders, tilt offsets":
-        yield from after_pairs(known, learned, survey, blind)
+        yield from after_pairs(known, learned, {"": survey, ", exact tilt in the survey": level}, blind)
     yield score("raw compass", *levelled(channels(survey), survey), survey["heading"].to_numpy())
     assert known.boresight is not None
     turn = Rotation.from_rotvec(known.boresight.rotation)
@@ -132,9 +133,9 @@ def levelled(vector: np.ndarray, log: xr.Dataset) -> tuple[np.ndarray, float]:
 
 
 def after_pairs(
-    known: Calibration, learned: xr.Dataset, survey: xr.Dataset, blind: xr.Dataset
+    known: Calibration, learned: xr.Dataset, surveys: dict[str, xr.Dataset], blind: xr.Dataset
 ) -> Iterator[Row]:
-    """Yield the rows of boresights that are estimated only from the first pairs of spirals."""
+    """Yield the rows of boresights from the first pairs of spirals alone, in each survey."""
     runs = np.unique(learned["run"])
     for pairs in PAIRS:
         first = blind.isel(time=np.isin(learned["run"], runs[: 2 * pairs]))
@@ -142,7 +143,9 @@ def after_pairs(
         if boresight is None:
             yield {"method": f"auto, boresight of {pairs} pairs", "failed": "no boresight"}
             continue
-        yield published(f"auto, boresight of {pairs} pairs", replace(known, boresight=boresight), survey)
+        used = replace(known, boresight=boresight)
+        for text, survey in surveys.items():
+            yield published(f"auto, boresight of {pairs} pairs{text}", used, survey)
 
 
 def aircraft() -> Iterator[Row]:
