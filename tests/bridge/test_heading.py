@@ -104,8 +104,8 @@ def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
     for tenth in range(400):
         time_us = START + 4_000_000 + 100_000 * tenth
         wrong = rng.normal(size=2) * radians(0.5)
-        events = [attitude(time_us - 1000, roll=ROLL + wrong[0], pitch=PITCH + wrong[1], yaw=YAW)]
-        field = last(fed(bridge, *[*events, sample(time_us, body_field())]), "MAG_FIELD")
+        tilted = attitude(time_us - 1000, roll=ROLL + wrong[0], pitch=PITCH + wrong[1], yaw=YAW)
+        field = last(fed(bridge, tilted, sample(time_us, body_field())), "MAG_FIELD")
         error = (field["heading"] - 130.0 + 180.0) % 360.0 - 180.0
         ratios.append(error / field["heading_sigma"])
     # the sigma also contains declination and boresight, which do not change here
@@ -114,13 +114,11 @@ def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
 
 def test_no_heading_without_attitude_or_with_an_old_one(tmp_path: Path) -> None:
     bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
-    field = last(fed(bridge, *[*begin(), sample(START + 100_000, body_field())]), "MAG_FIELD")
+    field = last(fed(bridge, *begin(), sample(START + 100_000, body_field())), "MAG_FIELD")
     assert field["heading_sigma"] == 0.0
-    known = last(
-        fed(bridge, *[attitude(START + 150_000), sample(START + 200_000, body_field())]), "MAG_FIELD"
-    )
+    known = last(fed(bridge, attitude(START + 150_000), sample(START + 200_000, body_field())), "MAG_FIELD")
     assert known["heading_sigma"] > 0.0
-    stale = last(fed(bridge, *[sample(START + 2_500_000, body_field())]), "MAG_FIELD")
+    stale = last(fed(bridge, sample(START + 2_500_000, body_field())), "MAG_FIELD")
     assert stale["heading_sigma"] == 0.0
 
 

@@ -252,10 +252,19 @@ def test_a_disk_that_does_not_take_it_leaves_the_old_one(flown: Flown, to: str, 
     assert named(received(sent), "MAG_FIELD")[-1]["calibration_id"] == learned
 
 
+def kept_after_restart(folder: Path, learning: LearningService) -> None:
+    """Restart the bridge, which starts with its first calibration; keep what the other one learned."""
+    again = bridge(folder).learning
+    assert again is not None
+    assert calibration_id(again.learner.calibration) == calibration_id(load(folder / "cal.json"))
+    again.to_keep.append(learning.learner.calibration)
+    assert keep(again, folder / "cal-learned.json") == ""
+
+
 def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown: Flown) -> None:
     """The next write of the file removes the remains of the interrupted write."""
     folder, _, learning = flown
-    path, first = folder / "cal-learned.json", calibration_id(load(folder / "cal.json"))
+    path = folder / "cal-learned.json"
     assert keep(learning, path) == ""
     before = path.read_bytes()
     command = [sys.executable, "-c", KILLED, str(folder / "cal.json"), str(path)]
@@ -263,22 +272,13 @@ def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown:
     (left,) = folder.glob(".cal-learned.*")
     assert left.stat().st_size > 0
     assert path.read_bytes() == before
-    again = bridge(folder).learning
-    assert again is not None
-    assert calibration_id(again.learner.calibration) == first
-    again.to_keep.append(learning.learner.calibration)
-    assert keep(again, path) == ""
+    kept_after_restart(folder, learning)
     assert not left.exists()
 
 
 def test_one_that_somebody_cut_short_is_not_read(flown: Flown) -> None:
     """The bridge starts with its first calibration, and writes the learned one again."""
     folder, _, learning = flown
-    path = folder / "cal-learned.json"
-    path.write_text('{"format": "magbri', encoding="utf-8")
-    again = bridge(folder).learning
-    assert again is not None
-    assert calibration_id(again.learner.calibration) == calibration_id(load(folder / "cal.json"))
-    again.to_keep.append(learning.learner.calibration)
-    assert keep(again, path) == ""
-    assert calibration_id(load(path)) == calibration_id(learning.learner.calibration)
+    (folder / "cal-learned.json").write_text('{"format": "magbri', encoding="utf-8")
+    kept_after_restart(folder, learning)
+    assert calibration_id(load(folder / "cal-learned.json")) == calibration_id(learning.learner.calibration)

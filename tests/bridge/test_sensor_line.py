@@ -91,6 +91,22 @@ def test_an_instrument_with_another_protocol_is_not_silent(bench: Bench, line: b
     assert bench.texts[-1] == "ascii is silent"
 
 
+def opened_line(*commands: bytes, searching: bool = False) -> tuple[SensorLine, Timers]:
+    """Return a sensor's line that was opened at 0, and its timers."""
+    timers = Timers()
+    announcer = Announcer(Outbox(Codec(1, 191)), timers)
+    line = SensorLine("hmr2300", lambda: commands, 10_000_000, announcer, timers, 0, searching=searching)
+    line.opened(0)
+    return line, timers
+
+
+def sent_at(line: SensorLine, timers: Timers, now_us: int) -> list[bytes]:
+    timers.advance(now_us, lambda _: None)
+    sent = list(line.to_send)
+    line.to_send.clear()
+    return sent
+
+
 @pytest.mark.parametrize(
     ("searching", "received", "sent"),
     [
@@ -104,15 +120,10 @@ def test_an_instrument_with_another_protocol_is_not_silent(bench: Bench, line: b
 def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
     searching: bool, received: bytes, sent: list[float]
 ) -> None:
-    timers, codec = Timers(), Codec(1, 191)
-    announcer = Announcer(Outbox(codec), timers)
-    line = SensorLine("hmr2300", lambda: (b"go",), 10_000_000, announcer, timers, 0, searching=searching)
-    line.opened(0)
+    line, timers = opened_line(b"go", searching=searching)
     times = []
     for k in range(50):
-        timers.advance(100_000 * k, lambda _: None)
-        times += [0.1 * k for _ in line.to_send]
-        line.to_send.clear()
+        times += [0.1 * k for _ in sent_at(line, timers, 100_000 * k)]
         if received and k % 10 == 7:
             line.on_unparsed(received[:11], 100_000 * k)
             line.on_unparsed(received[11:], 100_000 * k)
@@ -121,15 +132,10 @@ def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
 
 
 def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
-    timers, codec = Timers(), Codec(1, 191)
-    announcer, commands = Announcer(Outbox(codec), timers), (b"1", b"2", b"3")
-    line = SensorLine("hmr2300", lambda: commands, 10_000_000, announcer, timers, 0, searching=True)
-    line.opened(0)
+    line, timers = opened_line(b"1", b"2", b"3", searching=True)
     sent = []
     for now_us in range(0, 2_000_000, 10_000):
-        timers.advance(now_us, lambda _: None)
-        sent += line.to_send
-        line.to_send.clear()
+        sent += sent_at(line, timers, now_us)
         if sent and not line.wrong_device:
             line.on_unparsed(GGA, now_us)
     assert sent == [b"1"]
@@ -138,12 +144,7 @@ def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
 
 def test_commands_are_a_tenth_of_a_second_apart() -> None:
     """An instrument replies to one command before it reads the next."""
-    timers, codec = Timers(), Codec(1, 191)
-    announcer = Announcer(Outbox(codec), timers)
-    line = SensorLine("hmr2300", lambda: (b"1", b"2", b"3"), 10_000_000, announcer, timers, 0)
-    sent = {0: [b"1"], 100_000: [b"2"], 200_000: [b"3"]}
-    line.opened(0)
+    line, timers = opened_line(b"1", b"2", b"3")
     for now_us in range(0, 300_000, 10_000):
-        timers.advance(now_us, lambda _: None)
-        assert line.to_send == sent.get(now_us, [])
-        line.to_send.clear()
+        expected = {0: [b"1"], 100_000: [b"2"], 200_000: [b"3"]}.get(now_us, [])
+        assert sent_at(line, timers, now_us) == expected

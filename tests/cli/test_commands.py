@@ -215,14 +215,9 @@ def test_numbers_that_may_say_not_known_are_reported(
     assert np.isnan(read(declared)["pump_current"]).sum() == 2
 
 
-def test_a_log_that_the_calibration_was_made_from_is_reported(deployment: Path, command: Command) -> None:
-    write(read(deployment).isel(time=slice(0, FEW)), "log.csv")
-    command("calibrate", "log.csv", "--method", "nominal", "-o", "cal.json", "--force")
-    output = command("diagnose", "log.csv", "--calibration", "cal.json", "-o", "doubt", code=1)
-    assert "log.csv: the calibration was fitted to this log" in output.err
-
-
-def test_logs_of_one_name_are_all_remembered(deployment: Path, command: Command) -> None:
+def test_the_logs_that_a_calibration_was_made_from_are_remembered_and_reported(
+    deployment: Path, command: Command
+) -> None:
     """Two logs of equal name, of two days in two folders, are both recorded."""
     rows = read(deployment)
     for day, begin in (("one", 0), ("two", FEW)):
