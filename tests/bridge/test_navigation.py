@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from fed import fed, named, received, texts
+from passages import PLACE, hills
 from small import bridge_text
 
 from magbridge.bridge.events import Event, StartEvent
@@ -31,7 +33,6 @@ from sitl.fluxgate import open_encoder
 
 TRACKING = 2
 START = 1_780_000_000_000_000
-PLACE = (49.5, -57.9)
 SPEED, HEADING, OFF, DEPTH = 0.5, 60.0, 150.0, 1.0
 ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
 """Origin of the autopilot's local frame (deg, deg, m), on a hill near the water."""
@@ -54,21 +55,11 @@ options = {start_sigma = 200.0, current_sigma = 0.02, bias_sigma = 1.0, interval
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a map (hills of 300 m and 40 nT) and a calibration that changes nothing."""
+    """Return a folder with a map (hills of 80 to 300 m and 37 nT) and a calibration that changes nothing."""
     path = tmp_path_factory.mktemp("navigation")
     perfect = replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal")
     save(perfect, path / "cal.json")
-    latitude = PLACE[0] + np.linspace(-0.05, 0.08, 131)
-    longitude = PLACE[1] + np.linspace(-0.05, 0.12, 121)
-    rng = np.random.default_rng(4)
-    x, y = np.meshgrid(longitude * 72_000.0, latitude * 111_000.0)
-    anomaly = sum(
-        15.0 * np.sin((x * np.cos(a) + y * np.sin(a)) / length + phase)
-        for a, length, phase in zip(
-            rng.uniform(0, 3.1, 12), rng.uniform(80, 300, 12), rng.uniform(0, 6.3, 12), strict=True
-        )
-    )
-    AnomalyGrid(longitude, latitude, anomaly).save(path / "grid.nc")
+    hills().save(path / "grid.nc")
     return path
 
 
@@ -107,15 +98,8 @@ def bridge(folder: Path, fix: str) -> Pipeline:
     return set_up(load(path), StartEvent(START))
 
 
-def feed(pipeline: Pipeline, given: Iterable[Event]) -> list[tuple[int, bytes]]:
+def frames(pipeline: Pipeline, given: Iterable[Event]) -> list[tuple[int, bytes]]:
     return [sent for event in given for sent in pipeline.feed(event)]
-
-
-def received(stream: bytes) -> dict[str, list[Message]]:
-    messages: dict[str, list[Message]] = {}
-    for message in Codec(255, 190).parse(stream):
-        messages.setdefault(message.name, []).append(message)
-    return messages
 
 
 def where(time_us: int) -> tuple[float, float]:
@@ -144,15 +128,14 @@ class Sailed(NamedTuple):
 @pytest.fixture(scope="module", params=MESSAGES)
 def sailed(request: pytest.FixtureRequest, folder: Path) -> Sailed:
     pipeline = bridge(folder, request.param)
-    sent = feed(pipeline, events(folder))
-    messages = received(b"".join(frame for _, frame in sent))
-    return Sailed(request.param, pipeline, sent, messages[MESSAGES[request.param]])
+    sent = frames(pipeline, events(folder))
+    return Sailed(request.param, pipeline, sent, named(received(sent), MESSAGES[request.param]))
 
 
 def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None:
     """Each decoded fix is within its sigma of the truth, in the frame of its message."""
     kind, _, sent, fixes = sailed
-    last = received(b"".join(frame for _, frame in sent))["MAG_NAVIGATION"][-1]
+    last = named(received(sent), "MAG_NAVIGATION")[-1]
     honest = np.sqrt(0.5 * (last["covariance_nn"] + last["covariance_ee"]))
     assert len(fixes) > 50
     for fix in fixes[-40::8]:
@@ -192,13 +175,13 @@ def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None
 
 def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
     _, _, sent, fixes = sailed
-    messages = received(b"".join(frame for _, frame in sent))
-    tracking = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
+    messages = received(sent)
+    tracking = next(one for one in named(messages, "MAG_NAVIGATION") if one["state"] == TRACKING)["time_usec"]
     first_us = next(time_us for time_us, frame in sent if frame == fixes[0].frame)
     assert first_us > tracking
-    texts = [text["text"] for text in messages["STATUSTEXT"]]
-    assert any(text.startswith("navigation: tracking") for text in texts)
-    assert [text for text in texts if "fixes" in text][:3] == [
+    reported = texts(messages)
+    assert any(text.startswith("navigation: tracking") for text in reported)
+    assert [text for text in reported if "fixes" in text][:3] == [
         "no fixes to the autopilot: GPS is good",
         "no fixes to the autopilot: no valid position",
         "fixes go to the autopilot: GPS is lost",
@@ -208,7 +191,7 @@ def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
 def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> None:
     if sailed.kind != "GLOBAL_POSITION_SENSOR":
         pytest.skip("one kind is enough")
-    again = feed(bridge(folder, sailed.kind), islice(events(folder), 300))
+    again = frames(bridge(folder, sailed.kind), islice(events(folder), 300))
     assert again == sailed.sent[: len(again)]
 
 
@@ -221,7 +204,7 @@ def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
     beat = Codec(1, 1).pack("ATTITUDE") + Codec(1, 1).pack("GLOBAL_POSITION_INT", alt=-1000)
     last_us = events(folder)[-1].time_us
     silence = [Event(last_us + 200_000 * k, Channel.LINK, beat) for k in range(600)]
-    after = received(b"".join(frame for _, frame in feed(sailed.pipeline, silence)))["ODOMETRY"]
+    after = named(fed(sailed.pipeline, *silence), "ODOMETRY")
     grown = [one["pose_covariance"][0] for one in after]
     assert grown == sorted(grown)
     assert 2.0 < (after[-1]["time_usec"] - times[-1]) * 1e-6 < 45.0

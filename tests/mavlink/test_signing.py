@@ -107,7 +107,7 @@ def test_same_events_same_bytes() -> None:
     assert [text(codec()) for _ in range(2)] == [text(codec())] * 2
 
 
-def test_key_file(tmp_path: Path) -> None:
+def test_key_file_and_who_may_read_it(tmp_path: Path) -> None:
     path = tmp_path / "key.bin"
     with pytest.raises(FormatError, match="there is none"):
         load_key(path)
@@ -116,6 +116,9 @@ def test_key_file(tmp_path: Path) -> None:
         load_key(path)
     path.write_bytes(KEY)
     assert load_key(path) == KEY
+    for mode, reported in ((0o600, False), (0o640, False), (0o644, True)):
+        path.chmod(mode)
+        assert readable_by_all(path) is reported
 
 
 def test_signatures_follow_the_host_s_clock(peer: ModuleType) -> None:
@@ -228,14 +231,6 @@ def test_a_count_of_frames_stands_for_the_frames() -> None:
             text(one)
         other.skip(300)
         assert text(one) == text(other)
-
-
-def test_who_may_read_the_key(tmp_path: Path) -> None:
-    path = tmp_path / "key.bin"
-    path.write_bytes(KEY)
-    for mode, reported in ((0o600, False), (0o640, False), (0o644, True)):
-        path.chmod(mode)
-        assert readable_by_all(path) is reported
 
 
 # ---- A key that somebody sends over the link reaches neither the messages nor the log --------------------

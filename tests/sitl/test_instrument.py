@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sitl.instrument import Instrument, Samples, rotation
-from sitl.signals import autoregressive, first_order
+from sitl.signals import autoregressive
 
 FIELD = np.array([17000.0, -6000.0, 49600.0])
 IDEAL = Instrument(noise_sigma=0.0, corner=0.0)
@@ -95,28 +95,6 @@ def test_every_power_on_changes_the_offset() -> None:
     assert np.abs(np.diff(means, axis=0)).max() > 10
     steady = measure(Instrument(noise_sigma=0.0, power_on=(100.0,)), *constant(400))
     assert np.ptp(steady.channels, axis=0).max() == 0
-
-
-# ---- first-order lags and autoregressive noise -------------------------------------------------------------
-
-
-TAU = 1 / (2 * np.pi * 0.33)
-
-
-def test_a_step_rises_as_one_minus_e_to_the_t_over_tau() -> None:
-    # a step between two points is a ramp; a steep one must do
-    step = 1e-3
-    u = np.ones(5000)
-    y = first_order(u, step, TAU, start=0.0)
-    t = step * np.arange(5000)
-    np.testing.assert_allclose(y, 1 - np.exp(-t / TAU), atol=1e-12)
-
-
-def test_a_ramp_is_followed_one_time_constant_late_at_any_step() -> None:
-    for step in (0.01, 0.5, 4.0):
-        t = np.arange(0.0, 40.0, step)
-        y = first_order(t, step, TAU)
-        np.testing.assert_allclose(y, t - TAU * (1 - np.exp(-t / TAU)), atol=1e-9)
 
 
 @pytest.mark.parametrize("memory", [0.0, 3.0, 10.0])
