@@ -33,6 +33,11 @@ def count(folder: Path) -> tuple[int, int]:
     return sum(len(path.read_bytes().splitlines()) for path in paths), len(paths)
 
 
+def length(path: str) -> int:
+    """Return the number of lines of a file, whose path is relative to the project's root."""
+    return len((ROOT / path).read_bytes().splitlines())
+
+
 def parts(groups: dict[str, list[str]]) -> dict[str, tuple[int, int]]:
     """Return lines and modules of each part; modules of ``magbridge`` in no other part count as top level."""
     counts = {
@@ -99,12 +104,22 @@ def main() -> int:
         print()
     if "--comments" in sys.argv:
         return int(over and gate)
-    print(f"{'part':34} {'lines':>7} {'budget':>7} {'excess':>7} {'modules':>8}")
+    later = [path for paths in limits["added"].values() for path in paths]
+    print(f"{'part':34} {'lines':>7} {'budget':>7} {'added':>7} {'excess':>7} {'modules':>8}")
     for name, (lines, modules) in parts(limits["folders"]).items():
         budget = limits["budget"][name]
+        folders = tuple(limits["folders"].get(name, ["magbridge"]))
+        added = sum(
+            length(path)
+            for path in later
+            if path.startswith(folders) or ("top level" in name and path.count("/") == 1)
+        )
         over |= lines > limits["ceiling"].get(name, budget)
-        print(f"{name:34} {lines:7,} {budget:7,} {max(0, lines - budget):7,} {modules:8}")
-    print(f"modules of the package: budget {limits['max_modules']}")
+        excess = max(0, lines - budget - added)
+        print(f"{name:34} {lines:7,} {budget:7,} {added:7,} {excess:7,} {modules:8}")
+    print(f"modules of the package: budget {limits['max_modules']}. Abilities added after the budgets:")
+    for ability, paths in limits["added"].items():
+        print(f"    {ability}: {sum(map(length, paths)):,} lines")
     return int(over and gate)
 
 
