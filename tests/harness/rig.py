@@ -171,6 +171,11 @@ class Rig:
         temporary.replace(self.offset)
 
     @property
+    def port(self) -> int:
+        """Number of the link's UDP or TCP port."""
+        return int(self.url.rpartition(":")[2])
+
+    @property
     def mark(self) -> int:
         """Number of messages received until now."""
         return len(self.received)

@@ -26,25 +26,30 @@ def free(kind: socket.SocketKind) -> int:
 
 
 @contextmanager
-def served(clock: Path, *options: str, warned: bool = False, url: str = "") -> Iterator[Station]:
-    """Run the monitor on the link `url`; the file `clock` holds the shift of its clock in µs."""
+def served(
+    *options: str, clock: Path | None = None, warned: bool = False, url: str = ""
+) -> Iterator[Station]:
+    """Run the monitor on the link `url` until it serves; the file `clock` has the shift of its clock, µs."""
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
-    launch = [sys.executable, str(Path(__file__).parent / "stepped.py"), str(clock)]
-    command = [*launch, "monitor", url or f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
+    stepped = str(Path(__file__).with_name("stepped.py"))
+    program = ["-m", "magbridge"] if clock is None else [stepped, str(clock)]
+    command = [sys.executable, *program, "monitor", url or f"udpin:127.0.0.1:{link}", "--port", str(port)]
     # NiceGUI runs in a test mode if it sees pytest's variables
     alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:
+    with subprocess.Popen([*command, *options], stderr=subprocess.PIPE, env=alone) as process:
         assert process.stderr
         line = process.stderr.readline().decode()
         assert "the page is" in line
         if warned:
             assert process.stderr.readline().startswith(b"warning: the page is open to the network")
         place = line.rpartition(" ")[2].strip().replace("0.0.0.0", "127.0.0.1")
+        place += "" if "?" in place else "/"
         try:
-            yield place if "?" in place else f"{place}/", ("127.0.0.1", link)
+            get(place)
+            yield place, ("127.0.0.1", link)
         finally:
             process.send_signal(signal.SIGINT)
-        assert not process.stderr.read().strip()
+        assert process.stderr.read().strip() == b""
     assert process.returncode == 0
 
 

@@ -12,22 +12,19 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from devices import TRUTH, udp_socket
+from devices import TRUTH
+from ears import Ear, ftp
 from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as version_1
 from rig import Rig
 
-from magbridge.link.files import FTP_HEADER, Opcode
+from magbridge.link.files import Opcode
 from magbridge.mavlink import Codec, LogReader, Message
 from magbridge.records import Channel
 
 LOG = "20250101T000000Z_0001.tlog"
 MakeRig = Callable[[str], Rig]
 Start = Callable[..., Any]
-
-
-def port(rig: Rig) -> int:
-    return int(rig.url.rpartition(":")[2])
 
 
 def with_a_log(rig: Rig, size: int) -> bytes:
@@ -45,7 +42,7 @@ def test_mavproxy_reads_logs_both_ways(make_rig: MakeRig, start_peer: Start, pyt
     rig = make_rig("udpout")
     content = with_a_log(rig, 200_000)
     target = ("--target-system=1", "--target-component=191", "--default-modules=ftp,log,link,param")
-    peer = start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{port(rig)}", *target))
+    peer = start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{rig.port}", *target))
     peer.until("Detected vehicle 1:191")
     peer.ask("ftp list @MAV_LOG")
     peer.until(LOG)
@@ -68,36 +65,6 @@ def indices(values: list[Message]) -> set[int]:
     return {value["param_index"] for value in values}
 
 
-class Ear:
-    """Ground station on a socket that sends frames and stores the received frames."""
-
-    def __init__(self, system: int) -> None:
-        self.codec, self.ear = Codec(system, 190), Codec(0, 0)
-        self.line = udp_socket(0.0)
-        self.peer: Any = None
-        self.received: list[Message] = []
-
-    @property
-    def number(self) -> int:
-        return int(self.line.getsockname()[1])
-
-    def turn(self) -> None:
-        try:
-            while True:
-                data, self.peer = self.line.recvfrom(65536)
-                self.received += self.ear.parse(data)
-        except BlockingIOError:
-            return
-
-    def send_message(self, name: str, **fields: object) -> None:
-        if self.peer is not None:
-            self.line.sendto(self.codec.pack(name, **fields), self.peer)
-
-    def of(self, name: str) -> list[Message]:
-        self.turn()
-        return [one for one in self.received if one.name == name]
-
-
 @pytest.fixture
 def ears() -> Iterator[list[Ear]]:
     made = [Ear(255), Ear(254)]
@@ -106,25 +73,20 @@ def ears() -> Iterator[list[Ear]]:
         one.line.close()
 
 
-def ftp(opcode: int, data: bytes, sequence: int) -> dict[str, object]:
-    header = FTP_HEADER.pack(sequence, 0, opcode, len(data), 0, 0, 0)
-    return {"target_system": 1, "target_component": 191, "payload": (header + data).ljust(251, b"\0")}
-
-
 def test_two_stations_and_a_vehicle_behind_a_router(
     make_rig: MakeRig, start_peer: Start, python: Path, ears: list[Ear]
 ) -> None:
     """MAVProxy forwards between the bridge and two stations; another vehicle is heard through it, too."""
     rig = make_rig("udpout")
     with_a_log(rig, 1000)
-    outs = [f"--out=udp:127.0.0.1:{one.number}" for one in ears]
+    outs = [f"--out=udp:127.0.0.1:{one.line.getsockname()[1]}" for one in ears]
     target = (
         "--target-system=1",
         "--target-component=191",
         "--default-modules=link,output",
         "--streamrate=-1",
     )
-    start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{port(rig)}", *outs, *target))
+    start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{rig.port}", *outs, *target))
     rig.until(lambda: all(one.of("MAG_FIELD") or one.of("HEARTBEAT") for one in ears), 60)
     for one in ears:
         one.send_message("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)

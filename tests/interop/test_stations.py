@@ -28,16 +28,12 @@ MakeRig = Callable[[str], Rig]
 Start = Callable[..., Any]
 
 
-def port(rig: Rig) -> int:
-    return int(rig.url.rpartition(":")[2])
-
-
 def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     rig = make_rig("udpout")
     peer = start_peer(
         rig,
         [
-            python, python.with_name("mavproxy.py"), f"--master=udpin:127.0.0.1:{port(rig)}",
+            python, python.with_name("mavproxy.py"), f"--master=udpin:127.0.0.1:{rig.port}",
             "--state-basedir=.", "--logfile=station.tlog",
             "--default-modules=param,link,cmdlong,misc,calibration", "--target-system=1",
             "--target-component=191",
@@ -75,7 +71,7 @@ def read(path: Path) -> list[Any]:
 
 def test_mavsdk(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     rig = make_rig("udpout")
-    peer = start_peer(rig, [python, HERE / "mavsdk_station.py", f"udpin://127.0.0.1:{port(rig)}", XML])
+    peer = start_peer(rig, [python, HERE / "mavsdk_station.py", f"udpin://127.0.0.1:{rig.port}", XML])
     found = peer.answer("found")["found"]
     assert found == {"system": 1, "components": [191], "autopilot": False}
     received = peer.answer("heard")["heard"]
@@ -103,7 +99,7 @@ def test_node_mavlink(make_rig: MakeRig, start_peer: Start, modules: Path) -> No
     rig = make_rig("tcpin")
     rig.until(lambda: rig.logs and rig.logs[0].stat().st_size > 500)
     ours = json.dumps([layout(name) for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")])
-    peer = start_peer(rig, ["node", HERE / "node_station.cjs", modules, str(port(rig)), ours])
+    peer = start_peer(rig, ["node", HERE / "node_station.cjs", modules, str(rig.port), ours])
     result = peer.answer("result")["result"]
     assert result["bad"] == 0
     latest = result["latest"]

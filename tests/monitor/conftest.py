@@ -1,21 +1,12 @@
-"""Fixtures of the monitor's tests: a clock, and a browser."""
+"""Fixtures of the monitor's tests: a browser."""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
-
-
-@pytest.fixture
-def clock(tmp_path: Path) -> Path:
-    """Return a file with the shift (µs) of the clock of the page's computer, at first 0."""
-    offset = tmp_path / "offset"
-    offset.write_text("0")
-    return offset
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,14 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
 import pytest
-from station import get, served
+from station import served
 
 from magbridge.mavlink import Codec
 from magbridge.records import Quality
@@ -60,12 +61,9 @@ def feed(link: tuple[str, int], stop: threading.Event) -> None:
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    offset = tmp_path_factory.mktemp("clock") / "offset"
-    offset.write_text("0")
+def url() -> Iterator[str]:
     stop = threading.Event()
-    with served(offset) as (address, link):
-        get(address)
+    with served() as (address, link):
         sender = threading.Thread(target=feed, args=(link, stop))
         sender.start()
         try:
@@ -75,17 +73,20 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             sender.join()
 
 
-def visit(browser: Any, url: str, width: str = "desktop", scheme: str = "light") -> Any:
-    """Return the page once it shows the curve; what its console reports fails the test."""
+@contextmanager
+def visit(browser: Any, url: str, width: str = "desktop", scheme: str = "light") -> Iterator[Any]:
+    """Yield the page once it shows the curve; an error that the page reports fails the test."""
     size = dict(zip(("width", "height"), WIDTHS[width], strict=True))
     page = browser.new_context(viewport=size, color_scheme=scheme, accept_downloads=True).new_page()
     page.set_default_timeout(PATIENCE)
-    page.reports = []
-    page.on("pageerror", lambda error: page.reports.append(str(error)))
+    reports: list[str] = []
+    page.on("pageerror", lambda error: reports.append(str(error)))
     page.goto(url)
     page.get_by_text("MB_SETTLE_TIME").wait_for()
     page.wait_for_function(f"{CHART}?.getOption()?.series?.[2]?.data?.length > 200")
-    return page
+    yield page
+    assert reports == []
+    page.context.close()
 
 
 CHART = "magbridge.chart(document.querySelector('[data-chart]'))"
@@ -96,72 +97,63 @@ CHART = "magbridge.chart(document.querySelector('[data-chart]'))"
 def test_everybody_can_read_it(browser: Any, url: str, width: str, scheme: str) -> None:
     """No violation that axe finds; nothing is wider than the window; no error."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-    page = visit(browser, url, width, scheme)
-    found = axe.Axe().run(page).response["violations"]
-    assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= WIDTHS[width][0]
-    assert page.evaluate("document.body.classList.contains('body--dark')") is (scheme == "dark")
-    assert page.reports == []
-    page.context.close()
+    with visit(browser, url, width, scheme) as page:
+        found = axe.Axe().run(page).response["violations"]
+        assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= WIDTHS[width][0]
+        assert page.evaluate("document.body.classList.contains('body--dark')") is (scheme == "dark")
 
 
 def test_a_reader_zooms_with_keys_and_finds_the_day_again_after_a_reload(browser: Any, url: str) -> None:
-    page = visit(browser, url)
-    before = page.evaluate(f"{CHART}.getOption().series[2].data.length")
-    page.locator("[data-chart]").first.focus()
-    page.keyboard.press("+")
-    zoom = page.evaluate(f"{CHART}.getOption().dataZoom[0]")
-    assert (zoom["start"], zoom["end"]) == pytest.approx((25, 75))
-    page.wait_for_timeout(1500)  # new samples do not change the selected time span
-    assert page.evaluate(f"{CHART}.getOption().dataZoom[0].start") == pytest.approx(25)
-    page.keyboard.press("0")
-    assert page.evaluate(f"{CHART}.getOption().dataZoom[0].end") == 100
-    page.reload()
-    page.wait_for_function(f"{CHART}?.getOption()?.series?.[2]?.data?.length >= {before}")
-    page.get_by_role("button", name="24 h").click()
-    page.wait_for_function(f"{CHART}.getOption().series[2].data.length < 10")
-    assert page.reports == []
-    page.context.close()
+    with visit(browser, url) as page:
+        before = page.evaluate(f"{CHART}.getOption().series[2].data.length")
+        page.locator("[data-chart]").first.focus()
+        page.keyboard.press("+")
+        zoom = page.evaluate(f"{CHART}.getOption().dataZoom[0]")
+        assert (zoom["start"], zoom["end"]) == pytest.approx((25, 75))
+        page.wait_for_timeout(1500)  # new samples do not change the selected time span
+        assert page.evaluate(f"{CHART}.getOption().dataZoom[0].start") == pytest.approx(25)
+        page.keyboard.press("0")
+        assert page.evaluate(f"{CHART}.getOption().dataZoom[0].end") == 100
+        page.reload()
+        page.wait_for_function(f"{CHART}?.getOption()?.series?.[2]?.data?.length >= {before}")
+        page.get_by_role("button", name="24 h").click()
+        page.wait_for_function(f"{CHART}.getOption().series[2].data.length < 10")
 
 
 def test_a_spike_is_marked_and_does_not_flatten_the_axis(browser: Any, url: str) -> None:
-    page = visit(browser, url)
-    page.wait_for_function(f"{CHART}.getOption().series[3].data.length > 0")  # the next drawing adds the mark
-    axis = page.evaluate(f"{CHART}.getOption().yAxis[0]")
-    assert axis["max"] - axis["min"] < 100.0
-    marks = page.evaluate(f"{CHART}.getOption().series[3].data")
-    assert {round(mark["value"][2], -3) for mark in marks} == {61_000}
-    page.context.close()
+    with visit(browser, url) as page:
+        page.wait_for_function(f"{CHART}.getOption().series[3].data.length > 0")  # of the next drawing
+        axis = page.evaluate(f"{CHART}.getOption().yAxis[0]")
+        assert axis["max"] - axis["min"] < 100.0
+        marks = page.evaluate(f"{CHART}.getOption().series[3].data")
+        assert {round(mark["value"][2], -3) for mark in marks} == {61_000}
 
 
 def test_alarms_vehicles_and_texts(browser: Any, url: str) -> None:
-    page = visit(browser, url)
-    seen = page.get_by_role("button", name=re.compile("Seen: A parameter of the calibration"))
-    other = page.get_by_role("button", name=re.compile("Seen: Samples are missing")).element_handle()
-    seen.click()
-    seen.wait_for(state="detached")
-    assert other.evaluate("button => button.isConnected")  # a click on it would not have been lost
-    assert page.get_by_text("<b>bold</b> ballast is stale").count()  # as text, not as HTML
-    page.get_by_role("button", name=re.compile("Vehicle 2, component 191")).click()
-    page.get_by_text("41\u202f000.00").wait_for()
-    assert page.reports == []
-    page.context.close()
+    with visit(browser, url) as page:
+        seen = page.get_by_role("button", name=re.compile("Seen: A parameter of the calibration"))
+        other = page.get_by_role("button", name=re.compile("Seen: Samples are missing")).element_handle()
+        seen.click()
+        seen.wait_for(state="detached")
+        assert other.evaluate("button => button.isConnected")  # a click on it would not have been lost
+        assert page.get_by_text("<b>bold</b> ballast is stale").count()  # as text, not as HTML
+        page.get_by_role("button", name=re.compile("Vehicle 2, component 191")).click()
+        page.get_by_text("41\u202f000.00").wait_for()
 
 
 def test_a_picture_and_a_report_are_handed_out(browser: Any, url: str, tmp_path: Path) -> None:
-    page = visit(browser, url)
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Picture").click()
-    picture = tmp_path / "page.png"
-    download.value.save_as(picture)
-    data = picture.read_bytes()
-    assert data.startswith(b"\x89PNG")
-    height = int.from_bytes(data[20:24])
-    assert height > 1500  # all charts, one below the other
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Report").click()
-    with ZipFile(BytesIO(Path(download.value.path()).read_bytes())) as archive:
-        assert len(archive.read("samples.csv").splitlines()) > 200
-        assert b"MB_SETTLE_TIME" in archive.read("parameters.csv")
-    assert page.reports == []
-    page.context.close()
+    with visit(browser, url) as page:
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Picture").click()
+        picture = tmp_path / "page.png"
+        download.value.save_as(picture)
+        data = picture.read_bytes()
+        assert data.startswith(b"\x89PNG")
+        height = int.from_bytes(data[20:24])
+        assert height > 1500  # all charts, one below the other
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Report").click()
+        with ZipFile(BytesIO(Path(download.value.path()).read_bytes())) as archive:
+            assert len(archive.read("samples.csv").splitlines()) > 200
+            assert b"MB_SETTLE_TIME" in archive.read("parameters.csv")

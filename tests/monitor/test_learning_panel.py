@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from rig import Rig
-from station import get, served
+from station import served
 
 from magbridge.mavlink.enums import MAV_PARAM_TYPE
 
@@ -85,13 +85,10 @@ def press(button: Locator, answer: Locator) -> None:
     pytest.fail("no answer")
 
 
-def test_an_alarm_is_shown_accepted_and_forgotten(
-    flying: tuple[Rig, Turning], clock: Path, browser: Any
-) -> None:
+def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], browser: Any) -> None:
     """Onset, amplitude, causes and both predictions are shown; each button acts on the bridge."""
     rig, field = flying
-    with served(clock, url=rig.url.replace("udpin", "udpout")) as (address, _):
-        get(address)
+    with served(url=rig.url.replace("udpin", "udpout")) as (address, _):
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.set_default_timeout(PATIENCE)
         page.goto(address)

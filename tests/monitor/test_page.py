@@ -6,12 +6,13 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from commands import Command
-from station import Station, get, served
+from devices import udp_socket
+from station import get, served
 
 from magbridge.bridge.links import open_link
 from magbridge.mavlink import Codec, Signing
@@ -22,18 +23,10 @@ from magbridge.monitor.link import ReceivedBridges
 pytest.importorskip("nicegui")
 
 
-@pytest.fixture
-def page(clock: Path) -> Iterator[Station]:
-    with served(clock) as running:
-        yield running
-
-
-def test_page(page: Station) -> None:
-    url, link = page
-    assert "nothing heard yet" in get(url)
+def test_page() -> None:
     bridge = Codec(1, 191)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.settimeout(10)
+    with served() as (url, link), udp_socket(10.0) as sender:
+        assert "nothing heard yet" in get(url)
         field = {"total_field": 52_134.268, "total_field_sigma": 0.6, "time_usec": 10**15, "flags": 4}
         field |= {"magnetic_heading": 20.0, "heading": 3.25, "heading_sigma": 0.75}
         sender.sendto(bridge.pack("MAG_FIELD", **field), link)
@@ -63,48 +56,45 @@ def test_page(page: Station) -> None:
             "sensor lost: unplugged",
             "vehicle 1, component 191",
         )
-        deadline = time.monotonic() + 10.0
-        while missing := [text for text in shown if text not in (html := get(url))]:
-            assert time.monotonic() < deadline, missing
-            sender.sendto(bridge.pack("MAG_FIELD", **field), link)
+        html = until_shown(url, *shown, again=lambda: sender.sendto(bridge.pack("MAG_FIELD", **field), link))
     assert 'content="normal"' in html  # light or dark, as the browser asks
     assert 'src="http' not in html  # it must show without a network
     assert 'href="http' not in html
 
 
-def test_a_clock_set_back_hides_no_silence(page: Station, clock: Path) -> None:
-    url, link = page
-    get(url)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.settimeout(10)
+def until_shown(url: str, *texts: str, again: Callable[[], object] = bool) -> str:
+    """Request a page, and do something `again`, until the page has all texts; return the page."""
+    deadline = time.monotonic() + 15.0
+    while missing := [text for text in texts if text not in (html := get(url))]:
+        assert time.monotonic() < deadline, missing
+        again()
+    return html
+
+
+def test_a_clock_set_back_hides_no_silence(tmp_path: Path) -> None:
+    (clock := tmp_path / "offset").write_text("0")
+    with served(clock=clock) as (url, link), udp_socket(10.0) as sender:
         sender.sendto(Codec(1, 191).pack("MAG_FIELD", total_field=52_134.268), link)
         sender.recv(4096)
         clock.write_text("-3600000000")
         received_at = b"".join([sender.recv(4096) for _ in range(10)])
-    names = [message.name for message in Codec(1, 191).parse(received_at)]
-    assert names.count("HEARTBEAT") > 1
-    deadline = time.monotonic() + 15.0
-    while "nothing heard for" not in get(url):
-        assert time.monotonic() < deadline
+        names = [message.name for message in Codec(1, 191).parse(received_at)]
+        assert names.count("HEARTBEAT") > 1
+        until_shown(url, "nothing heard for")
 
 
-def test_a_bridge_that_signs_is_asked_in_signed_messages(clock: Path, tmp_path: Path) -> None:
+def test_a_bridge_that_signs_is_asked_in_signed_messages(tmp_path: Path) -> None:
     """Only messages that are signed with the same key are accepted."""
     key = bytes(range(32))
     (tmp_path / "key").write_bytes(key)
     bridge = Codec(1, 191, Signing(key))
-    with served(clock, "--signing-key", str(tmp_path / "key")) as (url, link):
-        get(url)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.settimeout(10)
-            sender.sendto(Codec(1, 191).pack("MAG_FIELD", total_field=52_134.268), link)
-            deadline = time.monotonic() + 10.0
-            while "nothing heard yet; frames refused for their signature: 1" not in get(url):
-                assert time.monotonic() < deadline
-            bridge.now_us = time.time_ns() // 1000
-            sender.sendto(bridge.pack("MAG_FIELD", total_field=52_134.268), link)
-            names = [bridge.parse(sender.recv(4096))[0].name for _ in range(3)]
-        assert "PARAM_REQUEST_LIST" in names
+    with served("--signing-key", str(tmp_path / "key")) as (url, link), udp_socket(10.0) as sender:
+        sender.sendto(Codec(1, 191).pack("MAG_FIELD", total_field=52_134.268), link)
+        until_shown(url, "nothing heard yet; frames refused for their signature: 1")
+        bridge.now_us = time.time_ns() // 1000
+        sender.sendto(bridge.pack("MAG_FIELD", total_field=52_134.268), link)
+        names = [bridge.parse(sender.recv(4096))[0].name for _ in range(3)]
+    assert "PARAM_REQUEST_LIST" in names
 
 
 def test_bad_input_is_one_line(command: Command) -> None:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from old_twinleaf import open_old_twinleaf
+from instruments import CASES, instrument
 
 from magbridge.errors import ConfigError
 from magbridge.records import Reading
@@ -15,42 +13,21 @@ from magbridge.sensors import DRIVERS, Driver, open_driver
 from sitl.fluxgate import ENCODERS, Encoder, open_encoder
 
 GAUSS = 100_000.0
-LINE = ["time", "x", "y", "z", "temperature", "supply", "sequence", "power_cycle"]
-NMEA: dict[str, Any] = {
-    "columns": LINE,
-    "separator": ",",
-    "prefix": "$PMAG,",
-    "checksum": "nmea",
-    "sequence_modulo": 256,
+QUANTUM_NT = {
+    "digitizer": 2.5 / 2**23 / 5e-5 / 2,
+    "digitizer, gain 4": 2.5 / 4 / 2**23 / 2e-5 / 2,
+    "hmr2300 binary": GAUSS / 15_000 / 2,
+    "hmr2300 ascii": GAUSS / 15_000 / 2,
+    "rm3100": open_driver("rm3100", {"cycle_count": 400}).nt_per_count / 2,
+    "twinleaf 2": 0.004,  # float32
+    "twinleaf 2 behind a hub, µT": 0.004,
+    "twinleaf 1": 0.004,
+    "ascii counts": 0.25,
 }
-CASES: dict[str, tuple[str, dict[str, Any], float]] = {
-    # driver, options, largest error of quantisation in nT
-    "digitizer": ("digitizer", {"sensitivity": 5e-5}, 2.5 / 2**23 / 5e-5 / 2),
-    "digitizer, gain 4": ("digitizer", {"sensitivity": 2e-5, "gain": 4.0}, 2.5 / 4 / 2**23 / 2e-5 / 2),
-    "hmr2300 binary": ("hmr2300", {"output": "binary"}, GAUSS / 15_000 / 2),
-    "hmr2300 ascii": ("hmr2300", {"output": "ascii", "device": 12}, GAUSS / 15_000 / 2),
-    "twinleaf 2": ("twinleaf", {"temperature": "therm"}, 0.004),  # float32
-    "twinleaf 2 behind a hub, µT": ("twinleaf", {"route": "/0/2", "unit": "uT"}, 0.004),
-    "twinleaf 1": ("twinleaf", {"temperature": "therm"}, 0.004),
-    "ascii nmea": ("ascii", NMEA, 1e-6),
-    "ascii gauss": ("ascii", {"columns": ["x", "y", "z", "-", "*"], "unit": "G"}, 1e-6),
-    "ascii counts": ("ascii", {"unit": "counts", "scale": 0.5, "terminator": "\r"}, 0.25),
-}  # fmt: skip
-HAS_TIME = ("digitizer", "twinleaf", "ascii nmea")
-HAS_TEMPERATURE = ("digitizer", "twinleaf 2", "twinleaf 1", "ascii nmea")
-RANGE = {"hmr2300": 200_000.0, "twinleaf": 100_000.0, "digitizer": 31_000.0, "ascii": 1e6}
-
-
-def pair(case: str) -> tuple[Driver, Encoder]:
-    """Return a driver and its emulated instrument, both started."""
-    name, options, _ = CASES[case]
-    old = case == "twinleaf 1"
-    encoder = open_old_twinleaf(options, 20.0) if old else open_encoder(name, options, rate=20.0)
-    driver = open_driver(name, options)
-    for command in driver.start():
-        assert driver.feed(encoder.feed(command)) == []
-    assert encoder.streaming
-    return driver, encoder
+"""Largest error of quantisation, nT; a line of text has none."""
+HAS_TIME = ("digitizer", "rm3100", "twinleaf", "ascii nmea", "ascii keys")
+HAS_TEMPERATURE = ("digitizer", "twinleaf 2", "twinleaf 1", "ascii nmea", "ascii range")
+RANGE_NT = {"hmr2300": 200_000.0, "twinleaf": 100_000.0, "digitizer": 31_000.0, "rm3100": 800_000.0}
 
 
 def through(driver: Driver, encoder: Encoder, sent: list[Reading]) -> list[Reading]:
@@ -65,18 +42,18 @@ def test_every_driver_has_its_instrument() -> None:
 @given(data=st.data())
 @settings(max_examples=30)
 def test_round_trip(case: str, data: st.DataObject) -> None:
-    name, _, quantum = CASES[case]
-    limit = 0.99 * RANGE[name]
+    name, options = CASES[case]
+    limit = 0.99 * options.get("range", RANGE_NT.get(name, 1e6))
     fields = data.draw(st.lists(st.tuples(*[st.floats(-limit, limit)] * 3), min_size=8, max_size=8))
     sent = [
         Reading(field, device_time=0.05 * k, temperature=4.0 + k, supply=3.3)
         for k, field in enumerate(fields)
     ]
-    driver, encoder = pair(case)
+    driver, encoder = instrument(case, 20.0)
     got = through(driver, encoder, sent)
     assert len(got) == len(sent)
     for there, here in zip(sent, got, strict=True):
-        assert here.field == pytest.approx(there.field, abs=quantum * 1.001 + 1e-6, rel=0)
+        assert here.field == pytest.approx(there.field, abs=QUANTUM_NT.get(case, 0.0) * 1.001 + 1e-6, rel=0)
         assert not here.saturated
         if case.startswith(HAS_TIME):
             assert here.device_time == pytest.approx(there.device_time, abs=1e-6)
@@ -89,7 +66,7 @@ def test_round_trip(case: str, data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("case", ["digitizer", "hmr2300 binary", "hmr2300 ascii", "twinleaf 2"])
 def test_a_field_beyond_the_range_saturates(case: str) -> None:
-    driver, encoder = pair(case)
+    driver, encoder = instrument(case, 20.0)
     fields = [(1000.0 + k, 2000.0, -300_000.0 if k == 7 else 100.0) for k in range(12)]
     got = through(driver, encoder, [Reading(field, device_time=0.05 * k) for k, field in enumerate(fields)])
     assert [k for k, reading in enumerate(got) if reading.saturated] == [7]
@@ -98,7 +75,7 @@ def test_a_field_beyond_the_range_saturates(case: str) -> None:
 
 @pytest.mark.parametrize("case", ["digitizer", "twinleaf 2", "twinleaf 1", "ascii nmea"])
 def test_a_power_cycle_shows(case: str) -> None:
-    driver, encoder = pair(case)
+    driver, encoder = instrument(case, 20.0)
     one = Reading((1.0, 2.0, 3.0), device_time=0.0)
     (before,) = through(driver, encoder, [one])
     encoder.power_on()
@@ -144,6 +121,6 @@ def test_wrong_options_name_the_key() -> None:
 @given(st.lists(st.binary(max_size=50), max_size=10), st.sampled_from(sorted(CASES)))
 @settings(max_examples=100)
 def test_an_instrument_survives_any_commands(chunks: list[bytes], case: str) -> None:
-    _, encoder = pair(case)
+    _, encoder = instrument(case, 20.0)
     for chunk in chunks:
         encoder.feed(chunk)
