@@ -148,14 +148,15 @@ class Maker(Table, frozen=True):
 
 
 @cache
-def _makers() -> dict[str, Maker]:
+def makers() -> dict[str, Maker]:
+    """Return the instruments of ``makers.toml`` by name."""
     return convert(load_toml(MAKERS_FILE), dict[str, Maker], MAKERS_FILE)
 
 
 def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple[str, ColumnMapping]:
     """Return the instrument's name ("" if unknown), and its maker's declarations overruled by the user's."""
     names = {heading.replace(" ", "") for heading in headings}
-    for name, maker in _makers().items():
+    for name, maker in makers().items():
         if maker.headings <= names:
             there = {ours: source for ours, source in maker.columns.items() if source.heading in names}
             return name, msgspec.structs.replace(declared, columns={**there, **declared.columns})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
@@ -29,22 +30,17 @@ FIRST_NAMED_LINE = 1e6
 """Number given to the first survey line whose name is not a number."""
 
 
-class LineNumbers:
-    """Numbers of survey lines by their names; the same name always has the same number."""
+def line_number(name: str, known: dict[str, float]) -> float:
+    """Return the number of a survey line; the same name always has the same number, kept in `known`.
 
-    def __init__(self) -> None:
-        self._known: dict[str, float] = {}
-
-    def number(self, name: str) -> float:
-        """Return 100 for ``LINE 100``, ``L100`` or ``100``, and a number from a million on for other names.
-
-        A second name with the same number, as ``TIE 100``, counts as another name.
-        """
-        text = " ".join(name.upper().split())
-        digits = re.sub(r"^(LINE|TIE)?[\s:]*L?", "", text)
-        label = float(digits) if re.fullmatch(r"\d+(\.\d*)?|NAN", digits) else nan
-        taken = (isnan(label) and digits != "NAN") or label in self._known.values()
-        return self._known.setdefault(text, FIRST_NAMED_LINE + len(self._known) if taken else label)
+    It is 100 for ``LINE 100``, ``L100`` or ``100``, and a number from a million on for other names. A second
+    name with the same number, as ``TIE 100``, counts as another name.
+    """
+    text = " ".join(name.upper().split())
+    digits = re.sub(r"^(LINE|TIE)?[\s:]*L?", "", text)
+    label = float(digits) if re.fullmatch(r"\d+(\.\d*)?|NAN", digits) else nan
+    taken = (isnan(label) and digits != "NAN") or label in known.values()
+    return known.setdefault(text, FIRST_NAMED_LINE + len(known) if taken else label)
 
 
 def geographic(path: Path, system: str, columns: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -84,7 +80,7 @@ class TableReader:
         self.guesses: list[str] = []
         self._midnights, self._last, self._first_number = 0.0, 0.0, 1
         self._counter = CountState(0.0, np.empty(0), 0.0)
-        self._lines = LineNumbers()
+        self._lines: dict[str, float] = {}
         self._clock = clock or self._clock_by(rows[: max(LAYOUT_LINES - layout.first, 1)])
         self._start = self._start_by(rows)
         if self._clock.assumed and not self._start:
@@ -275,11 +271,8 @@ class TableReader:
         if name == "quality" and not pd.api.types.is_numeric_dtype(column):
             return self._flags(column, numbers)
         if name == "line" and not pd.api.types.is_numeric_dtype(column):
-            values = (
-                column.astype("str")
-                .map(self._lines.number, na_action="ignore")
-                .to_numpy(np.float64, copy=True)
-            )
+            labels = column.astype("str").map(partial(line_number, known=self._lines), na_action="ignore")
+            values = labels.to_numpy(np.float64, copy=True)
         elif pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
             values = column.to_numpy(np.float64, copy=True)
         else:

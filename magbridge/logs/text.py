@@ -32,11 +32,11 @@ import csv
 import io
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace as replace_fields
 from functools import partial
 from itertools import chain, groupby, islice
-from math import isnan, nan
+from math import isnan
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -46,16 +46,15 @@ import pandas as pd
 import xarray as xr
 from msgspec.structs import replace
 
-from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT
 from magbridge.errors import FormatError
 from magbridge.logs.checks import validity_of
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, lasting, with_guesses, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout, Rows, cells, header_of, is_remark, rows_among
-from magbridge.logs.mapping import ColumnMapping, ColumnSource, Options
+from magbridge.logs.mapping import ColumnMapping, ColumnSource, Options, makers
 from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.registry import metadata_path, opened
-from magbridge.logs.table import LineNumbers, TableReader
+from magbridge.logs.table import TableReader, line_number
 from magbridge.records import Quality
 
 DEFAULTS = Options()
@@ -112,25 +111,26 @@ def _chunks(
     lines = _lines(file)
     header = list(islice(lines, LAYOUT_LINES))
     declared, added = options.declared, 0
-    if capture := _capture(header):
-        lines, added = capture.table(chain(header, lines)), 1
-        header = list(islice(lines, LAYOUT_LINES))
-        if capture.guess:
-            guess = [*guess, capture.guess]
-            declared = replace(declared, columns={"time": CAPTURE_TIME, **declared.columns})
+    if form := _sentence(header):
+        lines, added = _as_csv([*form.cells], form.row, chain(header, lines)), 1
+        guess = [*guess, *form.guess]
+        declared = replace(declared, columns={**form.declared, **declared.columns})
+    elif names := _json_names(header):
+        lines, added = _as_csv(names, partial(_json_row, names), chain(header, lines)), 1
+    header = list(islice(lines, LAYOUT_LINES)) if added else header
     further = list(islice(lines, FURTHER))
     foreign = not metadata_path(path).is_file()
     layout, first_rows = layout_of(path, header, further, declared, foreign=foreign)
     table = TableReader(path, layout, first_rows, strict=options.strict)
     attrs = {**_attributes(path), **layout.attrs, **table.attrs}
     attrs = with_guesses(path, attrs, [*guess, *layout.guesses, *table.guesses])
-    marks = _LineMarks(header[: layout.first])
-    numbered = enumerate(chain(header[layout.first :], further, lines), layout.first + 1 - added)
-    wanted = ((row, line) for row, line in numbered if line.strip() and not marks.passes(row, line))
+    numbered = enumerate(chain(header, further, lines), 1 - added)
+    wanted = _marked(numbered, layout.first + 1 - added)
     while block := list(islice(wanted, rows)):
-        time, columns, numbers = table.read_lines([line for _, line in block], [row for row, _ in block])
-        if marks.rows and "line" not in columns:
-            columns["line"] = marks.labels(numbers)
+        time, columns, numbers = table.read_lines([line for _, line, _ in block], [row for row, *_ in block])
+        if block[-1][2] is not None and "line" not in columns:
+            labels = {row: label for row, _, label in block}
+            columns["line"] = np.array([labels[row] for row in numbers], np.float64)
         piece = deployment(path, time, columns, layout.column_units, attrs)
         yield with_losses(piece, *table.faults.since_last()), numbers
     table.faults.finish()
@@ -168,99 +168,87 @@ def _lines(file: TextIO) -> Iterator[str]:
         yield line if line.endswith("\n") else f"{line}\n"
 
 
-class _LineMarks:
-    """Marks such as ``LINE 100`` and ``TIE 9000``, which Geosoft writes before the rows of a survey line.
+def _marked(lines: Iterable[tuple[int, str]], first: int) -> Iterator[tuple[int, str, float | None]]:
+    """Yield line number, text and survey line of each row from line number `first` on.
 
-    `rows`: line number of each mark in the file.
+    Geosoft writes marks such as ``LINE 100`` and ``TIE 9000`` before the rows of a survey line; None: no mark
+    has come yet.
     """
-
-    def __init__(self, preamble: Sequence[str]) -> None:
-        self.rows: list[int] = []
-        self._labels: list[float] = []
-        self._names = LineNumbers()
-        for line in preamble:
-            self.passes(0, line)
-
-    def passes(self, row: int, line: str) -> bool:
-        """Return True if a line is a comment or a mark, and not a row; store the mark and its line number."""
-        if not is_remark(line):
-            return False
-        if line[0] not in "#%/":
-            self.rows.append(row)
-            self._labels.append(self._names.number(line))
-        return True
-
-    def labels(self, rows: Sequence[int]) -> FloatArray:
-        """Return the label (n,) of the survey line of each row; NaN before the first mark."""
-        return np.append(nan, self._labels)[np.searchsorted(self.rows, rows)]
+    names: dict[str, float] = {}
+    label = None
+    for number, line in lines:
+        if is_remark(line):
+            if line[0] not in "#%/":
+                label = line_number(line, names)
+        elif number >= first and line.strip():
+            yield number, line, label
 
 
-CAPTURE_TIME = ColumnSource(heading="row [100 Hz]")
-"""Assumed time of a capture for MotionCal: its senders write a hundred lines a second, without times."""
-CAPTURE_LINE = re.compile(
-    r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*"
+class Sentence(NamedTuple):
+    """Form of the lines of a capture without headings."""
+
+    pattern: re.Pattern[str]
+    cells: dict[str, str]
+    """Heading -> template (:meth:`re.Match.expand`) of the cell."""
+    others: tuple[str, ...] = ()
+    """Beginnings of other lines from the same senders, which are not rows."""
+    declared: Mapping[str, ColumnSource] = {}
+    guess: tuple[str, ...] = ()
+
+    def row(self, line: str) -> list[str]:
+        """Return the cells of a line: no cell for a line to skip, one cell for a damaged line."""
+        if match := self.pattern.fullmatch(line):
+            return [match.expand(template) for template in self.cells.values()]
+        return [] if line.startswith(self.others) else [line]
+
+
+def _motioncal(kind: str, count_nt: float) -> Sentence:
+    """Return the form of one `kind` of the lines for MotionCal, with the size of its unit, nT."""
+    pattern = kind + r":\s*" + r",\s*".join([r"(-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"] * 9) + r"\s*"
+    # the senders write a hundred lines a second, without times
+    declared = {"time": ColumnSource(heading="row [100 Hz]")}
+    declared |= {name: ColumnSource(scale=count_nt) for name in CHANNELS}
+    others = tuple({"Raw:", "Uni:", "Ori:", "Cal1:", "Cal2:"} - {f"{kind}:"})
+    cells = {f"{name} [nT]": rf"\{k}" for k, name in enumerate(CHANNELS, 7)}
+    guess = f"MotionCal's {kind}: lines, {count_nt:g} nT a count"
+    return Sentence(re.compile(pattern), cells, others, declared, (guess,))
+
+
+MOTIONCAL = _motioncal("Uni", NT_PER_UNIT["uT"]), _motioncal("Raw", 0.1 * NT_PER_UNIT["uT"])
+EXPLORER = Sentence(
+    re.compile(
+        r"\*(?P<year>\d\d)\.(?P<day>\d{3})/(?P<clock>[\d:.]+) F:(?P<field>[\d.]+)"
+        r"(?: S:(?P<signal>[-+\d.]+))?(?: D:(?P<depth>[-+\d.]+)m)?(?: A:(?P<altitude>[-+\d.]+)m)?.*"
+    ),
+    {
+        "time": r"20\g<year>-\g<day>T\g<clock>",
+        "total_field [nT]": r"\g<field>",
+        "signal": r"\g<signal>",
+        "depth [m]": r"\g<depth>",
+        "altitude [m]": r"\g<altitude>",
+    },
 )
-OTHER_PREFIXES = "Uni:", "Ori:", "Cal1:", "Cal2:"
-"""Beginnings of other lines from MotionCal's senders."""
-COUNT = {"Raw": 0.1 * NT_PER_UNIT["uT"], "Uni": NT_PER_UNIT["uT"]}
-"""Kind of line -> nT in one unit of its magnetometer values."""
-EXPLORER = re.compile(
-    r"\*(?P<year>\d\d)\.(?P<day>\d{3})/(?P<clock>[\d:.]+) F:(?P<field>[\d.]+)"
-    r"(?: S:(?P<signal>[-+\d.]+))?(?: D:(?P<depth>[-+\d.]+)m)?(?: A:(?P<altitude>[-+\d.]+)m)?.*"
-)
-"""Sentence: year, day of the year, time, field in nT, signal strength, depth and altitude in m."""
-EXPLORER_HEADINGS = ["time", "total_field [nT]", "signal", "depth [m]", "altitude [m]"]
 MIN_LINE_FRACTION = 0.5
 """Fraction of the first lines above which a form of lines is recognised."""
 
 
-class Capture(NamedTuple):
-    """Conversion of lines without headings to a table."""
-
-    headings: list[str]
-    cells: Callable[[str], list[object]]
-    """Function that returns the cells of a line: no cell for a line to skip, one cell for a damaged line."""
-    guess: str = ""
-
-    def table(self, lines: Iterable[str]) -> Iterator[str]:
-        """Yield the lines of the table as CSV, the headings first."""
-        rows = (self.cells(line.strip()) for line in lines if line.strip())
-        for row in chain([list[object](self.headings)], rows):
-            if row:
-                text = io.StringIO()
-                csv.writer(text, lineterminator="\n").writerow(row)
-                yield text.getvalue()
-
-
-def _capture(header: Sequence[str]) -> Capture | None:
-    """Return the conversion for a capture that begins with these lines; None for other text."""
+def _sentence(header: Sequence[str]) -> Sentence | None:
+    """Return the form of the lines of a capture that begins with these lines; None for other text."""
     lines = [line.strip() for line in header if line.strip()]
-    kinds = [match[1] for line in lines if (match := CAPTURE_LINE.fullmatch(line))]
-    if kinds and len(kinds) >= len(header) / 4:
-        kind = "Uni" if "Uni" in kinds else "Raw"
-        guess = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count"
-        return Capture([f"{name} [nT]" for name in CHANNELS], partial(_motioncal, kind), guess)
-    if sum(EXPLORER.fullmatch(line) is not None for line in lines) > MIN_LINE_FRACTION * len(lines):
-        return Capture(EXPLORER_HEADINGS, _explorer)
+    uni, raw = ([one for one in lines if form.pattern.fullmatch(one)] for form in MOTIONCAL)
+    if (uni or raw) and len(uni) + len(raw) >= len(header) / 4:
+        return MOTIONCAL[0] if uni else MOTIONCAL[1]
+    is_explorer = sum(map(bool, map(EXPLORER.pattern.fullmatch, lines))) > MIN_LINE_FRACTION * len(lines)
+    return EXPLORER if is_explorer else None
+
+
+def _json_names(header: Sequence[str]) -> list[str]:
+    """Return the names in the JSON objects, an object a line, of a file that begins with these lines."""
+    lines = [line.strip() for line in header if line.strip()]
     objects = [one for line in lines if (one := _json(line)) is not None]
-    if len(objects) > MIN_LINE_FRACTION * len(lines):
-        names = list(dict.fromkeys(name for one in objects for name in one))
-        return Capture(names, partial(_json_cells, names))
-    return None
-
-
-def _motioncal(kind: str, line: str) -> list[object]:
-    match = CAPTURE_LINE.fullmatch(line)
-    if match and match[1] == kind:
-        return [COUNT[kind] * float(text) for text in match[2].split(",")[6:]]
-    return [] if match or line.startswith(OTHER_PREFIXES) else [line]
-
-
-def _explorer(line: str) -> list[object]:
-    if match := EXPLORER.fullmatch(line):
-        time = f"20{match['year']}-{match['day']}T{match['clock']}"
-        return [time, *(match[name] or "" for name in ("field", "signal", "depth", "altitude"))]
-    return [line]
+    if len(objects) <= MIN_LINE_FRACTION * len(lines):
+        return []
+    return list(dict.fromkeys(name for one in objects for name in one))
 
 
 def _json(line: str) -> dict[str, object] | None:
@@ -272,9 +260,20 @@ def _json(line: str) -> dict[str, object] | None:
     return found if isinstance(found, dict) else None
 
 
-def _json_cells(names: Sequence[str], line: str) -> list[object]:
+def _json_row(names: Sequence[str], line: str) -> list[object]:
     one = _json(line)
     return [line] if one is None else ["" if one.get(name) is None else one[name] for name in names]
+
+
+def _as_csv(
+    headings: list[str], row: Callable[[str], Sequence[object]], lines: Iterable[str]
+) -> Iterator[str]:
+    """Yield the lines of a capture as lines of CSV, the headings first; `row` returns the cells of a line."""
+    rows = (row(line.strip()) for line in lines if line.strip())
+    for cells_of_row in chain([headings], filter(None, rows)):
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(cells_of_row)
+        yield text.getvalue()
 
 
 class FileWriter:
@@ -359,42 +358,13 @@ class GeosoftWriter(FileWriter):
 
 
 MAGARROW_HEADINGS = [
-    *(
-        "Counter",
-        "Date",
-        "Time",
-        "Latitude",
-        "Longitude",
-        "Mag",
-        "MagValid",
-        "CompassX",
-        "CompassY",
-        "CompassZ",
-    ),
-    *("GyroscopeX", "GyroscopeY", "GyroscopeZ", "AccelerometerX", "AccelerometerY", "AccelerometerZ"),
-    *(
-        "ImuTemperature",
-        "Track",
-        "LocationSource",
-        "Hdop",
-        "FixQuality",
-        "SatellitesUsed",
-        "Altitude",
-        "Line",
-    ),
-]
+    "Counter", "Date", "Time", "Latitude", "Longitude", "Mag", "MagValid", "CompassX", "CompassY", "CompassZ",
+    "GyroscopeX", "GyroscopeY", "GyroscopeZ", "AccelerometerX", "AccelerometerY", "AccelerometerZ",
+    "ImuTemperature", "Track", "LocationSource", "Hdop", "FixQuality", "SatellitesUsed", "Altitude", "Line",
+]  # fmt: skip
 """Headings of Geometrics' MagArrow, in its order. GeoHammer finds them by name, MagComPy by their number."""
-
-
-MAGARROW_TEXTS = {"Latitude": ("latitude", "%.8f"), "Longitude": ("longitude", "%.8f")}
-"""Heading -> column and form of its numbers; ``NaN`` stands for an unknown value."""
-MAGARROW_NUMBERS = {
-    "CompassX": ("mag_y", 1.0),  # the instrument's x axis is our y, its y axis is opposite to our x
-    "CompassY": ("mag_x", -1.0),
-    "CompassZ": ("mag_z", 1.0),
-    "Line": ("line", 1.0),
-}
-"""Heading -> column and sign, for columns that a log may lack."""
+MAGARROW_FORMS = {"Latitude": "%.8f", "Longitude": "%.8f", "Mag": "%.5f"}
+"""Heading of a column that a log must have -> form of its numbers; ``NaN`` stands for an unknown value."""
 HEIGHTS = "altitude", "altitude_m", "height", "height_m"
 """Names of a column with the height, m, in small letters; without one, the opposite of ``depth``."""
 
@@ -411,9 +381,18 @@ class MagArrowWriter(FileWriter):
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows; if `first`, write the headings before. FormatError: no field or no position."""
         field = "scalar_field" if "scalar_field" in dataset else "total_field"
-        texts = MAGARROW_TEXTS | {"Mag": (field, "%.5f")}
-        for name, _ in texts.values():
-            if name not in dataset:
+        heights = [str(name) for name in dataset.data_vars if str(name).lower() in HEIGHTS]
+        declared = makers()["MagArrow"].columns.items()
+        columns = {source.heading or "": (name, source.scale) for name, source in declared}
+        columns |= {
+            "Latitude": ("latitude", 1.0),
+            "Longitude": ("longitude", 1.0),
+            "Mag": (field, 1.0),
+            "Altitude": (heights[0], 1.0) if heights else ("depth", -1.0),
+            "Line": ("line", 1.0),
+        }
+        for heading in MAGARROW_FORMS:
+            if (name := columns[heading][0]) not in dataset:
                 raise FormatError(Path(self._file.name), "expected this column in the log", column=name)
         valid = np.isfinite(dataset[field].to_numpy())
         if "quality" in dataset:
@@ -425,13 +404,10 @@ class MagArrowWriter(FileWriter):
         table["Date"] = moments.strftime("%Y/%m/%d")
         table["Time"] = moments.strftime("%H:%M:%S.%f").str[:-3]
         table["MagValid"] = valid.astype(int)
-        for heading, (name, form) in texts.items():
-            values = dataset[name].to_numpy().tolist()
-            table[heading] = ["NaN" if isnan(value) else form % value for value in values]
-        heights = [str(name) for name in dataset.data_vars if str(name).lower() in HEIGHTS]
-        height = (heights[0], 1.0) if heights else ("depth", -1.0)
-        for heading, (name, sign) in {**MAGARROW_NUMBERS, "Altitude": height}.items():
-            if name in dataset:
+        for heading, (name, sign) in columns.items():
+            if heading in table and name in dataset:
                 table[heading] = sign * dataset[name].to_numpy()
+                if form := MAGARROW_FORMS.get(heading):
+                    table[heading] = table[heading].map(form.__mod__).replace("nan", "NaN")
         self._rows += rows
         table.to_csv(self._file, index=False, header=first, lineterminator="\n", float_format="%.3f")
