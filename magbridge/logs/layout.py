@@ -110,6 +110,10 @@ class Layout:
         """Return the layout with the given units of some columns."""
         return replace(self, units={**self.units, **units})
 
+    def renamed(self, names: Mapping[int, str]) -> Layout:
+        """Return the layout with other names for the fields of some indices."""
+        return replace(self, names=tuple(names.get(k, name) for k, name in enumerate(self.names)))
+
     def number(self, cell: str) -> str:
         """Return a cell with a decimal point instead of the layout's decimal sign."""
         return cell.replace(",", ".") if self.decimal == "," else cell

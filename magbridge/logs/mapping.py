@@ -5,13 +5,13 @@ instruments and autopilots as their makers document them. PX4's topics as ``ulog
 microseconds since the boot and in gauss (PX4, msg/SensorMag.msg, msg/VehicleMagnetometer.msg). Geometrics'
 MagMap writes the month first. DatCon's ``offsetTime`` counts seconds from the start of a DJI flight.
 MagArrow's compass has its x to the right, its y aft and its z down (Geometrics, MagArrow user manual, 'Data
-Format'); ``Mag`` is its caesium magnetometer. :func:`aliases` recognises other columns by common names.
+Format'); ``Mag`` is its caesium magnetometer. :mod:`.naming` recognises other columns by common names.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import isfinite
@@ -29,28 +29,10 @@ MAKERS_FILE = Path(__file__).with_name("makers.toml")
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
 CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
-WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)) ?([a-zA-Z°µ%/]+)")
-"""A cell that is a number with its unit."""
 NAMES = load_toml(Path(__file__).with_name("names.toml"))
 """Names of columns and units in other programs."""
 KNOWN_UNITS = {*NT_PER_UNIT, *(column.units for column in COLUMNS.values()), *NAMES["units"].split()} - {"1"}
 """Units by which a row of units under the headings is recognised."""
-AXES = "x", "y", "z"
-PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
-VECTORS = NAMES["vectors"].split()
-"""Patterns of the three axes' names in other programs, in lower case without punctuation."""
-ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
-"""Name of an axis after the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
-ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
-"""Standard name -> names in other programs, the least ambiguous first."""
-TOWED = NAMES["towed"].split()
-"""Words before the name of a position that mark it as the towed sensor's, not the ship's."""
-PREFIXED_NAME = re.compile(
-    rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
-)
-"""Name of a position or an angle, with the words that may stand before and after it."""
-MAX_SENSORS = 8
-"""Largest number of a further vector sensor in one file."""
 
 
 class ColumnSource(Table, frozen=True, rename={"heading": "from"}):
@@ -190,111 +172,3 @@ def bare(name: str) -> str:
 def is_unit(text: str) -> bool:
     """Return True if a cell under the headings is a unit."""
     return usual(text.strip().strip("[]()")) in KNOWN_UNITS
-
-
-def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
-    """Return index -> standard name of the columns that have a common other name.
-
-    The three axes are recognised together or not at all: a single `b_x` is ambiguous. Three columns in
-    units of a magnetic field, with names that differ only in x, y and z, are the axes.
-    """
-    words = list(map(bare, names))
-    found: dict[int, str] = {}
-
-    def only(word: str, words: Sequence[str] = words) -> int | None:
-        return words.index(word) if words.count(word) == 1 else None
-
-    if not all(f"mag_{axis}" in names for axis in AXES):
-        for pattern in VECTORS:
-            places = [only(pattern.format(axis)) for axis in AXES]
-            if None not in places:
-                found |= {int(k or 0): f"mag_{axis}" for k, axis in zip(places, AXES, strict=True)}
-                break
-        else:
-            others = ["" if name in COLUMNS else word for name, word in zip(names, words, strict=True)]
-            found |= _axes(words, units) or _ending_alike(others)
-        found |= _further_axes(names, words, {name: k for k, name in found.items()})
-    pair = _position(words)
-    if any(names[k] != name for k, name in pair.items()):
-        found |= pair
-    inner = [match[2] if (match := PREFIXED_NAME.fullmatch(word)) else "" for word in words]
-    for name in COLUMNS:
-        if name in names or name in pair.values() or name == "quality":  # a foreign column has other flags
-            continue
-        aliases_of = [name.replace("_", ""), *ALIASES.get(name, [])]
-        places = [only(word) for word in aliases_of]
-        if name in PREFIXED_COLUMNS:
-            places += [only(word, inner) for word in aliases_of]
-        there = [k for k in places if k is not None and k not in found and names[k] not in COLUMNS]
-        if there:
-            found[there[0]] = name
-    return found
-
-
-def _position(words: Sequence[str]) -> dict[int, str]:
-    """Return index -> name of latitude and longitude in `words`, two names with equal prefix and ending.
-
-    A towed sensor's position is preferred, then a position without prefix, then any other.
-    """
-    pairs: dict[tuple[str, str], dict[str, int]] = {}
-    for k, word in enumerate(words):
-        match = PREFIXED_NAME.fullmatch(word)
-        for name in ("latitude", "longitude"):
-            if match and match[2] in [name, *ALIASES[name]]:
-                pairs.setdefault((match[1] or "", match[3] or ""), {}).setdefault(name, k)
-    whole = {around: pair for around, pair in pairs.items() if len(pair) == 2}
-    if not whole:
-        return {}
-    best = min(whole, key=lambda around: (around[0] not in TOWED, around[0] != "", list(whole).index(around)))
-    return {k: name for name, k in whole[best].items()}
-
-
-def _ending_alike(words: Sequence[str]) -> dict[int, str]:
-    """Return index -> name of the three axes in `words` by the endings of these, if they are unambiguous.
-
-    If the names of several sensors differ by a number, the axes are those of the lowest number.
-    """
-    sensors: dict[str, dict[str, int]] = {}
-    for k, word in enumerate(words):
-        if match := ENDING.fullmatch(word):
-            axes = sensors.setdefault(match[1] or match[3], {})
-            axes[match[2] or match[4]] = k
-    alike = len({re.sub(r"\d+", "", name) for name in sensors}) == 1
-    if not alike or any(sorted(axes) != list(AXES) for axes in sensors.values()):
-        return {}
-    return {k: f"mag_{axis}" for axis, k in sensors[min(sensors)].items()}
-
-
-def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str, int]) -> dict[int, str]:
-    """Return index -> name of the axes of further sensors, named as the first sensor with another number."""
-    if not all(f"mag_{axis}" in first for axis in AXES):
-        return {}
-    found: dict[int, str] = {}
-    for number in range(2, MAX_SENSORS + 1):
-        if f"mag{number}_x" in names:
-            continue
-        for numbered in _numberings(number):
-            wanted = [numbered(words[first[f"mag_{axis}"]]) for axis in AXES]
-            places = [words.index(word) for word in wanted if words.count(word) == 1]
-            if len(places) == len(AXES) and not {*places} & {*first.values()}:
-                found |= {k: f"mag{number}_{axis}" for k, axis in zip(places, AXES, strict=True)}
-                break
-    return found
-
-
-def _numberings(number: int) -> list[Callable[[str], str]]:
-    """Return functions that turn the name of an axis of the first sensor into one of sensor `number`."""
-    return [
-        # b1x, imu0magx: the last 0 or 1 is the number of the sensor
-        lambda word: re.sub(r"([01])(\D*)$", lambda m: f"{int(m[1]) + number - 1}{m[2]}", word),
-        lambda word: f"{word[:-1]}{number}{word[-1]}",
-        lambda word: f"{word}{number}",
-    ]
-
-
-def _axes(words: Sequence[str], units: Sequence[str]) -> dict[int, str]:
-    """Return index -> name of the three axes, if just three `words` have units of a magnetic field."""
-    fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and words[k]]
-    letters = {words[k][-1]: k for k in fields} if len(fields) == len(AXES) else {}
-    alike = len({words[k][:-1] for k in fields}) == 1
-    return {letters[axis]: f"mag_{axis}" for axis in AXES} if alike and set(letters) == set(AXES) else {}

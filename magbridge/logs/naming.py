@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +15,29 @@ from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usua
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
-from magbridge.logs.mapping import CELL_NUMBER, NAMES, WITH_UNIT, aliases, bare, is_unit, split
+from magbridge.logs.mapping import CELL_NUMBER, NAMES, bare, is_unit, split
 
+AXES = "xyz"
+PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
+VECTORS = NAMES["vectors"].split()
+"""Patterns of the three axes' names in other programs, in lower case without punctuation."""
+ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
+"""Name of an axis after the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
+ALIASES = {column: names.split() for column, names in NAMES["columns"].items()}
+"""Standard name -> names in other programs, the least ambiguous first."""
+TOWED = NAMES["towed"].split()
+"""Words before the name of a position that mark it as the towed sensor's, not the ship's."""
+PREFIXED_NAME = re.compile(
+    rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
+)
+"""Name of a position or an angle, with the words that may stand before and after it."""
+LAST_LETTER = re.compile(r"(.*)([xyz])")
+"""Name of an axis in a column with a unit of magnetic fields."""
+MAX_SENSORS = 8
+"""Largest number of a further vector sensor in one file."""
+NUMBERINGS = (r"0(\D*)$", r"{0}\1"), (r"1(\D*)$", r"{1}\1"), (r"(.)$", r"{1}\1"), (r"$", r"{1}")
+"""Pattern in the name of an axis of the first sensor, and what replaces it for a further sensor: the sensor's
+number, counted from 0 or from 1. In imu0magx and b1x the last 0 or 1 is the number."""
 ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """Declared time of a file without times: ``row [20 Hz]`` counts the rows at this rate."""
 HOUR = re.compile(
@@ -26,7 +47,7 @@ DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyy.?mm.?dd|dd.?mm.?yy|mm.?dd
 """Part of a heading that marks a column of dates."""
 TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
 """Part of a heading that marks the column of times, if only one heading has it."""
-UTM_HEADING = re.compile(r"[xy]_\w*?utm_?(\d{1,2})([ns])_m", re.IGNORECASE)
+UTM_HEADING = re.compile(r"([xy])_\w*?utm_?(\d{1,2})([ns])_m", re.IGNORECASE)
 """Heading of an easting or northing that names a zone of UTM, as MagComPy's ``X_NAD83UTM10N_m``."""
 LINE_NAMES = "line", "linename", "lineno", "linenumber"
 """Names of the column with the survey line, in lower case without punctuation."""
@@ -44,6 +65,8 @@ JOINED: dict[str, list[str]] = NAMES["times"]
 """Kind of time that several columns form -> patterns of their names, in lower case without punctuation."""
 UNIT_CELL_COLUMNS = "depth", "total_field", "sensor_temperature"
 """Standard columns whose cells may end with a unit, as 5.8m; those of a position end with N, S, E or W."""
+WITH_UNIT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+) ?([a-zA-Z°µ%/]+)")
+"""A cell that is a number with its unit."""
 HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 
 
@@ -61,9 +84,13 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     layout = _with_names(path, layout, [name for name, _ in parts], declares)
     for k, name in enumerate(layout.names):
         layout = _with_unit(layout, name, layout.headings[k], declares[k])
-    layout = _with_line(_with_utm(layout))
-    layout = _with_calendar(_with_time(layout, rows), rows)
-    return _without_texts(with_total(with_units_of_axes(layout, rows), rows), rows)
+    lines = [k for k, name in enumerate(layout.names) if bare(name) in LINE_NAMES]
+    if layout.foreign and len(lines) == 1:
+        layout = layout.renamed({lines[0]: "line"})
+    layout = _with_utm(layout)
+    layout = _with_time(layout, rows)
+    layout = replace(layout, calendar=_calendar(layout, rows))
+    return _without_texts(_with_total(_with_units_of_axes(layout, rows), rows), rows)
 
 
 def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[str]) -> Layout:
@@ -108,16 +135,15 @@ def _with_names(path: Path, layout: Layout, names: list[str], units: Sequence[st
 
 def _with_unit(layout: Layout, name: str, heading: str, unit: str) -> Layout:
     """Return the layout with a column's unit; a heading that states magnetic sets ``heading_reference``."""
-    source = layout.declared.columns.get(name)
     if name == "heading" and (match := re.search(r"\b(magnetic|mag)\b", f"{heading} {unit}".lower())):
         layout = replace(layout, attrs={"heading_reference": "magnetic", **layout.attrs})
         unit = unit.replace(match[1], "").strip(" ,")
     if name in COLUMNS and unit.lower() in REMARKS:
         unit = ""
-    if source is not None and source.unit is not None:
-        unit = source.unit
-    elif source is not None and source.heading and source.heading.strip() != heading.strip():
-        unit = split(source.heading)[1] or unit
+    if source := layout.declared.columns.get(name):
+        theirs = (source.heading or heading).strip()
+        said = split(theirs)[1] if theirs != heading.strip() else ""
+        unit = source.unit if source.unit is not None else said or unit
     return layout.with_units({name: unit}) if name and unit else layout
 
 
@@ -128,27 +154,14 @@ def _declared(path: Path, layout: Layout, names: Sequence[str]) -> dict[int, str
         theirs = source.heading or name
         if name == "time" and layout.rate:
             continue
-        for candidates in (layout.headings, names):
-            for wanted in (theirs, split(theirs)[0]):
-                if wanted in candidates:
-                    taken.setdefault(candidates.index(wanted), name)
-                    break
-            if name in taken.values():
-                break
-        else:
-            there = " ".join(repr(heading) if " " in heading else heading for heading in layout.headings)
-            expected = f"expected this column; there are: {there}"
+        wanted = theirs, split(theirs)[0]
+        found = [there.index(one) for there in (layout.headings, names) for one in wanted if one in there]
+        if not (free := [k for k in found if k not in taken]):
+            present = " ".join(repr(heading) if " " in heading else heading for heading in layout.headings)
+            expected = f"expected this column; there are: {present}"
             raise FormatError(path, expected, row=layout.row, column=theirs)
+        taken[free[0]] = name
     return taken
-
-
-def _with_line(layout: Layout) -> Layout:
-    """Return the layout with a column Line or Line_Name of another program as ``line``."""
-    found = [k for k, name in enumerate(layout.names) if bare(name) in LINE_NAMES]
-    if len(found) != 1 or not layout.foreign:
-        return layout
-    (k,) = found
-    return replace(layout, names=(*layout.names[:k], "line", *layout.names[k + 1 :]))
 
 
 def _with_utm(layout: Layout) -> Layout:
@@ -156,123 +169,114 @@ def _with_utm(layout: Layout) -> Layout:
 
     All datums of such headings (WGS 84, NAD83, ETRS89) agree within 2 m, so the zone of WGS 84 is used.
     """
-    zones = {
-        k: match for k, one in enumerate(layout.headings) if (match := UTM_HEADING.fullmatch(one.strip()))
-    }
-    if len(zones) != 2 or {"latitude", "longitude"} & set(layout.names):
+    names, zones = {}, set()
+    for k, heading in enumerate(layout.headings):
+        if match := UTM_HEADING.fullmatch(heading.strip()):
+            names[k] = "longitude" if match[1] in "xX" else "latitude"
+            zones.add(f"{PROJECTED_UNIT}{'326' if match[3] in 'nN' else '327'}{int(match[2]):02d}")
+    if sorted(names.values()) != [*HEMISPHERES] or len(zones) != 1 or {*HEMISPHERES} & {*layout.names}:
         return layout
-    names, units = list(layout.names), {}
-    for k, match in zones.items():
-        names[k] = "longitude" if layout.headings[k].strip()[0] in "xX" else "latitude"
-        units[names[k]] = f"{PROJECTED_UNIT}{'326' if match[2] in 'nN' else '327'}{int(match[1]):02d}"
-    if len(set(units)) != 2 or len(set(units.values())) != 1:
-        return layout
-    layout = replace(layout, names=tuple(names)).with_units(units)
+    layout = layout.renamed(names).with_units(dict.fromkeys(HEMISPHERES, *zones))
     return layout.guessing(f"position in the projection {layout.projection}")
 
 
 def _with_time(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with the column of the time, or with the columns that together form the time."""
+    """Return the layout with the fields that form the time: the last one is named ``time``, the others ''."""
+    stamp, unit, by_hour = _stamp(layout, rows)
+    layout = replace(layout, stamp=stamp, by_hour=by_hour)
+    if not stamp:
+        return layout
+    layout = layout.with_units({"time": unit})
+    if layout.rate:
+        return layout
+    if len(stamp) > 1 or layout.names[stamp[0]] != "time":
+        layout = layout.guessing(f"time from {' and '.join(repr(layout.headings[k]) for k in stamp)}")
+    return layout.renamed({**dict.fromkeys(stamp, ""), stamp[-1]: "time"})
+
+
+def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str, bool]:
+    """Return the indices of the fields that form the time, its unit, and True for times as HHMM.mmm."""
     place = layout.names.index("time") if "time" in layout.names else None
+    unit = layout.units.get("time", "")
     ours = [name if name in layout.declared.columns else "" for name in layout.names]
     called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, layout.headings, strict=True)]
     for kind, patterns in JOINED.items():
         places = [[k for k, name in enumerate(called) if re.fullmatch(one, name)] for one in patterns]
         if all(len(one) == 1 for one in places) and (place is None or [place] in places):
-            stamp = tuple(one[0] for one in places)
-            unit = kind if len(patterns) == 2 else ""
-            return _with_stamp(replace(layout, stamp=stamp).with_units({"time": unit}))
+            return tuple(k for (k,) in places), kind if len(patterns) == 2 else "", False
     dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
     if place is None and len(dates) == 1:
         clocks = [k for k in range(len(called)) if k not in dates and _all_match(CLOCK, rows, k)]
         near = [k for k in clocks if called[k][:4] == called[dates[0]][:4]]
         place = next((group[0] for group in (clocks, near) if len(group) == 1), dates[0])
     if place is None:
-        return layout
-    layout = replace(layout, stamp=(place,))
-    if len(dates) == 1 and dates != [place]:
-        layout = _with_date(layout, dates[0], place, rows)
-    return _with_stamp(layout)
-
-
-def _with_date(layout: Layout, date: int, place: int, rows: Rows) -> Layout:
-    """Return the layout with column `date` joined to column `place`, if the latter holds times of day."""
-    cells = [row[place] for row in rows if len(row) > place]
-    numbers = pd.to_numeric(pd.Series([cell.replace(",", ".") or "0" for cell in cells]), errors="coerce")
+        return (), unit, False
+    if len(dates) != 1 or dates == [place]:
+        return (place,), unit, False
+    # the time is a time of day, unless its cells are whole moments or count something else
+    present = cells_in(rows, place)
+    numbers = pd.to_numeric(pd.Series(present, dtype="str").str.replace(",", "."), errors="coerce")
     counted = SECONDS_HEADING.search(layout.headings[place]) and numbers.between(0.0, DAY, "left").all()
-    unit = layout.units.get("time", "")
     undated = "%" in unit and not {"%d", "%j"} & {*re.findall("%.", unit)}
-    by_hour = not unit and not counted and _by_hour(cells)
-    if (any(map(HOUR.fullmatch, cells)) or counted or by_hour) and not undated:
-        layout = replace(layout, stamp=(date, place))
-    if by_hour or (counted and not all(map(HOUR.fullmatch, cells))):
-        layout = replace(layout, by_hour=by_hour).with_units({"time": SECONDS_OF_DAY})
-    return layout
+    by_hour = not unit and not counted and _by_hour(present)
+    on_clock = [HOUR.fullmatch(cell) is not None for cell in present]
+    stamp = (dates[0], place) if (any(on_clock) or counted or by_hour) and not undated else (place,)
+    return stamp, SECONDS_OF_DAY if by_hour or (counted and not all(on_clock)) else unit, by_hour
 
 
-def _with_stamp(layout: Layout) -> Layout:
-    """Return the layout in which the last field of the time is named ``time`` and its other fields ''."""
-    stamp = layout.stamp
-    if layout.rate:
-        return layout
-    if len(stamp) > 1 or layout.names[stamp[0]] != "time":
-        layout = layout.guessing(f"time from {' and '.join(repr(layout.headings[k]) for k in stamp)}")
-    names = list(layout.names)
-    for k in stamp:
-        names[k] = "time" if k == stamp[-1] else ""
-    return replace(layout, names=tuple(names))
+def cells_in(rows: Rows, place: int) -> list[str]:
+    """Return the cells of one column that are not empty."""
+    return [row[place] for row in rows if place < len(row) and row[place]]
 
 
 def _all_match(pattern: re.Pattern[str], rows: Rows, place: int) -> bool:
     """Return True if all non-empty cells of a column match a pattern and there is at least one."""
-    values = {row[place] for row in rows if place < len(row) and row[place]}
-    return bool(values) and all(map(pattern.fullmatch, values))
+    present = set(cells_in(rows, place))
+    return bool(present) and all(map(pattern.fullmatch, present))
 
 
-def _by_hour(cells: Sequence[str]) -> bool:
+def _by_hour(present: Sequence[str]) -> bool:
     """Return True if the cells in a column next to a date are times of day written as HHMM.mmm."""
-    there = [cell for cell in cells if cell]
-    long = [cell for cell in there if len(cell.partition(".")[0]) >= 3]
-    return bool(long) and all(map(HOUR_AND_MINUTE.fullmatch, there)) and any("." in cell for cell in there)
+    is_long = any(len(cell.partition(".")[0]) >= 3 for cell in present)
+    return is_long and all(map(HOUR_AND_MINUTE.fullmatch, present)) and any("." in cell for cell in present)
 
 
-def _with_calendar(layout: Layout, rows: Rows) -> Layout:
-    """Return the layout with the fields, other than the time, that alone give date and time of day."""
+def _calendar(layout: Layout, rows: Rows) -> tuple[int, ...]:
+    """Return the indices of fields, other than the time, that alone give date and time of day."""
     others = [k for k in range(len(layout.headings)) if k not in layout.stamp]
     moments = [k for k in others if _all_match(DATE_AND_TIME, rows, k)]
     dates = [k for k in others if DATED.search(layout.headings[k])]
     clocks = [k for k in others if _all_match(CLOCK, rows, k)]
     if len(moments) == 1:
-        return replace(layout, calendar=tuple(moments))
-    if len(dates) == len(clocks) == 1:
-        return replace(layout, calendar=(*dates, *clocks))
-    return layout
+        return tuple(moments)
+    return (*dates, *clocks) if len(dates) == len(clocks) == 1 else ()
 
 
 def _without_texts(layout: Layout, rows: Rows) -> Layout:
     """Return the layout without columns of text; a column of N/S or E/W letters gives a position its sign."""
-    names, units, hemispheres = list(layout.names), dict(layout.units), dict(layout.hemispheres)
-    left = []
+    units, hemispheres = dict(layout.units), dict(layout.hemispheres)
+    left: dict[int, str] = {}
     for k, name in enumerate(layout.names):
-        values = {row[k] for row in rows if k < len(row) and row[k]}
+        present = set(cells_in(rows, k))
         kept = name == "line" or (name in COLUMNS and name not in UNIT_CELL_COLUMNS)
-        if not name or kept or not values:
+        if not name or kept or not present:
             continue
-        text = [layout.number(cell) for cell in values]
-        if any(CELL_NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
+        texts = [layout.number(cell) for cell in present]
+        if any(CELL_NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in texts):
             continue
-        behind = {match[2] if (match := WITH_UNIT.fullmatch(cell)) else "" for cell in text}
+        behind = {match[1] if (match := WITH_UNIT.fullmatch(cell)) else "" for cell in texts}
         if layout.foreign and len(behind) == 1 and is_unit(*behind) and behind != {""}:
             units.setdefault(name, *behind)
-            continue
-        names[k] = ""
-        side = [one for one, letters in HEMISPHERES.items() if {v.upper() for v in values} <= {*letters}]
-        if side and side[0] in names:
-            hemispheres[side[0]] = k
         else:
-            left.append(name)
-    layout = replace(layout, names=tuple(names), units=units, hemispheres=hemispheres)
-    return layout.guessing(f"left out, no numbers: {', '.join(left)}") if left else layout
+            left[k] = name
+    for k in left:
+        letters = {cell.upper() for cell in cells_in(rows, k)}
+        side = [one for one, known in HEMISPHERES.items() if letters <= {*known}]
+        if side and side[0] in layout.names:
+            hemispheres[side[0]] = k
+    texts = [name for k, name in left.items() if k not in hemispheres.values()]
+    layout = replace(layout, units=units, hemispheres=hemispheres).renamed(dict.fromkeys(left, ""))
+    return layout.guessing(f"left out, no numbers: {', '.join(texts)}") if texts else layout
 
 
 def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
@@ -284,15 +288,13 @@ def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
 
 READING_RANGE_NT = LOWEST_NT, HIGHEST_NT = 15_000.0, 90_000.0
 """Range of a reading's magnitude, the Earth's field plus the vehicle's, nT."""
-TOTAL_NAME = re.compile(
-    "f|nt|mag|tm[fi]|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?(field|intensity)|magneticfield"
-    "|reading1|scalar.*|magnitude"
-)
-"""Names of a scalar magnetometer's column, in lower case without punctuation."""
-
-
 SCALAR_NAME = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
-"""Names of a scalar sensor in a file with a vector, whose magnitude may have the other names."""
+"""Names of a scalar sensor in a file with a vector, in lower case without punctuation."""
+TOTAL_NAME = re.compile(
+    f"{SCALAR_NAME.pattern}|f|nt|mag|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?field|magneticfield"
+    "|reading1|magnitude"
+)
+"""Names of a scalar sensor, also those that may be a vector's magnitude."""
 ANGLES = "roll", "pitch", "heading"
 NEAR_HALF_TURN_RAD = 0.1
 """Headings whose maximum is less than this below pi or 2 pi are taken as radians, rad."""
@@ -315,7 +317,7 @@ def units_of_angles(layout: Layout, rows: Rows) -> Layout:
     return layout.with_units(dict.fromkeys(names, "rad")).guessing(guess)
 
 
-def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
+def _with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
     """Return the layout with a unit for axes without one, from another axis or from the field's magnitude."""
     undeclared = layout.foreign and not set(CHANNELS) & set(layout.declared.columns)
     if not undeclared or not set(CHANNELS) <= set(layout.names):
@@ -338,25 +340,23 @@ def with_units_of_axes(layout: Layout, rows: Rows) -> Layout:
     return layout.with_units(dict.fromkeys([*CHANNELS, *further], unit)).guessing(guess)
 
 
-def with_total(layout: Layout, rows: Rows) -> Layout:
+def _with_total(layout: Layout, rows: Rows) -> Layout:
     """Return the layout with ``total_field``, if one column has a scalar's name and the Earth's magnitude."""
     if not layout.foreign or "total_field" in layout.names:
         return layout
     pattern = SCALAR_NAME if set(CHANNELS) <= set(layout.names) else TOTAL_NAME
-    fields = [
-        k for k, name in enumerate(layout.names) if pattern.fullmatch(bare(name)) and name not in COLUMNS
-    ]
+    others = {k: name for k, name in enumerate(layout.names) if name not in COLUMNS}
+    fields = [k for k, name in others.items() if pattern.fullmatch(bare(name))]
     if len(fields) != 1:
         return layout
-    (k,) = fields
-    unit = layout.units.get(layout.names[k], "nT")
+    theirs = layout.names[fields[0]]
+    unit = layout.units.get(theirs, "nT")
     length = _length(layout, rows, fields) * NT_PER_UNIT.get(usual(unit), 0.0)
     if not LOWEST_NT < length < HIGHEST_NT:
         return layout
-    units = {name: unit for name, unit in layout.units.items() if name != layout.names[k]}
-    names = (*layout.names[:k], "total_field", *layout.names[k + 1 :])
-    named = replace(layout, names=names, units={**units, "total_field": unit})
-    return named.guessing(f"total_field is {layout.headings[k]!r}")
+    units = {name: unit for name, unit in layout.units.items() if name != theirs}
+    layout = replace(layout, units={**units, "total_field": unit}).renamed({fields[0]: "total_field"})
+    return layout.guessing(f"total_field is {layout.headings[fields[0]]!r}")
 
 
 def _numbers(layout: Layout, rows: Rows, places: Sequence[int]) -> FloatArray:
@@ -371,3 +371,95 @@ def _length(layout: Layout, rows: Rows, places: Sequence[int]) -> float:
     """Return the median magnitude of the vector in the columns `places`, in their unit; 0 without numbers."""
     numbers = _numbers(layout, rows, places)
     return float(np.median(np.linalg.norm(numbers, axis=1))) if len(numbers) else 0.0
+
+
+def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
+    """Return index -> standard name of the columns that have a common other name.
+
+    The three axes are recognised together or not at all: a single `b_x` is ambiguous. Three columns in
+    units of a magnetic field, with names that differ only in x, y and z, are the axes.
+    """
+    words = list(map(bare, names))
+    found: dict[int, str] = {}
+
+    def only(word: str, words: Sequence[str] = words) -> int | None:
+        return words.index(word) if words.count(word) == 1 else None
+
+    if not set(CHANNELS) <= set(names):
+        for pattern in VECTORS:
+            places = [only(pattern.format(axis)) for axis in AXES]
+            if None not in places:
+                found |= {int(k or 0): name for k, name in zip(places, CHANNELS, strict=True)}
+                break
+        else:
+            fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and words[k]]
+            of_fields = [word if k in fields else "" for k, word in enumerate(words)]
+            others = ["" if name in COLUMNS else word for name, word in zip(names, words, strict=True)]
+            found |= _vector(of_fields, LAST_LETTER) if len(fields) == len(AXES) else {}
+            found |= {} if found else _vector(others, ENDING)
+        found |= _further_axes(names, words, {name: k for k, name in found.items()})
+    pair = _position(words)
+    if any(names[k] != name for k, name in pair.items()):
+        found |= pair
+    inner = [match[2] if (match := PREFIXED_NAME.fullmatch(word)) else "" for word in words]
+    for name in COLUMNS:
+        if name in names or name in pair.values() or name == "quality":  # a foreign column has other flags
+            continue
+        aliases_of = [name.replace("_", ""), *ALIASES.get(name, [])]
+        places = [only(word) for word in aliases_of]
+        if name in PREFIXED_COLUMNS:
+            places += [only(word, inner) for word in aliases_of]
+        there = [k for k in places if k is not None and k not in found and names[k] not in COLUMNS]
+        if there:
+            found[there[0]] = name
+    return found
+
+
+def _position(words: Sequence[str]) -> dict[int, str]:
+    """Return index -> name of latitude and longitude in `words`, two names with equal prefix and ending.
+
+    A towed sensor's position is preferred, then a position without prefix, then any other.
+    """
+    pairs: dict[tuple[str, str], dict[str, int]] = {}
+    for k, word in enumerate(words):
+        match = PREFIXED_NAME.fullmatch(word)
+        for name in ("latitude", "longitude"):
+            if match and match[2] in [name, *ALIASES[name]]:
+                pairs.setdefault((match[1] or "", match[3] or ""), {}).setdefault(name, k)
+    whole = {around: pair for around, pair in pairs.items() if len(pair) == 2}
+    if not whole:
+        return {}
+    best = min(whole, key=lambda around: (around[0] not in TOWED, around[0] != "", list(whole).index(around)))
+    return {k: name for name, k in whole[best].items()}
+
+
+def _vector(words: Sequence[str], pattern: re.Pattern[str]) -> dict[int, str]:
+    """Return index -> name of the three axes in `words` by the endings of these, if they are unambiguous.
+
+    If the names of several sensors differ by a number, the axes are those of the lowest number.
+    """
+    sensors: dict[str, dict[str, int]] = {}
+    for k, word in enumerate(words):
+        if match := pattern.fullmatch(word):
+            name, axis = match.groups()[:2] if match[2] else match.groups()[2:]
+            sensors.setdefault(name, {})[axis] = k
+    alike = len({re.sub(r"\d+", "", name) for name in sensors}) == 1
+    if not alike or any(sorted(axes) != list(AXES) for axes in sensors.values()):
+        return {}
+    return {k: f"mag_{axis}" for axis, k in sensors[min(sensors)].items()}
+
+
+def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str, int]) -> dict[int, str]:
+    """Return index -> name of the axes of further sensors, named as the first sensor with another number."""
+    found: dict[int, str] = {}
+    for number in range(2, MAX_SENSORS + 1):
+        if f"mag{number}_x" in names or not all(name in first for name in CHANNELS):
+            continue
+        for pattern, other in NUMBERINGS:
+            numbered = other.format(number - 1, number)
+            wanted = [re.sub(pattern, numbered, words[first[name]]) for name in CHANNELS]
+            places = [words.index(word) for word in wanted if words.count(word) == 1]
+            if len(places) == len(AXES) and not {*places} & {*first.values()}:
+                found |= {k: f"mag{number}_{axis}" for k, axis in zip(places, AXES, strict=True)}
+                break
+    return found

@@ -39,7 +39,7 @@ from magbridge.logs import seaglider
 from magbridge.logs.checks import Faults, validity_of, without_invalid
 from magbridge.logs.deployment import deployment, sliced, with_losses
 from magbridge.logs.fields import field_maps
-from magbridge.logs.mapping import aliases
+from magbridge.logs.naming import aliases
 from magbridge.records import Quality
 from magbridge.version import __version__
 

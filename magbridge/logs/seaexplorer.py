@@ -26,7 +26,7 @@ from magbridge.errors import FormatError
 from magbridge.logs.clocks import epoch
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
 from magbridge.logs.fields import FieldMap, degrees, field_maps, linear
-from magbridge.logs.mapping import aliases
+from magbridge.logs.naming import aliases
 from magbridge.logs.registry import opened
 
 PAYLOAD = re.compile(r"(?P<mission>.+)\.pld\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
