@@ -9,6 +9,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from commands import Command
 from rig import Rig
 from small import bridge_text
 
@@ -17,7 +18,6 @@ from magbridge.bridge.check import Arrived, LiveCheck, findings
 from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter, identity
 from magbridge.calibration.terms import Polynomial
-from magbridge.cli import main
 from magbridge.config import load
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT
@@ -204,17 +204,16 @@ def test_live_reports_a_denial_with_its_remedy(make_rig: Callable[..., Rig]) -> 
 
 
 def test_live_reports_silent_ports(
-    make_rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    make_rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, command: Command
 ) -> None:
     rig = make_rig()
     monkeypatch.setattr(check, "LISTEN_TIME_S", 1.0)
-    assert main(["run", "--check", "--live", "--config", str(rig.config)]) == 0
-    out, err = capsys.readouterr()
+    out, err = command("run", "--check", "--live", "--config", rig.config)
     assert "sensor digitizer: 0 readings/s" in out
     assert "link: no HEARTBEAT of 1:1 and no other message: check link.url" in err
     assert "sensor: digitizer: no reading in 1 s: the port is not open" in err
     assert "the bridge would start, " in out
-    assert main(["run", "--live", "--config", str(rig.config)]) == 2
+    command("run", "--live", "--config", rig.config, code=2)
 
 
 def test_live_names_the_systems_that_send_and_telemetry_that_does_not_match(

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 from fed import logged
 from small import START, small_bridge
 
 from magbridge import logs
 from magbridge.bridge.events import Event, StartEvent, standstill
 from magbridge.calibration.file import load as load_calibration
-from magbridge.cli import main
 from magbridge.columns import CORRECTED
 from magbridge.correction import Correction
 from magbridge.mavlink import Codec
@@ -38,10 +38,10 @@ def battery(position: float) -> bytes:
 
 @pytest.mark.parametrize("suffix", ["nc", "csv", "tlog"])
 def test_what_was_set_in_the_course_of_the_log_is_reported(
-    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, suffix: str, command: Command
 ) -> None:
     """The correction repeats neither rejected values nor the rate of a message."""
-    station, log, out = Codec(1, 1), tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
+    station, log = Codec(1, 1), tmp_path / f"converted.{suffix}"
     asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
     to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
 
@@ -54,8 +54,8 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
 
     logged(small_bridge(tmp_path), events(), tmp_path / "logs")
     logs.write(logs.read(sorted((tmp_path / "logs").iterdir())), log)
-    assert main(["correct", str(log), "--calibration", str(tmp_path / "cal.json"), "-o", str(out)]) == 0
-    assert "MB_* parameters were set once in the course of the log" in capsys.readouterr().err
+    reported = command("correct", log, "--calibration", "cal.json", "-o", "out.nc").err
+    assert "MB_* parameters were set once in the course of the log" in reported
 
 
 @pytest.mark.parametrize(("suffix", "precision"), [("nc", 1e-7), ("csv", 1e-7), ("tlog", 1e-6)])

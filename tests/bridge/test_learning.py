@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 from disks import full_disk
 from fed import logged, named, received
 from turning import bridge, events
@@ -19,7 +20,6 @@ from magbridge.bridge.events import Event
 from magbridge.bridge.learning import LearningService, keep, kept_path
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import calibration_id, load
-from magbridge.cli import main
 from magbridge.config import load as load_config
 from magbridge.errors import ConfigError
 from magbridge.learning.alarms import CAUSE_UNITS
@@ -63,14 +63,13 @@ def test_the_same_events_give_the_same_bytes(flight: Flight, tmp_path: Path) -> 
     assert [one for event in events(tmp_path) for one in again.feed(event)] == flight[2]
 
 
-def test_ashore_it_learns_what_it_learned_live(flight: Flight, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ashore_it_learns_what_it_learned_live(flight: Flight, command: Command) -> None:
     """Offline, the bridge's own log gives the same calibration bit for bit."""
     folder, pipeline, sent = flight
     out, learned = folder / "out.nc", folder / "learned.json"
     log = sorted((folder / "logs").iterdir())
-    order = ["correct", *map(str, log), "--calibration", str(folder / "cal.json"), "-o", str(out)]
-    assert main([*order, "--learn", "--save", str(learned)]) == 0
-    assert "learned from" in capsys.readouterr().out
+    order = ["correct", *log, "--calibration", folder / "cal.json", "-o", out]
+    assert "learned from" in command(*order, "--learn", "--save", learned).out
     total = logs.read(out)["total_field"].to_numpy()
     live = np.array([message["total_field"] for message in named(received(sent), "MAG_FIELD")])
     np.testing.assert_array_equal(total, live)
@@ -142,7 +141,7 @@ def test_the_causes_bits_are_those_of_the_dialect() -> None:
     assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSE_UNITS)
 
 
-def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
+def test_from_nothing_live_and_ashore(tmp_path: Path, command: Command) -> None:
     """Without a calibration, the field is flagged until one is published; the log reproduces this."""
     sent = logged(bridge(tmp_path, known=False), events(tmp_path), tmp_path / "logs")
     fields = named(received(sent), "MAG_FIELD")
@@ -153,8 +152,7 @@ def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     assert abs(fields[-1]["total_field"] - 51_900.0) < 2.0 * fields[-1]["total_field_sigma"]
     assert np.std([one["total_field"] for one in fields[-100:]]) < 15.0
     out, log_file = tmp_path / "out.nc", sorted((tmp_path / "logs").iterdir())
-    order = ["correct", *map(str, log_file), "--learn", "--config", str(tmp_path / "bridge.toml")]
-    assert main([*order, "-o", str(out)]) == 0
+    command("correct", *log_file, "--learn", "--config", "bridge.toml", "-o", out)
     live = np.array([one["total_field"] for one in fields])
     np.testing.assert_array_equal(logs.read(out)["total_field"].to_numpy(), live)
     assert kept_path(load_config(tmp_path / "bridge.toml")) == tmp_path / "cal-learned.json"
@@ -179,15 +177,14 @@ def test_the_same_bytes_on_another_number_of_cores(name: str) -> None:
     assert reported.splitlines()[-1] == "{1}"
 
 
-def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, command: Command) -> None:
     """Without a start, `correct` prints one line and writes no file."""
     bridge(tmp_path)
     log, out = tmp_path / "log.csv", tmp_path / "out.nc"
     log.write_text("time,mag_x,mag_y,mag_z\n1,2,3,4\n", encoding="utf-8")
-    assert main(["correct", str(log), "-o", str(out)]) == 2
-    assert "expected --calibration cal.json, or --learn" in capsys.readouterr().err
-    assert main(["correct", str(log), "--config", str(tmp_path / "bridge.toml"), "-o", str(out)]) == 2
-    assert "--learn" in capsys.readouterr().err
+    words = "expected --calibration cal.json, or --learn"
+    assert words in command.refuses("correct", log, "-o", out, code=2)
+    assert "--learn" in command.refuses("correct", log, "--config", "bridge.toml", "-o", out, code=2)
     assert not out.exists()
 
 

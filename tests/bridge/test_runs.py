@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from checks import Measured, replays, soon
+from checks import Measured, records, replays, soon
 from devices import open_line
 from rig import Rig
 
 from magbridge.bridge.events import HostClock
-from magbridge.mavlink import Codec, LogReader, Signing
+from magbridge.mavlink import Codec, Signing
 
 MakeRig = Callable[..., Rig]
 KEY = bytes(range(32))
@@ -32,8 +32,7 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, measured: 
     assert back < soon(3.0)
     replays(rig)
     (log,) = rig.logs
-    with log.open("rb") as file:
-        texts = [record.message["text"] for record in LogReader(file) if record.message.name == "STATUSTEXT"]
+    texts = [one.message["text"] for one in records(log) if one.message.name == "STATUSTEXT"]
     assert any(text.startswith("digitizer lost: no such device: /") for text in texts)
     assert any(text.startswith(f"link: Connection refused: {rig.url[:8]}") for text in texts)
 
@@ -139,8 +138,7 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, measured: Measured) 
     assert rig.undue_flags(mark) == ""
     assert rig.status["samples_lost"] == 0
     (log,) = rig.logs
-    with log.open("rb") as file:
-        times = [record.time_us for record in LogReader(file)]
+    times = [record.time_us for record in records(log)]
     assert times == sorted(times)
     measured(noticed_s=noticed)
     replays(rig)

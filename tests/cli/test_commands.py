@@ -235,7 +235,7 @@ def test_plan(names: tuple[str, ...], deployment: Path, command: Command) -> Non
     known = expected_calibration(observations(read(deployment), names).ranges(), 52_000.0, order=2)
     save_calibration(known, "cal.json")
     asked = "plan", "--calibration", "cal.json", "--mission", deployment, "--runs", "2"
-    result = json.loads(command(*asked, "--json").out)
+    result = command.json(*asked)
     before, first, second = result["expected_worst_nT"]
     assert before > first > second
     assert [set(run) for run in result["runs"]] == [{"pitch", "roll", *names}] * 2
@@ -249,7 +249,7 @@ def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, comma
     save_calibration(known, "cal.json")
     asked = "plan", "--calibration", "cal.json", "--runs", "2", "--mission"
     write(log.assign(ballast=log["ballast"] * 0.0 + 200.0), "mission.nc")
-    runs = json.loads(command(*asked, "mission.nc", "--json").out)["runs"]
+    runs = command.json(*asked, "mission.nc")["runs"]
     # no further from where it is than a run may be
     assert all(run["ballast"] >= 200.0 - 0.35 * known.parameters[1].scale for run in runs)
     write(log.assign(pitch=log["pitch"] * np.nan), "flat.nc")
@@ -260,7 +260,7 @@ def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, comma
 
 def test_plan_of_a_survey_needs_no_calibration(deployment: Path, command: Command) -> None:
     asked = "plan", "--mission", deployment
-    found = json.loads(command(*asked, "--survey", "3", "--parameter", "battpos", "--json").out)["surveys"]
+    found = command.json(*asked, "--survey", "3", "--parameter", "battpos")["surveys"]
     assert found[0]["expected_worst_nT"] < found[-1]["expected_worst_nT"]
     assert found[-1]["open"]
     assert "expected --calibration, or --survey HOURS" in command(*asked, code=2).err

@@ -27,7 +27,7 @@ def test_info_of_the_demo(deployment: Path, command: Command) -> None:
     assert "battpos" in output.out
     assert "calibrate" in output.out
     assert "may move the field, for --parameter: battpos ballast" in " ".join(output.err.split())
-    facts = json.loads(command("info", deployment, "--json").out)[str(deployment)]
+    facts = command.json("info", deployment)[str(deployment)]
     assert facts["rows"] == 3600
     assert all(not lacks for lacks in facts["uses"].values())
     battpos = next(one for one in facts["columns"] if one["name"] == "battpos")
@@ -166,10 +166,7 @@ def test_what_was_lost_is_named(here: Path, command: Command) -> None:
     output = command("info", here / "one.csv")
     assert "in the logs: 1 row dropped" in output.err
     assert "row 11" in output.err
-    assert (
-        "row 11"
-        in json.loads(command("info", here / "one.csv", "--json").out)[str(here / "one.csv")]["losses"][0]
-    )
+    assert "row 11" in command.json("info", here / "one.csv")[str(here / "one.csv")]["losses"][0]
 
 
 def test_a_log_without_a_date_is_given_one(here: Path, command: Command) -> None:

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import polars as pl
 import pytest
+from commands import Command
 from fleets import fly
 
 from magbridge.arrays import FloatArray
@@ -179,13 +180,9 @@ def test_a_fleet_toml_names_what_is_wrong(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_or_foreign_catalogue_is_one_line(
-    name: str,
-    value: object,
-    kind: type[pl.DataType],
-    words: str,
-    catalogue: Catalogue,
+    name: str, value: object, kind: type[pl.DataType], words: str, catalogue: Catalogue,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+) -> None:  # fmt: skip
     (path,) = (catalogue.folder / "vehicles").glob("*.parquet")
     table = pl.read_parquet(path)
     table.with_columns(pl.lit(value, dtype=kind()).alias(name)).write_parquet(path)
@@ -211,15 +208,17 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return log, cal
 
 
-def add(catalogue: Catalogue, cal: Path, *more: str) -> int:
-    of = "--vehicle", "comet", "--deployment", "may", "--catalogue", catalogue.name
-    return main(["fleet", "add", str(cal), *of, *more])
+def adding(catalogue: Catalogue, cal: Path, vehicle: str = "comet") -> tuple[object, ...]:
+    of = "--vehicle", vehicle, "--deployment", "may", "--catalogue", catalogue.name
+    return "fleet", "add", cal, *of
 
 
-def test_it_teaches_what_its_data_determined(catalogue: Catalogue, made: tuple[Path, Path]) -> None:
+def test_it_teaches_what_its_data_determined(
+    catalogue: Catalogue, made: tuple[Path, Path], command: Command
+) -> None:
     log, cal = made
-    assert add(catalogue, cal, "--date", "2026-05-01") == 0
-    assert add(catalogue, cal, "--date", "2026-05-01") == 0
+    for _ in range(2):
+        command(*adding(catalogue, cal), "--date", "2026-05-01")
     assert status(catalogue)["vehicles"][0]["given"] == 1
     (given,) = lessons(catalogue, "comet")
     known = fleet_of(catalogue, "comet").known("comet", "may").rescaled(load(cal).parameters, given.field)
@@ -240,28 +239,25 @@ def test_it_teaches_what_its_data_determined(catalogue: Catalogue, made: tuple[P
 
 
 def test_what_does_not_fit_is_a_line(
-    catalogue: Catalogue, made: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    catalogue: Catalogue, made: tuple[Path, Path], tmp_path: Path, command: Command
 ) -> None:
     _, cal = made
-
-    def output(*more: str) -> str:
-        assert add(catalogue, cal, *more) == 2
-        return capsys.readouterr().err
-
-    when = "--date", "2026-05-01"
-    assert "expected --date YYYY-MM-DD, the day on which its deployment began" in output()
-    reported = output(*when, "--sensor", "HMR 9")
-    assert "comet may: expected a calibration of sensor 'HMR 9', got one of 'HMR 1'" in reported
     add_vehicle(catalogue, "other", Vehicle(parameters=("ballast",)))
-    of = "--vehicle", "other", "--deployment", "may", "--catalogue", catalogue.name
-    assert main(["fleet", "add", str(cal), *of, *when]) == 2
-    assert "other: expected a calibration with the parameters ballast, got battpos" in capsys.readouterr().err
-    assert add(catalogue, cal, *when) == 0
+    when = "--date", "2026-05-01"
+    for arguments, words in (
+        (adding(catalogue, cal), "expected --date YYYY-MM-DD, the day on which its deployment began"),
+        ((*adding(catalogue, cal), *when, "--sensor", "HMR 9"),
+         "comet may: expected a calibration of sensor 'HMR 9', got one of 'HMR 1'"),
+        ((*adding(catalogue, cal, "other"), *when),
+         "other: expected a calibration with the parameters ballast, got battpos"),
+    ):  # fmt: skip
+        assert words in command(*arguments, code=2).err
+    command(*adding(catalogue, cal), *when)
     (other := tmp_path / "other.json").write_text(cal.read_text().replace('"auto"', '"mine"'))
-    assert add(catalogue, other, *when) == 2
-    assert "comet may: has another calibration already; name another deployment" in capsys.readouterr().err
+    line = command(*adding(catalogue, other), *when, code=2).err
+    assert "comet may: has another calibration already; name another deployment" in line
     (broken := tmp_path / "broken.json").write_text("{")
-    assert add(catalogue, broken, *when) == 1
+    command(*adding(catalogue, broken), *when, code=1)
 
 
 # ---- How a refit moves coefficients is how a dipole's coefficients move when it is exchanged or shifted ----

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Barrier, Thread
@@ -12,6 +11,7 @@ import pytest
 pytest.importorskip("psycopg", reason="PostgreSQL's client is not installed")
 
 import psycopg
+from commands import Command
 from databases import program, server
 
 from magbridge.cli import main
@@ -57,21 +57,17 @@ def test_it_says_what_a_folder_says(url: str, flown: Path, tmp_path: Path) -> No
     assert set(few[0][0]) == {"rms", "warnings"}
 
 
-def test_the_commands_know_it(
-    url: str, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["fleet", "status", "--catalogue", url]) == 1
-    assert "expected a fleet's catalogue (magbridge fleet add makes one)" in capsys.readouterr().err
-    assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", url]) == 0
+def test_the_commands_know_it(url: str, flown: Path, tmp_path: Path, command: Command) -> None:
+    refused = command("fleet", "status", "--catalogue", url, code=1).err
+    assert "expected a fleet's catalogue (magbridge fleet add makes one)" in refused
+    command("fleet", "add", flown / "fleet.toml", "--catalogue", url)
     catalogue = open_catalogue(url, tmp_path)
     for job in jobs(catalogue):
         catalogue.add_tables(work(job, catalogue.results).tables)
-    capsys.readouterr()
-    assert main(["fleet", "status", "--catalogue", url, "--json"]) == 0
-    assert [one["calibrated"] for one in json.loads(capsys.readouterr().out)["vehicles"]] == [2, 1]
-    cal = str(tmp_path / "cal.json")
-    assert main(["calibrate", str(flown / "one/second.nc"), "--fleet", url, "-o", cal, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["fleet"]["deployments"] == 1
+    found = command.json("fleet", "status", "--catalogue", url)["vehicles"]
+    assert [one["calibrated"] for one in found] == [2, 1]
+    found = command.json("calibrate", flown / "one/second.nc", "--fleet", url, "-o", "cal.json")
+    assert found["fleet"]["deployments"] == 1
 
 
 def test_many_make_it_and_write_to_it_at_once(url: str) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 from disks import full_disk
 from fleets import catalogue_of, content, fly
 
 from magbridge.calibration.file import decode_calibration, load
-from magbridge.cli import main
 from magbridge.errors import WriteError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.fleet.catalogue import FolderCatalogue as Catalogue
@@ -150,9 +150,7 @@ def test_a_full_disk_is_a_line_and_nothing_is_on_record(flown: Path, tmp_path: P
     assert len(new_jobs(catalogue, jobs(catalogue))) == 3
 
 
-def test_a_change_is_dated_and_reported(
-    catalogue: Catalogue, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_change_is_dated_and_reported(catalogue: Catalogue, tmp_path: Path, command: Command) -> None:
     for number in range(5):
         log = fly(tmp_path / f"{number}.nc", 1, number)
         if number == 4:  # a magnetised screw
@@ -162,14 +160,13 @@ def test_a_change_is_dated_and_reported(
         add_logs(catalogue, "comet", Deployment(f"d{number}", (), "spring"), [log])
     for job in jobs(catalogue):
         catalogue.add_tables(work(job, tmp_path / "results").tables)
-    place, page = str(catalogue.folder), tmp_path / "page.html"
-    assert main(["fleet", "show", "comet", "--catalogue", place, "--html", str(page)]) == 0
-    reported = capsys.readouterr().out.splitlines()
+    place, page = catalogue.folder, tmp_path / "page.html"
+    reported = command("fleet", "show", "comet", "--catalogue", place, "--html", page).out.splitlines()
     assert reported[0] == "comet: 5 deployments, 1 change"
     assert "d4 (refit spring): hard iron, y moved by +" in reported[1]
     assert reported[1].endswith("iron that was magnetised, fitted or removed, and no refit is on record")
     pages = tmp_path / "pages"
-    assert main(["fleet", "show", "--catalogue", place, "--html", str(pages)]) == 0
+    command("fleet", "show", "--catalogue", place, "--html", pages)
     assert {path.name for path in pages.iterdir()} == {"index.html", "comet.html", "fleet.json"}
     for text in (page.read_text(), (pages / "comet.html").read_text()):
         assert "<td class=changed>hard iron, y</td>" in text
@@ -189,7 +186,7 @@ def test_a_change_is_dated_and_reported(
     catalogue.add("findings", [{**cause, "verdict": "explained", "signal_to_noise": 9.0}])
     catalogue.add("improvements", [{**cause, "ratio": 0.42, "low": 0.37, "high": 0.49}])
     catalogue.add("maps", [{**job.mark, "path": str(grid), "rms": 1.0, "sigma": 2.0}])
-    assert main(["fleet", "show", "--catalogue", place, "--html", str(page)]) == 0
+    command("fleet", "show", "--catalogue", place, "--html", page)
     text = page.read_text()
     assert "<td>temperature offset</td><td>0.42 times (0.37 to 0.49)</td>" in text
     assert 'alt="Anomaly map of deployment d4" src="data:image/png;base64,' in text
@@ -197,29 +194,24 @@ def test_a_change_is_dated_and_reported(
 
 
 def test_a_calibration_starts_from_its_fleet(
-    done: Catalogue, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    done: Catalogue, flown: Path, tmp_path: Path, command: Command
 ) -> None:
-    place = str(done.folder)
     log = fly(tmp_path / "third.nc", 1, 2)
     few = read(log)
     write(few.isel(time=np.isin(few["run"], np.unique(few["run"])[:2])), log)
-    arguments = ["calibrate", str(log), "--fleet", place, "-o", str(tmp_path / "cal.json"), "--json"]
-    assert main(arguments) == 2
-    assert "name the vehicle with --vehicle" in capsys.readouterr().err
-    assert main([*arguments, "--vehicle", "one", "--refit", "spring"]) == 0
-    found = json.loads(capsys.readouterr().out)["fleet"]
+    options = "--fleet", done.folder, "-o", "cal.json"
+    assert "name the vehicle with --vehicle" in command("calibrate", log, *options, code=2).err
+    found = command.json("calibrate", log, *options, "--vehicle", "one", "--refit", "spring")["fleet"]
     assert (found["deployments"], found["deployments_of_others"]) == (2, 1)
     assert found["expected_nT"] < 0.5 * found["expected_alone_nT"]
     # a log that is catalogued has its vehicle there, and is not learned from twice
-    again = ["calibrate", str(flown / "one/second.nc"), *arguments[2:]]
-    assert main(again) == 0
-    assert json.loads(capsys.readouterr().out)["fleet"]["deployments"] == 1
+    again = command.json("calibrate", flown / "one/second.nc", *options)
+    assert again["fleet"]["deployments"] == 1
 
 
-def test_what_is_expected_is_a_calibration(done: Catalogue, tmp_path: Path) -> None:
-    cal = tmp_path / "cal.json"
-    assert main(["fleet", "export", "one", "--catalogue", str(done.folder), "-o", str(cal)]) == 0
-    known = load(cal)
+def test_what_is_expected_is_a_calibration(done: Catalogue, command: Command) -> None:
+    command("fleet", "export", "one", "--catalogue", done.folder, "-o", "cal.json")
+    known = load("cal.json")
     assert known.method == "fleet"
     assert known.warnings
     (own, other) = (row for row in done.rows("calibrations") if row["vehicle"] == "one")
@@ -228,9 +220,8 @@ def test_what_is_expected_is_a_calibration(done: Catalogue, tmp_path: Path) -> N
     assert (np.abs(off) < 4.0 * np.sqrt(np.diag(known.covariance)[6:9])).all()
 
 
-def test_status_counts(done: Catalogue, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["fleet", "status", "--catalogue", str(done.folder), "--json"]) == 0
-    one, two = json.loads(capsys.readouterr().out)["vehicles"]
+def test_status_counts(done: Catalogue, command: Command) -> None:
+    one, two = command.json("fleet", "status", "--catalogue", done.folder)["vehicles"]
     counts = {"deployments": 2, "logs": 2, "calibrated": 2, "new": 0, "failed": 0}
     assert counts.items() <= one.items()
     assert (two["vehicle"], two["deployments"], two["failed"]) == ("two", 1, 0)

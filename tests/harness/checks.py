@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from itertools import zip_longest
+from pathlib import Path
 
 import numpy as np
 from rig import Rig
 
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, LogReader, TlogRecord
 
 Measured = Callable[..., None]
 """Function that records the values that a fault test measured: times in s, losses in messages or bytes."""
@@ -19,6 +20,15 @@ NOISE = np.random.default_rng(1).integers(0, 256, 4000, dtype=np.uint8).tobytes(
 def soon(limit: float) -> float:
     """Return the time limit (s) on this machine for an action that takes `limit` (s) on an idle machine."""
     return 2.0 * limit * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+def records(path: Path) -> list[TlogRecord]:
+    """Return the records of an undamaged log."""
+    with path.open("rb") as file:
+        reader = LogReader(file)
+        found = list(reader)
+    assert reader.damages == 0, path
+    return found
 
 
 def replays(rig: Rig) -> None:

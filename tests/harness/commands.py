@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import json
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -28,6 +29,10 @@ class Command:
         """Run a command, assert that its exit code is `code`, and return its output."""
         assert main([str(argument) for argument in arguments]) == code
         return Output(*self._capsys.readouterr())
+
+    def json(self, *arguments: object, code: int = 0) -> Any:
+        """Run a command with ``--json``, assert that its exit code is `code`, and return its result."""
+        return json.loads(self(*arguments, "--json", code=code).out)
 
     def refuses(self, *arguments: object, code: int = 1) -> str:
         """Run a command, assert that it fails with `code` and one line on stderr, and return that line."""

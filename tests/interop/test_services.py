@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from checks import records
 from devices import TRUTH
 from ears import Ear, ftp
 from pymavlink import mavutil
@@ -19,7 +20,7 @@ from pymavlink.dialects.v10 import common as version_1
 from rig import Rig
 
 from magbridge.link.files import Opcode
-from magbridge.mavlink import Codec, LogReader, Message
+from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel
 
 LOG = "20250101T000000Z_0001.tlog"
@@ -177,11 +178,7 @@ def tool(name: str, *arguments: object) -> str:
 
 
 def counted(log: Path) -> Counter[str]:
-    with log.open("rb") as file:
-        reader = LogReader(file)
-        counts = Counter(record.message.name for record in reader)
-    assert reader.damages == 0
-    return counts
+    return Counter(record.message.name for record in records(log))
 
 
 def test_mavlogdump_without_our_dialect(log: Path) -> None:
@@ -216,6 +213,4 @@ def test_mavlink_connection_with_our_dialect(log: Path, peer: ModuleType) -> Non
     assert last is not None
     assert last.get_srcComponent() == 191
     assert last.x == pytest.approx(TRUTH[0], abs=5)
-    with log.open("rb") as file:
-        stamps = {record.channel for record in LogReader(file)}
-    assert stamps == set(Channel)
+    assert {record.channel for record in records(log)} == set(Channel)
