@@ -6,7 +6,7 @@ import os
 import shutil
 import signal
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stdout
 from importlib.util import module_from_spec, spec_from_file_location
 from io import StringIO
@@ -90,6 +90,24 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], here: Path) -> Command:
     return Command(capsys)
+
+
+@pytest.fixture
+def make_rig(tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Yield a function that makes a bridge with simulated devices; the fixture closes all of them."""
+    from rig import Rig  # noqa: PLC0415 - few tests need it
+
+    made: list[Rig] = []
+
+    def make(*arguments: Any, **settings: Any) -> Rig:
+        folder = tmp_path / f"rig{len(made)}"
+        folder.mkdir()
+        made.append(Rig(folder, *arguments, **settings))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.close()
 
 
 @pytest.fixture(scope="session")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from checks import Measured
@@ -32,19 +31,3 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     made.start()
     yield made
     made.close()
-
-
-@pytest.fixture
-def make_rig(tmp_path: Path) -> Iterator[Callable[..., Rig]]:
-    """Yield a function that makes a bridge; the fixture closes all of them after the test."""
-    made: list[Rig] = []
-
-    def make(*arguments: Any, **settings: Any) -> Rig:
-        folder = tmp_path / f"rig{len(made)}"
-        folder.mkdir()
-        made.append(Rig(folder, *arguments, **settings))
-        return made[-1]
-
-    yield make
-    for rig in made:
-        rig.close()

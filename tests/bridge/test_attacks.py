@@ -6,7 +6,7 @@ import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from math import isnan, nan
+from math import nan
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,6 @@ from fed import FedBridge, named
 from rig import Rig
 from small import START, small_bridge
 
-from magbridge.bridge.position import Position
 from magbridge.bridge.run import FileServer
 from magbridge.correction import Correction
 from magbridge.mavlink import Codec, Message
@@ -103,9 +102,6 @@ def test_an_attack_costs_the_autopilot_nothing_or_is_reported(
 # ---- Valid frames and lines with extreme values end neither the bridge nor, unnoticed, a part of it ------
 
 
-INT32_MAX = 2**31 - 1
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_extreme_values_raise_nothing(seed: int, tmp_path: Path) -> None:
     bridge = make_bridge(tmp_path, seed)
@@ -120,33 +116,6 @@ def test_extreme_values_raise_nothing(seed: int, tmp_path: Path) -> None:
 
 def global_position(component: int = 1, **fields: int) -> bytes:
     return Codec(1, component).pack("GLOBAL_POSITION_INT", **fields)
-
-
-def parsed(frame: bytes) -> Message:
-    (message,) = Codec(0, 0).parse(frame)
-    return message
-
-
-@pytest.mark.parametrize(
-    "place", [(INT32_MAX, INT32_MAX), (495_000_000, -1_900_000_000), (950_000_000, 0)], ids=str
-)
-def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[int, int]) -> None:
-    position = Position(print)
-    position.update(parsed(global_position(lat=place[0], lon=place[1])), START)
-    assert position.place_and_depth[0] is None
-    assert isnan(position.main_field(START, START))
-
-
-def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
-    reports: list[str] = []
-    position = Position(reports.append)
-    here, away = (495_000_000, -579_000_000), (500_000_000, -579_000_000)  # 56 km
-    for second in range(900):
-        lat, lon = away if 100 <= second < 700 else here
-        position.update(parsed(global_position(lat=lat, lon=lon)), START + second * 1_000_000)
-        field = position.main_field(START + second * 1_000_000, START + second * 1_000_000)
-        assert isnan(field) == (100 <= second < 700)
-    assert reports == ["the position jumps farther than the vehicle can move"]
 
 
 def sent(bridge: FedBridge, second: int) -> list[Message]:

@@ -151,10 +151,7 @@ def test_parameter_out_of_range(rig: Rig) -> None:
     rig.until_well()
     mark = rig.mark
     for value in (0.5, float("nan"), float("inf"), -1.0):
-        rig.autopilot.send_message(
-            "PARAM_SET", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_value=value,
-            param_type=REAL32,
-        )  # fmt: skip
+        rig.set_parameter("MB_GAP_FACTOR", value)
     rig.until_reported("MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000", mark)
     rig.until(lambda: len(rig.of("PARAM_VALUE", mark)) == 4)
     assert {message["param_value"] for message in rig.of("PARAM_VALUE", mark)} == {2.5}

@@ -94,7 +94,8 @@ def test_a_log_that_is_removed(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig()
     rig.start()
     mark = rig.mark
-    set_parameter(rig)
+    rig.set_parameter("MB_GAP_FACTOR", 3.0)
+    rig.until(lambda: rig.of("PARAM_VALUE"))
     (gone,) = rig.logs
     gone.unlink()
     rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
@@ -115,18 +116,11 @@ def test_a_log_that_is_removed(make_rig: MakeRig, measured: Measured) -> None:
     measured(recovers_s=mended, records_lost=rig.status["log_lost"])
 
 
-def set_parameter(rig: Rig) -> None:
-    """Set a parameter as a station would."""
-    mark = rig.mark
-    to = {"target_system": 1, "target_component": 191}
-    rig.autopilot.send_message("PARAM_SET", **to, param_id="MB_GAP_FACTOR", param_value=3.0, param_type=9)
-    rig.until(lambda: rig.of("PARAM_VALUE", mark))
-
-
 def test_killed_without_warning(make_rig: MakeRig, measured: Measured) -> None:
     rig = make_rig()
     rig.start()
-    set_parameter(rig)
+    rig.set_parameter("MB_GAP_FACTOR", 3.0)
+    rig.until(lambda: rig.of("PARAM_VALUE"))
     rig.run(1.0)
     assert rig.process is not None
     rig.process.kill()

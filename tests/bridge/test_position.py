@@ -30,11 +30,13 @@ START, SECOND, YEAR = 1_780_000_000_000_000, 1_000_000, 31_557_600_000_000
 AGO = 20 * YEAR
 
 
-def update(position: Position, latitude: float, longitude: float, altitude: float = 0.0) -> Position:
-    """Give a position the report of an autopilot (deg, m) at the start."""
+def update(
+    position: Position, latitude: float, longitude: float, altitude: float = 0.0, now_us: int = START
+) -> Position:
+    """Give a position the report of an autopilot (deg, m)."""
     fields = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(altitude * 1e3)}
     (message,) = Codec(0, 0).parse(Codec(1, 1).pack("GLOBAL_POSITION_INT", **fields))
-    position.update(message, START)
+    position.update(message, now_us)
     return position
 
 
@@ -65,6 +67,23 @@ def test_an_old_position_or_none_gives_no_field() -> None:
     assert isnan(position.main_field(START + 61 * SECOND, START))
     assert isnan(position_at(0.0, 0.0, 0.0).main_field(START, START))
     assert isnan(Position(print).main_field(START, START))
+
+
+@pytest.mark.parametrize("place", [(214.7483647, 214.7483647), (49.5, -190.0), (95.0, 0.0)], ids=str)
+def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[float, float]) -> None:
+    position = position_at(*place, 0.0)
+    assert position.place_and_depth[0] is None
+    assert isnan(position.main_field(START, START))
+
+
+def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
+    reports: list[str] = []
+    position = Position(reports.append)
+    for second in range(900):
+        is_away, now_us = 100 <= second < 700, START + second * SECOND
+        update(position, 50.0 if is_away else 49.5, -57.9, now_us=now_us)  # 56 km
+        assert isnan(position.main_field(now_us, now_us)) == is_away
+    assert reports == ["the position jumps farther than the vehicle can move"]
 
 
 def test_the_field_is_that_of_the_day_to_which_the_clock_was_set() -> None:

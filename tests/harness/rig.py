@@ -24,6 +24,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message, Signing
+from magbridge.mavlink.enums import MAV_PARAM_TYPE
 from magbridge.records import Quality
 from sitl.replay.own_log import Recorded
 from sitl.replay.stage import Stage
@@ -140,6 +141,16 @@ class Rig:
             self.fluxgate.plug()
         self.autopilot.up()
         return self.restart()
+
+    def start_alone(self) -> None:
+        """Connect the sensor and start the bridge for a third-party peer in place of the autopilot."""
+        self.fluxgate.plug()
+        self.process = self.spawn(self.config)
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set a parameter of the bridge as a station does."""
+        fields = {"param_id": name, "param_value": value, "param_type": MAV_PARAM_TYPE.REAL32}
+        self.autopilot.send_message("PARAM_SET", target_system=1, target_component=191, **fields)
 
     def restart(self) -> float:
         """Start the bridge process; return the s until the output is normal."""

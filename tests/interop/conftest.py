@@ -116,20 +116,3 @@ def start_peer() -> Iterator[Callable[..., Peer]]:
     yield start
     for one in started:
         one.end()
-
-
-@pytest.fixture
-def make_rig(tmp_path: Path) -> Iterator[Callable[[str], Rig]]:
-    """Yield a function that starts a bridge without the rig's autopilot, for a third-party peer."""
-    made: list[Rig] = []
-
-    def make(link: str) -> Rig:
-        rig = Rig(tmp_path, link)
-        rig.fluxgate.plug()
-        rig.process = rig.spawn(rig.config)
-        made.append(rig)
-        return rig
-
-    yield make
-    for rig in made:
-        rig.close()

@@ -41,6 +41,7 @@ def proxy(python: Path, *arguments: str) -> list[object]:
 
 def test_mavproxy_reads_logs_both_ways(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     rig = make_rig("udpout")
+    rig.start_alone()
     content = with_a_log(rig, 200_000)
     target = ("--target-system=1", "--target-component=191", "--default-modules=ftp,log,link,param")
     peer = start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{rig.port}", *target))
@@ -79,6 +80,7 @@ def test_two_stations_and_a_vehicle_behind_a_router(
 ) -> None:
     """MAVProxy forwards between the bridge and two stations; another vehicle is heard through it, too."""
     rig = make_rig("udpout")
+    rig.start_alone()
     with_a_log(rig, 1000)
     outs = [f"--out=udp:127.0.0.1:{one.line.getsockname()[1]}" for one in ears]
     target = (
@@ -108,20 +110,17 @@ def test_two_stations_and_a_vehicle_behind_a_router(
     assert rig.stop() == 0
 
 
-def test_an_autopilot_that_sends_mavlink_1(tmp_path: Path) -> None:
+def test_an_autopilot_that_sends_mavlink_1(make_rig: MakeRig) -> None:
     """The bridge uses MAVLink 1 telemetry, and still sends MAVLink 2."""
-    rig = Rig(tmp_path, "udpin")
+    rig = make_rig("udpin")
     station = version_1.MAVLink(None, 1, 1)
-    try:
-        rig.fluxgate.plug()
-        rig.autopilot.up()
-        rig.autopilot.pack = lambda name, /, **fields: old(station, name, fields)  # type: ignore[method-assign]
-        rig.restart()
-        assert rig.status["autopilot_state"] == 1
-        assert rig.stop() == 0
-        assert all(one.message.frame[0] == 0xFD for one in rig.received)
-    finally:
-        rig.close()
+    rig.fluxgate.plug()
+    rig.autopilot.up()
+    rig.autopilot.pack = lambda name, /, **fields: old(station, name, fields)  # type: ignore[method-assign]
+    rig.restart()
+    assert rig.status["autopilot_state"] == 1
+    assert rig.stop() == 0
+    assert all(one.message.frame[0] == 0xFD for one in rig.received)
 
 
 def old(station: Any, name: str, fields: dict[str, Any]) -> bytes:
@@ -133,23 +132,20 @@ def old(station: Any, name: str, fields: dict[str, Any]) -> bytes:
     return bytes(make(**wanted).pack(station))
 
 
-def test_a_station_behind_the_autopilot(tmp_path: Path) -> None:
+def test_a_station_behind_the_autopilot(make_rig: MakeRig) -> None:
     """On a serial line all that a station says comes through the autopilot, and all answers go back there."""
-    rig = Rig(tmp_path, "serial")
-    try:
-        rig.start()
-        rig.until(lambda: rig.of("HEARTBEAT"))  # so the autopilot knows where 1:191 is
-        station, mark = Codec(255, 190), rig.mark
-        rig.autopilot.send(station.pack("HEARTBEAT", type=6, autopilot=8, mavlink_version=3))
-        rig.autopilot.send(station.pack("FILE_TRANSFER_PROTOCOL", **ftp(Opcode.LIST, b"/", 1)))
-        rig.until(lambda: rig.of("FILE_TRANSFER_PROTOCOL", mark))
-        rig.until(lambda: len(indices(rig.of("PARAM_VALUE", mark))) >= 15)
-        (reply,) = rig.of("FILE_TRANSFER_PROTOCOL", mark)
-        assert (reply["target_system"], reply["target_component"]) == (255, 190)
-        assert b"D@MAV_LOG\0" in reply["payload"]
-        assert rig.undue_flags(mark) == ""
-    finally:
-        rig.close()
+    rig = make_rig("serial")
+    rig.start()
+    rig.until(lambda: rig.of("HEARTBEAT"))  # so the autopilot knows where 1:191 is
+    station, mark = Codec(255, 190), rig.mark
+    rig.autopilot.send(station.pack("HEARTBEAT", type=6, autopilot=8, mavlink_version=3))
+    rig.autopilot.send(station.pack("FILE_TRANSFER_PROTOCOL", **ftp(Opcode.LIST, b"/", 1)))
+    rig.until(lambda: rig.of("FILE_TRANSFER_PROTOCOL", mark))
+    rig.until(lambda: len(indices(rig.of("PARAM_VALUE", mark))) >= 15)
+    (reply,) = rig.of("FILE_TRANSFER_PROTOCOL", mark)
+    assert (reply["target_system"], reply["target_component"]) == (255, 190)
+    assert b"D@MAV_LOG\0" in reply["payload"]
+    assert rig.undue_flags(mark) == ""
 
 
 # ---- pymavlink's own log tools read our log, without our dialect and with it -------------------------------

@@ -30,6 +30,7 @@ Start = Callable[..., Any]
 
 def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     rig = make_rig("udpout")
+    rig.start_alone()
     peer = start_peer(
         rig,
         [
@@ -71,6 +72,7 @@ def read(path: Path) -> list[Any]:
 
 def test_mavsdk(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     rig = make_rig("udpout")
+    rig.start_alone()
     peer = start_peer(rig, [python, HERE / "mavsdk_station.py", f"udpin://127.0.0.1:{rig.port}", XML])
     found = peer.answer("found")["found"]
     assert found == {"system": 1, "components": [191], "autopilot": False}
@@ -97,6 +99,7 @@ def layout(name: str) -> dict[str, object]:
 
 def test_node_mavlink(make_rig: MakeRig, start_peer: Start, modules: Path) -> None:
     rig = make_rig("tcpin")
+    rig.start_alone()
     rig.until(lambda: rig.logs and rig.logs[0].stat().st_size > 500)
     ours = json.dumps([layout(name) for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")])
     peer = start_peer(rig, ["node", HERE / "node_station.cjs", modules, str(rig.port), ours])

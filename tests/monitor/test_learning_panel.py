@@ -16,8 +16,6 @@ import pytest
 from rig import Rig
 from station import served
 
-from magbridge.mavlink.enums import MAV_PARAM_TYPE
-
 if TYPE_CHECKING:
     from playwright.sync_api import Locator
 
@@ -95,9 +93,7 @@ def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], b
         panel = page.get_by_role("region", name="Learning in flight")
         panel.get_by_text("learning", exact=True).wait_for()  # the state: nothing is published in a minute
         page.wait_for_timeout(5000.0)  # samples to learn from
-        to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
-        # learning stops, so that the alarm stays
-        rig.autopilot.send_message("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
+        rig.set_parameter("MB_LEARN_FREEZE", 1.0)  # learning stops, so that the alarm stays
         panel.get_by_text("frozen", exact=True).wait_for()
         field.level = 60.0
         panel.get_by_text("offset step").wait_for()
