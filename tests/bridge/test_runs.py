@@ -58,23 +58,42 @@ def test_another_device_fits_the_pattern_too(make_rig: MakeRig, measured: Measur
     os.close(far)
 
 
-def test_tcp_server_gone_and_back(make_rig: MakeRig, measured: Measured) -> None:
-    rig = make_rig("tcp")
+@pytest.mark.parametrize(
+    ("link", "away_s", "text", "within_s"),
+    [
+        ("udpout", 5.7, "autopilot 1:1 found", 1.5),  # silent for more than 5 s
+        ("tcp", 1.2, "link: open", 2.0),
+        ("serial", 1.0, "link: ", 2.0),  # "open", or that this text itself was not sent
+    ],
+)
+def test_the_autopilot_s_end_of_the_link_closes_and_opens_again(
+    make_rig: MakeRig, measured: Measured, link: str, away_s: float, text: str, within_s: float
+) -> None:
+    rig = make_rig(link)
     rig.start()
-    rig.run(0.3)
-    last, mark = rig.of("MAG_FIELD")[-1]["sequence"], rig.mark
+    rig.until_answered()
+    before, mark, away = rig.fresh_status(), rig.mark, time.monotonic()
+    last, made = rig.of("MAG_FIELD")[-1]["sequence"], rig.fluxgate.encoder.sequence
     rig.autopilot.down()
-    rig.run(1.2)
+    rig.run(away_s)
     assert rig.process is not None
     assert rig.process.poll() is None
     rig.autopilot.up()
     back = rig.until_well()
-    rig.until_reported("link: open", mark)
+    rig.until_reported(text, mark)
+    after = rig.fresh_status()
+    still = 50 * rig.machine.seconds(away, time.monotonic())
     sequences = [message["sequence"] for message in rig.of("MAG_FIELD", mark)]
     lost = next(number for number in sequences if number > last + 20) - last - 1
     assert sequences == sorted(sequences)
+    assert 50 * (away_s - 0.5) <= lost <= 100 * away_s + still
+    came = after["samples"] - before["samples"]  # the bridge went on measuring
+    assert came == pytest.approx(
+        rig.fluxgate.encoder.sequence - made, abs=25 + still
+    )  # half a second on the way
+    assert after["samples_lost"] == before["samples_lost"]
     measured(recovers_s=back, messages_lost=lost)
-    assert back < soon(2.0)
+    assert back < soon(within_s)
     replays(rig)
 
 
@@ -98,23 +117,6 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, measured: Measured) -
 def texts_in(logs: list[Path], text: str) -> bool:
     """Return True if a bridge has sent `text`, as far as its log is on the disk."""
     return any(text.encode() in path.read_bytes() for path in logs)
-
-
-def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, measured: Measured) -> None:
-    rig = make_rig("serial")
-    rig.start()
-    rig.until_answered()
-    last, mark, away = rig.of("MAG_FIELD")[-1]["sequence"], rig.mark, time.monotonic()
-    rig.autopilot.down()
-    rig.run(1.0)
-    rig.autopilot.up()
-    back = rig.until_well()
-    rig.until_reported("link: ", mark)  # "open", or that this text itself was not sent
-    lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
-    measured(recovers_s=back, messages_lost=lost)
-    assert back < soon(2.0)
-    assert 25 <= lost <= 100 + 50 * rig.machine.seconds(away, time.monotonic())
-    replays(rig)
 
 
 def test_host_clock_set_forward_and_back(make_rig: MakeRig, measured: Measured) -> None:

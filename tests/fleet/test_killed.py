@@ -77,7 +77,8 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
     two = [start("fleet", "process", "--catalogue", folder, "--workers", "1") for _ in range(2)]
     for one in two:  # two people at once
         out, output = one.communicate(timeout=PATIENCE)
-        assert (one.returncode, output) == (0, ""), out
+        lines = [line for line in output.splitlines() if not line.startswith("magbridge: deployments: ")]
+        assert (one.returncode, lines) == (0, []), out  # a busy computer prints the progress
     # except the last results, which the fixture's run did not learn
     mine, theirs = content(catalogue), content(done)
     assert len(mine.pop("populations")) == 1
