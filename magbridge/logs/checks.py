@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -89,8 +89,8 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
         dropped = part.sizes["time"] - len(index)
         if dropped:
             part, rows = part.isel(time=index), [rows[k] for k in index.tolist()]
-        part, values = _plausible(faults, part, rows)
-        faults.lost(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
+        part = _plausible(faults, part, rows)
+        faults.lost(rows_dropped=dropped, duplicate_rows=duplicates)
         part = merged(part) if duplicates else part
         if part.sizes["time"]:
             previous = float(part["time"].values[-1])
@@ -126,50 +126,52 @@ def _times(
     then = [*whole[index].tolist(), np.inf]
     index = index[index < len(time)]
     repeated = index[1:][np.diff(time[index]) == 0]
-    wrong = np.union1d(np.setdiff1d(np.arange(len(time)), index), repeated)
-    if len(wrong):
-        k = int(wrong[0])
+    wrong = ~np.isin(np.arange(len(time)), np.setdiff1d(index, repeated))
+    if wrong.any():
+        k = int(wrong.argmax())
         place = int(np.searchsorted(index, k))
         before = float(time[index[place - 1]]) if place else previous
         expected = _disorder(time) or _expected(float(time[k]), before, then[place])
-        faults.note("time", len(wrong), rows[k], expected)
+        faults.note("time", wrong, rows, expected, counted=False)
     return index, len(repeated)
 
 
-def _plausible(faults: Faults, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
-    """Return the piece with NaN for impossible values, and the number of these values."""
-    count, time = 0, dataset["time"].values
+def _plausible(faults: Faults, dataset: xr.Dataset, rows: Sequence[int]) -> xr.Dataset:
+    """Return the piece with NaN for impossible values."""
+    time = dataset["time"].values
     for name, column in dataset.data_vars.items():
         values = column.values
-        wrong, expected = _impossible(str(name), column.attrs.get("units", ""), values, time)
+        low, high, expected = _possible(str(name), column.attrs.get("units", ""))
         if not expected:
             continue
+        compared = values - time if name in CHANNEL_TIMES else values
+        wrong = (compared < low) | (compared > high)
         faults.count(str(name), int(np.isfinite(values).sum()))
+        faults.note(str(name), wrong, rows, expected, values)
         if wrong.any():
-            k = int(wrong.argmax())
-            expected = f"{expected}, not {float(values[k])!r}"
-            faults.note(str(name), int(wrong.sum()), rows[k], expected)
-            count += int(wrong.sum())
             dataset = dataset.assign({name: column.copy(data=np.where(wrong, np.nan, values))})
-    return dataset, count
+    return dataset
 
 
-def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
-    """Return a mask (n,) of the impossible `values` (n,) of a column, and the expected range ("" for any)."""
+def _possible(name: str, unit: str) -> tuple[float, float, str]:
+    """Return the lowest and highest possible value of a column, and the expectation ("" for any value).
+
+    The limits of a channel's time are relative to the time of its row.
+    """
     unit = usual(unit)
-    if name in MAX_MAGNITUDE:
-        return np.abs(values) > MAX_MAGNITUDE[name], f"expected {unit}, at most {MAX_MAGNITUDE[name]:g}"
+    if most := MAX_MAGNITUDE.get(name):
+        return -most, most, f"expected {unit}, at most {most:g}"
     if name == "reference_field":
         low, high = REFERENCE_FIELD_RANGE_NT
-        expected = f"expected {low:g} to {high:g} nT, or nothing where it is not known"
-        return (values < low) | (values > high), expected
+        return low, high, f"expected {low:g} to {high:g} nT, or nothing where it is not known"
     if name in CHANNEL_TIMES:
         expected = f"expected a time within {MAX_CHANNEL_DELAY_S:g} s of the row's"
-        return np.abs(values - time) > MAX_CHANNEL_DELAY_S, expected
-    if unit in MIN_VALUE:
-        expected = f"expected at least {MIN_VALUE[unit]:g} {unit}, or nothing where it is not known"
-        return values < MIN_VALUE[unit], expected
-    return np.zeros(len(values), bool), ""
+        return -MAX_CHANNEL_DELAY_S, MAX_CHANNEL_DELAY_S, expected
+    least = MIN_VALUE.get(unit)
+    expected = (
+        f"expected at least {least:g} {unit}, or nothing where it is not known" if least is not None else ""
+    )
+    return least or 0.0, np.inf, expected
 
 
 def _wrong(time: FloatArray, previous: float) -> IndexArray:
@@ -233,19 +235,34 @@ class Faults:
         self._lines: list[str] = []
 
     def note(
-        self, column: str, count: int, row: int, expected: str, counter: str = "", *, wrong: bool = True
+        self,
+        column: str,
+        marked: BoolArray,
+        rows: Sequence[int],
+        expected: str,
+        found: Sequence[Any] | FloatArray | None = None,
+        *,
+        counted: bool = True,
+        wrong: bool = True,
     ) -> None:
-        """Count `count` faults in a column, also in a deployment's `counter`.
+        """Count the `marked` (n,) values of a column as faults, or the rows if it is "" or ``time``.
 
-        `row`, `expected`: row number and expectation of the first fault. `wrong`: False for unknown values,
-        of which a column may have any number. FormatError: reading is strict.
+        `rows`: row numbers (n,). `expected`: expectation, and `found`: the values (n,), for the message about
+        the first fault. `counted`: False for faults that :meth:`lost` counts. `wrong`: False for unknown
+        values, of which a column may have any number. FormatError: reading is strict.
         """
-        error = FormatError(self._file, expected, row=row, column=column or None)
+        if not marked.any():
+            return
+        k, count = int(marked.argmax()), int(marked.sum())
+        if found is not None:
+            value = found[k]
+            expected += f", not {float(value) if isinstance(value, float) else str(value).strip()!r}"
+        error = FormatError(self._file, expected, row=rows[k], column=column or None)
         if self._strict:
             raise error
         self._wrong[column] += count * wrong
-        if counter:
-            self._counts[counter] += count
+        if counted:
+            self._counts["rows_dropped" if column in {"", "time"} else "values_dropped"] += count
         if column not in self._first:
             self._first[column] = error
             self._lines.append(str(error))
@@ -436,25 +453,21 @@ def without_invalid(
     The `rules` mark rows, which are dropped, and values, which become NaN. If `codes`, missing-value codes
     become NaN as well. `faults` counts all of them.
     """
-
-    def note(name: str, wrong: BoolArray, expected: str) -> None:
-        counter = "values_dropped" if name else "rows_dropped"
-        faults.note(name, int(wrong.sum()), numbers[int(wrong.argmax())], expected, counter, wrong=False)
-
     for name, wrong in (unknown(columns) if codes else {}).items():
-        value = float(columns[name][wrong][0])
-        note(name, wrong, f"expected a value, or nothing where it is not known, not {value!r}")
+        expected = "expected a value, or nothing where it is not known"
+        faults.note(name, wrong, numbers, expected, columns[name], wrong=False)
         columns[name][wrong] = np.nan
     keep = np.ones(len(time), bool)
     for rule in rules:
         bad = np.isin(columns[rule.column], list(rule.bad))
         expected = f"not valid by {rule.column!r}"
-        if bad.any() and not rule.targets:
-            note("", bad, expected)
+        if not rule.targets:
+            faults.note("", bad, numbers, expected, wrong=False)
             keep &= ~bad
         for name in rule.targets:
-            if name in columns and (there := bad & np.isfinite(columns[name])).any():
-                note(name, there, expected)
+            if name in columns:
+                there = bad & np.isfinite(columns[name])
+                faults.note(name, there, numbers, expected, wrong=False)
                 columns[name][there] = np.nan
     rows = np.flatnonzero(keep)
     kept = {name: values[rows] for name, values in columns.items()}

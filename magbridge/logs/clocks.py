@@ -62,7 +62,8 @@ EPOCHS = {
 """Kind of a number -> s since 1970 of its zero, and s in its unit."""
 SUMS = {"seconds and nanoseconds": (0.0, 1.0, 1e-9), "GPS week and seconds": (GPS_EPOCH, WEEK, 1.0)}
 """Kind of a pair of numbers, joined by a blank -> s since 1970 of its zero, and s in the unit of each."""
-SECONDS_OF_DAY = "date and seconds of the day"
+SECONDS_OF_DAY, BY_HOUR = "date and seconds of the day", "date and HHMM.mmm"
+"""Kinds of a date in one column and a time of day in another."""
 HEADING_WORDS = {
     "ms": r"milli|[_ .]ms$", "us": r"micro|[_ .]us$|time_?us$", "ns": r"nano|[_ .]ns$", "excel": "excel",
     "mjd": "mjd|modified", "julian": "julian|^jd$",
@@ -96,6 +97,8 @@ class TimeFormat(NamedTuple):
     """The assumption that was made; empty if the file states the format."""
     boot: bool = False
     """True if times count from an unknown start."""
+    by_hour: bool = False
+    """True if the time of day is written as HHMM.mmm."""
 
     @property
     def is_text(self) -> bool:
@@ -111,44 +114,42 @@ class TimeFormat(NamedTuple):
 
 
 class CountState(NamedTuple):
-    """State of a count from an unknown start while a file is read, with the shift for wraps and restarts."""
+    """State of times from an unknown start while a file is read, with the shift for wraps and restarts."""
 
-    shift_s: float
-    """Shift that is added to the count for wraps and for earlier runs, s."""
-    last: FloatArray
-    """(n,): Last values of the count before the shift, s."""
-    end_s: float
+    shift_s: float = 0.0
+    """Shift that is added to the times for wraps, such as midnights, and for earlier runs, s."""
+    last: FloatArray = np.empty(0)
+    """(n,): Last times before the shift, s."""
+    end_s: float = 0.0
     """Last time before the latest wrap or restart, with the shift, s."""
 
-    def go_on(self, times: FloatArray, kind: str) -> tuple[CountState, int]:
-        """Add the shift to the next times (n,), s, in place; return the new state and the number of boots.
+    def go_on(self, times: FloatArray, clock: TimeFormat) -> tuple[FloatArray, CountState, int]:
+        """Return the next times (n,), s, with the shift, the new state, and the number of boots.
 
-        After a wrap of a 32-bit count the times continue. After a restart they continue
-        :data:`BETWEEN_RUNS_S` after the last time.
+        After a wrap of a 32-bit count and after midnight the times continue. After a restart of a count they
+        continue :data:`BETWEEN_RUNS_S` after the last time.
         """
-        period = (1 << 32) * EPOCHS[kind][1] if kind in {"ms", "us", "ns"} else np.inf
+        unit = EPOCHS.get(clock.kind, (0.0, 1.0))[1] if clock.kind in {"ms", "us", "ns"} else np.inf
+        period, wrap = (DAY, DAY / 2) if clock.is_text else ((1 << 32) * unit, 0.9 * (1 << 32) * unit)
         before = len(self.last)
         whole = np.concatenate([self.last, times])
         known = np.flatnonzero(np.isfinite(whole))
-        shift, end, done, boots_found = self.shift_s, self.end_s, before, 0
+        shift, end, boots_found = self.shift_s, self.end_s, 0
+        shifts = np.full(len(times), shift)
         for k in boots(whole[known])[1:].tolist():
             row, last = int(known[k]), float(whole[known[k - 1]])
-            has_wrapped = last - whole[row] > 0.9 * period
+            has_wrapped = last - whole[row] > wrap
             # a restart that was too near to the end of the previous rows to be certain is found now
             seen = before if has_wrapped else before - MIN_RUN_ROWS + 1
-            if row < seen or (len(known) - k < MIN_RUN_ROWS and not has_wrapped):
+            is_restart = not clock.is_text and len(known) - k >= MIN_RUN_ROWS
+            if row < seen or not (has_wrapped or is_restart):
                 continue
-            row = max(row, before)
-            times[done - before : row - before] += shift
             end = shift + last
-            if has_wrapped:
-                shift += period
-            else:
-                shift = end + BETWEEN_RUNS_S - whole[known[k]]
-                boots_found += 1
-            done = row
-        times[done - before :] += shift
-        return CountState(shift, whole[known[-MEDIAN_ROWS:]] if len(known) else self.last, end), boots_found
+            shift = shift + period if has_wrapped else end + BETWEEN_RUNS_S - whole[row]
+            boots_found += not has_wrapped
+            shifts[max(row - before, 0) :] = shift
+        last_times = whole[known[-MEDIAN_ROWS:]] if len(known) else self.last
+        return times + shifts, CountState(shift, last_times, end), boots_found
 
 
 def date_order(headings: Sequence[str]) -> str:
@@ -166,8 +167,8 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
         return TimeFormat(unit, boot="%d" not in unit and "%j" not in unit)
     if unit == "iso" or unit in SUMS:
         return TimeFormat(unit, unit if unit in SUMS else "")
-    of_day, unit = unit == SECONDS_OF_DAY, unit if unit in EPOCHS else ""
-    present = [text.strip() for text in texts if text.strip()]
+    of_day, by_hour, unit = unit in {SECONDS_OF_DAY, BY_HOUR}, unit == BY_HOUR, unit if unit in EPOCHS else ""
+    present = [_seconds_of_day(text) if by_hour else text.strip() for text in texts if text.strip()]
     numbers = _numbers(pd.Series(present, dtype="str"))
     if not unit and _on_a_clock(heading, present):
         return TimeFormat("%H%M%S", OF_A_DAY, boot=True)
@@ -176,7 +177,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     if not digits and (not present or np.isfinite(numbers).any()):
         whole = all(re.fullmatch(r"\d+", one) for one in present)
         return _counted(heading, unit, numbers[np.isfinite(numbers)], integers=whole)
-    return _written(heading, present, zone, of_day=of_day)
+    return _written(heading, present, zone, of_day=of_day)._replace(by_hour=by_hour)
 
 
 def _on_a_clock(heading: str, texts: Sequence[str]) -> bool:
@@ -256,6 +257,8 @@ def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray
 
     `zone`: time zone of cells that do not state theirs; UTC if None.
     """
+    if clock.by_hour:
+        cells = cells.map(_seconds_of_day, na_action="ignore")
     if clock.kind in EPOCHS:
         start, scale = EPOCHS[clock.kind]
         times = _numbers(cells) * scale + start
@@ -343,3 +346,13 @@ def leap_seconds(gps: FloatArray) -> FloatArray:
     for since, ahead in LEAPS:
         leap[gps - ahead >= since] = ahead
     return leap
+
+
+def _seconds_of_day(text: str) -> str:
+    """Return a text with its time of day, HHMM.mmm, replaced by seconds of the day; other texts unchanged."""
+    date, _, clock = text.strip().rpartition(" ")
+    try:
+        hours, minutes = divmod(float(clock), 100.0)
+    except ValueError:
+        return text
+    return f"{date} {3600.0 * hours + 60.0 * minutes!r}"

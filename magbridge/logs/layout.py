@@ -13,11 +13,11 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import nan
 from pathlib import Path
 
+from msgspec import structs
+
 from magbridge.errors import FormatError
-from magbridge.logs.checks import Validity
 from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.mapping import CELL_NUMBER, ColumnMapping, declared_by_maker, is_unit
 from magbridge.wording import counted
@@ -61,12 +61,8 @@ class Layout:
     """Declarations of the user and of the instrument's maker."""
     stamp: tuple[int, ...] = ()
     """Indices of the fields that form the time, joined by blanks: one, or date and time of day ..."""
-    by_hour: bool = False
-    """True if the time of day is written as HHMM.mmm."""
     calendar: tuple[int, ...] = ()
     """Indices of fields with date and time of day, in addition to a time that may count from a boot."""
-    validity: tuple[Validity, ...] = ()
-    """Rules by which columns state which values are valid."""
     hemispheres: Mapping[str, int] = field(default_factory=dict)
     """``latitude``, ``longitude`` -> index of the field with N or S, E or W."""
     open_ended: bool = False
@@ -79,8 +75,6 @@ class Layout:
     """Rows per second, for a file without a column of times."""
     attrs: Mapping[str, str | float] = field(default_factory=dict)
     """Attributes that the comments declare."""
-    fill: float = nan
-    """The number that stands for a missing value."""
     foreign: bool = True
     """True if magbridge did not write the file: it has no metadata."""
     guesses: tuple[str, ...] = ()
@@ -140,7 +134,10 @@ def header_of(
 
     FormatError: no headings, or too many columns.
     """
-    comments, attrs, fill = _comments(path, lines)
+    comments, attrs = _comments(path, lines)
+    if "fill_value" in attrs and declared.fill_value is None:
+        declared = structs.replace(declared, fill_value=float(attrs["fill_value"]))
+    attrs.pop("fill_value", None)
     body = rows_among(lines[comments:])
     if not body or not lines[comments].strip():
         raise FormatError(path, "expected a header row, the file is empty", row=comments + 1)
@@ -174,7 +171,7 @@ def header_of(
     guesses += [f"columns as {maker} writes them"] if maker else []
     layout = Layout(
         separator, decimal, headings=tuple(headings), declared=declared, open_ended=open_ended, row=start + 1,
-        first=first, attrs=attrs, fill=fill, foreign=foreign, guesses=tuple(guesses),
+        first=first, attrs=attrs, foreign=foreign, guesses=tuple(guesses),
     )  # fmt: skip
     return layout, units, rows
 
@@ -195,31 +192,22 @@ def _mostly_digits(row: Sequence[str]) -> bool:
     return sum(cell.lstrip("+-.")[:1].isdigit() for cell in row) > len(row) / 2
 
 
-def _comments(path: Path, lines: Sequence[str]) -> tuple[int, dict[str, str | float], float]:
-    """Return the number of comment lines above the headings, their attributes, and the missing-value code.
+def _comments(path: Path, lines: Sequence[str]) -> tuple[int, dict[str, str | float]]:
+    """Return the number of comment lines above the headings, and their attributes.
 
-    The code is NaN if no comment declares it. FormatError: a setting that is not a number.
+    FormatError: a setting, or the code of a missing value, that is not a number.
     """
     attrs: dict[str, str | float] = {}
-    fill = nan
     for k, line in enumerate(lines):
         if not is_remark(line):
-            return k, attrs, fill
+            return k, attrs
         if match := ATTRIBUTE_LINE.fullmatch(line.strip()):
             name, text = match.groups()
-            if name == "fill_value":
-                fill = _declared_number(path, name, text, k + 1)
-            else:
-                number = name.startswith(SETTINGS)
-                attrs[name] = _declared_number(path, name, text, k + 1) if number else text
-    return len(lines) - 1, attrs, fill
-
-
-def _declared_number(path: Path, name: str, text: str, row: int) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise FormatError(path, f"expected a number, not {text!r}", row=row, column=name) from None
+            try:
+                attrs[name] = float(text) if name.startswith(SETTINGS) or name == "fill_value" else text
+            except ValueError:
+                raise FormatError(path, f"expected a number, not {text!r}", row=k + 1, column=name) from None
+    return len(lines) - 1, attrs
 
 
 def _separator(body: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ import pandas as pd
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usual
 from magbridge.errors import FormatError
-from magbridge.logs.clocks import DAY, SECONDS_OF_DAY
+from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
 from magbridge.logs.mapping import CELL_NUMBER, NAMES, bare, is_unit, split
 
@@ -182,8 +182,8 @@ def _with_utm(layout: Layout) -> Layout:
 
 def _with_time(layout: Layout, rows: Rows) -> Layout:
     """Return the layout with the fields that form the time: the last one is named ``time``, the others ''."""
-    stamp, unit, by_hour = _stamp(layout, rows)
-    layout = replace(layout, stamp=stamp, by_hour=by_hour)
+    stamp, unit = _stamp(layout, rows)
+    layout = replace(layout, stamp=stamp)
     if not stamp:
         return layout
     layout = layout.with_units({"time": unit})
@@ -194,8 +194,8 @@ def _with_time(layout: Layout, rows: Rows) -> Layout:
     return layout.renamed({**dict.fromkeys(stamp, ""), stamp[-1]: "time"})
 
 
-def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str, bool]:
-    """Return the indices of the fields that form the time, its unit, and True for times as HHMM.mmm."""
+def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str]:
+    """Return the indices of the fields that form the time, and its unit."""
     place = layout.names.index("time") if "time" in layout.names else None
     unit = layout.units.get("time", "")
     ours = [name if name in layout.declared.columns else "" for name in layout.names]
@@ -203,16 +203,16 @@ def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str, bool]:
     for kind, patterns in JOINED.items():
         places = [[k for k, name in enumerate(called) if re.fullmatch(one, name)] for one in patterns]
         if all(len(one) == 1 for one in places) and (place is None or [place] in places):
-            return tuple(k for (k,) in places), kind if len(patterns) == 2 else "", False
+            return tuple(k for (k,) in places), kind if len(patterns) == 2 else ""
     dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
     if place is None and len(dates) == 1:
         clocks = [k for k in range(len(called)) if k not in dates and _all_match(CLOCK, rows, k)]
         near = [k for k in clocks if called[k][:4] == called[dates[0]][:4]]
         place = next((group[0] for group in (clocks, near) if len(group) == 1), dates[0])
     if place is None:
-        return (), unit, False
+        return (), unit
     if len(dates) != 1 or dates == [place]:
-        return (place,), unit, False
+        return (place,), unit
     # the time is a time of day, unless its cells are whole moments or count something else
     present = cells_in(rows, place)
     numbers = pd.to_numeric(pd.Series(present, dtype="str").str.replace(",", "."), errors="coerce")
@@ -221,7 +221,8 @@ def _stamp(layout: Layout, rows: Rows) -> tuple[tuple[int, ...], str, bool]:
     by_hour = not unit and not counted and _by_hour(present)
     on_clock = [HOUR.fullmatch(cell) is not None for cell in present]
     stamp = (dates[0], place) if (any(on_clock) or counted or by_hour) and not undated else (place,)
-    return stamp, SECONDS_OF_DAY if by_hour or (counted and not all(on_clock)) else unit, by_hour
+    of_day = SECONDS_OF_DAY if counted and not all(on_clock) else unit
+    return stamp, BY_HOUR if by_hour else of_day
 
 
 def cells_in(rows: Rows, place: int) -> list[str]:

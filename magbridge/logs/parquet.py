@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ import xarray as xr
 
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import validity_of
 from magbridge.logs.clocks import TimeFormat
 from magbridge.logs.deployment import deployment, plain_attrs, with_guesses, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, Layout
@@ -89,7 +87,6 @@ def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TableReade
     layout = name_columns(path, Layout(foreign=foreign, headings=tuple(schema.names)), units, rows)
     if not layout.stamp:
         raise FormatError(path, absent("time", schema.names), column="time")
-    layout = replace(layout, validity=tuple(validity_of(layout.names, ())) if foreign else ())
     is_timestamp = pa.types.is_timestamp(schema.field(layout.stamp[-1]).type)
     return layout, TableReader(path, layout, rows, clock=TimeFormat("s") if is_timestamp else None)
 

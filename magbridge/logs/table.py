@@ -16,8 +16,8 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.checks import Faults, Validity, without_invalid
-from magbridge.logs.clocks import DAY, CountState, TimeFormat, clock_of, date_order, seconds
+from magbridge.logs.checks import Faults, Validity, validity_of, without_invalid
+from magbridge.logs.clocks import BY_HOUR, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.records import Quality
@@ -76,15 +76,21 @@ class TableReader:
     ) -> None:
         self._path, self._layout, self._declared = path, layout, layout.declared
         self.faults = Faults(path, strict=strict)
-        self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
-        self.guesses: list[str] = []
-        self._midnights, self._last, self._first_number = 0.0, 0.0, 1
-        self._counter = CountState(0.0, np.empty(0), 0.0)
+        self._fill = nan if self._declared.fill_value is None else self._declared.fill_value
+        found = validity_of(layout.names, rows) if layout.foreign else []
+        self.guesses = [rule.text for rule in found]
+        self._rules = [
+            Validity(source.valid, (name,), frozenset({0.0}))
+            for name, source in self._declared.columns.items()
+            if name in layout.names and source.valid in layout.names
+        ]
+        self._rules += found
+        self._first_number, self._counter = 1, CountState()
         self._lines: dict[str, float] = {}
         self._clock = clock or self._clock_by(rows[: max(LAYOUT_LINES - layout.first, 1)])
         self._start = self._start_by(rows)
         if self._clock.assumed and not self._start:
-            self.guesses.insert(0, f"time: {self._clock.assumed}")
+            self.guesses.insert(len(found), f"time: {self._clock.assumed}")
         self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._is_from_boot else {}
         if self._declared.heading_reference:
             self.attrs["heading_reference"] = self._declared.heading_reference
@@ -106,9 +112,8 @@ class TableReader:
             heading = order
         whole = [row for row in rows if len(row) == len(layout.headings)] or rows
         texts = [text.replace(layout.decimal, ".") for text in _joined(whole, layout.stamp)]
-        if layout.by_hour:
+        if layout.units.get("time") == BY_HOUR:
             self.guesses.append(f"{heading!r} as HHMM.mmm")
-            texts = [_seconds_of_day(text) for text in texts]
         try:
             return clock_of(heading, layout.units.get("time", ""), texts, self._declared.zone)
         except ValueError as error:
@@ -174,18 +179,13 @@ class TableReader:
         }
         for name, k in self._layout.hemispheres.items():
             values, columns[name] = columns[name], on_side(name, columns[name], frame[k])
-            if (unsure := np.isnan(columns[name]) & np.isfinite(values)).any():
-                expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
-                self._note(name, unsure, kept, expected, wrong=False)
+            unsure = np.isnan(columns[name]) & np.isfinite(values)
+            expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
+            self.faults.note(name, unsure, kept, expected, wrong=False)
         if self._layout.projection:
             columns |= geographic(self._path, self._layout.projection, columns)
-        rules = []
-        for name, source in self._declared.columns.items():
-            if name in columns and source.valid in columns:
-                rules.append(Validity(source.valid, (name,), frozenset({0.0})))
-        rules += self._layout.validity
         codes = self._layout.foreign
-        return without_invalid(self.faults, times, columns, kept, rules, codes=codes)
+        return without_invalid(self.faults, times, columns, kept, self._rules, codes=codes)
 
     def _dropping(
         self, wrong: list[bool], lines: list[str], numbers: Sequence[int], text: str
@@ -193,18 +193,9 @@ class TableReader:
         """Return the lines that are not `wrong`, and their numbers; count the other lines as dropped."""
         if not any(wrong):
             return lines, list(numbers)
-        self._note("", np.array(wrong), numbers, text)
+        self.faults.note("", np.array(wrong), numbers, text)
         rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong, strict=True) if not bad]
         return [line for line, _ in rows], [number for _, number in rows]
-
-    def _note(
-        self, column: str, marked: BoolArray, numbers: Sequence[int], expected: str, *, wrong: bool = True
-    ) -> None:
-        """Count the `marked` (n,) values of a column as dropped, or the rows if it is "" or ``time``."""
-        counter = "rows_dropped" if column in {"", "time"} else "values_dropped"
-        self.faults.note(
-            column, int(marked.sum()), numbers[int(marked.argmax())], expected, counter, wrong=wrong
-        )
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
         layout = self._layout
@@ -241,30 +232,19 @@ class TableReader:
         column = frame[first]
         for k in others:
             column = column.str.strip() + " " + frame[k].str.strip()
-        if self._layout.by_hour:
-            column = column.map(_seconds_of_day, na_action="ignore")
         if self._layout.decimal == "," and not pd.api.types.is_numeric_dtype(column):
             column = column.str.replace(",", ".")
         times = seconds(self._clock, column, self._declared.zone)
-        if self._clock.is_text and self._clock.boot:
-            known = np.isfinite(times)  # count times of day on beyond midnight
-            steps = np.diff(times[known], prepend=self._last)
-            days = self._midnights + DAY * np.cumsum(steps < -DAY / 2)
-            if known.any():
-                self._midnights, self._last = float(days[-1]), float(times[known][-1])
-                times[known] += days
-        elif self._is_from_boot and len(times):
-            self._counter, boots = self._counter.go_on(times, self._clock.kind)
+        wrong = np.isnan(times) & column.notna().to_numpy()
+        if self._clock.boot and (self._clock.is_text or not self._start):
+            times, self._counter, boots = self._counter.go_on(times, self._clock)
             if boots:
                 again = counted(boots, "time")
                 self.faults.remark(f"{self._path}: the clock started again {again}: each part is a run")
-        wrong = np.isnan(times) & column.notna().to_numpy()
         times[times == self._fill] = np.nan
         times += self._start
         self.faults.count("time", len(times))
-        if wrong.any():
-            text = str(column.iloc[int(wrong.argmax())]).strip()
-            self._note("time", wrong, numbers, f"expected {self._clock.expected}, not {text!r}")
+        self.faults.note("time", wrong, numbers, f"expected {self._clock.expected}", column.to_numpy())
         return times, wrong
 
     def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
@@ -280,9 +260,7 @@ class TableReader:
             values = _numbers(name, texts, self._layout.decimal, self._layout.units.get(name, ""))
             nothing = texts.str.lower().isin(["", "nan"]).to_numpy()
             wrong = np.isnan(values) & column.notna().to_numpy() & ~nothing
-            if wrong.any():
-                text = str(column.iloc[int(wrong.argmax())]).strip()
-                self._note(name, wrong, numbers, f"expected a number, not {text!r}")
+            self.faults.note(name, wrong, numbers, "expected a number", column.to_numpy())
         self.faults.count(name, int(column.notna().sum()))
         values[values == self._fill] = np.nan
         source = self._declared.columns.get(name)
@@ -323,13 +301,3 @@ def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray
         values = np.asarray(pd.to_numeric(texts, errors="coerce"), np.float64)
         return np.asarray(np.where(opposite, -np.abs(values), values))
     return np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
-
-
-def _seconds_of_day(text: str) -> str:
-    """Return a text with its time of day, HHMM.mmm, replaced by seconds of the day; other texts unchanged."""
-    date, _, clock = text.rpartition(" ")
-    try:
-        hours, minutes = divmod(float(clock), 100.0)
-    except ValueError:
-        return text
-    return f"{date} {3600.0 * hours + 60.0 * minutes!r}"

@@ -33,7 +33,6 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace as replace_fields
 from functools import partial
 from itertools import chain, groupby, islice
 from math import isnan
@@ -48,10 +47,9 @@ from msgspec.structs import replace
 
 from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT
 from magbridge.errors import FormatError
-from magbridge.logs.checks import validity_of
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, lasting, with_guesses, with_losses
-from magbridge.logs.layout import LAYOUT_LINES, Layout, Rows, cells, header_of, is_remark, rows_among
-from magbridge.logs.mapping import ColumnMapping, ColumnSource, Options, makers
+from magbridge.logs.layout import LAYOUT_LINES, cells, header_of, is_remark, rows_among
+from magbridge.logs.mapping import ColumnSource, Options, makers
 from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.registry import metadata_path, opened
 from magbridge.logs.table import TableReader, line_number
@@ -120,7 +118,10 @@ def _chunks(
     header = list(islice(lines, LAYOUT_LINES)) if added else header
     further = list(islice(lines, FURTHER))
     foreign = not metadata_path(path).is_file()
-    layout, first_rows = layout_of(path, header, further, declared, foreign=foreign)
+    layout, units, first_rows = header_of(path, header, declared, foreign=foreign)
+    layout = name_columns(path, layout, units, first_rows)
+    first_rows += [cells(line, layout.separator) for line in rows_among(further)]
+    layout = units_of_angles(layout, first_rows) if foreign else layout
     table = TableReader(path, layout, first_rows, strict=options.strict)
     attrs = {**_attributes(path), **layout.attrs, **table.attrs}
     attrs = with_guesses(path, attrs, [*guess, *layout.guesses, *table.guesses])
@@ -136,25 +137,6 @@ def _chunks(
     table.faults.finish()
     if not table.faults.rows:
         raise FormatError(path, "expected rows after the header", row=layout.first + 1)
-
-
-def layout_of(
-    path: Path, lines: Sequence[str], further: Sequence[str], declared: ColumnMapping, *, foreign: bool
-) -> tuple[Layout, Rows]:
-    """Return the layout of the file that begins with `lines`, and the cells of its first rows.
-
-    `further`: the following lines, whose values help to find units. `foreign`: True without a metadata file.
-
-    FormatError: no headings, two equal names, or a declared column is missing.
-    """
-    layout, units, rows = header_of(path, lines, declared, foreign=foreign)
-    layout = name_columns(path, layout, units, rows)
-    rows += [cells(line, layout.separator) for line in rows_among(further)]
-    if not foreign:
-        return layout, rows
-    layout = units_of_angles(layout, rows)
-    validity = validity_of(layout.names, rows)
-    return replace_fields(layout, validity=tuple(validity)).guessing(*(rule.text for rule in validity)), rows
 
 
 def _lines(file: TextIO) -> Iterator[str]:
