@@ -85,28 +85,23 @@ def test_each_parameter_that_is_lacking(config: Path) -> None:
     ]
 
 
+BARE = GOOD.replace('[calibration]\nfile = "cal.json"\n', "")
+
+
 @pytest.mark.parametrize(
-    ("table", "words"),
+    ("text", "is_fatal", "words"),
     [
-        ('[learning]\nprior = "bridge.toml"', "not a calibration"),
-        ('[learning]\nreference = "bridge.toml"', "expected a grid"),
-        ("[learning]\nranges = {fin = [0.0, 1.0]}", "telemetry.fin: missing"),
-        ('[navigation]\nmap = "none.nc"\nfix = "TELEPATHY"', "navigation.fix: expected one of"),
+        (BARE + '[learning]\nprior = "bridge.toml"', True, "not a calibration"),
+        (BARE + '[learning]\nreference = "bridge.toml"', True, "expected a grid"),
+        (BARE + "[learning]\nranges = {fin = [0.0, 1.0]}", True, "telemetry.fin: missing"),
+        (BARE + '[navigation]\nmap = "none.nc"\nfix = "TELEPATHY"', True, "navigation.fix: expected one of"),
+        (GOOD.replace("hmr2300", "twinleaf"), False, "every sample would be uncalibrated"),
+        (GOOD.replace('"logs"', '"bridge.toml"'), False, "bridge.toml is a file"),
     ],
 )
-def test_what_run_would_end_at_without_a_calibration(table: str, words: str, config: Path) -> None:
-    config.write_text(GOOD.replace('[calibration]\nfile = "cal.json"\n', "") + table)
-    assert any(words in line for line in lines(config, fatal=True))
-
-
-def test_a_calibration_of_another_sensor(config: Path) -> None:
-    config.write_text(GOOD.replace("hmr2300", "twinleaf"))
-    assert any("every sample would be uncalibrated" in line for line in lines(config, fatal=False))
-
-
-def test_a_log_that_cannot_be_written(config: Path) -> None:
-    (config.parent / "logs").write_text("a file")
-    assert any("logs is a file" in line for line in lines(config, fatal=False))
+def test_what_run_would_end_at_or_warn_of(text: str, is_fatal: bool, words: str, config: Path) -> None:
+    config.write_text(text)
+    assert any(words in line for line in lines(config, fatal=is_fatal))
 
 
 @pytest.mark.parametrize(

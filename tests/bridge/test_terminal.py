@@ -32,31 +32,25 @@ WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such fi
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_terminal_gets_the_state_of_the_link(tmp_path: Path, number: signal.Signals) -> None:
     """The terminal shows the state until the bridge receives a signal or the terminal is closed."""
-    with on_a_terminal(tmp_path) as (process, terminal):
+    with on_a_terminal(tmp_path, end=number) as terminal:
         read_until(terminal, WANTED)
-        process.send_signal(number)
-        assert process.wait(30.0) == 0
 
 
 def test_a_calibration_that_its_data_do_not_support_is_reported(tmp_path: Path) -> None:
     save(replace(identity(), method="nominal", warnings=("few headings",)), tmp_path / "cal.json")
-    with on_a_terminal(tmp_path, '[calibration]\nfile = "cal.json"') as (process, terminal):
+    with on_a_terminal(tmp_path, '[calibration]\nfile = "cal.json"') as terminal:
         read_until(terminal, ("calibration is not supported by its data",))
-        process.terminate()
-        assert process.wait(30.0) == 0
 
 
 def test_a_terminal_that_hangs_does_not_stop_the_bridge(tmp_path: Path) -> None:
     """Ctrl-S, or a connection that is gone: the bridge runs, and ends at a signal."""
-    with on_a_terminal(tmp_path, log='[log]\ndirectory = "."') as (process, terminal):
+    with on_a_terminal(tmp_path, '[log]\ndirectory = "."') as terminal:
         read_until(terminal, WANTED[:1])
         os.write(terminal, b"\x13")
         deadline = time.monotonic() + 60.0
         while not any(b"hmr2300 lost" in path.read_bytes() for path in tmp_path.glob("*.tlog")):
             assert time.monotonic() < deadline
             time.sleep(0.05)
-        process.terminate()
-        assert process.wait(30.0) == 0
 
 
 def test_a_service_tells_the_journal_how_severe_it_is(tmp_path: Path) -> None:
@@ -82,18 +76,16 @@ def test_kept_parameters_that_cannot_be_read_keep_no_vehicle_ashore(
     """An unreadable file is renamed; a folder of this name stays."""
     kept = tmp_path / "bridge.parameters.json"
     kept.write_text(content) if content else kept.mkdir()
-    with on_a_terminal(tmp_path) as (process, terminal):
+    with on_a_terminal(tmp_path) as terminal:
         read_until(terminal, (*WANTED, "cannot be read, not used: bridge.parameters.json"))
-        process.terminate()
-        assert process.wait(30.0) == 0
     aside = tmp_path / "bridge.parameters.json.damaged"
     assert kept.is_dir() if content is None else aside.read_text() == content
 
 
 @contextmanager
-def on_a_terminal(folder: Path, log: str = "") -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """Start a bridge on a terminal; yield it and the terminal's far end."""
-    (folder / "bridge.toml").write_text(CONFIG + log)
+def on_a_terminal(folder: Path, more: str = "", end: signal.Signals = signal.SIGTERM) -> Iterator[int]:
+    """Start a bridge on a terminal and yield the terminal's far end; end it by the signal `end`."""
+    (folder / "bridge.toml").write_text(CONFIG + more)
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "magbridge", "run", "--config", "bridge.toml"]
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
@@ -101,7 +93,9 @@ def on_a_terminal(folder: Path, log: str = "") -> Iterator[tuple[subprocess.Pope
     os.close(theirs)
     os.set_blocking(ours, False)
     try:
-        yield process, ours
+        yield ours
+        process.send_signal(end)
+        assert process.wait(30.0) == 0
     finally:
         process.kill()
         process.wait()

@@ -146,27 +146,24 @@ def test_a_survey_by_the_other_compass(deployment: Path, here: Path, command: Co
     assert line == f"{deployment.name}: expected a compass '1'; there are: 0"
 
 
-def test_compasses_that_are_columns_are_listed(here: Path, command: Command) -> None:
+def test_compasses_that_are_columns_are_listed(command: Command) -> None:
     axes = {f"{name}_{axis}": np.full(9, 20_000.0) for name in ("mag", "mag3") for axis in "xyz"}
     log = made("log", START + 0.5 * np.arange(9.0), axes | {"mag2_x": np.ones(9)})
-    assert [(one["number"], one["samples"], one["rate"]) for one in info(log)["compasses"]] == [
-        (0, 9, 2),
-        (2, 9, 2),
-    ]
-    write(log, here / "two.csv")
-    output = command("info", here / "two.csv")
+    found = [(one["number"], one["samples"], one["rate"]) for one in info(log)["compasses"]]
+    assert found == [(0, 9, 2), (2, 9, 2)]
+    write(log, "two.csv")
+    output = command("info", "two.csv")
     assert "compass 0: 2 Hz, 9 samples, read as mag_x mag_y mag_z" in output.out
     assert "compass 2: 2 Hz, 9 samples\n" in output.out
 
 
-def test_what_was_lost_is_named(here: Path, command: Command) -> None:
-    (here / "one.csv").write_text(
-        "time,depth\n" + "".join(f"{START + k},{k}\n" for k in range(9)) + f"{START},3\n"
-    )
-    output = command("info", here / "one.csv")
-    assert "in the logs: 1 row dropped" in output.err
-    assert "row 11" in output.err
-    assert "row 11" in command.json("info", here / "one.csv")[str(here / "one.csv")]["losses"][0]
+def test_what_was_lost_is_named(command: Command) -> None:
+    rows = [f"{START + k},{k}\n" for k in range(9)]
+    Path("one.csv").write_text("".join(["time,depth\n", *rows, f"{START},3\n"]))
+    reported = command("info", "one.csv").err
+    assert "in the logs: 1 row dropped" in reported
+    assert "row 11" in reported
+    assert "row 11" in command.json("info", "one.csv")["one.csv"]["losses"][0]
 
 
 def test_a_log_without_a_date_is_given_one(here: Path, command: Command) -> None:
