@@ -76,7 +76,8 @@ FIT_TEXTS = {
     "offset_crept": "the sensor's offset crept by {rms_nT:.1f} nT (RMS) during the survey: its mean stands "
     "in the calibration, and the sigma counts the rest",
     "held_out_errors": "held-out parts have errors of {ratio:.1f} times the fit's sigma, so its sigmas "
-    "were raised by that: an effect is missing in the model (magbridge diagnose), or in the reference",
+    "were raised by that: an effect is missing in the model (try a higher --order, or magbridge diagnose) or "
+    "in the reference",
     "unusual_scales": "the fit multiplies the readings by {low:.2f} to {high:.2f}, and anomalies with "
     "them: unless the sensor is that far off, the reference is; fit to runs at one place, or with a better "
     "map (--grid)",

@@ -54,7 +54,7 @@ GAIN_NT: Final = 60.0
 MASS_FRACTION: Final = 0.03
 """Prior 1-sigma of each error: of an axis's offset, drift and temperature effect, of the gain (nT in the
 Earth's field), and of a mass's telemetry (fraction of the calibrated range)."""
-RETENTION_SAMPLES: Final = 2000.0
+RETENTION_SAMPLES: Final = 1000.0
 """Time constant, in tested samples, of the exponential forgetting of evidence."""
 CONSISTENCY_ALARM_LOG_RATIO: Final = 15.0
 """Log-likelihood ratio L above which an alarm begins: by chance at most once in a million tested samples, if

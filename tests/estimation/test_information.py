@@ -55,9 +55,45 @@ def test_noise_of_another_size_scales_the_information() -> None:
     expected = information_of(J / 3.0, Y / 3.0)
     scaled = information_of(J, Y).divided(3.0)
     np.testing.assert_allclose(scaled.precision, expected.precision)
+    np.testing.assert_allclose(scaled.vector, expected.vector)
     assert scaled.constant == pytest.approx(expected.constant)
 
 
 def test_a_combination_that_is_free_is_refused() -> None:
     with pytest.raises(CalibrationError, match="leave a combination of coefficients free"):
         covariance_of(np.ones((2, 2)))
+
+
+def test_the_quadratic_at_a_point_is_that_of_the_data() -> None:
+    """Cost, half gradient and half Hessian of ``|J z - y|^2`` at any z give the information at z = 0."""
+    z = np.array([0.3, -1.2, 2.0, 0.1])
+    e = J @ z - Y
+    quadratic = GaussianInformation.from_derivatives(z, J.T @ J, J.T @ e, float(e @ e), 12.0)
+    exact = information_of(J, Y)
+    np.testing.assert_allclose(quadratic.vector, exact.vector)
+    assert (quadratic.constant, quadratic.n) == pytest.approx((exact.constant, exact.n))
+
+
+def test_the_information_is_recovered_from_prior_and_posterior() -> None:
+    """The unknowns have different units, and the prior has a mean."""
+    units = np.array([1.0, 1e-4, 1e3, 10.0])
+    before, prior = np.array([0.4, -0.2, 1.0, 0.3]) * units, np.linalg.inv(PRIOR) * np.outer(units, units)
+    exact = information_of(J / units, Y)
+    after = covariance_of(exact.precision + np.linalg.inv(prior))
+    mean = after @ (exact.vector + np.linalg.solve(prior, before))
+    found = GaussianInformation.from_posterior(mean, after, before, prior)
+    np.testing.assert_allclose(found.precision, exact.precision, rtol=1e-8)
+    np.testing.assert_allclose(found.vector, exact.vector, rtol=1e-8)
+
+
+def test_a_common_error_widens_the_posterior_along_its_direction() -> None:
+    direction, sigma = np.array([1.0, -0.5, 0.2, 2.0]), 1.7
+    exact = information_of(J, Y)
+    blurred = exact.blurred(direction, sigma)
+    covariance = np.linalg.inv(exact.precision)
+    np.testing.assert_allclose(
+        np.linalg.inv(blurred.precision), covariance + sigma**2 * np.outer(direction, direction), rtol=1e-8
+    )
+    np.testing.assert_allclose(
+        np.linalg.solve(blurred.precision, blurred.vector), covariance @ exact.vector, rtol=1e-8
+    )
