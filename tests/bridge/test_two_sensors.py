@@ -111,6 +111,15 @@ class Bench(FedBridge):
         line = b"%.3f %.3f %.3f %.6f\n" % (x, y, z, seconds)
         self.feed(seconds, Channel.SENSOR, line, sensor_id)
 
+    def turn(self, samples: int, wrong: int, jump_at: int) -> None:
+        """Send the lines of a vehicle that turns; the sensor `wrong` jumps by 300 nT at a sample."""
+        random = np.random.default_rng(1)
+        for k in range(samples):
+            for sensor_id in (0, 1):
+                total = FIELD_NT + (300.0 if sensor_id == wrong and k >= jump_at else 0.0)
+                x, y, z = attitude(np.array([0.1 * k]))[0] * total / FIELD_NT + random.normal(size=3)
+                self.vector(0.1 * k + 0.02 * sensor_id, x, y, z, sensor_id)
+
     def field(self, sensor_id: int) -> list[Message]:
         """Return the MAG_FIELDs of a sensor."""
         return [one for one in named(self.messages, "MAG_FIELD") if one["sensor_id"] == sensor_id]
@@ -145,13 +154,7 @@ def test_each_sensor_has_its_id_its_messages_and_its_state(tmp_path: Path) -> No
 @pytest.mark.parametrize("wrong", [0, 1])
 def test_a_sensor_that_jumps_is_named_and_its_sigma_grows(tmp_path: Path, wrong: int) -> None:
     bench = Bench(tmp_path, "tail", *VECTOR)
-    random = np.random.default_rng(1)
-    for k in range(1200):
-        seconds = 0.1 * k
-        for sensor_id in (0, 1):
-            offset = 300.0 if sensor_id == wrong and k >= 600 else 0.0
-            x, y, z = attitude(np.array([seconds]))[0] * (1 + offset / FIELD_NT) + random.normal(size=3)
-            bench.vector(seconds + 0.02 * sensor_id, x, y, z, sensor_id)
+    bench.turn(1200, wrong, jump_at=600)
     names = ["flux", "tail"]
     assert f"{names[wrong]} is wrong: " in "\n".join(bench.texts)
     last = [bench.field(0)[-1], bench.field(1)[-1]]
@@ -173,12 +176,7 @@ def test_the_learner_does_not_use_samples_that_another_sensor_contradicts(
     faulty: list[bool] = []
     learner = bench.bridge.learning.learner
     monkeypatch.setattr(learner, "sample", lambda *_, **values: faulty.append(values["faulty"]))
-    random = np.random.default_rng(1)
-    for k in range(jump_at + 200):
-        for sensor_id in (0, 1):
-            total = FIELD_NT + (300.0 if sensor_id and k >= jump_at else 0.0)
-            x, y, z = attitude(np.array([0.1 * k]))[0] * total / FIELD_NT + random.normal(size=3)
-            bench.vector(0.1 * k + 0.02 * sensor_id, x, y, z, sensor_id)
+    bench.turn(jump_at + 200, 1, jump_at)
     assert set(faulty[-100:]) == {not is_used}
 
 

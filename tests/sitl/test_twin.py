@@ -13,7 +13,7 @@ import xarray as xr
 from magbridge import logs
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save as save_calibration
-from magbridge.calibration.model import Parameter, identity
+from magbridge.calibration.model import Calibration, Parameter, identity
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.field.igrf import igrf
 from sitl import Scenario, Twin, load, segments, simulate, simulate_like
@@ -34,10 +34,12 @@ def demo() -> xr.Dataset:
     return simulate(load("demo"), 3)
 
 
-def test_every_scenario_that_comes_along_reads() -> None:
+def test_every_scenario_that_comes_along_reads_and_another_is_named(tmp_path: Path) -> None:
     assert {path.stem for path in SCENARIOS.glob("*.toml")} >= {"bonne_bay", "demo", "comet", "seaglider"}
     for path in SCENARIOS.glob("*.toml"):
         assert load(path.stem) == load(path)
+    with pytest.raises(ConfigError, match="waltz"):
+        load(tmp_path / "waltz.toml")
 
 
 def test_a_deployment_has_the_contracts_columns(demo: xr.Dataset) -> None:
@@ -72,8 +74,7 @@ def test_another_instrument_does_not_change_the_world_or_the_flight(demo: xr.Dat
 def test_a_perfect_instrument_on_a_vehicle_without_iron_reads_the_truth() -> None:
     scenario = load("demo").replace(instrument=PERFECT, vehicle=Vehicle(), mission=SHORT)
     deployment = simulate(scenario, 1)
-    truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
-    np.testing.assert_allclose(channels(deployment), truth, atol=0.5)  # attitude between points is linear
+    np.testing.assert_allclose(error_of(deployment), 0.0, atol=0.5)  # attitude between points is linear
     magnitude = np.linalg.norm(channels(deployment), axis=1)
     np.testing.assert_allclose(magnitude, deployment["truth_total_field"], atol=0.02)
 
@@ -113,47 +114,47 @@ def test_the_map_reference_is_the_igrf_and_a_map_without_fine_structure() -> Non
     np.testing.assert_allclose(deployment["reference_field"] - main, there, atol=1e-6)
 
 
-def test_a_calibration_stands_in_for_vehicle_and_instrument(tmp_path: Path) -> None:
-    battery = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
-    plain = identity((battery,), 53_000.0)
-    hard_iron = np.zeros(9)
-    hard_iron[6:] = 100.0, -200.0, 300.0
-    save_calibration(replace(plain, coefficients=hard_iron), tmp_path / "cal.json")
-    (tmp_path / "scene.toml").write_text("name = 'calibrated'\ncalibration = 'cal.json'\n")
+def calibrated(folder: Path, known: Calibration, instrument: Instrument) -> Scenario:
+    """Return a calm scenario whose vehicle and sensor are those of a calibration."""
+    save_calibration(known, folder / "cal.json")
+    (folder / "scene.toml").write_text("name = 'calibrated'\ncalibration = 'cal.json'\n")
     calm = Motion(wander=(0.0, 0.0, 0.0))
-    scenario = load(tmp_path / "scene.toml").replace(instrument=PERFECT, mission=SHORT, motion=calm)
-    deployment = simulate(scenario, 1)
+    return load(folder / "scene.toml").replace(instrument=instrument, mission=SHORT, motion=calm)
+
+
+def error_of(deployment: xr.Dataset) -> np.ndarray:
+    """Return the readings minus the true field (n, 3), nT."""
     truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
-    np.testing.assert_allclose(
-        channels(deployment) - truth, np.tile(hard_iron[6:], (len(truth), 1)), atol=0.02
-    )
+    return np.asarray(channels(deployment) - truth)
+
+
+def test_a_calibration_stands_in_for_vehicle_and_instrument(tmp_path: Path) -> None:
+    plain = identity((Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0),), 53_000.0)
+    hard_iron = np.array([0.0] * 6 + [100.0, -200.0, 300.0])
+    scenario = calibrated(tmp_path, replace(plain, coefficients=hard_iron), PERFECT)
+    error = error_of(simulate(scenario, 1))
+    np.testing.assert_allclose(error, np.tile(hard_iron[6:], (len(error), 1)), atol=0.02)
 
 
 @pytest.mark.parametrize("driven", [False, True], ids=["mission", "log"])
 def test_an_effect_of_temperature_follows_the_fluxgates_own(driven: bool, tmp_path: Path) -> None:
     """Driven by a log, the effect followed the log's temperature, and the simulated log held another."""
     warm = ChannelEffect(cause="temperature_offset", channel="sensor_temperature")
-    plain = identity((), 53_000.0)
-    coefficients, covariance = np.append(np.zeros(9), (20.0, 0.0, -10.0)), np.eye(12)
-    extended = replace(plain, effects=(warm,), coefficients=coefficients, covariance=covariance)
-    save_calibration(extended, tmp_path / "cal.json")
-    (tmp_path / "scene.toml").write_text("name = 'extended'\ncalibration = 'cal.json'\n")
-    cooling = msgspec.structs.replace(PERFECT, start_temperature=-10.0, thermal_lag=300.0)
-    scenario = load(tmp_path / "scene.toml").replace(
-        instrument=cooling, mission=SHORT, motion=Motion(wander=(0.0, 0.0, 0.0))
+    coefficients = np.append(np.zeros(9), (20.0, 0.0, -10.0))
+    extended = replace(
+        identity((), 53_000.0), effects=(warm,), coefficients=coefficients, covariance=np.eye(12)
     )
+    cooling = msgspec.structs.replace(PERFECT, start_temperature=-10.0, thermal_lag=300.0)
+    scenario = calibrated(tmp_path, extended, cooling)
     if driven:
         log = simulate(load("demo").replace(mission=SHORT), 1)
-        deployment = simulate_like(
-            log.assign(sensor_temperature=log["sensor_temperature"] + 7.0), scenario, 1
-        )
+        log = log.assign(sensor_temperature=log["sensor_temperature"] + 7.0)
+        deployment = simulate_like(log, scenario, 1)
     else:
         deployment = simulate(scenario, 1)
     temperature = deployment["sensor_temperature"].to_numpy()
     assert np.ptp(temperature) > 5.0
-    truth = np.column_stack([deployment[f"truth_field_{axis}"] for axis in "xyz"])
-    expected = temperature[:, None] * (20.0, 0.0, -10.0)
-    np.testing.assert_allclose(channels(deployment) - truth, expected, atol=0.1)
+    np.testing.assert_allclose(error_of(deployment), temperature[:, None] * (20.0, 0.0, -10.0), atol=0.1)
 
 
 def test_an_unknown_current_moves_the_truth_from_where_the_vehicle_believes_to_be() -> None:
@@ -195,11 +196,6 @@ def test_a_mistake_in_a_scenario_is_one_line_that_names_the_key(
     assert message.startswith(f"{path}: ")
     assert complaint in message
     assert "\n" not in message
-
-
-def test_a_missing_scenario_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="waltz"):
-        load(tmp_path / "waltz.toml")
 
 
 def test_a_log_drives_the_model_to_what_made_the_log() -> None:
