@@ -144,7 +144,6 @@ def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None
         if kind == "ODOMETRY":
             x, y = separation(*PLACE, *ORIGIN)
             got = fix["x"] + x, fix["y"] + y
-            assert (fix["frame_id"], fix["child_frame_id"], fix["quality"]) == (20, 12, 100)
             assert fix["z"] == pytest.approx(ORIGIN_ALTITUDE + DEPTH), "down from the origin"
             assert fix["q"] == pytest.approx(QUATERNION, abs=1e-6)
             covariance = fix["pose_covariance"]
@@ -153,12 +152,10 @@ def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None
             assert covariance[1] ** 2 < covariance[0] * covariance[6]
         elif kind == "GLOBAL_POSITION_SENSOR":
             got = separation(*PLACE, fix["lat"] * 1e-7, fix["lon"] * 1e-7)
-            assert (fix["id"], fix["source"], fix["processing_time"]) == (1, 5, 0)
             assert fix["alt"] == pytest.approx(-DEPTH)
             claimed = np.array([fix["eph"]])
         else:
             got = separation(*PLACE, fix["x"] * 1e-7, fix["y"] * 1e-7)
-            assert (fix["command"], fix["frame"], fix["param2"]) == (43003, 0, 0.0)
             assert fix["param1"] == pytest.approx(when_us * 1e-6 % 1e5, abs=0.01)
             claimed = np.array([fix["param3"]])
         if kind != "EXTERNAL_POSITION_ESTIMATE":

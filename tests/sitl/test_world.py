@@ -73,13 +73,10 @@ def test_without_crustal_field_there_is_only_the_main_field() -> None:
 # ---- the simulated vehicle's magnetic masses ---------------------------------------------------------------
 
 
-EARTH = np.array([17000.0, -6000.0, 49600.0])
-
-
 def test_a_mass_that_moves_changes_the_reading_and_a_vehicle_without_masses_does_not_care() -> None:
     vehicle = draw_vehicle(np.random.default_rng(2))
     battery, ballast = np.linspace(-0.5, 0.5, 50), np.full(50, 200.0)
-    ambient = np.tile(EARTH, (50, 1))
+    ambient = np.tile(MAIN, (50, 1))
     reading = vehicle.field(ambient, {"battpos": battery, "ballast": ballast})
     assert np.ptp(reading, axis=0).max() > 20
     bare = Vehicle(vehicle.hard_iron, vehicle.soft_iron)
