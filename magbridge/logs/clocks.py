@@ -99,6 +99,8 @@ class TimeFormat(NamedTuple):
     """True if times count from an unknown start."""
     by_hour: bool = False
     """True if the time of day is written as HHMM.mmm."""
+    zone: str | None = None
+    """Time zone of cells that do not state theirs; UTC if None."""
 
     @property
     def is_text(self) -> bool:
@@ -164,9 +166,9 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     """
     unit = {"seconds": "s", "sec": "s", "hours": "h"}.get(unit, unit)
     if "%" in unit:
-        return TimeFormat(unit, boot="%d" not in unit and "%j" not in unit)
+        return TimeFormat(unit, zone=zone, boot="%d" not in unit and "%j" not in unit)
     if unit == "iso" or unit in SUMS:
-        return TimeFormat(unit, unit if unit in SUMS else "")
+        return TimeFormat(unit, unit if unit in SUMS else "", zone=zone)
     of_day, by_hour, unit = unit in {SECONDS_OF_DAY, BY_HOUR}, unit == BY_HOUR, unit if unit in EPOCHS else ""
     present = [_seconds_of_day(text) if by_hour else text.strip() for text in texts if text.strip()]
     numbers = _numbers(pd.Series(present, dtype="str"))
@@ -177,7 +179,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     if not digits and (not present or np.isfinite(numbers).any()):
         whole = all(re.fullmatch(r"\d+", one) for one in present)
         return _counted(heading, unit, numbers[np.isfinite(numbers)], integers=whole)
-    return _written(heading, present, zone, of_day=of_day)._replace(by_hour=by_hour)
+    return _written(heading, present, zone, of_day=of_day)._replace(by_hour=by_hour, zone=zone)
 
 
 def _on_a_clock(heading: str, texts: Sequence[str]) -> bool:
@@ -252,11 +254,8 @@ def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bo
     return TimeFormat(fit[0], f"{fit[0]}, {zone_note}" if zone_note else fit[0])
 
 
-def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray:
-    """Return the times (n,) in the cells (n,), s since 1970-01-01 UTC; NaN for empty or unreadable cells.
-
-    `zone`: time zone of cells that do not state theirs; UTC if None.
-    """
+def seconds(clock: TimeFormat, cells: pd.Series) -> FloatArray:
+    """Return the times (n,) in the cells (n,), s since 1970-01-01 UTC; NaN for empty or unreadable cells."""
     if clock.by_hour:
         cells = cells.map(_seconds_of_day, na_action="ignore")
     if clock.kind in EPOCHS:
@@ -271,7 +270,7 @@ def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray
             small = small * 1e-3  # the second number is in milliseconds of the week
         times = start + large * scales[0] + small * scales[1]
     else:
-        times = epoch(cells, clock.kind, None if clock.boot else zone)
+        times = epoch(cells, clock.kind, None if clock.boot else clock.zone)
         return times % DAY if clock.boot else times
     return times - leap_seconds(times) if clock.kind.lower().startswith("gps") else times
 

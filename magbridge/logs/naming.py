@@ -280,13 +280,6 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
     return layout.guessing(f"left out, no numbers: {', '.join(texts)}") if texts else layout
 
 
-def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
-    """Return latitudes or longitudes (n,), deg, signed by hemisphere `letters` (n,); NaN without a letter."""
-    side = letters.astype("str").str.strip().str.upper()
-    signed = np.where(side.isin(["S", "W"]), -np.abs(values), values)
-    return np.asarray(np.where(side.isin([*HEMISPHERES[name]]), signed, np.nan))
-
-
 READING_RANGE_NT = LOWEST_NT, HIGHEST_NT = 15_000.0, 90_000.0
 """Range of a reading's magnitude, the Earth's field plus the vehicle's, nT."""
 SCALAR_NAME = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")

@@ -19,7 +19,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, validity_of, without_invalid
 from magbridge.logs.clocks import BY_HOUR, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells
-from magbridge.logs.naming import HEMISPHERES, on_side
+from magbridge.logs.naming import HEMISPHERES
 from magbridge.records import Quality
 from magbridge.wording import counted
 
@@ -87,59 +87,16 @@ class TableReader:
         self._rules += found
         self._first_number, self._counter = 1, CountState()
         self._lines: dict[str, float] = {}
-        self._clock = clock or self._clock_by(rows[: max(LAYOUT_LINES - layout.first, 1)])
-        self._start = self._start_by(rows)
-        if self._clock.assumed and not self._start:
-            self.guesses.insert(len(found), f"time: {self._clock.assumed}")
+        first = rows[: max(LAYOUT_LINES - layout.first, 1)]
+        self._clock, notes = (clock, []) if clock else clock_by(path, layout, first)
+        self._start, dated = start_by(layout, self._clock, rows)
+        if self._clock.assumed and not dated:
+            self.guesses.append(f"time: {self._clock.assumed}")
+        self.guesses += [*notes, *dated]
+        self._is_from_boot = self._clock.boot and not dated
         self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._is_from_boot else {}
         if self._declared.heading_reference:
             self.attrs["heading_reference"] = self._declared.heading_reference
-
-    @property
-    def _is_from_boot(self) -> bool:
-        return self._clock.boot and not self._start
-
-    def _clock_by(self, rows: Rows) -> TimeFormat:
-        """Return the format of the times, from the heading, the unit and the first cells."""
-        layout = self._layout
-        if layout.rate:
-            return TimeFormat("s", f"{layout.rate:g} rows a second", boot=True)
-        if not layout.stamp:
-            missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
-            raise FormatError(self._path, missing, row=layout.row, column="time")
-        heading = layout.headings[layout.stamp[-1]].strip()
-        if order := date_order([layout.headings[k] for k in layout.stamp]):
-            heading = order
-        whole = [row for row in rows if len(row) == len(layout.headings)] or rows
-        texts = [text.replace(layout.decimal, ".") for text in _joined(whole, layout.stamp)]
-        if layout.units.get("time") == BY_HOUR:
-            self.guesses.append(f"{heading!r} as HHMM.mmm")
-        try:
-            return clock_of(heading, layout.units.get("time", ""), texts, self._declared.zone)
-        except ValueError as error:
-            raise FormatError(self._path, str(error), column="time") from None
-
-    def _start_by(self, rows: Rows) -> float:
-        """Return the start of a count, s since 1970, from columns with date and time; 0 without them."""
-        layout, zone = self._layout, self._declared.zone
-        if not self._clock.boot or not layout.calendar or not layout.stamp:
-            return 0.0
-        rows = [row for row in rows if max(*layout.calendar, *layout.stamp) < len(row)]
-        texts = pd.Series(_joined(rows, layout.calendar), dtype="str")
-        counts = pd.Series(_joined(rows, layout.stamp), dtype="str")
-        headings = [layout.headings[k] for k in layout.calendar]
-        try:
-            clock = clock_of(" ".join(headings), "", texts.tolist(), zone)
-        except ValueError:  # a date that can be read in two ways
-            return 0.0
-        moments = seconds(clock, texts, zone)
-        ahead = moments - seconds(self._clock, counts, None)
-        if clock.boot or not np.isfinite(ahead).any():
-            return 0.0
-        self.guesses.append(f"dated by {' and '.join(map(repr, headings))}")
-        # times cut to whole seconds are early by half a second on average, if several rows share a second
-        cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
-        return float(np.nanmedian(ahead)) + cut
 
     def read_lines(
         self, lines: list[str], numbers: Sequence[int]
@@ -178,7 +135,7 @@ class TableReader:
             if name and name != "time"
         }
         for name, k in self._layout.hemispheres.items():
-            values, columns[name] = columns[name], on_side(name, columns[name], frame[k])
+            values, columns[name] = columns[name], _on_side(name, columns[name], frame[k])
             unsure = np.isnan(columns[name]) & np.isfinite(values)
             expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
             self.faults.note(name, unsure, kept, expected, wrong=False)
@@ -234,9 +191,9 @@ class TableReader:
             column = column.str.strip() + " " + frame[k].str.strip()
         if self._layout.decimal == "," and not pd.api.types.is_numeric_dtype(column):
             column = column.str.replace(",", ".")
-        times = seconds(self._clock, column, self._declared.zone)
+        times = seconds(self._clock, column)
         wrong = np.isnan(times) & column.notna().to_numpy()
-        if self._clock.boot and (self._clock.is_text or not self._start):
+        if self._is_from_boot or (self._clock.boot and self._clock.is_text):
             times, self._counter, boots = self._counter.go_on(times, self._clock)
             if boots:
                 again = counted(boots, "time")
@@ -268,16 +225,63 @@ class TableReader:
 
     def _flags(self, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
         """Return the bits of named flags; FormatError: an unknown name, since a flag is never dropped."""
-        known: dict[str, float] = {}
-        texts = column.fillna("").tolist()
-        for row, text in zip(numbers, texts, strict=True):
+        texts = column.fillna("")
+        known = {}
+        for text in texts.unique():
             try:
-                if text not in known:
-                    known[text] = float(Quality.parse(text))
+                known[text] = float(Quality.parse(text))
             except KeyError:
+                row = numbers[int((texts == text).to_numpy().argmax())]
                 expected = f"expected the names of flags, not {text!r}"
                 raise FormatError(self._path, expected, row=row, column="quality") from None
-        return np.array([known[text] for text in texts])
+        return np.asarray(texts.map(known), np.float64)
+
+
+def clock_by(path: Path, layout: Layout, rows: Rows) -> tuple[TimeFormat, list[str]]:
+    """Return the format of the times, from the heading, the unit and the first cells, and assumptions.
+
+    FormatError: there is no time, or it can be read in two ways.
+    """
+    if layout.rate:
+        return TimeFormat("s", f"{layout.rate:g} rows a second", boot=True), []
+    if not layout.stamp:
+        missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
+        raise FormatError(path, missing, row=layout.row, column="time")
+    ordered = date_order([layout.headings[k] for k in layout.stamp])
+    heading = ordered or layout.headings[layout.stamp[-1]].strip()
+    whole = [row for row in rows if len(row) == len(layout.headings)] or rows
+    texts = [text.replace(layout.decimal, ".") for text in _joined(whole, layout.stamp)]
+    unit = layout.units.get("time", "")
+    try:
+        clock = clock_of(heading, unit, texts, layout.declared.zone)
+    except ValueError as error:
+        raise FormatError(path, str(error), column="time") from None
+    return clock, [f"{heading!r} as HHMM.mmm"] if unit == BY_HOUR else []
+
+
+def start_by(layout: Layout, clock: TimeFormat, rows: Rows) -> tuple[float, list[str]]:
+    """Return the start of a count, s since 1970, from columns with date and time, and the assumption.
+
+    Without such columns they are 0 and empty.
+    """
+    if not clock.boot or not layout.calendar or not layout.stamp:
+        return 0.0, []
+    rows = [row for row in rows if max(*layout.calendar, *layout.stamp) < len(row)]
+    texts, counts = (
+        pd.Series(_joined(rows, places), dtype="str") for places in (layout.calendar, layout.stamp)
+    )
+    headings = [layout.headings[k] for k in layout.calendar]
+    try:
+        calendar = clock_of(" ".join(headings), "", texts.tolist(), layout.declared.zone)
+    except ValueError:  # a date that can be read in two ways
+        return 0.0, []
+    moments = seconds(calendar, texts)
+    ahead = moments - seconds(clock, counts)
+    if calendar.boot or not np.isfinite(ahead).any():
+        return 0.0, []
+    # times cut to whole seconds are early by half a second on average, if several rows share a second
+    cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
+    return float(np.nanmedian(ahead)) + cut, [f"dated by {' and '.join(map(repr, headings))}"]
 
 
 def _joined(rows: Rows, places: Sequence[int]) -> list[str]:
@@ -301,3 +305,10 @@ def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray
         values = np.asarray(pd.to_numeric(texts, errors="coerce"), np.float64)
         return np.asarray(np.where(opposite, -np.abs(values), values))
     return np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
+
+
+def _on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
+    """Return latitudes or longitudes (n,), deg, signed by hemisphere `letters` (n,); NaN without a letter."""
+    side = letters.astype("str").str.strip().str.upper()
+    signed = np.where(side.isin(["S", "W"]), -np.abs(values), values)
+    return np.asarray(np.where(side.isin([*HEMISPHERES[name]]), signed, np.nan))

@@ -35,9 +35,8 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain, groupby, islice
-from math import isnan
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import msgspec
 import numpy as np
@@ -263,28 +262,24 @@ class FileWriter:
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
-        self._csv = csv.writer(self._file, lineterminator="\n")
         self.metadata = b""
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows; if `first`, write the header before."""
+        headings = ["time"]
+        for name in map(str, dataset.data_vars):
+            unit = dataset[name].attrs.get("units", "1")
+            heading = name if name in COLUMNS or unit == "1" else f"{name} [{unit}]"
+            if name == "heading" and dataset.attrs.get("heading_reference") == "magnetic":
+                heading = f"heading [{unit} magnetic]"
+            headings.append(heading)
         if first:
-            headings = ["time"]
-            for name in map(str, dataset.data_vars):
-                unit = dataset[name].attrs.get("units", "1")
-                heading = name if name in COLUMNS or unit == "1" else f"{name} [{unit}]"
-                if name == "heading" and dataset.attrs.get("heading_reference") == "magnetic":
-                    heading = f"heading [{unit} magnetic]"
-                headings.append(heading)
             self.metadata = _metadata(dataset, headings)
-            self._csv.writerow(headings)
-        self._csv.writerows(self.texts(dataset))
+        self.write(_frame(dataset), headings if first else False)
 
-    def texts(self, dataset: xr.Dataset) -> list[tuple[str, ...]]:
-        """Return the cells of each row as text."""
-        columns = [_texts("time", dataset["time"].values)]
-        columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]
-        return list(zip(*columns, strict=True))
+    def write(self, frame: pd.DataFrame, header: list[str] | bool, **options: Any) -> None:
+        """Write a data frame as lines of CSV; `options` are those of ``to_csv``."""
+        frame.to_csv(self._file, header=header, index=False, lineterminator="\n", **options)
 
     def close(self) -> None:
         """Write everything to the file and close it."""
@@ -314,10 +309,13 @@ def _attributes(path: Path) -> dict[str, str | float]:
         raise FormatError(sidecar, "expected the metadata of a CSV file, with one note") from None
 
 
-def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:
-    if name == "quality":  # no flags: the row was not corrected
-        return ["uncalibrated" if isnan(v) else Quality(int(v)).names() for v in values.tolist()]
-    return ["" if isnan(v) else repr(v) for v in values.tolist()]
+def _frame(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return the rows as a data frame, with the names of the flags."""
+    frame = pd.DataFrame({name: dataset[name].to_numpy() for name in ("time", *dataset.data_vars)})
+    if "quality" in frame:  # no flags: the row was not corrected
+        flags = frame["quality"].map(lambda value: Quality(int(value)).names(), na_action="ignore")
+        frame["quality"] = flags.fillna("uncalibrated").replace("", None)
+    return frame
 
 
 class GeosoftWriter(FileWriter):
@@ -330,13 +328,12 @@ class GeosoftWriter(FileWriter):
         if first:
             self._file.write("/ ")
             super().append(table.isel(time=slice(0)), first=True)
-        rows = [tuple(cell or "*" for cell in row) for row in self.texts(table)]
-        if not lines:
-            self._csv.writerows(rows)
-            return
-        for line, part in groupby(np.arange(len(rows)).tolist(), key=lambda row: lines[row]):
-            self._file.write(f"LINE {line:.12g}\n")
-            self._csv.writerows(rows[row] for row in part)
+        frame = _frame(table)
+        # without survey lines, all rows belong together
+        for line, part in groupby(range(len(frame)), key=lambda row: lines[row] if lines else None):
+            if line is not None:
+                self._file.write(f"LINE {line:.12g}\n")
+            self.write(frame.iloc[list(part)], header=False, na_rep="*")
 
 
 MAGARROW_HEADINGS = [
@@ -392,4 +389,4 @@ class MagArrowWriter(FileWriter):
                 if form := MAGARROW_FORMS.get(heading):
                     table[heading] = table[heading].map(form.__mod__).replace("nan", "NaN")
         self._rows += rows
-        table.to_csv(self._file, index=False, header=first, lineterminator="\n", float_format="%.3f")
+        self.write(table, first, float_format="%.3f")

@@ -55,7 +55,7 @@ BAD_CSV = {
     "# fill_value = none\ntime,mag_x\n1,2\n": "row 1, column 'fill_value': expected a number, not 'none'",
     "time,quality\n2,splendid\n": "row 2, column 'quality': expected the names of flags, not 'splendid'",
     "# heading_reference = Magnetic\ntime,heading\n1,2\n": (
-        "heading_reference: expected true or magnetic, not 'Magnetic'"
+        "heading_reference: expected true, magnetic or inertial, not 'Magnetic'"
     ),
     "# heading_reference = magnetic\ntime,mag_x\n1,2\n\n2,x\n": (
         "row 5, column 'mag_x': expected a number, not 'x'"
