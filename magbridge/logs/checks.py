@@ -390,13 +390,10 @@ def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Val
         elif (match := QUALITY_OF.fullmatch(name)) and bare(match[1]) in words:
             found.append(Validity(name, (names[words.index(bare(match[1]))],), BAD_QUALITY))
         elif FLAG.fullmatch(word):
-            cells = [row[k] for row in rows if k < len(row) and row[k]]
-            marked = sum(cell in {"1", "1.0"} for cell in cells)
-            binary = bool(cells) and all(cell in {"0", "0.0", "1", "1.0"} for cell in cells)
-            if binary and marked <= MAX_FLAGGED * len(cells):
-                found.append(Validity(name, (), frozenset({1.0})))
-            elif binary and len(cells) - marked <= MAX_FLAGGED * len(cells):
-                found.append(Validity(name, (), frozenset({0.0})))
+            marks = [row[k].removesuffix(".0") for row in rows if k < len(row) and row[k]]
+            rare = min("10", key=marks.count)
+            if marks and {*marks} <= {*"01"} and marks.count(rare) <= MAX_FLAGGED * len(marks):
+                found.append(Validity(name, (), frozenset({float(rare)})))
     return found
 
 

@@ -61,8 +61,6 @@ class Layout:
     """Declarations of the user and of the instrument's maker."""
     stamp: tuple[int, ...] = ()
     """Indices of the fields that form the time, joined by blanks: one, or date and time of day ..."""
-    calendar: tuple[int, ...] = ()
-    """Indices of fields with date and time of day, in addition to a time that may count from a boot."""
     hemispheres: Mapping[str, int] = field(default_factory=dict)
     """``latitude``, ``longitude`` -> index of the field with N or S, E or W."""
     open_ended: bool = False

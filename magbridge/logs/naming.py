@@ -89,7 +89,6 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
         layout = layout.renamed({lines[0]: "line"})
     layout = _with_utm(layout)
     layout = _with_time(layout, rows)
-    layout = replace(layout, calendar=_calendar(layout, rows))
     return _without_texts(_with_total(_with_units_of_axes(layout, rows), rows), rows)
 
 
@@ -242,7 +241,7 @@ def _by_hour(present: Sequence[str]) -> bool:
     return is_long and all(map(HOUR_AND_MINUTE.fullmatch, present)) and any("." in cell for cell in present)
 
 
-def _calendar(layout: Layout, rows: Rows) -> tuple[int, ...]:
+def calendar_of(layout: Layout, rows: Rows) -> tuple[int, ...]:
     """Return the indices of fields, other than the time, that alone give date and time of day."""
     others = [k for k in range(len(layout.headings)) if k not in layout.stamp]
     moments = [k for k in others if _all_match(DATE_AND_TIME, rows, k)]

@@ -19,7 +19,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, validity_of, without_invalid
 from magbridge.logs.clocks import BY_HOUR, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells
-from magbridge.logs.naming import HEMISPHERES
+from magbridge.logs.naming import HEMISPHERES, calendar_of
 from magbridge.records import Quality
 from magbridge.wording import counted
 
@@ -264,13 +264,13 @@ def start_by(layout: Layout, clock: TimeFormat, rows: Rows) -> tuple[float, list
 
     Without such columns they are 0 and empty.
     """
-    if not clock.boot or not layout.calendar or not layout.stamp:
+    places = calendar_of(layout, rows) if clock.boot and layout.stamp else ()
+    if not places:
         return 0.0, []
-    rows = [row for row in rows if max(*layout.calendar, *layout.stamp) < len(row)]
-    texts, counts = (
-        pd.Series(_joined(rows, places), dtype="str") for places in (layout.calendar, layout.stamp)
-    )
-    headings = [layout.headings[k] for k in layout.calendar]
+    rows = [row for row in rows if max(*places, *layout.stamp) < len(row)]
+    texts = pd.Series(_joined(rows, places), dtype="str")
+    counts = pd.Series(_joined(rows, layout.stamp), dtype="str")
+    headings = [layout.headings[k] for k in places]
     try:
         calendar = clock_of(" ".join(headings), "", texts.tolist(), layout.declared.zone)
     except ValueError:  # a date that can be read in two ways

@@ -61,8 +61,8 @@ CASES = {
         "log.csv", "\r\n".join(MOTIONCAL), {"mag_x": 3e4, "mag_y": 5e3}, 9, True, "100 nT a count", "row 1:",
     ),
     "MotionCal with more digits": Case(
-        "log.txt", "Raw:0,0,8192,0,0,0,305,50,450\nUni:0.0,0.0,9.8,0.0,0.0,0.0,30.51,5.02,45.03\n" * 3,
-        {"mag_x": 30_510.0}, 3, True,
+        "log.txt", "Raw:0,0,8192,0,0,0,305,50,450\nUni:0,0,9.8,0,0,0,30.51,5.02,45.03\n" * 3 + "Uni:0",
+        {"mag_x": 30_510.0}, 3, True, "1000 nT a count", "row 4:",
     ),
     # in a file of blackbox_decode an index in brackets is not a unit
     "a blackbox": Case(

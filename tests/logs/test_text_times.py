@@ -188,19 +188,19 @@ def in_pieces(tmp_path: Path, text: str, rows: int) -> tuple[np.ndarray, list[st
 @pytest.mark.parametrize("rows", [7, 20, 1 << 16])
 def test_counts_go_on(rows: int, tmp_path: Path) -> None:
     """Times of day beyond midnight, a count of 32 bits beyond its end, a logger beyond its restart."""
-    stamps = pd.date_range("2022-05-04T23:59:50", periods=2000, freq="60s").strftime("%H:%M:%S")
+    stamps = [*pd.date_range("2022-05-04T23:59:50", periods=2000, freq="60s").strftime("%H:%M:%S")]
+    stamps[610] = "23:59:59"  # damaged: it costs itself
     time, _ = in_pieces(tmp_path, "time,mag_x\n" + "".join(f"{stamp},1\n" for stamp in stamps), rows)
-    np.testing.assert_allclose(np.diff(time), 60.0)
+    np.testing.assert_allclose(np.delete(np.diff(time), 609), 60.0)
     first = 2**32 - 20 * 250_000
     wraps = lines("time_us,mag_x,mag_y,mag_z", lambda k: f"{(first + 250_000 * k) % 2**32},1,2,45000")
     time, _ = in_pieces(tmp_path, wraps, rows)
     np.testing.assert_allclose(np.diff(time), [0.25] * 39)
     text = lines("millis,mag_x,mag_y,mag_z", lambda k: f"{500 + 100 * (k % 25)},1,2,45000", 50)
     time, losses = in_pieces(tmp_path, text, rows)
-    assert len(time) == 50
+    assert (len(time), sum("started again" in line for line in losses)) == (50, 1)
     assert (np.diff(time) > 0).all()
     assert np.flatnonzero(np.diff(time) > 1.0).tolist() == [24]
-    assert sum("started again" in line for line in losses) == 1
 
 
 def test_rows_without_times_come_at_a_rate_and_a_bad_one_leaves_its_place(tmp_path: Path) -> None:
