@@ -32,6 +32,7 @@ from magbridge.calibration.fitting.boresight import (
     LEAST_INFORMATION,
     MAX_ITERATIONS,
     MIN_BORESIGHT_SAMPLES,
+    MIN_TILT_SIGMA_DEG,
     RUN_TILT_SIGMA_DEG,
     field_body,
     find_boresight,
@@ -42,7 +43,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import samples_per_independent
-from magbridge.estimation.residual import PAIRS, residuals_of, robust_scale, symmetric
+from magbridge.estimation.residual import PAIRS, residuals_of, rms, robust_scale, symmetric
 
 CONVERGED = 1e-6
 """Length of a step, in standard deviations of z and in rad, below which the iterations have converged."""
@@ -99,6 +100,9 @@ def with_direction(found: Fit, data: Observations, *, headings: bool) -> Fit:
         z, rotation = z + step[:-3], Rotation.from_rotvec(step[-3:]) * rotation
         if np.linalg.norm(step) < CONVERGED:
             break
+    # the vertical component, which does not depend on the heading, shows the errors of roll and pitch
+    vertical = np.einsum("nri,ni->n", _vertical(attitude), v - h) / np.hypot(*reference[:, :2].T)
+    tilt_sigma = max(float(np.degrees(rms(vertical))), MIN_TILT_SIGMA_DEG)
     covariance = np.linalg.inv(precision)
     # an error that all attitudes of the data share does not show in their scatter
     shared = np.radians(RUN_TILT_SIGMA_DEG) ** 2 * np.eye(3)
@@ -107,7 +111,7 @@ def with_direction(found: Fit, data: Observations, *, headings: bool) -> Fit:
         calibration,
         coefficients=c,
         covariance=L @ covariance[:-3, :-3] @ L.T,
-        boresight=to_boresight(rotation, covariance[-3:, -3:] + shared),
+        boresight=to_boresight(rotation, covariance[-3:, -3:] + shared, tilt_sigma),
     )
     # where magnitude and direction disagree, the residual of the magnitude grows, and its noise with it
     residual = residuals_of(found.samples, c)
