@@ -208,6 +208,11 @@ class AnomalyGrid:
         return anomaly
 
     @cached_property
+    def mean_and_variance(self) -> tuple[float, float]:
+        """Mean (nT) and variance (nT²) of the map's known nodes."""
+        return float(np.nanmean(self.anomaly)), float(np.nanvar(self.anomaly))
+
+    @cached_property
     def rms(self) -> float:
         """RMS of the map about its best-fitting plane, nT."""
         # Residual of the least-squares plane over all known nodes.

@@ -78,7 +78,7 @@ class Bank:
         level: float = 0.0,
     ) -> None:
         self._grid, self._gate = grid, gate
-        self._off_map = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
+        self._off_map = grid.mean_and_variance
         self._updates = 0
         self.resolution = self.finest = resolution
         self.curvature_variance = 0.0

@@ -47,7 +47,8 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid | None, path: str | Pa
     hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
     for name, draw in draws.items():
         draw(panels[name], hours, result)
-        _legend_above(panels[name])
+        where, columns = (0.0, 1.0), min(len(panels[name].get_legend_handles_labels()[1]), 3)
+        panels[name].legend(loc="lower left", bbox_to_anchor=where, ncols=columns, fontsize=8, frameon=False)
     save(figure, path)
 
 
@@ -226,14 +227,6 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
             end = hours[min(piece[-1] + 1, state.size - 1)]
             axis.axvspan(hours[piece[0]], end, color=SHADES[kind], alpha=0.5, lw=0, label=label)
             seen.add(kind)
-
-
-def _legend_above(axis: Axes) -> None:
-    """Place the legend above the axes, where it hides no line."""
-    entries = axis.get_legend_handles_labels()[1]
-    axis.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(len(entries), 3), fontsize=8, frameon=False
-    )
 
 
 def _plain(axis: Axes) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import expm1, inf, isfinite, log, sqrt
+from math import exp, expm1, inf, isfinite, log, sqrt
 
 import numpy as np
 
@@ -10,7 +10,14 @@ from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, Innovation, widest
 from magbridge.navigate.deadreckoning import MotionNoise, Step
-from magbridge.navigate.integrity import ELSEWHERE, IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
+from magbridge.navigate.integrity import (
+    ELSEWHERE,
+    Competitor,
+    IntegrityMonitor,
+    Unmapped,
+    Verdict,
+    squared_mahalanobis,
+)  # fmt: skip
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
 from magbridge.navigate.options import NavigationOptions, wider_level
 from magbridge.navigate.record import Jump, NavigationState, Rival
@@ -29,6 +36,11 @@ MIN_REFINEMENT = 0.8
 """Fraction of the resolution; a measurement changes the resolution only if it needs less than this."""
 SUSPECT_LOG_ODDS = 1.0
 """Natural log odds of another place above which the position is invalid, even below ``alarm_odds``."""
+RESTLESS_FRACTION, PRIOR_ODDS_RESTLESS = 0.1, 0.3
+"""Growth of the velocity error of restless motion, as with a wrong heading, over the speed in one correlation
+length of the map; odds of such motion before the field is compared."""
+MAX_LOG_ODDS_RESTLESS = 3.0
+"""Natural log-likelihood ratio at which the filter of restless motion replaces the other or begins again."""
 SEARCH_SPREADS = (2.0, 4.0, 2.0, 8.0)
 """1-sigma of successive searches, in units of :meth:`Estimate._reach`."""
 
@@ -45,8 +57,8 @@ class Estimate:
     remains possible, and no test rejects the position. For a smoother, `moved` holds F and Q of the last
     prediction, and `jumps` the restarts, which it must not cross. `alone_x` (4,) and `alone` (4, 4) are mean
     and covariance of position and current by dead reckoning alone since the start or the last fix. `options`
-    are the given ones, but with a wider bias once the filter was lost. `rival` is another position of the
-    vehicle, by the test of the GNSS positions; None without one.
+    are the given ones, but with a wider bias once the filter was lost. `rivals` are other positions of the
+    vehicle, by the test of the GNSS positions.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -54,7 +66,8 @@ class Estimate:
         self.state = NavigationState.OFF
         self.x, self.P = prior(options)
         self.valid = False
-        self.rival: Rival | None = None
+        self.rivals: list[Rival] = []
+        self._restless: Competitor | None = None  # a filter whose velocity error grows faster
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
         self.time_us, self.travelled, self.motion = 0, 0.0, NO_MOTION_NOISE
@@ -69,7 +82,7 @@ class Estimate:
         self._level: tuple[float, int] | None = (
             None  # variance of the bias at a known place, nT²; its time, µs
         )
-        self._lost = False
+        self._lost = self._known = False  # lost; valid at least once
         self._searches = 0
         self._unique = False  # competing filters that began wider have come to the same place
         self._map_confirmed = False  # the map has described the field
@@ -77,14 +90,17 @@ class Estimate:
 
     @property
     def position_covariance(self) -> FloatArray:
-        """Covariance (2, 2) of the position, m²; it includes the possibility of the position `rival`."""
-        P = self.P[:2, :2]
-        if self.rival is None:
-            return P
-        # Mixture of N(x, P) and, with probability w, N(y, S), about x: (1 - w) P + w (S + d d'), d = y - x.
-        y, S, w = self.rival
-        d = y - self.x[:2]
-        return np.asarray((1.0 - w) * P + w * (S + np.outer(d, d)))
+        """Covariance (2, 2) of the position, m²; it includes the rivals' positions by their odds."""
+        # Mixture of N(x, P) with the odds 1 and each N(y, S) with the odds o, about x, with d = y - x:
+        # (P + sum of o (S + d d')) / (1 + sum of o).
+        total, odds = self.P[:2, :2], 1.0
+        for y, S, log_odds in self._all_rivals():
+            d, ratio = y - self.x[:2], exp(log_odds)
+            total, odds = total + ratio * (S + np.outer(d, d)), odds + ratio
+        return np.asarray(total / odds)
+
+    def _all_rivals(self) -> list[Rival]:
+        return self.rivals + ([self._restless.rival(PRIOR_ODDS_RESTLESS)] if self._restless else [])
 
     @property
     def begun(self) -> bool:
@@ -125,7 +141,9 @@ class Estimate:
         if distance > MAX_FIX_DISTANCE_SQUARED:
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
-            self._begin(np.concatenate([fix, self.x[2:]]), start, "a fix contradicts the filter")
+            there = np.concatenate([fix, self.x[2:]])
+            self._jump(there, "a fix contradicts the filter")
+            self._filter, self.x, self.P = self._estimator(there, start), there, start
             self._log_odds_unmapped = 0.0
         else:
             self._filter.update_position(float(fix[0]), float(fix[1]), fused_sigma or sigma)
@@ -134,16 +152,19 @@ class Estimate:
         if self._lost and not self._fixed:
             self._map_confirmed, self._log_odds_unmapped = False, 0.0
         self._monitor, self._unique, self._fixed = None, True, True
+        self._restless = None
         self.alone_x = self.x[:4].copy()
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
-    def replace(self, bank: Bank) -> None:
-        """Replace the filter by one that has not used fixes that were wrong."""
+    def replace(self, bank: Bank, cause: str) -> None:
+        """Replace the filter by one with other fixes or another motion, which is likelier."""
         x, P = bank.moments()
         unique = self._unique
-        self._begin(x, P, "a filter without the receiver's positions is likelier")
-        self._unique = unique
-        self.alone_x, self.alone = x[:4].copy(), P[:4, :4].copy()
+        self._jump(x, cause)
+        self._filter, self._unique = bank, unique
+        self._refresh()
+        if widest(self.alone) < widest(P):  # dead reckoning went on from wrong fixes
+            self.alone_x, self.alone = x[:4].copy(), P[:4, :4].copy()
 
     def update(self, block: Block, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> Innovation:
         """Update with a measurement and return its innovation, NaN off the map.
@@ -165,6 +186,8 @@ class Estimate:
         # 3. On the map: compare the filter with other explanations of the same measurement.
         on_the_map = isfinite(seen.anomaly)
         if on_the_map:
+            if self._restless:
+                self._restless.update(block, seen.log_likelihood)
             if widest(self.alone) < self._resolution:
                 self._level = float(self.P[4, 4]), block.time_us
             then_us, before, earlier = self._measured
@@ -172,15 +195,18 @@ class Estimate:
             self.step = Step(seconds, travelled - before, motion.growth_since(earlier))
             self._measured = block.time_us, travelled, motion
             self._judge(block, seen)
+            # A filter of restless motion begins again if it is unlikely, so that such motion shows soon.
+            if self._restless is None or self._restless.log_odds < -MAX_LOG_ODDS_RESTLESS:
+                bank = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
+                self._restless = Competitor(bank)
+            elif self._restless.log_odds > MAX_LOG_ODDS_RESTLESS:
+                self.replace(self._restless.filter, "a filter with restless motion is likelier")
         # 4. One filter or a bank, the state, and whether the position may be used.
         self._set_state(on_the_map)
         proven = self._unique and self._map_confirmed
-        suspect = (
-            self.odds > SUSPECT_LOG_ODDS
-            or self._log_odds_unmapped > 0.0
-            or widest(self.P) > self.options.sigma_limit
-        )
+        suspect = self.odds > SUSPECT_LOG_ODDS or self._log_odds_unmapped > 0.0 or self._is_vague
         self.valid = self.state is NavigationState.TRACKING and proven and not suspect
+        self._known |= self.valid
         return seen
 
     def predict(self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> None:
@@ -193,6 +219,10 @@ class Estimate:
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
         # x' = F x, P' = F P F' + Q. Dead reckoning alone follows the same model without measurements.
         F, Q = transition(self.options, seconds, metres, motion.growth_since(self.motion))
+        if self._restless and seconds > 0.0:
+            # Random walk of the velocity error: (f v)^2 for each correlation length of the map.
+            gained = (RESTLESS_FRACTION * metres / seconds) ** 2 * metres / self.grid.correlation_length
+            self._restless.filter.predict(F, Q + np.diag([0.0, 0.0, gained, gained, 0.0, 0.0]))
         self.time_us, self.travelled, self.motion = time_us, travelled, motion
         self.alone_x = F[:4, :4] @ self.alone_x
         self.alone = F[:4, :4] @ self.alone @ F[:4, :4].T + Q[:4, :4]
@@ -212,6 +242,7 @@ class Estimate:
             Q[2:4, 2:4] = missing_variance(bank.moments()[1][2:4, 2:4], sigma)
             bank.predict(np.eye(len(Q)), Q)
         self.alone[2:, 2:] += missing_variance(self.alone[2:, 2:], sigma)
+        self._restless = None
         self._refresh()
 
     def _refresh(self) -> None:
@@ -225,15 +256,11 @@ class Estimate:
         single = widest(P) < SPLIT_SPREAD * self._resolution
         return Bank(self.grid, x, P, inf if single else self._resolution, self.options.gate)
 
-    def _begin(self, x: FloatArray, P: FloatArray, cause: str) -> None:
-        """Restart the filter from the Gaussian `x` (6,), `P` (6, 6), and record the jump with its cause."""
-        self._jump(x, cause)
-        self._filter, self.x, self.P = self._estimator(x, P), x, P
-
     def _jump(self, x: FloatArray, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
         self.jumps.append(Jump(self.time_us, north, east, widest(self.alone), cause))
         self._monitor, self._unique, self._fixed = None, False, False
+        self._restless = None
 
     def _judge(self, block: Block, seen: Innovation) -> None:
         """Compare the filter with the competing explanations, and replace it if one of them has won."""
@@ -316,17 +343,18 @@ class Estimate:
         """True if the field has made the position clearly more precise than dead reckoning alone."""
         return widest(self.P) <= MAX_INFORMED_RATIO * widest(self.alone)
 
-    def _is_contradicted(self) -> bool:
-        """Return True if the vehicle is more likely at the rival's position, which is another place."""
-        if self.rival is None or self.rival[2] < 0.5:
-            return False
-        away = self.rival[0] - self.x[:2]
-        return squared_mahalanobis(away, self.P[:2, :2] + self.rival[1]) > ELSEWHERE
+    @property
+    def is_lost(self) -> bool:
+        """True if the field contradicts the map at the position, or a rival at another place is likelier."""
+        return self._lost or any(
+            log_odds > 0.0 and squared_mahalanobis(y - self.x[:2], self.P[:2, :2] + S) > ELSEWHERE
+            for y, S, log_odds in self._all_rivals()
+        )
 
-    def _tracks_from_fix(self) -> bool:
-        """Return True if a fix and the dead reckoning since then are as precise as the map could be."""
-        limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
-        return self._fixed and self._map_confirmed and widest(self.alone) <= limit
+    @property
+    def _is_vague(self) -> bool:
+        """True if the position may err by more than ``sigma_limit``; dead reckoning from a fix does not."""
+        return min(widest(self.position_covariance), widest(self.alone)) > self.options.sigma_limit
 
     def _set_state(self, on_the_map: bool) -> None:
         """Change between one filter and a bank if the position's width requires it, and set the state."""
@@ -338,13 +366,14 @@ class Estimate:
             self._monitor = None
         elif not self._filter.is_single and width < JOIN_SPREAD * self._resolution:
             self._filter = self._estimator(self.x, self.P)
-        if self._lost or self._is_contradicted():
+        # A fix and the dead reckoning since then may be as precise as the map could be.
+        limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
+        tracks_from_fix = self._fixed and self._map_confirmed and widest(self.alone) <= limit
+        if self.is_lost or (self._is_vague and self._known and on_the_map):
             self.state = NavigationState.LOST
         elif not self._compact(width):
             self.state = NavigationState.SEARCHING
-        elif self._tracks_from_fix():
-            self.state = NavigationState.TRACKING
-        elif not on_the_map or not self.informed:
+        elif not tracks_from_fix and not (on_the_map and self.informed):
             self.state = NavigationState.DEAD_RECKONING
         else:
             self.state = NavigationState.TRACKING

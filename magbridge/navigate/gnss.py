@@ -29,7 +29,7 @@ from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank
 from magbridge.navigate.deadreckoning import Step
-from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
+from magbridge.navigate.integrity import Competitor, Unmapped, squared_mahalanobis
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import NavigationOptions, wider_level
 from magbridge.navigate.record import Rival
@@ -75,8 +75,8 @@ of the next, s: one of them began shortly before a carry-off does."""
 MIN_SEPARATION_S = 20.0
 """Smallest time without the positions of the filter that replaces the navigator's, s: in less, no test but
 that by the field finds a fault."""
-PRIOR_ODDS_WRONG = 0.05
-"""Odds of wrong positions before the field is compared, while the navigator uses them."""
+PRIOR_ODDS_WRONG = 0.2
+"""Odds of wrong positions since the start of a comparison filter, before the field is compared."""
 RECENT_POSITIONS = 64
 """Number of recent positions, from which the position at a measurement is interpolated."""
 OK_STATE, DETECTED_STATE = 1, 3
@@ -112,19 +112,18 @@ class Prediction(NamedTuple):
     """Position that the navigator predicts at the time of a GNSS position, relative to dead reckoning."""
 
     position: FloatArray
-    """Predicted position (2,), m north and east."""
     covariance: FloatArray
     alone: FloatArray
-    """`covariance`, `alone`: covariances (2, 2), m², of the position, and of dead reckoning alone since the
-    last position that was used."""
+    """`position`, `covariance`, `alone`: position (2,), m north and east, and its covariance (2, 2), m²; that
+    of dead reckoning alone since the last position that was used."""
     current: FloatArray
-    """Velocity error of dead reckoning (2,), m/s."""
     current_sigma: float
     heading_error: float = 0.0
     travelled: float = 0.0
     speed: float = 0.0
-    """`current_sigma`, `heading_error`, `travelled`, `speed`: 1-sigma of the current on each axis, and of the
-    velocity because of a heading known to be poor, m/s; distance travelled since the start, m; speed, m/s."""
+    """`current`, `current_sigma`, `heading_error`, `travelled`, `speed`: velocity error of dead reckoning
+    (2,), m/s, and its 1-sigma on each axis; 1-sigma of the velocity because of a heading known to be poor,
+    m/s; distance travelled since the start, m; speed, m/s."""
     turns: float = 0.0
     """:attr:`MotionNoise.turns` since the start."""
     lost: bool = False
@@ -159,37 +158,28 @@ class GnssMonitor:
         self._frozen_from = 0.0  # m travelled when the receiver first sent the present position
         self._since_us = 0  # time since which the positions agree with each other
         self._count = 0  # number of positions since `_since_us`
-        self._jump_count = 0  # since the last position that was used
+        # False if the positions jumped from ones that were used to the present ones: no vehicle does.
+        self._may_be_right = True
         self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
         self._change = 0.0  # of the positions over the window against dead reckoning, in its errors
         self._reported = GnssReason.NONE
         self._reported_us = -MAX_GNSS_AGE_US
         self.evidence = _FieldTest(grid, options)
 
-    def rival(self, time_us: int) -> Rival | None:
-        """Return the position of a filter without the receiver's, or the receiver's if they are not used.
+    def rivals(self, time_us: int) -> list[Rival]:
+        """Return the positions of filters without the receiver's, or the receiver's if they are not used.
 
-        None without a recent position, or if the position cannot be right.
+        The list is empty without a recent position, or if the position cannot be right.
         """
         field, last = self.evidence, self._history[-1] if self._history else None
         if last is None or time_us - last.time_us > MAX_GNSS_AGE_US:
-            return None
-        if self.state is not GnssState.GOOD:
-            if not self._may_be_right or last.time_us - self._since_us < RIVAL_HOLD_US:
-                return None
-            log_odds = field.log_odds_of_position + min(field.log_odds_of_map, 0.0)
-            place = np.array([last.north, last.east])
-            return Rival(place, last.sigma**2 * np.eye(2), _probability(log_odds))
-        best = field.best_separate
-        if best is None:
-            return None
-        x, P = best.filter.moments()
-        return Rival(x[:2], P[:2, :2], _probability(best.log_odds + log(PRIOR_ODDS_WRONG)))
-
-    @property
-    def _may_be_right(self) -> bool:
-        """True if the positions have not jumped from right ones to the present ones: no vehicle does."""
-        return self._jump_count != 1
+            return []
+        if self.state is GnssState.GOOD:
+            return [one.rival(PRIOR_ODDS_WRONG) for one in field.separate_filters]
+        if not self._may_be_right or last.time_us - self._since_us < RIVAL_HOLD_US:
+            return []
+        log_odds = field.log_odds_of_position + min(field.log_odds_of_map, 0.0)
+        return [Rival(np.array([last.north, last.east]), last.sigma**2 * np.eye(2), log_odds)]
 
     def receive_integrity(self, time_us: int, jamming: int, spoofing: int) -> None:
         """Store the receiver's own report: jamming_state and spoofing_state of GNSS_INTEGRITY."""
@@ -259,7 +249,7 @@ class GnssMonitor:
             elif self.evidence.contradicts or (prediction.lost and self.evidence.log_odds_of_map < 0.0):
                 self._set(GnssState.SUSPECT, GnssReason.FIELD, time_us)
         elif self._returns(time_us, agrees, prediction):
-            self.state, self.reason, self._jump_count = GnssState.GOOD, GnssReason.NONE, 0
+            self.state, self.reason, self._may_be_right = GnssState.GOOD, GnssReason.NONE, True
             self._trusted = None
         elif not agrees and prediction.informed:
             self.state = GnssState.REJECTED
@@ -315,7 +305,8 @@ class GnssMonitor:
         if jumped:
             self._trusted = self._trusted or history[0]
             history.clear()
-            self._since_us, self._count, self._jump_count = time_us, 0, self._jump_count + 1
+            self._since_us, self._count = time_us, 0
+            self._may_be_right = self.state is not GnssState.GOOD
         history.append(_Position(time_us, *offset_m, sigma, prediction))
         self._count += 1
         return jumped
@@ -339,33 +330,21 @@ class GnssMonitor:
         # The field decides first, if the map describes it clearly better at the position.
         field, by_field = self.evidence, self.reason is GnssReason.FIELD
         on_the_map = field.log_odds_of_map > 0.0
-        if field.favours and on_the_map and (self._may_be_right or not prediction.lost):
+        log_odds, limit = field.log_odds_of_position, field.limit
+        if log_odds >= limit and on_the_map and (self._may_be_right or not prediction.lost):
             return True
         # Then the motion since, against dead reckoning: a spoofer's carry-off continues while rejected.
         moves = self._change > MAX_RETURN_SIGMA and held_us < MAX_HOLD_US
-        if field.contradicts or field.disfavours or (moves and not by_field):
+        if field.contradicts or log_odds <= -0.5 * limit or (moves and not by_field):
             return False
-        if by_field or (field.describes and self._may_be_right):
-            return field.describes and (not by_field or field.log_odds_of_position >= 0.0)
+        describes = field.log_odds_of_map >= limit
+        if by_field or (describes and self._may_be_right):
+            return describes and (not by_field or log_odds >= 0.0)
         # Neither decides: time does. A lost navigator has no position to compare with.
         waited = held_us >= LONG_HOLD_US
         if prediction.lost:
             return waited and on_the_map
         return agrees or (waited and self._may_be_right and not prediction.informed)
-
-
-def _probability(log_odds: float) -> float:
-    return 1.0 / (1.0 + exp(-log_odds))
-
-
-class _Separate:
-    """Filter that goes on from the navigator's x (6,), P (6, 6) without the receiver's positions.
-
-    `log_odds` is its log-likelihood ratio against the navigator, and `seconds` the time since its start.
-    """
-
-    def __init__(self, bank: Bank) -> None:
-        self.filter, self.log_odds, self.seconds = bank, 0.0, 0.0
 
 
 class _FieldTest:
@@ -394,7 +373,7 @@ class _FieldTest:
         self.log_odds_of_map = self.log_odds_of_position = 0.0
         self._unmapped = Unmapped(self._grid, self._options)
         self._filter: Bank | None = None
-        self._separate: list[_Separate] = []
+        self.separate_filters: list[Competitor] = []
         self._filtered = np.zeros(2)  # position at the last measurement
         self._positions: deque[tuple[int, float, float]] = deque(maxlen=RECENT_POSITIONS)
         self._sigma = inf
@@ -402,7 +381,7 @@ class _FieldTest:
 
     def unaided(self, *, by_field: bool) -> Bank | None:
         """Return the likeliest filter without recent positions; if not `by_field`, the latest; else None."""
-        clean = [one for one in self._separate if one.seconds >= MIN_SEPARATION_S]
+        clean = [one for one in self.separate_filters if one.seconds >= MIN_SEPARATION_S]
         best = self.best_separate if by_field else clean[-1] if clean else None
         return None if best is None else best.filter
 
@@ -413,24 +392,9 @@ class _FieldTest:
         return self.log_odds_of_map <= -self.limit or (best is not None and best.log_odds >= self.limit)
 
     @property
-    def best_separate(self) -> _Separate | None:
+    def best_separate(self) -> Competitor | None:
         """The likeliest of the filters without the receiver's positions; None if none is running."""
-        return max(self._separate, key=lambda one: one.log_odds, default=None)
-
-    @property
-    def describes(self) -> bool:
-        """True if the map describes the field at the position, at ``alarm_odds``."""
-        return self.log_odds_of_map >= self.limit
-
-    @property
-    def disfavours(self) -> bool:
-        """True if the map describes the field better at the navigator's position; default odds: 45."""
-        return self.log_odds_of_position <= -0.5 * self.limit
-
-    @property
-    def favours(self) -> bool:
-        """True if the map describes the field better at the receiver's position, at ``alarm_odds``."""
-        return self.log_odds_of_position >= self.limit
+        return max(self.separate_filters, key=lambda one: one.log_odds, default=None)
 
     def move(self, time_us: int, offset_m: tuple[float, float], sigma: float, *, restart: bool) -> None:
         """Move the test to a position (m north and east of dead reckoning) of 1-sigma `sigma` (m).
@@ -446,7 +410,7 @@ class _FieldTest:
         """Discard evidence except that against the map: from now on the navigator rejects the positions."""
         self.log_odds_of_map = min(self.log_odds_of_map, 0.0)
         self.log_odds_of_position = 0.0
-        self._separate = []
+        self.separate_filters = []
 
     def separate(self, x: FloatArray, P: FloatArray) -> None:
         """Start a filter without the positions from the navigator's x (6,), P (6, 6), if one is due.
@@ -456,10 +420,10 @@ class _FieldTest:
         Solution separation: the likelihood ratio of this filter against the navigator begins at 1. As long as
         the positions are right, it exceeds c with a probability of at most 1/c in each period (Ville 1939).
         """
-        if not self._separate or self._separate[-1].seconds >= SEPARATION_INTERVAL_S:
-            self._separate.append(_Separate(Bank(self._grid, x, P, inf, self._options.gate)))
-        if self._separate[0].seconds > SEPARATION_TIME_S:
-            self._separate.pop(0)
+        if not self.separate_filters or self.separate_filters[-1].seconds >= SEPARATION_INTERVAL_S:
+            self.separate_filters.append(Competitor(Bank(self._grid, x, P, inf, self._options.gate)))
+        if self.separate_filters[0].seconds > SEPARATION_TIME_S:
+            self.separate_filters.pop(0)
 
     def update(self, block: Block, step: Step, filter_likelihood: float) -> None:
         """Add a measurement to the log odds; `step` is the motion since the previous measurement."""
@@ -468,10 +432,10 @@ class _FieldTest:
             return
         whole, self._step = self._step, Step()
         F, Q = transition(self._claimed, *whole)
-        for one in self._separate:
+        for one in self.separate_filters:
             one.seconds += whole.seconds
             one.filter.predict(F, Q)
-            one.log_odds += one.filter.update(block).log_likelihood - filter_likelihood
+            one.update(block, filter_likelihood)
         is_first = self._filter is None
         if self._filter is None:
             x, P = prior(self._options, self._sigma)
@@ -485,9 +449,9 @@ class _FieldTest:
         if not seen.accepted:  # as the filter does: a rejected measurement is never evidence for the map
             unmapped = max(unmapped, seen.log_likelihood)
         # Cumulative sums of log-likelihood ratios, limited so that a change of truth shows soon.
-        self.log_odds_of_map = self._limited(self.log_odds_of_map + seen.log_likelihood - unmapped)
-        gained = seen.log_likelihood - filter_likelihood
-        self.log_odds_of_position = self._limited(self.log_odds_of_position + gained)
+        sums = self.log_odds_of_map - unmapped, self.log_odds_of_position - filter_likelihood
+        limited = np.clip(np.add(sums, seen.log_likelihood), -self.limit, self.limit)
+        self.log_odds_of_map, self.log_odds_of_position = limited.tolist()
 
     def _predict(self, bank: Bank, step: Step, time_us: int) -> None:
         """Propagate the filter of H1 to `time_us`: the receiver's error decays, and its position moves."""
@@ -503,6 +467,3 @@ class _FieldTest:
         bank.predict(F, Q)
         bank.x[:2] += position[:, None]
         self._filtered = position
-
-    def _limited(self, log_odds: float) -> float:
-        return min(max(log_odds, -self.limit), self.limit)

@@ -23,8 +23,9 @@ from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.model import Block, average, block_length, transition
 from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.record import Rival
 
-__all__ = ["ELSEWHERE", "IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
+__all__ = ["ELSEWHERE", "Competitor", "IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 
 MAX_AGREEING_DISTANCE = 9.0
 """Largest squared Mahalanobis distance of two estimates of the same place."""
@@ -61,9 +62,9 @@ class Unmapped:
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self._options = options
         self._rate = sqrt(3.0) / grid.correlation_length
-        self._mean = float(np.nanmean(grid.anomaly))
-        self._value = float(np.nanvar(grid.anomaly)) + options.bias_sigma**2 + options.map_sigma**2
-        self._slope = self._rate**2 * float(np.nanvar(grid.anomaly))
+        self._mean, variance = grid.mean_and_variance
+        self._value = variance + options.bias_sigma**2 + options.map_sigma**2
+        self._slope = self._rate**2 * variance
         self._x = 0.0, 0.0
         self._p = self._value, 0.0, self._slope
 
@@ -178,6 +179,22 @@ class IntegrityMonitor:
             if squared_mahalanobis(there - here, spread + narrow) < MAX_AGREEING_DISTANCE
             else Verdict.OPEN
         )
+
+
+class Competitor:
+    """Filter with its log-likelihood ratio against the navigator's, `log_odds`, and its age, `seconds`."""
+
+    def __init__(self, bank: Bank) -> None:
+        self.filter, self.log_odds, self.seconds = bank, 0.0, 0.0
+
+    def update(self, block: Block, likelihood: float) -> None:
+        """Update with a measurement, whose log-likelihood in the navigator's filter is `likelihood`."""
+        self.log_odds += self.filter.update(block).log_likelihood - likelihood
+
+    def rival(self, prior_odds: float) -> Rival:
+        """Return its position, with the odds against the navigator's before the field is compared."""
+        x, P = self.filter.moments()
+        return Rival(x[:2], P[:2, :2], self.log_odds + log(prior_odds))
 
 
 def squared_mahalanobis(difference: FloatArray, P: FloatArray) -> float:

@@ -100,8 +100,8 @@ class Navigator:
             state = monitor.check(time_us, place, away, known, self._prediction(time_us))
             # Positions that were fused before the fault was found may have been wrong.
             if was_good and state is not GnssState.GOOD and monitor.unaided is not None:
-                estimate.replace(monitor.unaided)
-            estimate.rival = monitor.rival(time_us)
+                estimate.replace(monitor.unaided, "a filter without the receiver's positions is likelier")
+            estimate.rivals = monitor.rivals(time_us)
         if state is not GnssState.GOOD:
             return None
         return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
@@ -118,7 +118,7 @@ class Navigator:
         recent = time_us - since_us < HEADING_AGE_US
         return Prediction(
             x[:2], P[:2, :2], alone, x[2:4], float(current_sigma), error if recent else 0.0, where.travelled,
-            where.speed, where.noise.turns, now.state is NavigationState.LOST, now.informed,
+            where.speed, where.noise.turns, now.is_lost, now.informed,
         )  # fmt: skip
 
     def _correct(
@@ -204,7 +204,7 @@ class Navigator:
         x, P = F @ last.x, F @ last.P @ F.T + Q
         position = P[:2, :2] + last.position_covariance - last.P[:2, :2]
         # Do not send a position that has become too uncertain since the valid update.
-        if widest(position) > last.options.sigma_limit:
+        if widest(P) > last.options.sigma_limit:
             return None
         place = offset(*self.reckoned(time_us), float(x[0]), float(x[1]))
         (nn, ne), (_, ee) = position.tolist()
@@ -220,7 +220,7 @@ class Navigator:
         seen = now.update(block, where.travelled, where.noise)
         if isfinite(seen.anomaly):
             self.gnss.observe(block, now.step, seen.log_likelihood, now.x, now.P)
-        now.rival = self.gnss.rival(block.time_us)
+        now.rivals = self.gnss.rivals(block.time_us)
         north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
         (nn, ne), (_, ee) = now.position_covariance.tolist()

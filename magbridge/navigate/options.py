@@ -53,7 +53,7 @@ class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """Longest time over which samples are averaged to one update, s. Averaging ends earlier if the vehicle
     has moved 2 % of the map's correlation length."""
     sigma_limit: Positive = 500.0
-    """Largest 1-sigma of a valid position, m."""
+    """Largest 1-sigma of a valid position, m; beyond it, a position that was known counts as lost."""
     alarm_odds: Positive = 2_000.0
     """Odds at which another explanation of the field replaces the filter's."""
 

@@ -48,7 +48,7 @@ def sample(
     mover = _Mover(likelihood, np.random.default_rng(0))
     u = mover.rng.normal(size=(number, q))
     for count in counts:
-        mover.begin_stage(count)
+        mover.before, mover.count, mover.power = mover.count, count, 0.0
         seen = [mover.evaluate(one) for one in u]
         # Tempering: raise the power of the new likelihood in steps, resample, and move the particles.
         while mover.power < 1.0:
@@ -103,10 +103,6 @@ class _Mover:
         self.likelihood, self.rng = likelihood, rng
         self.before = self.count = 0
         self.power, self.root, self.step_size = 0.0, np.eye(1), 0.5 * MAX_STEP_SIZE
-
-    def begin_stage(self, count: int) -> None:
-        """Begin a stage that ends with the first `count` data."""
-        self.before, self.count, self.power = self.count, count, 0.0
 
     def evaluate(self, u: FloatArray) -> tuple[Evaluation, Evaluation]:
         """Return log likelihood and gradient of the data before this stage, and of those including it."""

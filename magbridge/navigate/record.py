@@ -24,7 +24,8 @@ class NavigationState(IntEnum):
     DEAD_RECKONING = 3
     """The vehicle is off the map, or the field does not improve the dead-reckoned position."""
     LOST = 4
-    """The field contradicts the map at the position, or agrees with it better elsewhere."""
+    """The field contradicts the map at the position or agrees with it better elsewhere, or a position that
+    was known has become more uncertain than ``sigma_limit``."""
 
 
 class Record(msgspec.Struct, frozen=True, gc=False):
@@ -99,9 +100,10 @@ class Jump(NamedTuple):
 class Rival(NamedTuple):
     """Position at which the vehicle may be instead of at the navigator's.
 
-    Its position (2,) is in m north and east of dead reckoning, its covariance (2, 2) in m².
+    Its position (2,) is in m north and east of dead reckoning, its covariance (2, 2) in m². `log_odds` is the
+    natural logarithm of its odds against the navigator's position.
     """
 
     position: FloatArray
     covariance: FloatArray
-    probability: float
+    log_odds: float

@@ -293,7 +293,9 @@ class _JointFit:
     def _gauss_newton(self) -> _Solution:
         """Refine the shift together with all other terms by Gauss-Newton steps; return the last solution."""
         blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
-        effects = sum(len(block.shape) for block in blocks if _is_effect(block))
+        # Effects are the heading error and the terms, not line levels or slow changes.
+        names = "heading error", "effect of "
+        effects = sum(len(block.shape) for block in blocks if block.name.startswith(names))
         slopes: FloatArray | None = None
         for _ in range(GAUSS_NEWTON_STEPS + 1):
             # Linearise about the shift so far: y = levels + heading error + terms + field + slopes * step.
@@ -421,11 +423,6 @@ class _JointFit:
                 values = {"column": column, "channel": name, "effect_nT": contribution[name]}
                 found.append(Diagnostic(code, values))
         return tuple(found)
-
-
-def _is_effect(block: ParameterBlock) -> bool:
-    """Return True if a block is the heading error or a term, not line levels or slow changes."""
-    return block.name == "heading error" or block.name.startswith("effect of ")
 
 
 def _harmonics(heading: FloatArray) -> FloatArray:

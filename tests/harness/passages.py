@@ -18,8 +18,9 @@ START = 1_780_000_000.0
 LOST, BACK, LAST = 60.0, 840.0, 900.0
 """Times at which GPS is lost, GPS returns and the track ends, s after the start."""
 AIRCRAFT = NavigationOptions(
-    start_sigma=50.0, current_sigma=4.0, current_time=3600.0, bias_sigma=2.0, map_sigma=2.0, interval=5.0
-)
+    start_sigma=50.0, current_sigma=4.0, current_time=3600.0, bias_sigma=2.0, map_sigma=2.0, interval=5.0,
+    sigma_limit=65.0,
+)  # fmt: skip
 """Navigation options for a plane in a wind of 4 m/s (1-sigma)."""
 OPTIONS = NavigationOptions(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
 
