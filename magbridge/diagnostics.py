@@ -187,9 +187,8 @@ DIAGNOSIS_TEXTS = {
     "summary.one_condition": "Fit for use on one condition: {condition}",
     "summary.not_needed": "There is no need for it: the calibration's own coefficients, refitted, do as "
     "well.",
-    "summary.reference_only": "It has no new term: the error found belongs to the reference, not to the "
-    "vehicle. Its coefficients are refitted without that error.",
     "summary.no_improvement": "The corrected field does not improve on held-out parts.",
+    "summary.within_sigma": "The error that it removes hardly exceeds its own sigma: calibrate again first.",
     "summary.refit_as_good": "A refit of the calibration alone corrects as well: calibrate again instead.",
     "summary.refused": "The extension is refused. {why}. calibration.json is the calibration as it was "
     "given.",
@@ -198,6 +197,7 @@ DIAGNOSIS_TEXTS = {
     "summary.nothing_added": "calibration.json is the calibration as it was given. It does not describe all "
     "that this vehicle's sensor sees: expect errors like the {before_nT:3} nT RMS found here.",
     # Why an extension is refused, with the allowed and the found value
+    "refusal.reference_only": "It would have no new term: no effect found is one that it corrects",
     "refusal.not_linear": "On parts left out of the fit the linear model predicts an error of {allowed:3} nT "
     "RMS, and the corrector leaves {found:3} nT",
     "refusal.outside_prior": "It would move the corrected field by {found:3} nT where this log does not "

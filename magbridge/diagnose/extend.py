@@ -43,12 +43,7 @@ MODES = 64
 """Number of directions over which the misfit of an idealised regressor is spread, from the blind study."""
 
 
-def loosened(
-    problem: Problem,
-    model: Sequence[Candidate],
-    columns: Sequence[Columns],
-    fit: Joint,
-) -> Joint:
+def loosened(problem: Problem, model: Sequence[Candidate], columns: Sequence[Columns], fit: Joint) -> Joint:
     """Return the fit with its covariance widened for nonlinear parameters; `columns` are of `model`."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if not any(piece.point.rebuild and piece.point.cells for piece in pieces):

@@ -6,9 +6,10 @@ The log is divided into folds of whole dives, runs or eighths. Each fold is corr
 :func:`magbridge.calibration.correct.correct` with a calibration that is fitted to the other folds. For
 comparison, the calibration as given is refitted in the same way without any cause.
 
-An extension is refused for one of three reasons. The linear model's held-out prediction and the corrected
-field differ by more than the noise. The corrected field moves further than the given covariance allows, where
-the log does not determine it. Or the held-out field becomes worse.
+An extension is refused for one of four reasons. It corrects no named cause, so only the refit would change
+the calibration. The linear model's held-out prediction and the corrected field differ by more than the noise.
+The corrected field moves further than the given covariance allows, where the log does not determine it. Or
+the held-out field becomes worse.
 """
 
 from __future__ import annotations
@@ -81,8 +82,6 @@ class Extension:
     """Held-out error (n,), nT: corrected field less reference."""
     reference_error: FloatArray
     """Held-out error (n,) of the reference by its named causes, nT."""
-    sigma: FloatArray
-    """Stated sigma (n,) of the corrected field, nT."""
     score: float
     """Log predictive density, summed over the folds."""
     day_error: FloatArray | None = None
@@ -98,12 +97,7 @@ def corrected(survey: Survey, calibration: Calibration) -> CorrectedArrays:
     return correct(calibration, survey.field, survey.values(calibration.channels), survey.time)
 
 
-def extension_of(
-    problem: Problem,
-    model: Sequence[Candidate],
-    fit: Joint,
-    counts: BoolArray,
-) -> Extension:
+def extension_of(problem: Problem, model: Sequence[Candidate], fit: Joint, counts: BoolArray) -> Extension:
     """Extend the calibration by the causes of a model; without a model, refit its own coefficients.
 
     `counts` (n,) are the samples by which the improvement is measured. Attempts with ever tighter priors are
@@ -116,17 +110,15 @@ def extension_of(
         if not tried.refused:
             return tried
         first = first or tried
+        if tried.refused == "reference_only":  # no tighter prior adds a term
+            break
         tried.problem.let_go()
     assert first is not None
     return replace(first, calibration=problem.calibration)
 
 
 def attempt(
-    problem: Problem,
-    model: Sequence[Candidate],
-    fit: Joint,
-    counts: BoolArray,
-    factor: float = 1.0,
+    problem: Problem, model: Sequence[Candidate], fit: Joint, counts: BoolArray, factor: float = 1.0
 ) -> Extension:
     """Return the extension with the calibration's prior sigma multiplied by `factor`, and its checks."""
     if factor < 1.0:
@@ -159,11 +151,14 @@ def attempt(
         variance = _excess_variance(problem, calibration, forward, [counts & late])
         calibration = with_level_variance(calibration, variance)
     extension = Extension(
-        calibration, settled, tuple(blocks), fit, error, reference_error,
-        corrected(problem.survey, calibration).sigma, out.score, day_error,
-    )  # fmt: skip
+        calibration, settled, tuple(blocks), fit, error, reference_error, out.score, day_error
+    )
     if not model:
         return extension
+    # An error of the reference is not the vehicle's: without a new term, the given calibration stays
+    added = set(calibration.effects)
+    if all(c.about != "vehicle" or (c.effects and added.isdisjoint(c.effects)) for c in model):
+        return replace(extension, refused="reference_only")
     reason, details = _refusal(problem, extension, out, counts, bool(dropped))
     return replace(extension, refused=reason, details=details)
 

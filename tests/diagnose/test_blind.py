@@ -136,17 +136,10 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"
-    keys = {
-        "verdict",
-        "rms_before_nT",
-        "rms_after_nT",
-        "improvement",
-        "findings",
-        "unexplained",
-        "remarks",
-        "scalar",
-    }
-    assert set(found) == {*keys, "format", "assessment"}
+    assert set(found) == {
+        "format", "verdict", "rms_before_nT", "rms_after_nT", "improvement", "findings", "unexplained",
+        "remarks", "scalar", "assessment",
+    }  # fmt: skip
     assert found["findings"][0]["cause"] == "current_field"
     improvement = found["improvement"]
     assert improvement["interval"][0] <= improvement["rms_ratio"] <= improvement["interval"][1] < 1.0
@@ -164,15 +157,16 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
 
 
 def test_a_maps_error_is_reported_by_its_size(short: None) -> None:
-    """The report states the RMS of a map's error instead of its hundred coefficients."""
+    """The report states the RMS of a map's error, and the vehicle's calibration stays as it is."""
     here = deployment.Background.of(deployment.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)
-    diagnosis = diagnose([here.log(hidden.ds)], here.deployment.calibration).diagnosis
+    diagnosis, use = diagnose([here.log(hidden.ds)], here.deployment.calibration)
     (named,) = [one for one in diagnosis.findings if one.candidate.cause == "map_error"]
     numbers = parameters(named, len(diagnosis.problem))
     assert set(numbers) == {"rms"}
     assert numbers["rms"]["value"] == pytest.approx(np.std(hidden.signature), rel=0.2)
-    assert not useful(diagnosis)  # nothing of it is the vehicle's
+    assert diagnosis.calibration is here.deployment.calibration
+    assert (use.fit_for_use, diagnosis.refused) == ("no", "reference_only")
     assert 0.0 < numbers["rms"]["sigma"] < 0.2 * numbers["rms"]["value"]
 
 

@@ -73,6 +73,9 @@ def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
     assert found.fit_for_use == "conditional"
     assert "own data do not support it: all headings lie within 20 degrees." in "".join(reasons(found))
     assert "calibrate again" in found.condition
+    removed = clear.improvement._replace(before=1.0, after=0.9)
+    weak = replace(clear, problem=replace(clear.problem, calibration=given), improvement=removed)
+    assert (answer(weak).fit_for_use, answer(weak).reason) == ("no", "within_sigma")
 
 
 def test_another_possible_cause_sets_a_condition_that_a_manoeuvre_removes(clear: Diagnosis) -> None:
