@@ -313,7 +313,7 @@ STATE_TEXTS = {
     NavigationState.SEARCHING: "searching",
     NavigationState.TRACKING: "tracking",
     NavigationState.DEAD_RECKONING: "dead reckoning: no information in the field here",
-    NavigationState.LOST: "lost: the field and the map disagree",
+    NavigationState.LOST: "lost: the field contradicts the map, or the position is uncertain",
 }
 
 GPS_REASONS = {
