@@ -39,8 +39,8 @@ SUSPECT_LOG_ODDS = 1.0
 RESTLESS_FRACTION, PRIOR_ODDS_RESTLESS = 0.1, 0.3
 """Growth of the velocity error of restless motion, as with a wrong heading, over the speed in one correlation
 length of the map; odds of such motion before the field is compared."""
-MAX_LOG_ODDS_RESTLESS = 3.0
-"""Natural log-likelihood ratio at which the filter of restless motion replaces the other or begins again."""
+MIN_LOG_ODDS_RESTLESS = -3.0
+"""Natural log-likelihood ratio below which the filter of restless motion begins again."""
 SEARCH_SPREADS = (2.0, 4.0, 2.0, 8.0)
 """1-sigma of successive searches, in units of :meth:`Estimate._reach`."""
 
@@ -196,10 +196,10 @@ class Estimate:
             self._measured = block.time_us, travelled, motion
             self._judge(block, seen)
             # A filter of restless motion begins again if it is unlikely, so that such motion shows soon.
-            if self._restless is None or self._restless.log_odds < -MAX_LOG_ODDS_RESTLESS:
+            if self._restless is None or self._restless.log_odds < MIN_LOG_ODDS_RESTLESS:
                 bank = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
                 self._restless = Competitor(bank)
-            elif self._restless.log_odds > MAX_LOG_ODDS_RESTLESS:
+            elif self._restless.log_odds > log(self.options.alarm_odds):
                 self.replace(self._restless.filter, "a filter with restless motion is likelier")
         # 4. One filter or a bank, the state, and whether the position may be used.
         self._set_state(on_the_map)
