@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magbridge.calibration.correct import Corrector, correct, forward
+from magbridge.calibration.correct import Corrector, correct, forward, vector_covariance
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.kernel import TABLE_SUMS
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, identity
@@ -119,7 +119,7 @@ def test_one_by_one_and_all_at_once_agree_to_1e_12(
     rng = np.random.default_rng(seed)
     field[rng.random(n) < 0.02] = np.nan
     channels[rng.random(channels.shape) < 0.02] = np.nan
-    batch = correct(cal, field, channels, time)
+    batch, covariance = correct(cal, field, channels, time), vector_covariance(cal, field, channels, time)
     live = Corrector(cal)
     for i in range(n):
         one = live.step(round(time[i] * 1e6), tuple(field[i].tolist()), channels[i].tolist())
@@ -128,6 +128,9 @@ def test_one_by_one_and_all_at_once_agree_to_1e_12(
         np.testing.assert_allclose(one.field, batch.vector[i], rtol=0.0, atol=1e-12 * F_0)
         np.testing.assert_allclose(one.total_field_sigma, batch.sigma[i], rtol=1e-12)
         np.testing.assert_allclose(one.field_sigma, batch.vector_sigma[i], rtol=1e-12)
+        if np.isfinite(one.total_field):
+            own = np.reshape(live.vector_covariance(), (3, 3))
+            np.testing.assert_allclose(own, covariance[i], rtol=1e-9, atol=1e-12 * covariance[i].max())
 
 
 def test_one_sample_is_summed_in_one_order_on_any_processor() -> None:
@@ -258,3 +261,12 @@ def test_a_change_of_position_is_the_difference_of_the_totals() -> None:
         assert moved == pytest.approx([there - value for value in elsewhere], abs=1e-11 * there)
         assert corrector.changes(tuple(h), tuple(p), spans) == moved
         assert corrector.changes(tuple(h), (*p, 3.0), [*spans, (2, 0.0, 1.0)]) == moved
+
+
+def test_the_effects_of_independent_errors_make_up_sigma() -> None:
+    cal = replace(random_calibration(3, boresight=True, extra=True), noise=Noise(0.0))
+    field, channels, _ = random_samples(4, 20, len(cal.channels))
+    corrector = Corrector(cal)
+    for i, (h, values) in enumerate(zip(field.tolist(), channels.tolist(), strict=True)):
+        sigma = corrector.step(i * 4_000_000, tuple(h), values).total_field_sigma
+        assert np.sqrt(np.sum(corrector.error_effects() ** 2)) == pytest.approx(sigma, rel=1e-6)
