@@ -87,6 +87,31 @@ def test_a_wide_start_is_found(grid: AnomalyGrid, options: NavigationOptions) ->
     assert NavigationState.LOST not in run.state
 
 
+def test_a_known_position_that_has_become_vague_is_lost(
+    grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset
+) -> None:
+    """After the map has confirmed the position, samples become useless: the sigma grows past the limit."""
+    names = ("velocity_north", "velocity_east", "total_field")
+    time_us = np.round(ds["time"].to_numpy() * 1e6).astype(int).tolist()
+    rows = list(zip(time_us, *(ds[name].to_numpy().tolist() for name in names), strict=True))
+    lost = {}
+    for limit in (200.0, 500.0):
+        navigator = _fresh(grid, replace(options, sigma_limit=limit))
+        feed(navigator, ds, slice(0, len(rows) // 2))
+        seen = []
+        for t, north, east, field in rows[len(rows) // 2 :]:
+            navigator.telemetry(t - 4_000_000, velocity_north=north, velocity_east=east, depth=30.0)
+            if (record := navigator.measure(t, field, 300.0)) is not None:
+                ne = record.covariance_ne
+                P = [[record.covariance_nn, ne], [ne, record.covariance_ee]]
+                seen.append((float(np.linalg.eigvalsh(P)[1]) ** 0.5, record.state))
+        assert max(sigma for sigma, _ in seen) > 300.0
+        lost[limit] = [sigma for sigma, state in seen if state is NavigationState.LOST]
+    assert min(lost[200.0]) > 200.0
+    assert max(lost[200.0]) > 300.0
+    assert not lost[500.0]
+
+
 def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again() -> None:
     hours_valid, hours_lost = carried(Map(30, 1500), 3)
     assert 0.0 < hours_lost < 2.0
