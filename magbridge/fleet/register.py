@@ -106,11 +106,10 @@ def masses(row: Row) -> dict[str, Mounting]:
 def vehicle_named(catalogue: Catalogue, name: str) -> Row:
     """Return the row of the vehicle `name`; WrongUse: the vehicle does not exist."""
     known = vehicles(catalogue)
-    if name not in known:
-        if not known:
-            raise WrongUse(f"{name}: {catalogue.name} has no vehicle yet; add one with magbridge fleet add")
-        raise WrongUse(f"{catalogue.name}: vehicle: {one_of(name, known)}")
-    return known[name]
+    if name in known:
+        return known[name]
+    there = f"vehicle: {one_of(name, known)}" if known else "it has no vehicle yet"
+    raise WrongUse(f"{catalogue.name}: {there}; magbridge fleet add --vehicle {name} --parameter ... adds it")
 
 
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
@@ -143,7 +142,7 @@ def add_logs(
 ) -> tuple[int, list[str]]:
     """Add the logs of a deployment to the catalogue; return the number of new rows, and warnings.
 
-    A warning names a log that cannot be read or that has changed since it was added.
+    A warning names a log that cannot be read, has changed, or belonged to another deployment.
 
     WrongUse: the vehicle does not exist, or the deployment's name cannot be a folder's.
     """
@@ -168,6 +167,8 @@ def add_logs(
             continue
         if last is not None and last["sha256"] != sha:
             lines.append(f"{log}: has changed since it was catalogued; its present contents count")
+        if last is not None and (was := (last["vehicle"], last["deployment"])) != (vehicle, deployment.name):
+            lines.append(f"{log}: belonged to {', '.join(was)}; now to {vehicle}, {deployment.name}")
         rows.append({**content, "version": 1 if last is None else last["version"] + 1})
     return catalogue.add("files", rows), lines
 
@@ -199,9 +200,7 @@ def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
 
 def is_file_name(name: str) -> bool:
     """Return True if `name` is usable as a file or folder name and does not lead to another folder."""
-    return (
-        bool(name.strip()) and not name.startswith(".") and not set(name) & set("/\\") and name.isprintable()
-    )
+    return bool(name.strip()) and name.isprintable() and name[0] != "." and not set(name) & set("/\\")
 
 
 def _check_name(name: str, kind: str) -> None:

@@ -141,6 +141,9 @@ def test_a_log_that_changed_is_another_version(catalogue: Catalogue, tmp_path: P
     log.write_bytes(kept)  # and back
     add_logs(catalogue, "comet", MAY, [log])
     assert jobs(catalogue)[0].name == first
+    count, (output,) = add_logs(catalogue, "comet", Deployment("june", ()), [log])
+    assert count == 1
+    assert output.endswith("log.nc: belonged to comet, may; now to comet, june")
 
 
 @pytest.mark.parametrize("name", ["", "../up", "a\\b", ".hidden", "two\nlines"])
@@ -153,7 +156,9 @@ def test_a_name_that_can_be_no_folders_is_refused(empty: Catalogue, name: str) -
 
 
 def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) -> None:
-    with pytest.raises(WrongUse, match=r"nemo: .* has no vehicle yet"):
+    with pytest.raises(
+        WrongUse, match=r"it has no vehicle yet; magbridge fleet add --vehicle nemo --parameter"
+    ):
         add_logs(empty, "nemo", MAY, [])
     add_vehicle(empty, "comet", Vehicle())
     count, (output,) = add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])
