@@ -249,9 +249,9 @@ def with_true_heading(deployment: xr.Dataset, reference: str | None = None) -> x
     The true heading is the magnetic one plus the IGRF's declination ``D = atan2(B_east, B_north)``. Without
     a position it is NaN.
     """
-    reference = reference or deployment.attrs.get("heading_reference", "true")
+    reference = reference or deployment.attrs.get("heading_reference")
     if reference != "magnetic" or "heading" not in deployment:
-        return deployment.assign_attrs(heading_reference=reference)
+        return deployment.assign_attrs(heading_reference=reference) if reference else deployment
     require_date(deployment)
     # True heading = magnetic heading + declination, D = atan2(B_east, B_north).
     north, east, _ = main_field(deployment).T

@@ -45,6 +45,8 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import samples_per_independent
 from magbridge.estimation.residual import PAIRS, residuals_of, rms, robust_scale, symmetric
 
+MAX_DIRECTIONS = 20_000
+"""Approximate number of samples whose direction is used; time and memory are proportional to it."""
 CONVERGED = 1e-6
 """Length of a step, in standard deviations of z and in rad, below which the iterations have converged."""
 CLIP_SIGMA = 3.0
@@ -66,7 +68,9 @@ def with_direction(found: Fit, data: Observations, *, headings: bool) -> Fit:
         needed = "roll, pitch and heading" if headings else "roll and pitch"
         raise CalibrationError(f"direction: needs {needed} and a position in {MIN_BORESIGHT_SAMPLES} samples")
     known, attitude, reference = data.directed()
-    samples = found.samples.part(known)
+    step = max(len(attitude) // MAX_DIRECTIONS, 1)
+    used, attitude, reference = np.flatnonzero(known)[::step], attitude[::step], reference[::step]
+    samples, steps = found.samples.part(used), data.part(np.isin(np.arange(len(data)), used)).steps
     h = field_body(attitude, reference)
     Q = _across(h) if headings else _vertical(attitude)
     # c = c_0 + L z, from the eigenvectors: a covariance may have directions without variance
@@ -91,14 +95,15 @@ def with_direction(found: Fit, data: Observations, *, headings: bool) -> Fit:
         # noise of a row, with Huber's weights and the correlation of the contributions to the gradient
         sigma = max(robust_scale(e.ravel()), 1e-9)
         weight = np.minimum(1.0, CLIP_SIGMA * sigma / np.maximum(np.abs(e), 1e-300))
-        information = np.einsum("nr,nri,nrj->ij", weight, J, J) / sigma**2
-        pulls = np.einsum("nr,nri->ni", weight * e, J) / np.sqrt(np.diag(information) + 1e-300)
-        variance = samples_per_independent(pulls, data.part(known).steps)
+        rows = J.reshape(-1, J.shape[2])
+        information = (rows * weight.reshape(-1, 1)).T @ rows / sigma**2
+        pulls = ((weight * e)[:, :, None] * J).sum(axis=1)
+        variance = samples_per_independent(pulls / np.sqrt(np.diag(information) + 1e-300), steps)
         precision = information / variance + prior
-        gradient = np.einsum("nr,nri->i", weight * e, J) / sigma**2 / variance
-        step = -np.linalg.solve(precision, gradient + np.append(z, np.zeros(3)))
-        z, rotation = z + step[:-3], Rotation.from_rotvec(step[-3:]) * rotation
-        if np.linalg.norm(step) < CONVERGED:
+        gradient = pulls.sum(axis=0) / sigma**2 / variance
+        move = -np.linalg.solve(precision, gradient + np.append(z, np.zeros(3)))
+        z, rotation = z + move[:-3], Rotation.from_rotvec(move[-3:]) * rotation
+        if np.linalg.norm(move) < CONVERGED:
             break
     # the vertical component, which does not depend on the heading, shows the errors of roll and pitch
     vertical = np.einsum("nri,ni->n", _vertical(attitude), v - h) / np.hypot(*reference[:, :2].T)
