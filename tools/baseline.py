@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ import measured
 import navigation
 import numpy as np
 import survey
-from studies import DATA, Row, command_line, in_order
+from studies import DATA, Row, command_line, in_order, run_case
 from study import table
 from study_worlds import NOISES
 from voyages import Map
@@ -50,7 +50,7 @@ class Part(NamedTuple):
     """
 
     name: str
-    run: Callable[..., list[Row]]
+    run: Callable[..., Iterable[Row]]
     cases: Sequence[tuple[Any, ...]]
     by: tuple[str, ...] = ()
     columns: Mapping[str, str] = {}
@@ -59,7 +59,7 @@ class Part(NamedTuple):
         """Return the figures of a case; a case that fails is the figure "failed cases"."""
         warnings.simplefilter("ignore")
         try:
-            rows = self.run(*case)
+            rows = run_case(self.run, case) if self.columns else [*self.run(*case)]
         except Exception as error:  # noqa: BLE001 - a case that fails is a figure of its own, the others go on
             print(f"{self.name}: {case}: {error!r}", file=sys.stderr, flush=True)
             return {f"{self.name}: failed cases": 1.0}
@@ -117,7 +117,7 @@ def real_logs() -> list[Row]:
         "aircraft: second half, extended model, nT": found.total.after,
         "aircraft: smallest scale": fitted.scales[0],
     }
-    return [figures | {f"ArduSub, second half: {row.method}, nT": row.rms for row in halves}]
+    return [figures | {f"ArduSub, second half: {row['method']}, nT": row["rms"] for row in halves}]
 
 
 def replay() -> list[Row]:
@@ -134,7 +134,7 @@ ERROR = {"error / noise": "ratio"}
 
 def gliders(method: str) -> list[tuple[Any, ...]]:
     """Return the cases of a method's calibrations, without bounds and other programs."""
-    return [(seed, noise, 2, (method,), "", False) for noise in NOISES for seed in range(20)]
+    return [(2, noise, seed, "", (method,), False) for noise in NOISES for seed in range(20)]
 
 
 BOTH = "noise", "method"
@@ -160,7 +160,8 @@ PARTS = (
     ),
     Part("diagnosis", diagnosis, [(entry,) for entry in blind.plan(60)]),
     Part(
-        "navigation", navigated, [(navigation.MAPS[k], seed) for k in (0, 2) for seed in range(20)], ("map",),
+        "navigation", navigated, [(navigation.MAPS[k], seed) for k in (0, 2) for seed in range(20)],
+        ("kind",),
         {
             "error / bound": "ratio", "normalised squared error": "nees", "lost": "lost",
             "valid fraction": "valid",

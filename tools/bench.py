@@ -32,9 +32,9 @@ BENCHMARKS: dict[str, tuple[str, int]] = {
     "start": ("benchmarks.latency:start", 5),
     "learning": ("benchmarks.processor:learning", 5),
     "commands": ("benchmarks.latency:commands", 7),
-    "fitting": ("benchmarks.calibration:fitting", 3),
-    "correcting": ("benchmarks.calibration:correcting", 5),
-    "diagnosing": ("benchmarks.diagnose:diagnosing", 1),
+    "fitting": ("benchmarks.offline:fitting", 3),
+    "correcting": ("benchmarks.offline:correcting", 5),
+    "diagnosing": ("benchmarks.offline:diagnosing", 1),
 }
 """Benchmark's name to ``module:function`` and repetitions; the function takes a folder and this number."""
 

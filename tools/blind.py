@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,7 +44,6 @@ from sitl.dataset import corrected
 from sitl.inject import HiddenEffect
 
 NAMES = tuple(EFFECTS)
-LADDER = (4.0, 3.0, 5.0, 2.0, 6.0)
 LOUD = (25.0, 100.0, 15.0, 50.0)
 LASTING = (
     "temperature_offset", "temperature_scale", "current_field", "unmodelled_actuator", "actuator_order",
@@ -66,77 +64,50 @@ GOLDEN = 0.6180339887498949
 
 
 class Part(NamedTuple):
-    """Part of the study: its fraction of the cases, and a function that returns its k-th case."""
+    """Part of the study: its fraction of the cases, and cycles of effects, sizes (S/N) and noises."""
 
     share: float
-    entry: Callable[[int], Row]
-
-
-def _null(k: int) -> Row:
-    return {"names": (), "wanted": 0.0, "noise": NOISES[k % len(NOISES)]}
-
-
-def _named(k: int) -> Row:
-    return {"names": (NAMES[k % len(NAMES)],), "wanted": 8.0, "noise": ("white", "ar")[k // len(NAMES) % 2]}
-
-
-def _ladder(k: int) -> Row:
-    return _named(k) | {"wanted": LADDER[k // len(NAMES) % len(LADDER)]}
-
-
-def _loud(k: int) -> Row:
-    return _named(k) | {"wanted": LOUD[k // len(NAMES) % len(LOUD)]}
-
-
-def _unknown(k: int) -> Row:
-    names = (*KNOWN, *(name for name in FOREIGN if name not in STRANGE + SEEN))
-    name = names[k % len(names)]
-    return {"names": (name,), "wanted": 10.0, "noise": "white", "without": name if name in CAUSES else ""}
-
-
-def _foreign(names: tuple[str, ...]) -> Callable[[int], Row]:
-    return lambda k: {
-        "names": (names[k % len(names)],), "wanted": 10.0, "noise": ("white", "ar")[k // len(names) % 2],
-    }  # fmt: skip
-
-
-def _pair(k: int) -> Row:
-    a, b = np.random.default_rng([20131212, k]).choice(len(KNOWN), 2, replace=False)
-    return {"names": (KNOWN[int(a)], KNOWN[int(b)]), "wanted": 10.0, "noise": ("white", "ar")[k % 2]}
-
-
-def _gain(k: int) -> Row:
-    return {"names": (LASTING[k % len(LASTING)],), "wanted": 20.0, "noise": "white"}
-
-
-def _charted(k: int) -> Row:
-    """Return the k-th case like the paper's log: the reference is a map; a third of the cases hide none."""
-    names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
-    return {
-        "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
-        "reference": CHARTS[k // len(LOUD) % len(CHARTS)], "losses": "surfacing",
-    }  # fmt: skip
-
-
-def _flicker(k: int) -> Row:
-    """Return the k-th case in flicker noise; its signal-to-noise refers to white noise of the same RMS."""
-    names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
-    return {"names": names, "wanted": 25.0 * bool(names), "noise": FLICKER}
+    effects: tuple[str, ...]
+    sizes: tuple[float, ...]
+    noises: tuple[str, ...] = ("white", "ar")
 
 
 PARTS: dict[str, Part] = {
-    "null": Part(0.18, _null),
-    "named": Part(0.22, _named),
-    "ladder": Part(0.12, _ladder),
-    "loud": Part(0.08, _loud),
-    "unknown": Part(0.1, _unknown),
-    "pair": Part(0.08, _pair),
-    "gain": Part(0.07, _gain),
-    "seen": Part(0.03, _foreign(SEEN)),
-    "foreign": Part(0.04, _foreign(STRANGE)),
-    "charted": Part(0.04, _charted),
-    "flicker": Part(0.04, _flicker),
+    "null": Part(0.18, (), (0.0,), NOISES),
+    "named": Part(0.22, NAMES, (8.0,)),
+    "ladder": Part(0.12, NAMES, (4.0, 3.0, 5.0, 2.0, 6.0)),
+    "loud": Part(0.08, NAMES, LOUD),
+    "unknown": Part(
+        0.1, (*KNOWN, *(name for name in FOREIGN if name not in STRANGE + SEEN)), (10.0,), ("white",)
+    ),
+    "pair": Part(0.08, KNOWN, (10.0,)),
+    "gain": Part(0.07, LASTING, (20.0,), ("white",)),
+    "seen": Part(0.03, SEEN, (10.0,)),
+    "foreign": Part(0.04, STRANGE, (10.0,)),
+    "charted": Part(0.04, LASTING, LOUD, (GLIDER,)),
+    "flicker": Part(0.04, LASTING, (25.0,), (FLICKER,)),
 }
+"""Parts of the study. In `unknown`, the table lacks the effect's cause. In `charted`, the reference is a map.
+The signal-to-noise ratio in `flicker` refers to white noise of the same RMS. A third of the cases in these
+two parts hides nothing."""
+
+
+def entry_of(name: str, k: int) -> Row:
+    """Return the k-th case of a part: each size and each noise with every effect, before the next ones."""
+    part, lost = PARTS[name], losses(k)
+    cycle, place = divmod(k, max(len(part.effects), 1))
+    names = part.effects[place : place + 1]
+    size, noise = (series[cycle % len(series)] for series in (part.sizes, part.noises))
+    more = {}
+    if name == "pair":
+        a, b = np.random.default_rng([20131212, k]).choice(len(KNOWN), 2, replace=False)
+        names, noise = (KNOWN[int(a)], KNOWN[int(b)]), part.noises[k % 2]
+    if name in ("charted", "flicker") and k % 3 == 0:
+        names = ()
+    if name == "charted":
+        cycle, place = divmod(k, len(LOUD))
+        size, lost, more = LOUD[place], "surfacing", {"reference": CHARTS[cycle % len(CHARTS)]}
+    return {"losses": lost, "names": names, "wanted": size * bool(names), "noise": noise, **more}
 
 
 def losses(k: int) -> str:
@@ -157,29 +128,24 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
     made = []
     # the last two parts share a range of 100,000 numbers, because a seed has only ten ranges
     for place, (name, part) in zip((*range(10), 9.5), PARTS.items(), strict=True):
-        count = round(cases * part.share) if name in parts else 0
-        made += [
-            (
-                (k + 0.5) / part.share,
-                {"losses": losses(k)}
-                | part.entry(k)
-                | {"part": name, "number": SEEDS * seed + int(100_000 * place) + k},
-            )
-            for k in range(count)
-        ]
+        number = SEEDS * seed + int(100_000 * place)
+        for k in range(round(cases * part.share) if name in parts else 0):
+            entry = entry_of(name, k) | {"part": name, "number": number + k}
+            made.append(((k + 0.5) / part.share, entry))
     return [entry for _, entry in sorted(made, key=lambda item: item[0])]
 
 
 def case(entry: Row) -> Row:
     """Hide the effects of an entry, diagnose the log, and return the row with the ideal results."""
     began = time.process_time()
-    number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
+    number, noise, names = entry["number"], entry["noise"], entry["names"]
     deployment = deployment_of(number, noise, entry.get("reference", "true"))
     background = Background.of(deployment, number, noise, entry["losses"])
     hidden = [background.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
     whole = hidden[0].ds if len(hidden) == 1 else background.measure(*(one.hidden for one in hidden))
     ds = background.log(whole)
-    table = {name: cause for name, cause in CAUSES.items() if name != without}
+    removed = names if entry["part"] == "unknown" else ()
+    table = {name: cause for name, cause in CAUSES.items() if name not in removed}
     judged = diagnose([ds], deployment.calibration, training_logs=deployment.learned, causes=table)
     result, found = judged.diagnosis, findings(judged)
     row = entry | {

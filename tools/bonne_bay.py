@@ -13,7 +13,6 @@ diagnosed against the true field, the map continued down to the glider, and the 
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 import numpy as np
@@ -46,7 +45,7 @@ def run(seed: int, at_depth: bool) -> list[Row]:
             paper_runs, paper_survey = PAPER.get((trial, method), (np.nan, np.nan))
             rows.append(
                 {
-                    "trial": trial, "method": method, "seed": seed,
+                    "trial": trial, "method": method,
                     "failed": flight.failed.get((trial, method), ""),
                     "runs": flight.rms(trial, trial, method), "paper_runs": paper_runs,
                     "survey": flight.rms("survey", trial, method), "paper_survey": paper_survey,
@@ -71,7 +70,7 @@ def has_signature(flight: Trials) -> bool:
     return nominal >= 3.0 * max(runs) and is_worse_on_survey and survey[0] > survey[1]
 
 
-def run_diagnosis(seed: int, reference: str) -> list[Row]:
+def run_diagnosis(reference: str, seed: int) -> list[Row]:
     """Diagnose the survey with trial 1's calibration, without a hint that the cause is a temperature."""
     telemetry = {"reference": "map" if reference == "map" else "true"}
     twin = Twin.draw(load("bonne_bay").replace(telemetry=telemetry), seed)
@@ -83,7 +82,7 @@ def run_diagnosis(seed: int, reference: str) -> list[Row]:
         rms(corrected(survey, known).total - true_field(survey)) for known in (calibration, found.calibration)
     )
     causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
-    return [{"reference": reference, "seed": seed, "causes": causes, "before": before, "after": after}]
+    return [{"causes": causes, "before": before, "after": after}]
 
 
 STUDY = Study(
@@ -114,13 +113,7 @@ DIAGNOSIS = Study(
 )
 
 
-def worlds(options: argparse.Namespace) -> range:
-    """Return the seeds of the worlds."""
-    return range(options.first, options.first + options.seeds)
-
-
 if __name__ == "__main__":
-    shown, cases = STUDY, lambda o: [(seed, o.at_depth) for seed in worlds(o)]
-    if "--diagnose" in sys.argv:
-        shown, cases = DIAGNOSIS, lambda o: [(k, name) for name in ("true", *CHARTS) for k in worlds(o)]
-    shown.main(__doc__, cases, first=FIRST_SEED, seeds=1, at_depth=False, diagnose=False)
+    shown = DIAGNOSIS if "--diagnose" in sys.argv else STUDY
+    references = ["true", *CHARTS]
+    shown.main(__doc__, first=FIRST_SEED, seeds=1, at_depth=False, diagnose=False, references=references)

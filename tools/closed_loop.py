@@ -1,6 +1,6 @@
 """Measure how far the positions of a bridge and of an autopilot that uses its fixes diverge over hours.
 
-    python tools/closed_loop.py [--runs 1] [--hours 6] [--maps 2] [--telemetry speed ...]
+    python tools/closed_loop.py [--seeds 1] [--hours 6] [--charts 2] [--telemetry speed ...]
 
 The gliders of tools/navigation.py have GPS for the first ten and the last five minutes only.
 Each kind of fix and of telemetry is run twice: with an autopilot that ignores fixes, and with an autopilot
@@ -15,10 +15,7 @@ back, s       time from the return of GPS until the autopilot's position is with
 
 from __future__ import annotations
 
-import argparse
 from functools import partial
-from itertools import product
-from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -41,11 +38,12 @@ STREAMS = {
 }
 AUTOPILOTS: dict[str, type[Autopilot]] = {"ArduPilot": ArduPilot, "PX4": Px4}
 PAIRS = (
-    ("EXTERNAL_POSITION_ESTIMATE", "ArduPilot"),
-    ("ODOMETRY", "ArduPilot"),
-    ("EXTERNAL_POSITION_ESTIMATE", "PX4"),
-    ("GLOBAL_POSITION_SENSOR", "PX4"),
+    "EXTERNAL_POSITION_ESTIMATE ArduPilot",
+    "ODOMETRY ArduPilot",
+    "EXTERNAL_POSITION_ESTIMATE PX4",
+    "GLOBAL_POSITION_SENSOR PX4",
 )
+"""Fixes and the autopilots that get them."""
 
 
 def passage(kind: Map, seed: int, hours: float) -> Passage:
@@ -69,16 +67,18 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.square(values))))
 
 
-def run(fix: str, stack: str, streams: str, kind: Map, seed: int, hours: float) -> list[Row]:
+def run(pair: str, telemetry: str, chart: int, seed: int, hours: float) -> list[Row]:
     """Simulate a glider with an autopilot that uses fixes and with one that ignores fixes; return the row."""
+    fix, autopilot = pair.split()
+    kind = MAPS[chart]
     grid, way = synthetic(kind, seed % 10), passage(kind, seed, hours)
     options = replace(GLIDER, start_sigma=0.2 * grid.correlation_length)
 
     def sailed(obeys: bool) -> tuple[Run, Autopilot]:
-        make = partial(AUTOPILOTS[stack], streams=STREAMS[streams], obeys=obeys)
+        make = partial(AUTOPILOTS[autopilot], streams=STREAMS[telemetry], obeys=obeys)
         return sail(way, grid, options, fix, make)[:2]
 
-    using, autopilot = sailed(True)
+    using, pilot = sailed(True)
     ignoring, _ = sailed(False)
     end = hours * HOUR - BACK_S
     lost = (using.seconds > LOST_S) & (using.seconds < end)
@@ -90,20 +90,20 @@ def run(fix: str, stack: str, streams: str, kind: Map, seed: int, hours: float) 
     bridge = rms(using.error[lost])
     return [
         {
-            "fix": fix, "autopilot": stack, "telemetry": streams, "map": str(kind),
+            "map": str(kind),
             "follows": reported[-1].removeprefix(FOLLOWS).partition(":")[0] if reported else "",
             "bridge": bridge, "ratio": bridge / rms(ignoring.error[lost]),
             "own": rms(np.hypot(*using.autopilot[fed].T)), "alone": rms(np.hypot(*ignoring.autopilot[fed].T)),
             "claimed": rms(using.claimed[fed]),
             "normalised": rms(using.autopilot[fed] / using.claimed[fed, None]),
-            "back": float(far[-1] + 1 if far.size else 0), "fixes": float(sum(autopilot.taken.values())),
+            "back": float(far[-1] + 1 if far.size else 0), "fixes": float(sum(pilot.taken.values())),
         }
     ]  # fmt: skip
 
 
 STUDY = Study(
     run,
-    ("fix", "autopilot", "telemetry", "map", "follows"),
+    ("pair", "telemetry", "map", "follows"),
     {
         "bridge, m": Column("bridge", form=".0f"),
         "ratio": Column("ratio"),
@@ -117,11 +117,5 @@ STUDY = Study(
 )
 
 
-def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
-    """Return the cases: every kind of fix and of telemetry, on every map."""
-    kinds = product(PAIRS, options.telemetry, MAPS[: options.maps], range(options.runs))
-    return [(*pair, streams, kind, seed, options.hours) for pair, streams, kind, seed in kinds]
-
-
 if __name__ == "__main__":
-    STUDY.main(__doc__, cases_of, runs=1, hours=6.0, maps=len(MAPS), telemetry=list(STREAMS))
+    STUDY.main(__doc__, pairs=list(PAIRS), telemetry=list(STREAMS), charts=len(MAPS), seeds=1, hours=6.0)

@@ -39,19 +39,10 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAG_RAW_FLAGS": (),
     "MAV_AUTOPILOT": ("GENERIC", "ARDUPILOTMEGA", "INVALID", "PX4"),
     "MAV_CMD": (
-        "GET_MESSAGE_INTERVAL",
-        "SET_MESSAGE_INTERVAL",
-        "REQUEST_MESSAGE",
-        "REQUEST_PROTOCOL_VERSION",
-        "REQUEST_AUTOPILOT_CAPABILITIES",
-        "EXTERNAL_POSITION_ESTIMATE",
-        "PREFLIGHT_CALIBRATION",
-        "FIXED_MAG_CAL",
-        "FIXED_MAG_CAL_FIELD",
-        "FIXED_MAG_CAL_YAW",
-        "DO_START_MAG_CAL",
-        "DO_ACCEPT_MAG_CAL",
-        "DO_CANCEL_MAG_CAL",
+        "GET_MESSAGE_INTERVAL", "SET_MESSAGE_INTERVAL", "REQUEST_MESSAGE",
+        "REQUEST_PROTOCOL_VERSION", "REQUEST_AUTOPILOT_CAPABILITIES", "EXTERNAL_POSITION_ESTIMATE",
+        "PREFLIGHT_CALIBRATION", "FIXED_MAG_CAL", "FIXED_MAG_CAL_FIELD", "FIXED_MAG_CAL_YAW",
+        "DO_START_MAG_CAL", "DO_ACCEPT_MAG_CAL", "DO_CANCEL_MAG_CAL",
     ),
     "MAV_ESTIMATOR_TYPE": ("VISION",),
     "MAV_FRAME": ("GLOBAL", "LOCAL_NED", "BODY_FRD", "LOCAL_FRD"),
@@ -61,41 +52,11 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAV_SEVERITY": (),
     "MAV_STATE": ("ACTIVE", "CRITICAL"),
     "MAV_TYPE": ("GCS", "SUBMARINE", "ONBOARD_CONTROLLER"),
-}
+}  # fmt: skip
 """Enumerations that the code uses, and the entries that it needs; an empty tuple selects all entries."""
 
 
-UPSTREAM = """<?xml version="1.0"?>
-<mavlink>
-  <messages>
-    <message id="396" name="COMPONENT_INFORMATION_BASIC">
-      <description>Basic component information data; to be requested.</description>
-      <field type="uint32_t" name="time_boot_ms" units="ms">Time since system boot.</field>
-      <field type="uint64_t" name="capabilities">Component capability flags.</field>
-      <field type="uint32_t" name="time_manufacture_s" units="s" invalid="0">Date of manufacture.</field>
-      <field type="char[32]" name="vendor_name">Name of the component vendor.</field>
-      <field type="char[32]" name="model_name">Name of the component model.</field>
-      <field type="char[24]" name="software_version">Software version.</field>
-      <field type="char[24]" name="hardware_version">Hardware version.</field>
-      <field type="char[32]" name="serial_number">Hardware serial number.</field>
-    </message>
-    <message id="397" name="COMPONENT_METADATA">
-      <description>Where the general metadata file is, which names the others.</description>
-      <field type="uint32_t" name="time_boot_ms" units="ms">Time since system boot.</field>
-      <field type="uint32_t" name="file_crc">CRC-32 of the general metadata file.</field>
-      <field type="char[100]" name="uri">MAVLink FTP URI of the general metadata file.</field>
-    </message>
-    <message id="111" name="TIMESYNC">
-      <description>Time synchronization, with the address.</description>
-      <field type="int64_t" name="tc1" units="ns">Time sync timestamp 1.</field>
-      <field type="int64_t" name="ts1" units="ns">Time sync timestamp 2.</field>
-      <extensions/>
-      <field type="uint8_t" name="target_system">Target system id. Request: 0 (broadcast).</field>
-      <field type="uint8_t" name="target_component">Target component id. Request: 0 (broadcast).</field>
-    </message>
-  </messages>
-</mavlink>
-"""
+UPSTREAM = Path(__file__).with_name("upstream.xml")
 """XML of upstream messages that pymavlink's definitions lack."""
 
 
@@ -138,7 +99,7 @@ def render_dialect() -> str:
     with TemporaryDirectory() as name:
         folder = Path(name)
         ours = XML.read_text(encoding="utf-8").replace("  <include>common.xml</include>\n", "")
-        newer = UPSTREAM.split("<messages>", 1)[1].split("</messages>", 1)[0]
+        newer = UPSTREAM.read_text(encoding="utf-8").split("<messages>", 1)[1].split("</messages>", 1)[0]
         (folder / "magbridge.xml").write_text(
             ours.replace("</messages>", f"{newer}</messages>"), encoding="utf-8"
         )

@@ -1,8 +1,7 @@
 """Put faults of sensor, telemetry and computer into a survey, and count the wrong samples without a flag.
 
-    python3 tools/faults.py                      the table: each fault on a simulated survey
-    python3 tools/faults.py --hours 6 "x stuck"  the named faults, on a longer survey
-    python3 tools/faults.py --clean 30           30 days without a fault: false alarms
+    python3 tools/faults.py                                   each fault on a simulated survey
+    python3 tools/faults.py --faults none --hours 24 --seeds 30   30 days without a fault: false alarms
 
 The glider of ``magbridge demo`` performs calibration spirals and a survey. The bridge processes the survey's
 bytes with a fault in them. A sample is wrong if it has no flag and its error exceeds three sigmas.
@@ -10,7 +9,6 @@ bytes with a fault in them. A sample is wrong if it has no flag and its error ex
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -261,7 +259,7 @@ def run(fault: str, seed: int, hours: float) -> list[Row]:
     texts = [t for t in found.reported if any(w in t for w in words) and not t.startswith("field: ")]
     return [
         {
-            "fault": fault, "seed": seed, "samples": found.samples, "flagged": found.flagged / found.samples,
+            "samples": found.samples, "flagged": found.flagged / found.samples,
             "wrong": found.wrong / found.samples, "worst": found.worst, "sigma": found.sigma,
             "messages": " | ".join(dict.fromkeys(texts))[:120],
         }
@@ -281,14 +279,6 @@ STUDY = Study(
 )
 
 
-def cases_of(options: argparse.Namespace) -> list[tuple[str, int, float]]:
-    """Return the cases: the named faults, or days without a fault."""
-    if options.clean:
-        days = range(options.first, options.first + int(np.ceil(options.clean)))
-        return [("none", seed, 24.0) for seed in days]
-    return [(name, seed, options.hours) for seed in range(1, options.seeds + 1) for name in options.names]
-
-
 if __name__ == "__main__":
-    names = (*FAULTS, *STALLS, OTHER)
-    STUDY.main(__doc__, cases_of, names, hours=6.0, seeds=1, clean=0.0, first=1000)
+    faults = [*FAULTS, *STALLS, OTHER]
+    STUDY.main(__doc__, faults=faults, seeds=1, first=1, hours=6.0)

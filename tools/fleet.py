@@ -14,14 +14,15 @@ all changes are known exactly.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from itertools import product
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import xarray as xr
-from studies import Column, Row, Study, in_order, percentile, show
-from study_worlds import MASSES, BestFit, Glider
+from studies import Row, Study, in_order, show
+from study_worlds import MASSES, SCORES, BestFit, Glider
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -114,30 +115,25 @@ def lesson(flight: Flight) -> Lesson | str:
     )  # fmt: skip
 
 
-def run(flight: Flight, counts: tuple[int, ...], known: Known) -> list[Row]:
+def run(flight: Flight, counts: tuple[int, ...], known: Known) -> Iterator[Row]:
     """Calibrate a vehicle's last deployment with some of its runs, each with and without the prior."""
     runs, survey, vehicle = flight.fly()
-    flown = Glider(vehicle, runs, survey)
-    labels = np.unique(runs["run"])
-    rows: list[Row] = []
-    for count, (name, prior) in product(counts, {"none": None, "fleet": known}.items()):
-        if not count and prior is None:
-            continue
-        row: Row = {"runs": count, "prior": name, "vehicle": flight.vehicle, "failed": ""}
+    flown, labels = Glider(vehicle, runs, survey), np.unique(runs["run"])
+    for count in counts:
         part = runs.isel(time=np.isin(runs["run"], labels[:count]))
-        try:
-            found = fit(observations(part, MASSES), known=prior).calibration if count else expected(known)
-            rows.append(row | flown.score(found))
-        except CalibrationError as error:
-            rows.append(row | {"failed": str(error)})
-    for count in filter(None, counts):
-        part = runs.isel(time=np.isin(runs["run"], labels[:count]))
-        best = BestFit(vehicle, part, survey, 1.0, widths=flight.widths())
-        ratio = rms(best.bound) / rms(best.floor)
-        rows.append(
-            {"runs": count, "prior": "bound", "vehicle": flight.vehicle, "failed": "", "ratio": ratio}
-        )
-    return rows
+        for name, prior in {"none": None, "fleet": known}.items():
+            if not count and prior is None:
+                continue
+            row: Row = {"runs": count, "prior": name, "vehicle": flight.vehicle}
+            try:
+                found = fit(observations(part, MASSES), known=prior).calibration if count else expected(known)
+                yield row | flown.score(found)
+            except CalibrationError as error:
+                yield row | {"failed": str(error)}
+        if count:
+            best = BestFit(vehicle, part, survey, 1.0, widths=flight.widths())
+            ratio = rms(best.bound) / rms(best.floor)
+            yield {"runs": count, "prior": "bound", "vehicle": flight.vehicle, "ratio": ratio}
 
 
 def expected(known: Known) -> Calibration:
@@ -172,16 +168,7 @@ def cases_of(options: argparse.Namespace) -> list[tuple[Flight, tuple[int, ...],
     ]
 
 
-STUDY = Study(
-    run,
-    ("runs", "prior"),
-    {
-        "error / noise: median": Column("ratio", np.median, ".3f"),
-        "95 %": Column("ratio", percentile(95), ".3f"),
-        "maximum": Column("ratio", np.max, ".3f"),
-        "normalised error: median": Column("sigma"),
-    },
-)
+STUDY = Study(run, ("runs", "prior"), SCORES)
 
 
 if __name__ == "__main__":

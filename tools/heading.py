@@ -11,11 +11,8 @@ is the truth.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -53,10 +50,12 @@ AIRCRAFT_STEP = 10
 SIMULATED = ("gliders", "gliders, tilt offsets", "gliders, filter", "Bonne Bay twin")
 
 
-def run(name: str, seed: int, peers: str) -> list[Row]:
-    """Return the rows of one vehicle: a heading's RMS error and its normalised error, by method."""
-    rows = list(aircraft() if name == "aircraft" else simulated(name, seed, peers))
-    return [{"data": name, "seed": seed, "failed": ""} | row for row in rows]
+def run(name: str, seed: int, peers: str) -> Iterator[Row]:
+    """Yield the rows of one vehicle: a heading's RMS error and its normalised error, by method."""
+    if name != "aircraft":
+        yield from simulated(name, seed, peers)
+    elif seed == 0:
+        yield from aircraft()
 
 
 def score(method: str, heading: np.ndarray, sigma: np.ndarray | float, truth: np.ndarray) -> Row:
@@ -179,7 +178,7 @@ def aircraft() -> Iterator[Row]:
 
 STUDY = Study(
     run,
-    ("data", "method"),
+    ("name", "method"),
     {
         "error, deg RMS: median": Column("rms"),
         "maximum": Column("rms", np.max),
@@ -189,11 +188,5 @@ STUDY = Study(
 )
 
 
-def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
-    """Return the cases: the simulated vehicles, and the aircraft once."""
-    cases = [(name, seed, options.peers) for name, seed in product(SIMULATED, range(options.seeds))]
-    return [*cases, ("aircraft", 0, "")]
-
-
 if __name__ == "__main__":
-    STUDY.main(__doc__, cases_of, seeds=6, peers=PEERS)
+    STUDY.main(__doc__, names=[*SIMULATED, "aircraft"], seeds=6, peers=PEERS)

@@ -12,11 +12,8 @@ extended calibration on the later part.
 
 from __future__ import annotations
 
-import argparse
 import warnings
-from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -145,18 +142,17 @@ def hide(
     return changed, size(changed)
 
 
-def case(vehicle: str, effect: str, seed: int, snr: float, data: str) -> list[Row]:
+def run(seed: int, log: str, effect: str, snr: float, data: Path) -> list[Row]:
     """Hide one effect in one vehicle's log and diagnose it; return the row, or none if impossible."""
     warnings.simplefilter("ignore")
-    known = VEHICLES[vehicle](Path(data))
+    known = VEHICLES[log](data)
     calibration = fit(observations(joined(known.known), known.parameters)).calibration
     rest = with_telemetry(joined(known.asked), seed)
     half = rest.sizes["time"] // 2
-    row: Row = {"log": vehicle, "effect": effect, "seed": seed, "failed": ""}
     hidden = hide(effect, rest, slice(0, half), calibration, known.parameters, snr, seed)
     if hidden is None:
         return []
-    changed, row["snr"] = hidden
+    changed, size = hidden
     found, use = diagnose([changed.isel(time=slice(0, half))], calibration)
     first = [one.candidate.cause for one in found.findings]
     every = {candidate.cause for one in found.findings for candidate in one.possible}
@@ -165,7 +161,8 @@ def case(vehicle: str, effect: str, seed: int, snr: float, data: str) -> list[Ro
     given, written = (corrected(later, one) for one in (calibration, found.calibration))
     before, after = (rms(one.total - later.reference) for one in (given, written))
     return [
-        row | {
+        {
+            "size": size,
             "found": float(bool(first) or found.unexplained is not None), "named": ", ".join(first) or "none",
             "right": float(effect in first[:1]), "in_set": float(effect in every),
             "alone": float(every == {effect}), "false_name": float(bool(first) and effect not in every),
@@ -177,9 +174,9 @@ def case(vehicle: str, effect: str, seed: int, snr: float, data: str) -> list[Ro
 
 
 STUDY = Study(
-    case, ("log", "effect", "named", "use"),
+    run, ("log", "effect", "named", "use"),
     {
-        "S/N": Column("snr", form=".1f"), "right": Column("right", form=".0f"),
+        "S/N": Column("size", form=".1f"), "right": Column("right", form=".0f"),
         "in set": Column("in_set", form=".0f"),
         "promised": Column("promised"), "real": Column("real"), "sigma, nT": Column("sigma", form=".0f"),
         "error, nT": Column("error", form=".0f"),
@@ -192,17 +189,10 @@ def cell(rows: pd.DataFrame, name: str) -> str:
     return f"{int(rows[name].sum())} of {len(rows)}"
 
 
-def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
-    """Return the cases: every effect in every vehicle's log."""
-    seeds = range(options.first, options.first + options.seeds)
-    return [
-        (vehicle, effect, seed, options.snr, str(options.data))
-        for seed, vehicle, effect in product(seeds, VEHICLES, EFFECTS)
-    ]
-
-
 if __name__ == "__main__":
-    rows = STUDY.main(__doc__, cases_of, data=DATA, snr=12.0, seeds=1, first=0)
+    rows = STUDY.main(
+        __doc__, seeds=1, first=0, logs=list(VEHICLES), effects=list(EFFECTS), snr=12.0, data=DATA
+    )
     own, foreign = (rows[rows["effect"].isin(FOREIGN) == is_foreign] for is_foreign in (False, True))
     show(
         f"causes: found {cell(own, 'found')}, right first {cell(own, 'right')}, in the set "

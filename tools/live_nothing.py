@@ -9,7 +9,6 @@ of the survey; *mean* is its mean error, which is not observable; *normalised* i
 
 from __future__ import annotations
 
-import argparse
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -38,7 +37,7 @@ def run(seed: int, hours: float) -> list[Row]:
         parameters.append(Parameter(name, "", low, high, 0.5 * (low + high), 0.5 * (high - low)))
     prior = class_prior(tuple(parameters))
     seen = live.learn(Learner(prior), prior, log)
-    time, error = live.hours(log), seen.total - log["truth_total_field"].to_numpy()
+    time, error = live.hours_of(log), seen.total - log["truth_total_field"].to_numpy()
     rest = live.at_rest(seen.quality)
     rows: list[Row] = []
     for low, high in pairwise(STRETCH_ENDS_H):
@@ -46,7 +45,7 @@ def run(seed: int, hours: float) -> list[Row]:
         if here.sum() > 10:
             rows.append(
                 {
-                    "hours": f"{low:g} to {high:g}", "middle": float(np.sqrt(low * high)), "seed": seed,
+                    "stretch": f"{low:g} to {high:g} h", "middle": float(np.sqrt(low * high)),
                     "error": float(np.std(error[here])) / SENSOR_NOISE_NT,
                     "mean": abs(float(np.mean(error[here]))), "sigma": float(np.median(seen.sigma[here])),
                     "normalised": rms((error / seen.sigma)[here]),
@@ -57,7 +56,7 @@ def run(seed: int, hours: float) -> list[Row]:
 
 STUDY = Study(
     run,
-    ("hours",),
+    ("stretch",),
     {
         "error / noise": Column("error"),
         "maximum": Column("error", np.max),
@@ -89,13 +88,8 @@ def draw(rows: pd.DataFrame, file: Path) -> None:
     figure.savefig(file)
 
 
-def cases_of(options: argparse.Namespace) -> list[tuple[int, float]]:
-    """Return the cases: the gliders."""
-    return [(seed, options.hours) for seed in range(options.first, options.first + options.seeds)]
-
-
 if __name__ == "__main__":
     # the plot's file is the argument after -o
-    rows = STUDY.main(__doc__, cases_of, seeds=4, first=0, hours=24.0, o=Path)
+    rows = STUDY.main(__doc__, seeds=4, first=0, hours=24.0, o=Path)
     if "-o" in sys.argv:
         draw(rows, Path(sys.argv[sys.argv.index("-o") + 1]))

@@ -14,18 +14,17 @@ fitted by least squares to the calibration's residuals, with each eighth of the 
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from accuracy import ask_peers
+from accuracy import PEERS, ask_peers
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from studies import DATA, command_line, show, table
+from studies import DATA, Column, Row, Study, command_line, show
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
@@ -52,7 +51,6 @@ SEAGLIDER_CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
     ("nominal", (), 0),
     ("auto", ("pitchCtl", "vbdCC"), 1),
     ("auto", ("pitchCtl", "vbdCC"), 3),
-    ("auto", ("pitchCtl", "rollCtl", "vbdCC"), 3),
     ("cubic", ("pitchCtl", "vbdCC"), 3),
 )
 """Method, masses and polynomial order of each calibration."""
@@ -138,46 +136,58 @@ def hold_runs_out(data: Observations, method: str, order: int = 3) -> tuple[Floa
     return error, normalised
 
 
-def show_seaglider(options: argparse.Namespace) -> None:
-    """Print the error of each choice of masses, with each dive held out in turn."""
-    log = read(sorted((options.data / "seaglider_sg167").glob("p*.nc")))
-    shown = table("Seaglider, each dive held out", "method", "order", "masses", "nT", "normalised error")
-    for method, masses, order in SEAGLIDER_CHOICES:
-        try:
-            error, normalised = hold_runs_out(observations(log, masses), method, order)
-            cells = f"{rms(error[np.isfinite(error)]):.1f}", f"{np.nanstd(normalised):.2f}"
-        except CalibrationError as refusal:
-            cells = "refused", str(refusal).partition(";")[0]
-        shown.add_row(method, str(order), ", ".join(masses), *cells)
-    show(shown)
+def run_seaglider(method: str, masses: tuple[str, ...], order: int, data: Path) -> list[Row]:
+    """Correct each dive of a Seaglider by a fit of the other dives, with a choice of masses."""
+    log = read(sorted((data / "seaglider_sg167").glob("p*.nc")))
+    error, normalised = hold_runs_out(observations(log, masses), method, order)
+    return [{"rms": rms(error[np.isfinite(error)]), "normalised": float(np.nanstd(normalised))}]
 
 
 # ---- halves of a log ---------------------------------------------------------------------------------------
 
 
-class HalfScore(NamedTuple):
-    """Result of one method on one compass: errors in nT, and the claimed sigma over the RMS error."""
-
-    method: str
-    rms: float
-    median: float = np.nan
-    claimed: float = np.nan
-    scales: str = ""
-    note: str = ""
+def run_halves(log: Path, peers: str) -> Iterator[Row]:
+    """Compare the methods on each compass of a log."""
+    for number in [str(one.number) for one in compasses_in(read(log))] or ["0"]:
+        for row in compare_halves(read(log, options=Options(compass=number)), peers):
+            yield {"compass": number} | row
 
 
-def compare_halves(deployment: xr.Dataset, peers: str = "") -> list[HalfScore]:
-    """Fit every method to the first half of a log; return its scores on the second half."""
+def compare_halves(deployment: xr.Dataset, peers: str = "") -> Iterator[Row]:
+    """Fit every method to the first half of a log; yield its scores on the second half, nT."""
     bare = observations(deployment, ())
     half = float(np.median(bare.time))
     early, late = bare.part(bare.time <= half), bare.part(bare.time > half)
     known = has_known_direction(late, early)
     if min(len(early), int(known.sum())) < MIN_HALF_SAMPLES:
-        raise MagbridgeError(f"{len(early)} samples to fit and {int(known.sum())} to test: too few")
-    tested = late.time[known]
-    choices: tuple[tuple[str, tuple[str, ...] | None], ...] = (("nominal", ()), ("auto", ()), ("auto", None))
-    rows = [_score_half(deployment, half, tested, method, names) for method, names in choices]
-    return [*rows, *_magfits(deployment, early, late.part(known), peers)] if peers else rows
+        raise CalibrationError(f"{len(early)} samples to fit and {int(known.sum())} to test: too few")
+    first = deployment.sel(time=deployment["time"] <= half)
+    for label, method in (("nominal", "nominal"), ("auto", "auto"), ("auto --parameter auto", "auto")):
+        try:
+            names = best_parameters(first, movers(first))[0] if "--" in label else ()
+            found = fit(observations(first, names), method)
+        except MagbridgeError as refusal:
+            yield {"method": label, "failed": str(refusal)[:60]}
+            continue
+        data = observations(deployment, names)
+        data = data.part(np.isin(data.time, late.time[known]))
+        corrected = correct(found.calibration, data.field, data.parameters, data.time)
+        row = {
+            "method": label,
+            "parameters": " ".join(names),
+            "low": found.scales[0],
+            "high": found.scales[1],
+        }
+        yield row | errors(corrected.total - data.reference, rms(corrected.sigma))
+    if peers and early.attitude is not None and early.reference_ned is not None:
+        yield from _magfits(deployment, early, late.part(known), peers)
+
+
+def errors(error: FloatArray, sigma: float) -> Row:
+    """Return the RMS and median of an error (n,), nT, and the claimed `sigma` over the RMS."""
+    return {
+        "rms": rms(error), "median": float(np.median(np.abs(error))), "claimed": sigma / rms(error),
+    }  # fmt: skip
 
 
 def has_known_direction(late: Observations, early: Observations) -> BoolArray:
@@ -197,34 +207,8 @@ def _directions(data: Observations) -> FloatArray:
     return found
 
 
-def _score_half(
-    deployment: xr.Dataset, half: float, tested: FloatArray, method: str, names: tuple[str, ...] | None
-) -> HalfScore:
-    """Return the score of a fit of the first half, which also chooses the parameters if `names` is None."""
-    label = method if names is not None else "auto --parameter auto"
-    first = deployment.sel(time=deployment["time"] <= half)
-    try:
-        if names is None:
-            names, _ = best_parameters(first, movers(first))
-        found = fit(observations(first, names), method)
-    except MagbridgeError as refusal:
-        return HalfScore(label, np.nan, note=str(refusal)[:60])
-    data = observations(deployment, names)
-    data = data.part(np.isin(data.time, tested))
-    corrected = correct(found.calibration, data.field, data.parameters, data.time)
-    error = corrected.total - data.reference
-    claimed = rms(corrected.sigma) / rms(error)
-    low, high = found.scales
-    scales = f"{low:.2f}-{high:.2f}"
-    return HalfScore(label, rms(error), float(np.median(np.abs(error))), claimed, scales, " ".join(names))
-
-
-def _magfits(
-    deployment: xr.Dataset, early: Observations, late: Observations, peers: str
-) -> Iterator[HalfScore]:
+def _magfits(deployment: xr.Dataset, early: Observations, late: Observations, peers: str) -> Iterator[Row]:
     """Yield the scores of MAVProxy's magfit, fitted and tested on the samples of the other methods."""
-    if early.attitude is None or early.reference_ned is None:
-        return
     time = deployment["time"].to_numpy()
     current = np.zeros(len(time))
     if "battery_current" in deployment:
@@ -236,31 +220,13 @@ def _magfits(
     }  # fmt: skip
     for name, answer in ask_peers(peers, arrays, "magfit").items():
         if "failed" in answer:
-            yield HalfScore(name, np.nan, note=answer["failed"][:60])
+            yield {"method": name, "failed": answer["failed"][:60]}
             continue
         A, T, K = (np.array(answer[key]) for key in "ATK")
         by_current = np.outer(np.interp(late.time, time, current), K)
         error = np.linalg.norm((late.field - T) @ A.T + by_current, axis=1) - late.reference
         scales = np.linalg.svd(A, compute_uv=False)
-        median = float(np.median(np.abs(error)))
-        yield HalfScore(name, rms(error), median, scales=f"{scales[-1]:.2f}-{scales[0]:.2f}")
-
-
-def show_halves(options: argparse.Namespace) -> None:
-    """Print a table of all methods for each compass of each log."""
-    for path in options.log:
-        for number in [str(one.number) for one in compasses_in(read(path))] or ["0"]:
-            shown = table(
-                f"{path.name}, compass {number}",
-                "method", "RMS, nT", "median", "claimed / error", "scales", "parameters",
-            )  # fmt: skip
-            try:
-                for row in compare_halves(read(path, options=Options(compass=number)), options.peers):
-                    numbers = f"{row.rms:.0f}", f"{row.median:.0f}", f"{row.claimed:.2f}"
-                    shown.add_row(row.method, *numbers, row.scales, row.note)
-            except MagbridgeError as error:
-                shown.add_row(str(error))
-            show(shown)
+        yield {"method": name, "low": scales[-1], "high": scales[0]} | errors(error, np.nan)
 
 
 # ---- diagnosis, with an independent check ------------------------------------------------------------------
@@ -288,7 +254,7 @@ def held_out_error(X: FloatArray, y: FloatArray) -> float:
     return float(np.std(missed))
 
 
-def check_by_tolles_lawson(found: Diagnosis) -> tuple[float, float, float]:
+def check_by_tolles_lawson(found: Diagnosis) -> Row:
     """Return the residual without bias, with 9 Tolles-Lawson terms, and with 18 terms, nT RMS."""
     log, known = found.problem.survey, found.problem.calibration
     new = ~log.learned
@@ -296,9 +262,10 @@ def check_by_tolles_lawson(found: Diagnosis) -> tuple[float, float, float]:
     u = (got.vector / np.linalg.norm(got.vector, axis=1)[:, None])[new]
     error = (got.total - log.reference)[new]
     static, eddy = tolles_lawson(u, log.time[new], log.reference[new])
-    return (
-        float(np.std(error)), held_out_error(static, error), held_out_error(np.hstack([static, eddy]), error),
-    )  # fmt: skip
+    return {
+        "about_mean": float(np.std(error)), "static": held_out_error(static, error),
+        "eddy": held_out_error(np.hstack([static, eddy]), error),
+    }  # fmt: skip
 
 
 def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
@@ -307,60 +274,85 @@ def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
     return fitted, diagnose([joined(vehicle.asked)], fitted.calibration).diagnosis
 
 
-def show_diagnoses(options: argparse.Namespace) -> None:
-    """Print the findings in each vehicle's log, and the errors by Tolles-Lawson's terms."""
-    shown = table(
-        "Measured logs, nT RMS",
-        "log", "scales", "verdict", "found", "before", "held out", "95 %", "about mean", "+ 9 terms",
-        "+ eddy",
-    )  # fmt: skip
-    for name, vehicle in VEHICLES.items():
-        fitted, found = calibrate_and_diagnose(vehicle(options.data))
-        causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
-        low, high = found.improvement.interval
-        shown.add_row(
-            name, "{:.2f}-{:.2f}".format(*fitted.scales), found.verdict, causes,
-            f"{found.improvement.before:.1f}", f"{found.improvement.after:.1f}", f"{low:.2f}-{high:.2f}",
-            *(f"{value:.1f}" for value in check_by_tolles_lawson(found)),
-        )  # fmt: skip
-    show(shown)
+def run_diagnose(log: str, data: Path) -> list[Row]:
+    """Diagnose a vehicle's log, and check it by Tolles and Lawson's terms; return the row, nT RMS."""
+    fitted, found = calibrate_and_diagnose(VEHICLES[log](data))
+    causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
+    low, high = found.improvement.interval
+    row = {"found": causes, "scales": "{:.2f}-{:.2f}".format(*fitted.scales), "least": low, "most": high}
+    row |= {"before": found.improvement.before, "held_out": found.improvement.after}
+    return [row | check_by_tolles_lawson(found)]
 
 
 # ---- an airborne survey ------------------------------------------------------------------------------------
 
 
-def show_survey(options: argparse.Namespace) -> None:
-    """Print the errors of tie lines predicted from the other lines, and the mis-ties of all lines."""
-    samples = read_table(options.data / "rio_magnetic" / "rio-magnetic.csv.xz")
-    done = survey(samples.part(~samples.tie))
-    ties = samples.part(samples.tie)
+def run_survey(data: Path) -> Iterator[Row]:
+    """Predict the tie lines of an airborne survey from its other lines; level all lines; yield errors, nT."""
+    samples = read_table(data / "rio_magnetic" / "rio-magnetic.csv.xz")
+    lines, ties = samples.part(~samples.tie), samples.part(samples.tie)
+    done = survey(lines)
     anomaly, sigma = done.gridded.evaluate(ties.place, ties.depth)
-    error = anomaly - ties.value
-    kriged = done.gridded.kriged
-    z = error / np.hypot(sigma, done.gridded.sigma if kriged is None else kriged.of_a_line(ties.place))
-    near = cKDTree(samples.part(~samples.tie).place).query(ties.place)[0] < MAX_LINE_DISTANCE_M
+    error, kriged = anomaly - ties.value, done.gridded.kriged
+    claimed = np.hypot(sigma, done.gridded.sigma if kriged is None else kriged.of_a_line(ties.place))
+    near = cKDTree(lines.place).query(ties.place)[0] < MAX_LINE_DISTANCE_M
     joint = survey(samples)
-    for name, values in {
-        "all ties": error,
-        f"within {MAX_LINE_DISTANCE_M:.0f} m of a line": error[near],
-    }.items():
-        show(f"{name}: median error {np.median(np.abs(values)):.1f} nT, RMS {rms(values):.0f}")
-    show(f"normalised error: RMS {rms(z):.2f}, median / 0.6745 {1.4826 * np.median(np.abs(z)):.2f}")
-    show(f"{len(joint.before)} mis-ties: {rms(joint.before):.1f} nT RMS, {rms(joint.after):.1f} levelled")
+    none = np.full(1, np.nan)
+    for name, values, sigmas in (
+        ("all ties", error, claimed),
+        (f"within {MAX_LINE_DISTANCE_M:.0f} m of a line", error[near], claimed[near]),
+        (f"{len(joint.before)} mis-ties", joint.before, none),
+        ("mis-ties, levelled", joint.after, none),
+    ):
+        row = {"values": name, "median": float(np.median(np.abs(values))), "rms": rms(values)}
+        yield row | {"normalised": rms(values / sigmas)}
+
+
+def columns(form: str, **sources: str) -> dict[str, Column]:
+    """Return columns of one form: their headings, and the rows' columns; ``_`` is a space in a heading."""
+    return {heading.replace("_", " "): Column(source, form=form) for heading, source in sources.items()}
+
+
+SCALES = columns(".2f", smallest_scale="low", largest="high")
+STUDIES = {
+    "seaglider": Study(
+        run_seaglider, ("method", "masses", "order"), columns(".2f", RMS="rms", normalised="normalised")
+    ),
+    "halves": Study(
+        run_halves,
+        ("log", "compass", "method"),
+        columns(".0f", RMS="rms", median="median") | columns(".2f", claimed="claimed") | SCALES,
+    ),
+    "diagnose": Study(
+        run_diagnose,
+        ("log", "scales", "found"),
+        columns(".1f", before="before", held_out="held_out")
+        | columns(".2f", least="least", most="most")
+        | columns(".1f", about_mean="about_mean", with_9_terms="static", with_eddy_currents="eddy"),
+    ),
+    "survey": Study(
+        run_survey,
+        ("values",),
+        columns(".1f", median="median", RMS="rms") | columns(".2f", normalised="normalised"),
+    ),
+}
 
 
 def main() -> None:
-    """Print the tables of one part."""
-    parts = {
-        "seaglider": show_seaglider,
-        "halves": show_halves,
-        "diagnose": show_diagnoses,
-        "survey": show_survey,
-    }
-    chosen = command_line(__doc__, parts, data=DATA, log=[DATA / "ardusub" / "small.tlog"], peers="")
+    """Print the tables of the parts."""
+    chosen = command_line(
+        __doc__, STUDIES, data=DATA, log=[DATA / "ardusub" / "small.tlog"], peers=PEERS, out=Path, workers=2
+    )
     warnings.simplefilter("ignore")
+    cases: dict[str, list[tuple[Any, ...]]] = {
+        "seaglider": [(*choice, chosen.data) for choice in SEAGLIDER_CHOICES],
+        "halves": [(log, chosen.peers) for log in chosen.log],
+        "diagnose": [(name, chosen.data) for name in VEHICLES],
+        "survey": [(chosen.data,)],
+    }
     for name in chosen.names:
-        parts[name](chosen)
+        study = STUDIES[name]
+        show(study.table(f"Measured logs: {name}, nT", study.rows(cases[name], chosen)))
 
 
 if __name__ == "__main__":

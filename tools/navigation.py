@@ -5,12 +5,12 @@
 accuracy      narrow and wide first positions, with the errors that an `auto` calibration leaves
 watch         duration for which a wrong position counts as valid
 misinformed   validity of the position if the field has an offset, or half of the map's variance is missing
-unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 100 minutes
+unmapped      surveys of 6 and 12 h without a map
 smoothed      flights on a rough map, and on that map without its short wavelengths
 dived         gliders that dive under a map from 90 m, without and with its continuation
 calibrations  gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         processor time of an update, of 100,000 samples, and of the start
-peers         Stone Soup on the same measurements (--peers PYTHON); MagNav.jl's flight (--data DIR)
+peers         Stone Soup on the same measurements (--peers PYTHON)
 
 Errors are those of the second half of each run, in m. *ratio* is the median of error / bound of the same run,
 *all* the RMS of all errors over the RMS of all bounds, *lost* the fraction of the runs in which the truth was
@@ -23,20 +23,18 @@ import argparse
 import subprocess
 import tempfile
 import time as clock
-from dataclasses import replace
-from itertools import pairwise, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as with_options
-from studies import Column, Row, Study, command_line, percentile, show, table
+from studies import Column, Row, Study, command_line, percentile, show
 from voyages import (
-    AIRCRAFT,
     GLIDER,
     PLACE,
     START,
-    SURVEYOR,
+    VEHICLES,
     Map,
     blocks,
     calibrated,
@@ -44,7 +42,6 @@ from voyages import (
     dived,
     drawn_track,
     located,
-    magnav_flight,
     misled,
     sail,
     synthetic,
@@ -57,14 +54,11 @@ from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank
 from magbridge.navigate.batch import navigate
-from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import Block, prior, transition
-from magbridge.navigate.options import NavigationOptions
 
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))
 STARTS = {"narrow": 0.2, "wide": 1.0}
 """1-sigma of the initial position, in correlation lengths of the map."""
-VEHICLES = {"6 h": SURVEYOR, "12 h": replace(SURVEYOR, hours=12.0), "aircraft": AIRCRAFT}
 PARTICLES = 20_000
 LEVEL_NT = 60.0
 """Offset of the field in a misinformed run, nT."""
@@ -73,64 +67,35 @@ WAVELENGTHS_M = 1_000.0, 2_000.0
 """Wavelengths at which the smoothed maps keep half of the amplitude, m."""
 
 
-def rms_ratio(values: np.ndarray) -> float:
-    """Return the RMS of the first column over the RMS of the second, of values (n, 2)."""
-    return float(np.sqrt(np.mean(values[:, 0] ** 2) / np.mean(values[:, 1] ** 2)))
-
-
-# ---- what a row has, and how it is shown -------------------------------------------------------------------
-
-SCORES = {
-    "DRMS, m": Column("drms", form=".0f"),
-    "bound": Column("bound", form=".0f"),
-    "ratio": Column(("drms", "bound"), lambda v: float(np.median(v[:, 0] / v[:, 1]))),
-    "90 %": Column(("drms", "bound"), lambda v: float(np.percentile(v[:, 0] / v[:, 1], 90))),
-    "all": Column(("drms", "bound"), rms_ratio),
-    "dead reckoning": Column("unaided", form=".0f"),
-    "lost": Column("lost", np.mean, ".0%"),
-    "NEES/2": Column("nees", np.mean),
-    "false alarm": Column("false_alarm", np.mean, ".0%"),
-    "valid": Column("valid", np.mean, ".0%"),
-    "after, h": Column("waited", form=".1f"),
-    "ms/sample": Column("milliseconds", np.mean),
-}
-
-
 def run_accuracy(kind: Map, start: str, seed: int) -> list[Row]:
     """Navigate with the errors of an `auto` calibration; return the row."""
-    return [{"map": str(kind), "start": start} | sail(*drawn_track(kind, seed, STARTS[start])).score()]
+    return [sail(*drawn_track(kind, seed, STARTS[start])).score()]
 
 
-def run_watch(case: str, kind: Map, seed: int) -> list[Row]:
+def run_watch(situation: str, kind: Map, seed: int) -> list[Row]:
     """Measure the time for which a wrong position counts as valid; return the row."""
-    silent, lost = {"carried": carried, "misled": misled}[case](kind, seed)
-    row: Row = {"situation": case, "map": str(kind), "lost": float(lost > 0.0)}
+    silent, lost = {"carried": carried, "misled": misled}[situation](kind, seed)
+    row: Row = {"lost": float(lost > 0.0)}
     if lost > 0.0:
         row |= {"flagged": float(silent <= 0.5), "silent": 60.0 * silent, "recovered": float(lost <= 2.0)}
     return [row]
 
 
-def run_misinformed(case: str, kind: Map, seed: int) -> list[Row]:
+def run_misinformed(situation: str, kind: Map, seed: int) -> list[Row]:
     """Measure the fractions of the time in which a right and a wrong position count as valid.
 
     In the case "level", the field is always 60 nT too large, with a claimed sigma of 0.5 nT. In the case
     "half", the map has half of the variance of the field.
     """
     field = None
-    if case == "half":
+    if situation == "half":
         grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
         field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
     ds, grid, options = drawn_track(kind, seed, 0.2, first=9000, over=field)
-    if case == "level":
+    if situation == "level":
         ds = ds.assign(total_field=ds["total_field"] + LEVEL_NT)
     right, wrong = sail(ds, grid, options).standing()
-    return [{"situation": case, "map": str(kind), "right": right, "wrong": wrong}]
-
-
-def run_dived(seed: int) -> list[Row]:
-    """Navigate a glider that dives under a map, without and with the map's continuation; return the rows."""
-    names = "as it was flown", "at the glider's depth"
-    return [{"map": name} | found for name, found in zip(names, dived(seed), strict=True)]
+    return [{"right": right, "wrong": wrong}]
 
 
 def run_smoothed(seed: int) -> list[Row]:
@@ -143,12 +108,7 @@ def run_smoothed(seed: int) -> list[Row]:
     return rows
 
 
-def run_unmapped(name: str, kind: Map, seed: int) -> list[Row]:
-    """Localise a survey without a map; return the row."""
-    return [{"vehicle": name, "map": str(kind)} | located(VEHICLES[name], kind, seed)]
-
-
-def run_stone_soup(python: str, kind: Map, start: str, seed: int) -> list[Row]:
+def run_stone_soup(kind: Map, start: str, python: str, seed: int) -> list[Row]:
     """Compare the navigator with Stone Soup's Kalman and particle filters on the same measurements."""
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, start_sigma=STARTS[start] * grid.correlation_length)
@@ -178,8 +138,7 @@ def run_stone_soup(python: str, kind: Map, start: str, seed: int) -> list[Row]:
     when = np.array([b.time_us for b, _ in found]) * 1e-6
     second_half = when > 0.5 * (when[0] + when[-1])
     away = np.stack([np.interp(when, ds["time"], ds[f"away_{axis}"]) for axis in ("north", "east")], axis=1)
-    row: Row = {"map": str(kind), "start": start, "bound": score["bound"]}
-    row |= {"ours": score["drms"], "ours_nees": score["nees"]}
+    row: Row = {"bound": score["bound"], "ours": score["drms"], "ours_nees": score["nees"]}
     for name in ("ekf", "particles"):
         error = (theirs[f"{name}_x"][:, :2] - away)[second_half]
         spread = theirs[f"{name}_P"][second_half, :2, :2] + 1e-6 * np.eye(2)
@@ -188,8 +147,33 @@ def run_stone_soup(python: str, kind: Map, start: str, seed: int) -> list[Row]:
     return [row | {"milliseconds": 1e3 * float(theirs["particles_seconds"]) / len(found)}]
 
 
+# ---- the parts: columns and cases of each ------------------------------------------------------------------
+
+
+def ratios(statistic: Any) -> Column:
+    """Return the column of a statistic of error over bound of the runs."""
+    return Column(("drms", "bound"), lambda values: float(statistic(values[:, 0] / values[:, 1])))
+
+
+def rms_ratio(values: np.ndarray) -> float:
+    """Return the RMS of the first column over the RMS of the second, of values (n, 2)."""
+    return rms(values[:, 0]) / rms(values[:, 1])
+
+
+SCORES = {
+    "DRMS, m": Column("drms", form=".0f"),
+    "bound": Column("bound", form=".0f"),
+    "ratio": ratios(np.median),
+    "90 %": ratios(percentile(90)),
+    "all": Column(("drms", "bound"), rms_ratio),
+    "dead reckoning": Column("unaided", form=".0f"),
+    "lost": Column("lost", np.mean, ".0%"),
+    "NEES/2": Column("nees", np.mean),
+    "valid": Column("valid", np.mean, ".0%"),
+    "after, h": Column("waited", form=".1f"),
+}
 STUDIES = {
-    "accuracy": Study(run_accuracy, ("map", "start"), SCORES),
+    "accuracy": Study(run_accuracy, ("kind", "start"), SCORES),
     "calibrations": Study(
         calibrated,
         ("map", "calibration"),
@@ -197,7 +181,7 @@ STUDIES = {
     ),
     "watch": Study(
         run_watch,
-        ("situation", "map"),
+        ("situation", "kind"),
         {
             "lost": Column("lost", np.mean, ".0%"),
             "flagged in 30 min": Column("flagged", np.mean, ".0%"),
@@ -207,7 +191,7 @@ STUDIES = {
     ),
     "misinformed": Study(
         run_misinformed,
-        ("situation", "map"),
+        ("situation", "kind"),
         {
             "right and valid": Column("right", np.mean, ".1%"),
             "wrong and valid": Column("wrong", np.mean, ".1%"),
@@ -215,7 +199,7 @@ STUDIES = {
         },
     ),
     "dived": Study(
-        run_dived,
+        dived,
         ("map",),
         {
             "error, m: median": Column("error", form=".0f"),
@@ -227,8 +211,8 @@ STUDIES = {
     ),
     "smoothed": Study(run_smoothed, ("map",), SCORES),
     "unmapped": Study(
-        run_unmapped,
-        ("vehicle", "map"),
+        located,
+        ("vehicle", "kind"),
         {
             "bound, m": Column("bound", rms, ".0f"),
             "error": Column("error", rms, ".0f"),
@@ -243,7 +227,7 @@ STUDIES = {
     ),
     "peers": Study(
         run_stone_soup,
-        ("map", "start"),
+        ("kind", "start"),
         {
             name: Column(source, form=form)
             for name, source, form in (
@@ -259,29 +243,18 @@ STUDIES = {
 
 def cases_of(part: str, options: argparse.Namespace) -> list[tuple[Any, ...]]:
     """Return the cases of a part."""
+    surveys = [("6 h", kind) for kind in (Map(30, 500), Map(30, 1000), Map(60, 500), Map(60, 1000))]
+    surveys += [("6 h", Map(30, 1000, rough=True)), ("12 h", Map(30, 500))]
+    kinds: dict[str, Any] = {
+        "accuracy": product(MAPS, STARTS),
+        "calibrations": [((MAPS[0], MAPS[2]),)],
+        "watch": product(("carried", "misled"), MAPS[:4]),
+        "misinformed": product(("level", "half"), MAPS[:4]),
+        "unmapped": [one for one in surveys if one[0] in options.vehicle],
+        "peers": product((MAPS[2], MAPS[0]), STARTS, [options.peers] * bool(options.peers)),
+    }
     seeds = range(options.first, options.first + options.runs)
-    kinds: list[tuple[Any, ...]]
-    if part == "accuracy":
-        kinds = list(product(MAPS, STARTS))
-    elif part == "calibrations":
-        kinds = [((MAPS[0], MAPS[2]),)]
-    elif part in ("watch", "misinformed"):
-        kinds = list(product(("carried", "misled") if part == "watch" else ("level", "half"), MAPS[:4]))
-    elif part == "unmapped":
-        gliders = [("6 h", kind) for kind in (Map(30, 500), Map(30, 1000), Map(60, 500), Map(60, 1000))]
-        kinds = [*gliders, ("6 h", Map(30, 1000, rough=True)), ("12 h", Map(30, 500))]
-        kinds = [kind for kind in (*kinds, ("aircraft", Map(60, 1500))) if kind[0] in options.vehicle]
-    elif part == "peers":
-        kinds = (
-            [(options.peers, *kind) for kind in product((MAPS[2], MAPS[0]), STARTS)] if options.peers else []
-        )
-        seeds = seeds[:20]
-    else:
-        kinds = [()]
-    return [(*kind, seed) for kind in kinds for seed in seeds]
-
-
-# ---- speed, and a published flight -------------------------------------------------------------------------
+    return [(*kind, seed) for kind in kinds.get(part, [()]) for seed in seeds]
 
 
 def show_speed() -> None:
@@ -304,55 +277,20 @@ def show_speed() -> None:
     show(f"wide start: {1e3 * sail(*drawn_track(MAPS[0], 7, 1.0, bias_sigma=1.0)).seconds:.2f} ms a sample")
 
 
-def show_magnav(folder: Path) -> None:
-    """Print the errors on MagNav.jl's simple example, with its map, magnetometer and inertial track.
-
-    The inertial track has an error of 2 m after 100 s. MagNav.jl's filter is not comparable, because it
-    estimates the errors of the inertial unit.
-    """
-    grid, ds = magnav_flight(folder)
-    names = ("gps_latitude", "gps_longitude", "dr_latitude", "dr_longitude")
-    places = np.stack([ds[name] for name in names], axis=1)
-    true = places[:, :2]
-    inertial = rms(np.hypot(*np.transpose([separation(*row) for row in places.tolist()])))
-    metres = sum(np.hypot(*separation(*here, *there)) for here, there in pairwise(true.tolist()))
-    title = f"MagNav.jl's flight, {metres / 1e3:.0f} km; inertial track: {inertial:.1f} m"
-    shown = table(title, "start, m", "interval, s", "error, m", "smoothed", "bound")
-    motions = ((3.0, 0.01, 0.01), (100.0, 0.5, 0.1))
-    for (start, current, drift), interval in product(motions, (NavigationOptions().interval, 0.0)):
-        options = NavigationOptions(
-            bias_sigma=3.0, bias_time=600.0, map_sigma=3.0, interval=interval,
-            start_sigma=start, current_sigma=current, drift=drift,
-        )  # fmt: skip
-        result = navigate(ds, grid, options, start=tuple(places[0, 2:].tolist()))
-        errors = [
-            float(np.sqrt((result[f"{p}error_north"] ** 2 + result[f"{p}error_east"] ** 2).mean()))
-            for p in ("", "smoothed_")
-        ]
-        depth = float(ds["depth"].mean())
-        bound = position_bound(grid, ds["time"], true[:, 0], true[:, 1], options, 3.0, depth, 1.0)
-        cells = [f"{value:.1f}" for value in (*errors, rms(bound.sigma))]
-        shown.add_row(f"{start:g}", f"{interval:g}", *cells)
-    show(shown)
-
-
 def main() -> None:
     """Run the parts, and print their tables."""
     options = command_line(
-        __doc__, part=[*STUDIES, "speed"], runs=100, first=0, vehicle=list(VEHICLES), peers="", data=Path,
-        out=Path, workers=2,
+        __doc__, part=[*STUDIES, "speed"], runs=100, first=0, vehicle=list(VEHICLES), peers="", out=Path,
+        workers=2,
     )  # fmt: skip
     out = options.out
     for part in options.part:
         if part == "speed":
             show_speed()
-            continue
-        options.out = out and out.with_stem(f"{out.stem}-{part}")
-        if cases := cases_of(part, options):
+        elif cases := cases_of(part, options):
+            options.out = out and out.with_stem(f"{out.stem}-{part}")
             study = STUDIES[part]
             show(study.table(f"{part}, {options.runs} runs", study.rows(cases, options)))
-        if part == "peers" and options.data:
-            show_magnav(options.data / "magnav_example")
 
 
 if __name__ == "__main__":

@@ -9,15 +9,14 @@ bank. Each glider is calibrated by `auto` on both sets of runs, and surveys the 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-from typing import Any
+from functools import cache
 
 import numpy as np
 import xarray as xr
 from msgspec.structs import replace
-from studies import Column, Row, Study, percentile
-from study_worlds import MASSES, glider
+from studies import Column, Row, Study
+from study_worlds import MASSES, SCORES, glider
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
@@ -36,17 +35,17 @@ from magbridge.field.reference import main_field
 from sitl import load, segments, simulate
 from sitl.dataset import at_rest
 from sitl.mission import TABLE_1, Run, Spirals
-from sitl.scenario import Scenario
 
 BANK_DEG = 6.0
 """Maximum bank to either side, deg; the paper's spirals have this bank to one side."""
 
 
-def plans(scenario: Scenario, noise: float) -> dict[str, tuple[list[PlannedRun], float]]:
+@cache
+def plans() -> dict[str, tuple[list[PlannedRun], float]]:
     """Return the runs of Table 1 and of the plan by name, each with its predicted RMS error, nT."""
-    parts = segments(simulate(scenario, 0))
+    parts = segments(simulate(load("random_glider"), 0))
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
-    before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=noise)
+    before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=1.0)
     mission, ned = Mission.from_observations(survey), main_field(parts["calibration"])[0]
     paper = [
         PlannedRun(pitch, BANK_DEG, (battery, float(np.copysign(200.0, pitch))))
@@ -64,9 +63,9 @@ def observed(part: xr.Dataset) -> Observations:
     return dataclasses.replace(found, reference_ned=np.tile(main_field(part)[0], (len(found), 1)))
 
 
-def run(seed: int, noise: float, name: str, runs: list[PlannedRun], expected: float) -> list[Row]:
-    """Calibrate a glider on `runs` and score the calibration on its survey; return the row."""
-    scenario = load("random_glider").replace(instrument={"noise_sigma": noise})
+def run(name: str, seed: int) -> list[Row]:
+    """Calibrate a glider on runs and score the calibration on its survey; return the row."""
+    scenario, (runs, expected) = load("random_glider"), plans()[name]
     if name == "planned":
         spirals = tuple(
             Run(pitch=one.pitch, roll=one.roll, parameters=dict(zip(MASSES, one.parameters, strict=True)))
@@ -78,28 +77,11 @@ def run(seed: int, noise: float, name: str, runs: list[PlannedRun], expected: fl
         scenario = scenario.replace(mission=tuple(mission))
     flown = glider(scenario, seed)
     found = fit(observations(flown.runs, MASSES)).calibration
-    return [{"runs": name, "seed": seed, "expected": expected, **flown.score(found)}]
+    return [{"expected": expected} | flown.score(found)]
 
 
-STUDY = Study(
-    run,
-    ("runs",),
-    {
-        "expected, nT": Column("expected"),
-        "error / noise: median": Column("ratio", np.median, ".3f"),
-        "95 %": Column("ratio", percentile(95), ".3f"),
-        "maximum": Column("ratio", np.max, ".3f"),
-    },
-)
-
-
-def cases_of(options: argparse.Namespace) -> list[tuple[Any, ...]]:
-    """Return the cases, and print the planned runs: pitch, roll and positions of the masses."""
-    made = plans(load("random_glider").replace(instrument={"noise_sigma": options.noise}), options.noise)
-    for number, one in enumerate(made["planned"][0], 1):
-        print(number, *(f"{value:.2f}" for value in (one.pitch, one.roll, *one.parameters)))
-    return [(k, options.noise, name, *runs) for name, runs in made.items() for k in range(options.seeds)]
+STUDY = Study(run, ("name",), {"expected, nT": Column("expected")} | SCORES)
 
 
 if __name__ == "__main__":
-    STUDY.main(__doc__, cases_of, seeds=12, noise=1.0)
+    STUDY.main(__doc__, names=["Table 1", "planned"], seeds=12)

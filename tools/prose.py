@@ -1,8 +1,7 @@
 """Check the wording of Markdown pages, docstrings, comments and messages.
 
     python tools/prose.py PATH...     print each finding as ``path:line: rule: text -> advice``
-    python tools/prose.py --gate      compare every area's findings per 1,000 words with tools/limits.toml
-    python tools/prose.py --areas     print the table of all areas
+    python tools/prose.py --gate      print the areas whose findings per 1,000 words exceed tools/limits.toml
 
 An area is a key of ``[prose]`` in the limits: a folder or a file. A file belongs to the longest key that
 matches. Standard library only.
@@ -27,71 +26,11 @@ ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
 MAX_SENTENCE_WORDS, MAX_SENTENCE_NUMBERS = 25, 4
 GENERATED = ("magbridge/mavlink/dialect.py", "magbridge/mavlink/enums.py")
-QUOTED = ("tools/prose.py", "tests/tools/test_gate.py")
+QUOTED = ("tests/tools/test_gate.py",)
 """Files that contain the forbidden words because they search for them."""
 
-RULES = {
-    "said": (
-        r"\b(?:is|are|was|were|be) (?:\w+ly |also |then )?(?:said|told)\b|\bsays so\b",
-        "name the program and the channel: 'the bridge sends a STATUSTEXT'",
-    ),
-    "anew": (r"\banew\b", "again, or a verb with re-: refit, restart"),
-    "beside": (r"\bbeside\b", "next to, in addition to, given, compared with"),
-    "but-for": (r"\bbut for\b", "except"),
-    "nobody": (r"\bnobody\b", "state what is unknown or not allowed"),
-    "is-no": (
-        r"\b(?:is|are|was|were) no (?!longer|more|less|fewer|such|need|reason|way|guarantee)[a-z]+",
-        "is not a ...",
-    ),
-    "foretell": (r"\bforet(?:ell|ells|old|elling)\b", "predict"),
-    "learnt": (r"\blearnt\b", "learned"),
-    "mend": (r"\bmend(?:s|ed|ing)?\b", "fix"),
-    "of-others": (r"\bof others\b|\bof one's own\b|\bothers'(?!\w)", "third-party; your own"),
-    "rock": (r"\brocks?\b", "crustal field, crustal anomaly"),
-    "lie": (
-        r"\b(?:mass|masses|telemetry|sensor)(?:'s telemetry)? (?:that )?lies?\b|\bliars?\b",
-        "wrong, inconsistent, spoofed",
-    ),
-    "doubt": (r"\bdoubt(?:s|ed|ing)?\b", "alarm, unexplained residual, suspected fault"),
-    "apart": (
-        r"\b(?:tell|tells|told) (?:\w+ )?(?:apart|from)\b|(?<!\d [a-zµ]m )(?<!\d ms )(?<!\d m )\bapart\b",
-        "distinguish; separate; difference",
-    ),
-    "alike": (r"\balike\b", "correlated; equal; similar"),
-    "what-is": (
-        r"\b[Ww]hat (?:is|was|were|has|had|comes|came|becomes|moves|follows|it|no|others)\b(?![^.]*\?)",
-        "name the thing: 'the learned calibration', not 'what is learned'",
-    ),
-    "who": (
-        r"\bwho(?:ever)? (?:knows?|takes?|climbs|looks|puts|sends?)\b|\b[Ww]hoever\b",
-        "users who; a program that",
-    ),
-    "such-as-one": (
-        r"\bis such an? one\b|\b[Ss]o (?:is|are|do|does|was|were) (?:that|the|a|an|it|those)\b",
-        "write it in full",
-    ),
-    "let": (
-        r"^\s*(?:Let|Say|Tell|Whether|Take)\b (?!a |one )|\blets? expect\b",
-        "the verb of the action: set, allow, predict; 'Return True if ...'",
-    ),
-    "speak": (r"\b(?:speaks?|hears?|heeds?)\b", "sends, receives, handles"),
-    "settle": (r"\bsettle[sd]?\b|\bcome to rest\b", "converge (solver), resolve (alarm)"),
-    "flown": (r"\b(?:was|were|is|are|not|be|been) flown (?:again|once|before|since)\b", "run, simulated"),
-    "take-note": (r"\btakes? note\b|\btaken? (?:in|up|off|out)\b", "record, include, subtract, remove"),
-    "by-chance": (r"\bbeyond chance\b", "statistically significant, with the threshold"),
-    "room": (r"\brooms?\b(?! for| temperature)|\bthe house\b", "package, layer"),
-    "nats": (r"\bnats\b", "log-likelihood ratio of N (natural log)"),
-    "honest": (r"\bhonest(?:ly)?\b", "consistent (normalised error near 1)"),
-    "opens-of": (
-        r"(?:^|[.:] )Of (?:a|an|the|what|which|those|such|drones|others|several|channels)\b",
-        "start with the subject",
-    ),
-    "unit-only": (r"^(?:nT|m|s|µs|Hz|deg|h|kB/s)(?:, .{0,25})?\.$", "the quantity, then its unit"),
-    "same": (
-        r"^(?:The same|As given|As above|That one|The one|One of them|Of the|Of what)\b",
-        "repeat the noun",
-    ),
-}
+RULES: dict[str, tuple[str, str]] = tomllib.loads((ROOT / "tools" / "wording.toml").read_text("utf-8"))
+"""Pattern and advice of each rule."""
 NUMBER = re.compile(r"(?<![\w`./:-])[-−]?\d[\d,.]*")
 
 
@@ -170,22 +109,10 @@ def _code(text: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string.lstrip("# ")
 
 
-def files_of(paths: list[Path]) -> list[Path]:
-    """Return the Markdown pages and Python modules among the paths and in their folders."""
-    found: list[Path] = []
-    for path in paths:
-        found += [path] if path.is_file() else (p for p in path.rglob("*") if p.suffix in {".md", ".py"})
-    return sorted(found)
-
-
 def checkout() -> list[Path]:
     """Return the Markdown pages and Python modules of the checkout, without generated and quoted files."""
-    try:
-        listed = subprocess.run(
-            ["git", "ls-files", "*.md", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout.split()
-    except (OSError, subprocess.CalledProcessError):  # an unpacked archive
-        listed = [str(path.relative_to(ROOT)) for path in files_of([ROOT]) if ".venv" not in path.parts]
+    command = ["git", "ls-files", "*.md", "*.py"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
     skipped = (*GENERATED, *QUOTED)
     return [ROOT / name for name in listed if name not in skipped and (ROOT / name).is_file()]
 
@@ -204,19 +131,18 @@ def areas(limits: dict[str, float]) -> dict[str, tuple[int, int]]:
     return dict(sorted(counts.items()))
 
 
-def compare(*, verbose: bool) -> int:
-    """Print the areas above their limit, or all areas if `verbose`; return 1 if an area is above."""
+def gate() -> int:
+    """Print the areas above their limit; return 1 if there are any."""
     limits = tomllib.loads(LIMITS.read_text(encoding="utf-8"))["prose"]
     over = 0
     for area, (findings, words) in areas(limits).items():
         rate, limit = 1000 * findings / max(words, 1), limits.get(area, limits["default"])
-        is_over = rate > limit and findings > 1
-        over += is_over
-        if verbose or is_over:
+        if rate > limit and findings > 1:
+            over = 1
             print(f"{area:32} {findings:5} in {words:7,} words: {rate:5.1f} per 1,000, at most {limit:.1f}")
     if over:
         print("\nprose: see each finding with: python tools/prose.py PATH")
-    return int(over > 0)
+    return over
 
 
 def main() -> int:
@@ -224,16 +150,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("paths", nargs="*", type=Path)
     parser.add_argument("--gate", action="store_true")
-    parser.add_argument("--areas", action="store_true")
     options = parser.parse_args()
-    if options.gate or options.areas:
-        return compare(verbose=options.areas)
+    if options.gate:
+        return gate()
     total = words = 0
-    for path in files_of(options.paths):
-        count, findings = check(path)
-        for line, rule, text, advice in findings:
-            print(f"{path}:{line}: {rule}: …{text}… -> {advice}")
-        total, words = total + len(findings), words + count
+    for path in options.paths:
+        for file in [path] if path.is_file() else sorted([*path.rglob("*.md"), *path.rglob("*.py")]):
+            count, findings = check(file)
+            for line, rule, text, advice in findings:
+                print(f"{file}:{line}: {rule}: …{text}… -> {advice}")
+            total, words = total + len(findings), words + count
     print(
         f"{total} findings in {words:,} words: {1000 * total / max(words, 1):.1f} per 1,000", file=sys.stderr
     )

@@ -3,53 +3,22 @@
     python tools/second_world.py --cases 40
 
 The forward model has dipoles with an induced part, eddy currents of a plate with a time constant, and
-currents in a loop. The detector was not tuned on it. A diagnosis is *right* if it names the hidden cause,
-*alone* if it names nothing else; *a second* is any further name. *Foreign* effects are not in the table of
-causes, so any name for them is wrong.
+currents in a loop. The detector was not tuned on it. :mod:`independent` explains the table.
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
-import xarray as xr
-from studies import Column, Row, Study, show
-from study.ideal import cause_names
+from independent import Log, along, calibrated, diagnosed, main, rotated
+from studies import Row
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.run import diagnose
 
 STEP, HOURS, EPOCH = 5.0, 4.0, 1.75e9
 EARTH = np.array([17_000.0, -4_600.0, 46_500.0])
 """Main field, nT: north, east, down."""
-UNITS = {
-    "mag_x": "nT", "mag_y": "nT", "mag_z": "nT", "reference_field": "nT", "roll": "deg", "pitch": "deg",
-    "heading": "deg", "latitude": "deg", "longitude": "deg", "depth": "m", "battpos": "mm", "vbd": "cc",
-    "sensor_temperature": "degC", "motor_current": "A", "fin": "deg",
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Log:
-    """Telemetry columns of a log, (n,) each, and the true field in body axes (n, 3), nT."""
-
-    columns: dict[str, FloatArray]
-    body: FloatArray
-
-
-def rotated(columns: dict[str, FloatArray], field: FloatArray) -> FloatArray:
-    """Rotate a field (n, 3) from north-east-down to body axes, by heading, pitch and roll."""
-    roll, pitch, heading = (np.radians(columns[name]) for name in ("roll", "pitch", "heading"))
-    n, e, d = field.T
-    x, y = np.cos(heading) * n + np.sin(heading) * e, np.cos(heading) * e - np.sin(heading) * n
-    x, d = np.cos(pitch) * x - np.sin(pitch) * d, np.sin(pitch) * x + np.cos(pitch) * d
-    return np.stack([x, np.cos(roll) * y + np.sin(roll) * d, np.cos(roll) * d - np.sin(roll) * y], axis=1)
 
 
 def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
@@ -139,8 +108,7 @@ def _lagged(x: FloatArray, lag: float) -> FloatArray:
 
 
 def _along(x: FloatArray, rng: np.random.Generator) -> FloatArray:
-    axis = rng.normal(size=3)
-    return np.outer(x - x[0], axis / np.linalg.norm(axis))
+    return along(x - x[0], rng)
 
 
 def _plate(log: Log, rng: np.random.Generator) -> FloatArray:
@@ -150,12 +118,8 @@ def _plate(log: Log, rng: np.random.Generator) -> FloatArray:
     return np.stack([_lagged(x, 2.0) for x in (rate @ K.T).T], axis=1)
 
 
-def _hours(log: Log) -> FloatArray:
-    return np.asarray((log.columns["time"] - log.columns["time"][0]) / 3600.0)
-
-
 def _onset(log: Log, rng: np.random.Generator) -> FloatArray:
-    return (_hours(log) > rng.uniform(0.8, 3.2)).astype(float)
+    return (log.hours > rng.uniform(0.8, 3.2)).astype(float)
 
 
 def _telegraph(log: Log, rng: np.random.Generator, minutes: float) -> FloatArray:
@@ -189,88 +153,45 @@ OWN: dict[str, Effect] = {
     "temperature_offset": lambda log, rng: _along(_lagged(log.columns["sensor_temperature"], 600.0), rng),
     "current_field": lambda log, rng: _along(log.columns["motor_current"], rng),
     "offset_step": lambda log, rng: _along(_onset(log, rng), rng),
-    "offset_drift": lambda log, rng: _along(_hours(log) + 0.06 * _hours(log) ** 2, rng),
+    "offset_drift": lambda log, rng: _along(log.hours + 0.06 * log.hours ** 2, rng),
     "pressure_offset": lambda log, rng: _along(log.columns["depth"], rng),
     "eddy_current": _plate,
     "unmodelled_actuator": _fin,
-    "interference_tone": lambda log, rng: _along(np.sin(log.columns["time"] / rng.uniform(2.1, 14.0)), rng),
+    "interference_tone": lambda log, rng: _along(np.sin(log.time / rng.uniform(2.1, 14.0)), rng),
     "map_error": _chart,
-    "diurnal_variation": lambda log, rng: np.cos(2 * np.pi * (_hours(log) - rng.uniform(0.0, 24.0)) / 24.0),
+    "diurnal_variation": lambda log, rng: np.cos(2 * np.pi * (log.hours - rng.uniform(0.0, 24.0)) / 24.0),
 }  # fmt: skip
 """Effects by their cause: each returns an offset (n, 3), or an error of the reference (n,)."""
 FOREIGN: dict[str, Effect] = {
     "relay": lambda log, rng: _along(_telegraph(log, rng, 20.0), rng),
     "connector": lambda log, rng: _along(_telegraph(log, rng, 2.0) * _onset(log, rng), rng),
-    "ship": lambda log, rng: _along((1.0 + ((_hours(log) - rng.uniform(1, 3)) / 0.1) ** 2) ** -1.5, rng),
+    "ship": lambda log, rng: _along((1.0 + ((log.hours - rng.uniform(1, 3)) / 0.1) ** 2) ** -1.5, rng),
     "loose bolt": _bolt,
-    "bursts": lambda log, rng: _along(_telegraph(log, rng, 15.0) * np.sin(log.columns["time"] / 11.0), rng),
+    "bursts": lambda log, rng: _along(_telegraph(log, rng, 15.0) * np.sin(log.time / 11.0), rng),
 }  # fmt: skip
 """Foreign effects by name: none is a cause of the table."""
 
 
-def dataset(log: Log, H: FloatArray, reference: FloatArray | float = 0.0) -> xr.Dataset:
-    columns = log.columns | dict(zip(("mag_x", "mag_y", "mag_z"), H.T, strict=True))
-    columns["reference_field"] = columns["reference_field"] + reference
-    ds = xr.Dataset({k: ("time", v) for k, v in columns.items() if k != "time"}, {"time": columns["time"]})
-    for name, unit in UNITS.items():
-        ds[name].attrs["units"] = unit
-    return ds.assign_attrs(source="second world")
+NAMES = (*OWN, *FOREIGN)
 
 
-def case(number: int, name: str, snr: float) -> list[Row]:
+def run(case: int, snr: float) -> list[Row]:
     """Calibrate a glider, hide one effect in its survey, diagnose the survey, and return the row."""
-    rng = np.random.default_rng([20_251, number])
+    name, rng = NAMES[case % len(NAMES)], np.random.default_rng([20_251, case])
     glider, spins, survey = Glider(rng), logged(rng, 1.0, spins=True), logged(rng, HOURS, spins=False)
 
     def noise(n: int) -> FloatArray:
         e = rng.standard_t(6.0, (n, 3)) * 0.8
         return e + 0.6 * np.vstack([np.zeros(3), e[:-1]])  # a moving average, unlike the simulator's noise
 
-    clean = glider.reads(spins)
-    calibration = fit(
-        observations(dataset(spins, clean + noise(len(clean))), ["battpos", "vbd"]), "auto"
-    ).calibration
+    calibration = calibrated(spins.dataset(glider.reads(spins) + noise(len(spins.time))))
     effect = (OWN | FOREIGN)[name](survey, rng)
-    unit = survey.body / np.linalg.norm(survey.body, axis=1)[:, None]
-    seen = effect if effect.ndim == 1 else np.sum(effect * unit, axis=1)
+    seen = effect if effect.ndim == 1 else survey.visible(effect)
     effect = effect * snr / (np.std(seen) * np.sqrt(len(seen)))
-    H = glider.reads(survey) + noise(len(seen)) + (effect if effect.ndim == 2 else 0.0)
-    log = dataset(survey, H, effect if effect.ndim == 1 else 0.0)
-    return reported(name, diagnose([log], calibration).diagnosis, OWN)
-
-
-def reported(name: str, found: Diagnosis, own: Container[str]) -> list[Row]:
-    """Return the row of a case; `own` holds the effects that are causes of the table."""
-    named = cause_names(one.candidate.cause for one in found.findings)
-    named |= {"outliers"} if found.wrong is not None else set()
-    sets = named | cause_names(r.candidate.cause for one in found.findings for r in one.competing)
-    truth = cause_names([name])
-    row: Row = {"kind": "foreign" if name else "nothing", "hidden": name, "named": ", ".join(sorted(named))}
-    row["name"] = float(bool(named))
-    if name in own:
-        row |= {
-            "kind": "cause", "right": float(truth <= named), "in_set": float(truth <= sets),
-            "alone": float(sets == truth), "second": float(len(named) > 1),
-        }  # fmt: skip
-    return [row]
-
-
-HEADINGS = {
-    "a name": "name", "right": "right", "in the set": "in_set", "alone": "alone", "a second": "second",
-}  # fmt: skip
-
-
-def study(run: Callable[..., list[Row]], names: Sequence[str], doc: str | None) -> None:
-    """Run cases, each of which hides one of `names` (none if empty), and print the counts of the names."""
-
-    def cases_of(options: argparse.Namespace) -> list[tuple[int, str, float]]:
-        numbers = range(options.first, options.first + options.cases)
-        return [(number, names[number % len(names)], options.snr) for number in numbers]
-
-    columns = {heading: Column(source, np.mean, ".0%") for heading, source in HEADINGS.items()}
-    rows = Study(run, ("kind",), columns).main(doc, cases_of, cases=2 * len(names), first=0, snr=25.0)
-    show(rows[["hidden", "named"]].to_string())
+    H = glider.reads(survey) + noise(len(seen))
+    log = survey.dataset(H, effect) if effect.ndim == 1 else survey.dataset(H + effect)
+    return diagnosed(name, log, calibration, OWN)
 
 
 if __name__ == "__main__":
-    study(case, (*OWN, *FOREIGN), __doc__)
+    main(run, 2 * len(NAMES), __doc__)

@@ -1,8 +1,8 @@
 """Common part of the studies: run cases in parallel, store their rows, and print the tables of the results.
 
-A study consists of a function that runs one case and returns its rows, the columns that distinguish the lines
-of the table, and a statistic for each further column. ``--out FILE.parquet`` stores the rows; cases in the
-file are not run again.
+A study consists of a function that runs one case, the columns that distinguish the lines of the table, and a
+statistic for each further column. The cases are all combinations of the options that are named like the
+function's parameters. ``--out FILE.parquet`` stores the rows; cases in the file are not run again.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from inspect import signature
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
+
+from magbridge.errors import CalibrationError
 
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
@@ -139,40 +143,73 @@ def consistent(values: np.ndarray) -> float:
     return float(np.mean((values > 0.8) & (values < 1.25)))
 
 
+def combinations(run: Callable[..., Any], options: argparse.Namespace) -> list[tuple[Any, ...]]:
+    """Return all combinations of the options that are named like the parameters of `run`.
+
+    An option may be in the plural. Then a list has the values, and an integer is the number of the values,
+    which are successive from the option ``first`` on.
+    """
+    values: list[Sequence[Any]] = []
+    for name in signature(run).parameters:
+        if name not in options and f"{name}s" not in options:
+            break  # this parameter and the next ones have defaults
+        value = vars(options).get(f"{name}s", vars(options).get(name))
+        if isinstance(value, int) and not isinstance(value, bool) and f"{name}s" in options:
+            first = vars(options).get("first", 0)
+            value = range(first, first + value)
+        values.append(value if isinstance(value, list | range) else [value])
+    return list(product(*values))
+
+
+def run_case(run: Callable[..., Iterable[Row]], case: tuple[Any, ...]) -> list[Row]:
+    """Return the rows of a case, each with the arguments of `run`; a refused calibration is a row."""
+    known: Row = {"failed": ""}
+    for name, value in zip(signature(run).parameters, case, strict=False):
+        known[name] = value if isinstance(value, str | int | float) else str(value)
+    try:
+        return [known | row for row in run(*case)]
+    except CalibrationError as refused:
+        return [known | {"failed": str(refused)}]
+
+
 @dataclass(frozen=True)
 class Study:
     """Function that runs a case of a study, and the columns of the study's table.
 
-    `run` takes the elements of a case and returns its rows, each a dictionary. Rows with a text in ``failed``
-    are counted, but are not part of the statistics. `by` are the columns of the rows that distinguish the
-    lines of the table; `columns` are further columns of the table by heading.
+    `run` takes the elements of a case and returns its rows, each a dictionary, to which the study adds the
+    elements under the names of the parameters. Rows with a text in ``failed`` are counted, but are not part
+    of the statistics. `by` are the columns of the rows that distinguish the lines of the table; `columns` are
+    further columns of the table by heading.
     """
 
-    run: Callable[..., list[Row]]
+    run: Callable[..., Iterable[Row]]
     by: tuple[str, ...]
     columns: Mapping[str, Column]
 
     def rows(self, cases: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> pd.DataFrame:
         """Return the rows of all cases; run only the cases that the file ``--out`` lacks."""
         path: Path | None = options.out
-        kept = pd.read_parquet(path) if path is not None and path.exists() else pd.DataFrame({"case": []})
+        kept = (
+            pd.read_parquet(path) if path is not None and path.exists() else pd.DataFrame({"arguments": []})
+        )
         names = [repr(case) for case in cases]
-        todo = [case for case, name in zip(cases, names, strict=True) if name not in set(kept["case"])]
-        for case, future in as_done(self.run, todo, options):
-            new = pd.DataFrame([{"case": repr(case)} | row for row in future.result()])
+        known = set(kept["arguments"])
+        todo = [(self.run, case) for case, name in zip(cases, names, strict=True) if name not in known]
+        for (_, case), future in as_done(run_case, todo, options):
+            new = pd.DataFrame([{"arguments": repr(case)} | row for row in future.result()])
             kept = pd.concat([kept, new], ignore_index=True) if len(kept) else new
             if path is not None:
                 kept.to_parquet(path)
         order = {name: number for number, name in enumerate(names)}
-        rows = kept[kept["case"].isin(names)]
-        return rows.sort_values("case", key=lambda case: case.map(order), kind="stable", ignore_index=True)
+        rows = kept[kept["arguments"].isin(names)]
+        return rows.sort_values("arguments", key=lambda c: c.map(order), kind="stable", ignore_index=True)
 
     def table(self, title: str, rows: pd.DataFrame) -> Table:
         """Return the table of the rows, with a line for each combination of the columns `by`."""
         headings = (*self.by, "rows", *self.columns, "failed")
         made = table(title, *headings, left=(self.by[0], self.by[-1]))
         for key, group in rows.groupby(list(self.by), sort=False):
-            good = group[group["failed"] == ""] if "failed" in group else group
+            good = group[group["failed"] == ""]
             cells = [column.cell(good) for column in self.columns.values()]
             failed = len(group) - len(good)
             made.add_row(*map(str, key), str(len(group)), *cells, str(failed) if failed else "")
@@ -181,18 +218,19 @@ class Study:
     def main(
         self,
         doc: str | None,
-        cases_of: Callable[[argparse.Namespace], Sequence[tuple[Any, ...]]],
-        names: Collection[str] = (),
+        cases_of: Callable[[argparse.Namespace], Sequence[tuple[Any, ...]]] | None = None,
         /,
         **defaults: Any,
     ) -> pd.DataFrame:
-        """Run the cases that `cases_of` makes of the options, print the table, and return the rows.
+        """Run the cases, print the table, and return the rows.
 
-        The other arguments are those of :func:`command_line`. Each study also has ``--out``, the file of the
-        rows, and ``--workers``, the number of processes.
+        The cases are :func:`combinations` of the options, or the result of `cases_of`. The other arguments
+        are those of :func:`command_line`. Each study also has ``--out``, the file of the rows, and
+        ``--workers``, the number of processes.
         """
-        options = command_line(doc, names, **defaults, out=Path, workers=2)
-        rows = self.rows(cases_of(options), options)
+        options = command_line(doc, **defaults, out=Path, workers=2)
+        cases = cases_of(options) if cases_of else combinations(self.run, options)
+        rows = self.rows(cases, options)
         show(self.table((doc or "").partition("\n")[0], rows))
         return rows
 

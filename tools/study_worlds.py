@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 from scipy.spatial.distance import cdist
+from studies import Column, percentile
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, fit
@@ -62,6 +63,15 @@ class Glider(NamedTuple):
         after = corrected(self.survey, calibration)
         error = after.total - true_field(self.survey)
         return {"ratio": rms(error) / self.floor, "sigma": float(np.std(error / after.sigma))}
+
+
+SCORES = {
+    "error / noise: median": Column("ratio", np.median, ".3f"),
+    "95 %": Column("ratio", percentile(95), ".3f"),
+    "maximum": Column("ratio", np.max, ".3f"),
+    "normalised error: median": Column("sigma"),
+}
+"""Columns of a study's table for the rows of :meth:`Glider.score`."""
 
 
 def glider(scenario: Scenario, seed: int, masses: Sequence[str] = MASSES) -> Glider:
@@ -267,40 +277,18 @@ class BestFit:
         at_sigma: float = 0.05,
         widths: FloatArray | None = None,
     ) -> None:
-        self._vehicle, self._calibration, self._survey = vehicle, calibration, survey
-        self._phi = np.exp(-1 / memory) if memory else 0.0
         # θ in units of its prior's 1-sigma, so that the information is well scaled
         scale = _widths(vehicle, at_sigma) if widths is None else widths
-        g, self._learned_floor = _sensitivity(vehicle, calibration, sigma)
-        self._g = self._whitened(g) * scale
-        self._covariance = np.linalg.inv(self._g.T @ self._g + np.eye(len(scale)))
+        g, learned_floor = _sensitivity(vehicle, calibration, sigma)
+        # whiten the noise of consecutive samples; runs are independent
+        g = g / learned_floor[:, None] * scale
+        phi = np.exp(-1 / memory) if memory else 0.0
+        follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
+        g = np.where(follows, (g - phi * np.roll(g, 1, axis=0)) / np.sqrt(1 - phi**2), g)
+        covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
         h, self.floor = _sensitivity(vehicle, survey, sigma)
-        self._h = h * scale
-        self.bound = np.sqrt(np.einsum("ni,ij,nj->n", self._h, self._covariance, self._h) + self.floor**2)
-
-    def error(self, rng: np.random.Generator) -> FloatArray:
-        r"""Return the survey's error (n,), nT, with the simulated noise; `bound` is its expected 1-sigma.
-
-        Notes
-        -----
-        Linear about the truth: with :math:`\mathbf e` the whitened noise of the calibration and a prior whose
-        centre is :math:`\mathbf p` of its widths off the truth,
-        :math:`dθ = P (\mathbf g^T \mathbf e + \mathbf p)`.
-        """
-        noise, after = (
-            oracle(self._vehicle, part) - part["truth_total_field"].to_numpy()
-            for part in (self._calibration, self._survey)
-        )
-        e = self._whitened(noise[:, None])[:, 0]
-        off = self._covariance @ (self._g.T @ e + rng.normal(size=len(self._covariance)))
-        return np.asarray(after - self._h @ off)
-
-    def _whitened(self, values: FloatArray) -> FloatArray:
-        """Return whitened columns (m, j), from nT, on the calibration's samples; runs are independent."""
-        values = values / self._learned_floor[:, None]
-        follows = (np.diff(self._calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
-        innovations = (values - self._phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - self._phi**2)
-        return np.where(follows, innovations, values)
+        h = h * scale
+        self.bound = np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + self.floor**2)
 
 
 class SurveyBound:

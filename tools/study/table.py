@@ -153,70 +153,48 @@ def equal_size(row: Row) -> float:
 
 def lines(rows: Sequence[Row]) -> list[str]:
     """Return the lines of the table in Markdown."""
-    part = {name: [r for r in rows if r["part"] == name] for name in {r["part"] for r in rows}}
-    figures = [
-        *_nulls(part.get("null", [])),
-        *_detection(part),
-        *_names(part.get("named", [])),
-        *_parameters([r for r in rows if r["part"] not in ("charted", "flicker")]),
-        *_others(part),
-    ]
-    header = ("| figure | ideal detector | measured (95 % interval) | cases |", "|---|---|---|---|")
-    return [*header, *(f"| {' | '.join(line)} |" for line in figures)]
 
+    def of(*parts: str) -> list[Row]:
+        return [row for row in rows if row["part"] in parts]
 
-def _nulls(rows: Sequence[Row]) -> list[Line]:
-    kinds = [(f"... {noise}", [r for r in rows if r["noise"] == noise]) for noise in NOISES]
-    return [(label, "1 %", share(own, found)) for label, own in (("false alarms", rows), *kinds)]
-
-
-def _detection(part: dict[str, list[Row]]) -> list[Line]:
-    single = [r for name in ("ladder", "named", "gain", "loud") for r in part.get(name, [])]
-    known = part.get("ladder", []) + part.get("named", [])
-    out: list[Line] = []
-    for size in sorted({r["wanted"] for r in single}):
-        own = [r for r in single if r["wanted"] == size]
-        out.append((f"S/N {size:g}: found", f"{100 * detection_curve(known, size):.0f} %", share(own, found)))
+    null, named, known, outside = of("null"), of("named"), of("ladder", "named"), of(*NAMELESS)
+    table: list[Line] = [("false alarms", "1 %", share(null, found))]
+    for noise in NOISES:
+        own = [row for row in null if row["noise"] == noise]
+        table.append((f"... {noise}", "1 %", share(own, found)))
+    single = of("ladder", "named", "gain", "loud")
+    for size in sorted({row["wanted"] for row in single}):
+        own = [row for row in single if row["wanted"] == size]
+        ideal = f"{100 * detection_curve(known, size):.0f} %"
+        table.append((f"S/N {size:g}: found", ideal, share(own, found)))
     if factor := needed_size(known):
         middle, low, high = (100 * (f - 1) for f in factor)
         text = f"{middle:+.0f} % ({low:+.0f} to {high:+.0f} %, of 68 %) | {len(known)}"
-        out.append(("S/N needed beyond an ideal detector's", "0 %", text))
-    return out
-
-
-def _names(rows: Sequence[Row]) -> list[Line]:
-    nameable = [r for r in rows if is_nameable(r)]
-    other = [r for r in rows if not is_nameable(r)]
-    out: list[Line] = [("S/N 8: a false second name", "", share(rows, has_second))]
-    for label, own in (("where the ideal detector can", nameable), ("elsewhere", other)):
-        out += [
-            (f"S/N 8, {label}: named alone and right", chance(own, "alone"), share(own, is_right_alone)),
-            ("... truth in the set of names", chance(own, "inside"), share(own, holds)),
-        ]
-    return out
-
-
-def _parameters(rows: Sequence[Row]) -> list[Line]:
-    out: list[Line] = []
+        table.append(("S/N needed beyond an ideal detector's", "0 %", text))
+    table.append(("S/N 8: a false second name", "", share(named, has_second)))
+    for label, nameable in (("where the ideal detector can", True), ("elsewhere", False)):
+        own = [row for row in named if is_nameable(row) is nameable]
+        alone = f"S/N 8, {label}: named alone and right"
+        table.append((alone, chance(own, "alone"), share(own, is_right_alone)))
+        table.append(("... truth in the set of names", chance(own, "inside"), share(own, holds)))
     for label, low, high in (("S/N 8 to 25", 8.0, 25.0), ("S/N 50 and 100", 50.0, 100.0)):
-        z = scores([r for r in rows if len(r["names"]) == 1 and low <= r["wanted"] <= high])
-        out.append((f"95 % intervals cover, {label}", "95 %", fraction(np.abs(z) < 1.96)))
-    return out
-
-
-def _others(part: dict[str, list[Row]]) -> list[Line]:
-    charted, flicker = part.get("charted", []), part.get("flicker", [])
-    outside = [r for name in NAMELESS for r in part.get(name, [])]
-    lines: list[Line] = [
-        (f"harm against a {kind}", "0 %", share([r for r in charted if r["reference"] == kind], is_worse))
-        for kind in CHARTS
-    ]
-    return [
-        *lines,
+        own = [row for row in rows if row["part"] not in ("charted", "flicker")]
+        z = scores([row for row in own if len(row["names"]) == 1 and low <= row["wanted"] <= high])
+        table.append((f"95 % intervals cover, {label}", "95 %", fraction(np.abs(z) < 1.96)))
+    for chart in CHARTS:
+        own = [row for row in of("charted") if row["reference"] == chart]
+        table.append((f"harm against a {chart}", "0 %", share(own, is_worse)))
+    table += [
         ("an effect outside the list gets a name", "0 %", share(outside, lambda r: bool(r["found"]))),
-        ("two at S/N 10, both named", "", share(part.get("pair", []), lambda r: hidden(r) <= asserted(r))),
-        ("flicker noise: a false name", "0 %", share(flicker, lambda r: bool(asserted(r) - hidden(r)))),
+        ("two at S/N 10, both named", "", share(of("pair"), lambda r: hidden(r) <= asserted(r))),
+        (
+            "flicker noise: a false name",
+            "0 %",
+            share(of("flicker"), lambda r: bool(asserted(r) - hidden(r))),
+        ),
     ]
+    header = ("| figure | ideal detector | measured (95 % interval) | cases |", "|---|---|---|---|")
+    return [*header, *(f"| {' | '.join(line)} |" for line in table)]
 
 
 # ---- the plots ---------------------------------------------------------------------------------------------
