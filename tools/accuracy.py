@@ -8,17 +8,11 @@ their travel, and the distribution of moments, volumes and iron. "Bound" is the 
 (Cramér-Rao, with this prior).
 
     python tools/accuracy.py --seeds 40 --out accuracy.parquet
-    python tools/accuracy.py --peers .venv-peers/bin/python        # see tools/peers.py
 """
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,31 +25,23 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
-from magbridge.field.reference import main_field
 from sitl import load
-from sitl.dataset import channels, side_by_side
-from sitl.instrument import rotation
+from sitl.dataset import channels
 
 MASSES = {1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "ballast", "rollpos")}
 TAPE_SIGMA_M = 0.05
 """Standard deviation of the masses' positions measured with a tape, m on an axis."""
 TAPE = "auto, positions to 5 cm"
-PEERS = os.environ.get("MAGBRIDGE_PEERS", "")
-"""Interpreter that has magyc and MAVProxy."""
 
 
 def run(
     masses: int,
     noise: str,
     seed: int,
-    peers: str = "",
     methods: tuple[str, ...] = (*METHODS, TAPE),
     oracles: bool = True,
 ) -> Iterator[Row]:
-    """Simulate a glider with some moving masses, calibrate by every method, and score on the survey.
-
-    Third-party programs run on two masses with the first noise only.
-    """
+    """Simulate a glider with some moving masses, calibrate by every method, and score on the survey."""
     sigma, memory = NOISES[noise]
     names = MASSES[masses]
     instrument = {"noise_sigma": sigma, "noise_memory": memory}
@@ -64,9 +50,9 @@ def run(
     for at_sigma, name in ((0.5, "oracle"), (TAPE_SIGMA_M, "oracle, positions to 5 cm")) if oracles else ():
         best = BestFit(flown.vehicle, flown.runs, flown.survey, sigma, memory, at_sigma)
         scores[f"{name}: bound"] = {"ratio": rms(best.bound) / rms(best.floor)}
-    peers = peers if masses == 2 and noise == next(iter(NOISES)) else ""
-    for name, (A, T, failed) in other_methods(flown.runs, peers) if oracles else ():
-        scores[name] = {"ratio": rms(remainder(A, T, flown.survey)) / flown.floor, "failed": failed}
+    if oracles:
+        A, T = ellipsoid(flown.runs)
+        scores["scipy ellipsoid"] = {"ratio": rms(remainder(A, T, flown.survey)) / flown.floor}
     yield from ({"method": method} | score for method, score in scores.items())
 
 
@@ -92,41 +78,6 @@ def tape(flown: Glider, seed: int) -> dict[str, dict[str, object]]:
         }
         for name, mass in flown.vehicle.mass.items()
     }
-
-
-def other_methods(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
-    """Yield name and (A, T, failure) of third-party methods; the corrected field is ``A (raw - T)``."""
-    yield "scipy ellipsoid", (*ellipsoid(runs), "")
-    if not peers:
-        return
-    attitude = rotation(*(runs[name].to_numpy() for name in ("roll", "pitch", "heading")))
-    time = runs["time"].to_numpy()
-    turned = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(time)[:, None]
-    arrays = {
-        "field": channels(runs),
-        "reference": true_field(runs),
-        "attitude": side_by_side(runs, ("roll", "pitch", "heading")),
-        "rates": np.vstack([turned, turned[-1:]]),
-        "reference_ned": main_field(runs)[0],
-        "time": time,
-    }
-    for name, answer in ask_peers(peers, arrays).items():
-        failed = answer.get("failed", "")
-        nothing = np.full((3, 3), np.nan), np.full(3, np.nan)
-        yield name, (*(nothing if failed else (np.array(answer["A"]), np.array(answer["T"]))), failed)
-
-
-def ask_peers(interpreter: str, arrays: dict[str, Any], *arguments: str) -> dict[str, Any]:
-    """Return the results of tools/peers.py, run by another interpreter, for each method."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "runs.npz"
-        np.savez(file, **arrays)
-        command = [interpreter, str(Path(__file__).with_name("peers.py")), str(file), *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{interpreter}: {done.stderr.strip().splitlines()[-1]}")
-    answers: dict[str, Any] = json.loads(done.stdout)
-    return answers
 
 
 def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -157,4 +108,4 @@ STUDY = Study(
 
 
 if __name__ == "__main__":
-    STUDY.main(__doc__, seeds=40, masses=[2, 1, 3], noise=list(NOISES), peers=PEERS)
+    STUDY.main(__doc__, seeds=40, masses=[2, 1, 3], noise=list(NOISES))

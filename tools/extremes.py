@@ -1,24 +1,18 @@
-"""Feed the bridge valid frames and sensor lines with extreme values; no event may raise.
-
-    python tools/extremes.py --events 1000000 [--seed 1]
+"""Make valid frames and sensor lines with extreme values, and a bridge that gets them (``fuzz.py bridge``).
 
 Autopilot, another component and a station send every message of the dialect. Some fields have plausible
 values; the others are NaN, infinities, denormals and the limits of their type. The bridge calibrates in
-flight and navigates, and its optional parts do not catch exceptions.
+flight and navigates.
 """
 
 from __future__ import annotations
 
 import random
 import struct
-import sys
-import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 from small import START, small_bridge
-from studies import command_line
 
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline
@@ -28,11 +22,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid
 from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.messages import MESSAGES
-from magbridge.parts import OptionalParts
 from magbridge.records import Channel
-
-PART = 20_000
-"""Number of events after which a new bridge starts."""
 
 CONFIG = """NAMED_VALUE_FLOAT = 1
 [telemetry.current]
@@ -209,28 +199,3 @@ def feed(bridge: Pipeline, files: FileServer, event: Event) -> None:
         bridge.interleaved(replies)
     bridge.streams[0].line.to_send.clear()
     bridge.recorder.drain()
-
-
-def main() -> None:
-    """Feed the events; print the first event that raises an exception."""
-    given = command_line(__doc__, events=1_000_000, seed=1)
-    OptionalParts.propagate = True
-    begun, fed, part = time.monotonic(), 0, given.seed
-    while fed < given.events:
-        with tempfile.TemporaryDirectory() as folder:
-            bridge = make_bridge(Path(folder), part)
-            files = FileServer(bridge.component.metadata, Path(folder), lambda: 1e9, lambda _: None)
-            for index, event in enumerate(events(min(PART, given.events - fed), part)):
-                try:
-                    feed(bridge, files, event)
-                except Exception:
-                    print(f"seed {part}, event {index}: {event.channel!r} {event.data!r}")
-                    raise
-            files.close()
-            fed, part = fed + index + 1, part + 1
-        print(f"\r{fed} events", end="", file=sys.stderr, flush=True)
-    print(f"\r{fed} events in {time.monotonic() - begun:.0f} s: no exception", file=sys.stderr)
-
-
-if __name__ == "__main__":
-    main()

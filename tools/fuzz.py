@@ -2,6 +2,7 @@
 
     python tools/fuzz.py mavlink digitizer -n 1000000 -o fuzz
     python tools/fuzz.py --kind file --seconds 600 -o fuzz
+    python tools/fuzz.py bridge -n 2000           a million events with extreme values
 
 The undamaged inputs come from magbridge's writers and the emulators. The tool changes bits, bytes and
 numbers, and moves, doubles or cuts off pieces. Input k of a seed is equal in every run. The output folder
@@ -22,6 +23,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from extremes import events, feed, make_bridge
 from small import bridge_text, polynomial
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
@@ -35,6 +37,7 @@ from studies import command_line, show, table
 from ulogs import ulog_of
 
 from magbridge import config, logs
+from magbridge.bridge.run import FileServer
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.model import CalibratedSensor, Parameter, Run
 from magbridge.errors import MagbridgeError
@@ -42,6 +45,7 @@ from magbridge.field import read
 from magbridge.field.grid import AnomalyGrid
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.mavlink.tlog import LogReader
+from magbridge.parts import OptionalParts
 from magbridge.records import Reading
 from magbridge.sensors import open_driver
 from sitl.fluxgate import open_encoder
@@ -130,6 +134,22 @@ def _calibration(_: Path) -> list[bytes]:
     return [encode_calibration(made)]
 
 
+def _bridge(folder: Path) -> Read:
+    """Return a function that feeds a bridge with 500 events of extreme values, which the bytes seed."""
+
+    def read(data: bytes) -> object:
+        OptionalParts.propagate = True
+        seed = int.from_bytes(hashlib.sha256(data).digest()[:4], "big")
+        bridge = make_bridge(folder, seed)
+        files = FileServer(bridge.component.metadata, folder, lambda: 1e9, lambda _: None)
+        for event in events(500, seed):
+            feed(bridge, files, event)
+        files.close()
+        return bridge
+
+    return read
+
+
 # ---- targets of files --------------------------------------------------------------------------------------
 
 
@@ -208,6 +228,7 @@ TARGETS: dict[str, Target] = {
         "bytes", lambda _: lambda data: [(one, one.message) for one in LogReader(BytesIO(data))], _frame_log
     ),
     "calibration": Target("bytes", lambda _: decode_calibration, _calibration),
+    "bridge": Target("events", _bridge, lambda _: [bytes(64)]),
     "config": _file(
         "bridge.toml",
         config.load,
@@ -312,7 +333,7 @@ class Counts:
 
 def main() -> int:
     """Fuzz each target in turn; print the outcomes and return the exit code."""
-    kinds = ["bytes", "file"]
+    kinds = ["bytes", "file", "events"]
     chosen = command_line(
         __doc__, TARGETS, kind=kinds, n=10_000, seconds=float("inf"), seed=0, o=Path("fuzz")
     )

@@ -1,12 +1,11 @@
 """Measure the error of the heading out of sample, and whether its stated standard deviation is right.
 
 Each row of the table is a calibration, tested on another log. No calibration uses the headings of its log,
-except in the row that states it. Third-party methods estimate no boresight, so each gets magbridge's. The
+except in the row that states it. A free ellipsoid has no boresight, so it gets magbridge's. The
 aircraft's log is third-party data (``$MAGBRIDGE_REAL_DATA``, or ``../shared/data``); its inertial heading
 is the truth.
 
     python tools/heading.py --seeds 6 --out heading.parquet
-    python tools/heading.py --peers .venv-peers/bin/python        # adds magyc, see tools/peers.py
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 import xarray as xr
-from accuracy import PEERS, other_methods
+from accuracy import ellipsoid
 from scipy.spatial.transform import Rotation
 from studies import DATA, Column, Row, Study
 from study_worlds import MASSES, glider, measure_trials
@@ -50,10 +49,10 @@ AIRCRAFT_STEP = 10
 SIMULATED = ("gliders", "gliders, tilt offsets", "gliders, filter", "Bonne Bay twin")
 
 
-def run(name: str, seed: int, peers: str) -> Iterator[Row]:
+def run(name: str, seed: int) -> Iterator[Row]:
     """Yield the rows of one vehicle: a heading's RMS error and its normalised error, by method."""
     if name != "aircraft":
-        yield from simulated(name, seed, peers)
+        yield from simulated(name, seed)
     elif seed == 0:
         yield from aircraft()
 
@@ -85,7 +84,7 @@ def with_tilt_errors(log: xr.Dataset, rng: np.random.Generator, offset_deg: floa
     return log
 
 
-def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
+def simulated(name: str, seed: int) -> Iterator[Row]:
     """Yield the rows of a simulated vehicle, calibrated by spirals and tested on a survey's true headings."""
     exact = {"roll_pitch_sigma": 0.0, "heading_sigma": 0.0}
     rng = np.random.default_rng([seed, 5])
@@ -117,9 +116,9 @@ def simulated(name: str, seed: int, peers: str) -> Iterator[Row]:
     yield score("raw compass", *levelled(channels(survey), survey), survey["heading"].to_numpy())
     assert known.boresight is not None
     turn = Rotation.from_rotvec(known.boresight.rotation)
-    for method, (A, T, failed) in other_methods(learned, peers):
-        vector = turn.apply((channels(survey) - T) @ A.T)
-        yield score(method, *levelled(vector, survey), survey["heading"].to_numpy()) | {"failed": failed}
+    A, T = ellipsoid(learned)
+    vector = turn.apply((channels(survey) - T) @ A.T)
+    yield score("scipy ellipsoid", *levelled(vector, survey), survey["heading"].to_numpy())
 
 
 def levelled(vector: np.ndarray, log: xr.Dataset) -> tuple[np.ndarray, float]:
@@ -189,4 +188,4 @@ STUDY = Study(
 
 
 if __name__ == "__main__":
-    STUDY.main(__doc__, names=[*SIMULATED, "aircraft"], seeds=6, peers=PEERS)
+    STUDY.main(__doc__, names=[*SIMULATED, "aircraft"], seeds=6)

@@ -16,10 +16,10 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from measured import VEHICLES, joined
 from studies import DATA, Column, Row, Study, show
+from study.names import judge
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -154,21 +154,17 @@ def run(seed: int, log: str, effect: str, snr: float, data: Path) -> list[Row]:
         return []
     changed, size = hidden
     found, use = diagnose([changed.isel(time=slice(0, half))], calibration)
-    first = [one.candidate.cause for one in found.findings]
-    every = {candidate.cause for one in found.findings for candidate in one.possible}
-    every |= {one.candidate.cause for one in found.unexplained.within} if found.unexplained else set()
+    judged = judge(found, [effect])
+    first = judged.pop("first")
+    row: Row = {key: float(value) for key, value in judged.items() if isinstance(value, bool)}
+    row |= {"named": ", ".join(first) or "none", "right": float(first[:1] == [effect])}
     later = load_survey([changed.isel(time=slice(half, None))], found.calibration)
     given, written = (corrected(later, one) for one in (calibration, found.calibration))
     before, after = (rms(one.total - later.reference) for one in (given, written))
     return [
-        {
-            "size": size,
-            "found": float(bool(first) or found.unexplained is not None), "named": ", ".join(first) or "none",
-            "right": float(effect in first[:1]), "in_set": float(effect in every),
-            "alone": float(every == {effect}), "false_name": float(bool(first) and effect not in every),
-            "second": float(len(first) > 1), "use": use.fit_for_use, "reason": use.reason,
-            "promised": found.improvement.ratio, "real": after / before,
-            "sigma": float(np.median(written.sigma)), "error": after,
+        row | {
+            "size": size, "use": use.fit_for_use, "reason": use.reason, "promised": found.improvement.ratio,
+            "real": after / before, "sigma": float(np.median(written.sigma)), "error": after,
         }
     ]  # fmt: skip
 
@@ -184,19 +180,20 @@ STUDY = Study(
 )  # fmt: skip
 
 
-def cell(rows: pd.DataFrame, name: str) -> str:
-    """Return the number of rows in which the column `name` is true, as text "k of n"."""
-    return f"{int(rows[name].sum())} of {len(rows)}"
+SUMMARY = Study(
+    run, ("foreign",),
+    {
+        "found": Column("found", np.sum, ".0f"), "right first": Column("right", np.sum, ".0f"),
+        "in the set": Column("in_set", np.sum, ".0f"), "alone": Column("alone", np.sum, ".0f"),
+        "a second name": Column("second", np.sum, ".0f"), "a name": Column("a_name", np.sum, ".0f"),
+        "later part worse by more than 2 %": Column("worse", np.sum, ".0f"),
+    },
+)  # fmt: skip
 
 
 if __name__ == "__main__":
     rows = STUDY.main(
         __doc__, seeds=1, first=0, logs=list(VEHICLES), effects=list(EFFECTS), snr=12.0, data=DATA
     )
-    own, foreign = (rows[rows["effect"].isin(FOREIGN) == is_foreign] for is_foreign in (False, True))
-    show(
-        f"causes: found {cell(own, 'found')}, right first {cell(own, 'right')}, in the set "
-        f"{cell(own, 'in_set')}, alone {cell(own, 'alone')}, a second name {cell(own, 'second')}; foreign "
-        f"with a name {int((foreign['named'] != 'none').sum())} of {len(foreign)}",
-        f"later part worse than as given by more than 2 %: {int((rows['real'] > 1.02).sum())} of {len(rows)}",
-    )
+    judged = {"foreign": rows["effect"].isin(FOREIGN), "a_name": rows["named"] != "none"}
+    show(SUMMARY.table("Number of cases", rows.assign(**judged, worse=rows["real"] > 1.02)))

@@ -1,8 +1,7 @@
 """Common part of the worlds that share no physics with ``sitl``: logs, calibrations, scores and tables.
 
-Nothing in this module is physics, except the rotation of a vector by an attitude. A diagnosis is *right* if
-it names the hidden cause, *alone* if it names nothing else; *a second* is any further name. *Foreign* effects
-are not in the table of causes, so any name for them is wrong.
+Nothing in this module is physics, except the rotation of a vector by an attitude. :mod:`study.names` explains
+the columns of the table. *Foreign* effects are not in the table of causes, so any name for them is wrong.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from studies import Column, Row, Study, show
-from study.ideal import cause_names
+from study.names import judge
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -85,18 +84,11 @@ def calibrated(runs: xr.Dataset, masses: Sequence[str] = ("battpos", "vbd")) -> 
 
 def diagnosed(name: str, log: xr.Dataset, calibration: Calibration, own: Collection[str]) -> list[Row]:
     """Diagnose a log with the hidden effect `name`; return the row. `own` are the causes of the table."""
-    found = diagnose([log], calibration).diagnosis
-    named = cause_names(one.candidate.cause for one in found.findings)
-    named |= {"outliers"} if found.wrong is not None else set()
-    sets = named | cause_names(r.candidate.cause for one in found.findings for r in one.competing)
-    truth = cause_names([name])
-    row: Row = {"kind": "foreign" if name else "nothing", "hidden": name, "named": ", ".join(sorted(named))}
-    row["name"] = float(bool(named))
+    judged = judge(diagnose([log], calibration).diagnosis, [name] * bool(name))
+    row: Row = {"kind": "foreign" if name else "nothing", "hidden": name, "named": ", ".join(judged["named"])}
+    row["name"] = float(bool(judged["named"]))
     if name in own:
-        row |= {
-            "kind": "cause", "right": float(truth <= named), "in_set": float(truth <= sets),
-            "alone": float(sets == truth), "second": float(len(named) > 1),
-        }  # fmt: skip
+        row |= {key: float(judged[key]) for key in ("right", "in_set", "alone", "second")} | {"kind": "cause"}
     return [row]
 
 

@@ -6,9 +6,8 @@ Each glider is calibrated by the runs of the paper's Table 1. It then surveys a 
 another day, with one change. The reference is the IGRF. A sample's telemetry is two seconds old, so a motion
 begins before its report; the figures exclude samples during a motion.
 
-fixed, MagNav, bound, published   RMS error without bias after three hours, over the noise floor: of the
-              fixed calibration, of MagNav.jl's online filter (:func:`online`), of a filter that knows
-              cause and onset, and of the published field
+fixed, bound, published   RMS error without bias after three hours, over the noise floor: of the fixed
+              calibration, of a filter that knows cause and onset, and of the published field
 normalised    normalised error of the published field, from the alarm on
 delay         samples until the alarm, over the delay of a detector that knows cause and calibration
 among, alone  fraction of the runs in which the true cause is among the named causes, or the only one
@@ -22,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from measured import tolles_lawson
 from studies import Column, Row, Study
 from study_worlds import MASSES
 
@@ -36,7 +34,7 @@ from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.estimation.residual import rms
 from magbridge.estimation.sequential import ALARM_LOG_RATIO
-from magbridge.estimation.track_process import CORRELATION_LENGTH_M, TRACK_STATES
+from magbridge.estimation.track_process import TRACK_STATES
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
@@ -208,59 +206,6 @@ def best_field(
     return np.asarray(total - np.sum(by_change * known, axis=1))
 
 
-# ---- a third-party filter ----------------------------------------------------------------------------------
-
-
-PERMANENT, INDUCED, EDDY = 20.0, 20.0, 5.0
-"""Prior 1-sigma of the three kinds of terms, nT: a power-on's offset change; an eddy term at 1 deg/s."""
-WALK = 3.0 / 86_400.0**0.5
-"""Random walk of the coefficients, nT per square root of a second, as in magbridge."""
-
-
-def online(
-    vector: np.ndarray,
-    total: np.ndarray,
-    reference: np.ndarray,
-    time: np.ndarray,
-    use: np.ndarray,
-    noise: float,
-    field: tuple[float, float],
-) -> np.ndarray:
-    """Return the total field (n,), nT, that MagNav.jl's linear online filter corrects sample by sample.
-
-    In ``ekf_online`` (Canciani 2022, IEEE Trans. Aerospace and Electronic Systems 58:420), the states are the
-    18 coefficients of Tolles and Lawson and a first-order Gauss-Markov field. The filter has no terms for
-    moving masses, so its input is the field after the fixed calibration.
-
-    `vector` (n, 3) and `total` (n,), nT, are corrected by the fixed calibration; `reference` (n,) is in nT,
-    `time` (n,) in s. The mask `use` (n,) selects the samples that update the filter; `noise` is in nT.
-    `field` is the 1-sigma (nT) and the time constant (s) of the Gauss-Markov field.
-    """
-    # Tolles and Lawson's terms of the measured direction; the eddy-current terms are per deg/s
-    static, eddy = tolles_lawson(vector / np.linalg.norm(vector, axis=1)[:, None], time, np.ones(len(time)))
-    A = np.hstack([static, eddy / np.radians(1.0)])
-    x = np.zeros(19)
-    P = np.diag(np.r_[[PERMANENT**2] * 3, [INDUCED**2] * 6, [EDDY**2] * 9, field[0] ** 2])
-    out = np.empty(len(time))
-    last = time[0]
-    for k in range(len(time)):
-        phi = np.exp(-(time[k] - last) / field[1])
-        x[-1] *= phi
-        P[-1] *= phi
-        P[:, -1] *= phi
-        P[-1, -1] += field[0] ** 2 * (1.0 - phi * phi)
-        P[range(18), range(18)] += WALK**2 * (time[k] - last)
-        last = time[k]
-        out[k] = total[k] - A[k] @ x[:-1]
-        if use[k]:
-            h = np.r_[A[k], 1.0]
-            improvement = P @ h / (h @ P @ h + noise**2)
-            x += improvement * (total[k] - reference[k] - h @ x)
-            P -= np.outer(improvement, h @ P)
-            P = 0.5 * (P + P.T)
-    return out
-
-
 # ---- the flight, and the bridge ----------------------------------------------------------------------------
 
 
@@ -348,13 +293,10 @@ def run(change: str, seed: int, hours: float, size: float) -> list[Row]:
     seen = learn(Learner(calibration, currents=currents(log)), calibration, log)
     rest = at_rest(seen.quality)
     reference = magnitude(main_field(log))
-    peer = online(
-        fixed.vector, fixed.total, reference, time, rest, calibration.noise.sensor, field_model(log)
-    )
     best = best_field(added, log, rest, calibration, reference) if added.any() else fixed.total
     late = rest & (hours_of(log) > min(3.0, 0.5 * hours))
     row: Row = {}
-    for label, total in (("fixed", fixed.total), ("peer", peer), ("bound", best), ("published", seen.total)):
+    for label, total in (("fixed", fixed.total), ("bound", best), ("published", seen.total)):
         row[label] = float(np.std((total - truth)[late])) / calibration.noise.sensor
     since = int(begins * len(time))
     real = [(k, causes) for k, causes in seen.alarms if cause and k >= since]
@@ -374,20 +316,11 @@ def run(change: str, seed: int, hours: float, size: float) -> list[Row]:
     return [row]
 
 
-def field_model(log: xr.Dataset) -> tuple[float, float]:
-    """Return standard deviation (nT) and time constant (s) of the crustal field along a track."""
-    latitude, longitude, time = (log[name].to_numpy() for name in ("latitude", "longitude", "time"))
-    metres = separation(latitude[0], longitude[0], latitude[100], longitude[100])
-    speed = float(np.hypot(*metres)) / (time[100] - time[0])
-    return Align().reference_sigma, CORRELATION_LENGTH_M / speed
-
-
 STUDY = Study(
     run,
     ("change",),
     {
         "fixed": Column("fixed"),
-        "MagNav": Column("peer"),
         "bound": Column("bound"),
         "published": Column("published"),
         "maximum": Column("published", np.max),

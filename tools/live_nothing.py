@@ -1,6 +1,6 @@
-"""Measure and plot the accuracy of a bridge that starts without a calibration, as a function of time.
+"""Measure the accuracy of a bridge that starts without a calibration, as a function of time.
 
-    python tools/live_nothing.py --seeds 4 --hours 24 -o docs/figures/learning.png
+    python tools/live_nothing.py --seeds 4 --hours 24
 
 Random gliders survey a crustal field of 60 nT in a criss-cross, with the IGRF as the only reference and no
 calibration run. *Error* is the published field's error without bias over the noise floor, in each stretch
@@ -9,13 +9,10 @@ of the survey; *mean* is its mean error, which is not observable; *normalised* i
 
 from __future__ import annotations
 
-import sys
 from itertools import pairwise
-from pathlib import Path
 
 import live
 import numpy as np
-import pandas as pd
 from studies import Column, Row, Study
 from study_worlds import MASSES
 
@@ -45,7 +42,7 @@ def run(seed: int, hours: float) -> list[Row]:
         if here.sum() > 10:
             rows.append(
                 {
-                    "stretch": f"{low:g} to {high:g} h", "middle": float(np.sqrt(low * high)),
+                    "stretch": f"{low:g} to {high:g} h",
                     "error": float(np.std(error[here])) / SENSOR_NOISE_NT,
                     "mean": abs(float(np.mean(error[here]))), "sigma": float(np.median(seen.sigma[here])),
                     "normalised": rms((error / seen.sigma)[here]),
@@ -68,28 +65,5 @@ STUDY = Study(
 )
 
 
-def draw(rows: pd.DataFrame, file: Path) -> None:
-    """Plot error and sigma against the time since the start, and write the plot to `file`."""
-    import matplotlib.pyplot as plt  # noqa: PLC0415 - only here
-
-    figure, axes = plt.subplots(figsize=(7.0, 4.0), constrained_layout=True)
-    for _, one in rows.groupby("seed"):
-        axes.plot(one["middle"], one["error"], color="tab:blue", alpha=0.35, lw=1)
-        axes.plot(one["middle"], one["mean"], color="tab:orange", alpha=0.35, lw=1)
-    middle = rows.groupby("middle")[["error", "mean", "sigma"]].median()
-    axes.plot(middle.index, middle["error"], "o-", color="tab:blue", label="error about the mean")
-    axes.plot(middle.index, middle["mean"], "s-", color="tab:orange", label="mean error")
-    axes.plot(middle.index, middle["sigma"], "k--", label="claimed sigma, of both")
-    axes.axhline(SENSOR_NOISE_NT, color="0.5", lw=1, label="noise of the sensor")
-    axes.set(xscale="log", yscale="log", xlabel="hours since the start", ylabel="nT")
-    axes.set_xticks([0.1, 0.3, 1, 3, 6, 12, 24], ["0.1", "0.3", "1", "3", "6", "12", "24"])
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False)
-    figure.savefig(file)
-
-
 if __name__ == "__main__":
-    # the plot's file is the argument after -o
-    rows = STUDY.main(__doc__, seeds=4, first=0, hours=24.0, o=Path)
-    if "-o" in sys.argv:
-        draw(rows, Path(sys.argv[sys.argv.index("-o") + 1]))
+    STUDY.main(__doc__, seeds=4, first=0, hours=24.0)

@@ -5,11 +5,11 @@
     python tools/measured.py diagnose --data DIR        the second half diagnosed, and the Tolles-Lawson check
     python tools/measured.py survey --data DIR          tie lines of an airborne survey by its other lines
 
-``halves`` fits by ``nominal``, ``auto``, ``auto --parameter auto`` and, with ``--peers PYTHON`` (see
-tools/peers.py), MAVProxy's magfit. It tests the samples whose field direction in the body is within 8 deg of
-a direction in the first half. The table also has the scales, because a fit with a scale far from 1 has
-collapsed even if its RMS is small. ``diagnose`` has an independent check: Tolles & Lawson's terms (1950),
-fitted by least squares to the calibration's residuals, with each eighth of the log held out in turn.
+``halves`` fits by ``nominal``, ``auto`` and ``auto --parameter auto``. It tests the samples whose field
+direction in the body is within 8 deg of a direction in the first half. The table also has the scales, because
+a fit with a scale far from 1 has collapsed even if its RMS is small. ``diagnose`` has an independent check:
+Tolles & Lawson's terms (1950), fitted by least squares to the calibration's residuals, with each eighth of
+the log held out in turn.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from accuracy import PEERS, ask_peers
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from studies import DATA, Column, Row, Study, command_line, show
@@ -146,14 +145,14 @@ def run_seaglider(method: str, masses: tuple[str, ...], order: int, data: Path) 
 # ---- halves of a log ---------------------------------------------------------------------------------------
 
 
-def run_halves(log: Path, peers: str) -> Iterator[Row]:
+def run_halves(log: Path) -> Iterator[Row]:
     """Compare the methods on each compass of a log."""
     for number in [str(one.number) for one in compasses_in(read(log))] or ["0"]:
-        for row in compare_halves(read(log, options=Options(compass=number)), peers):
+        for row in compare_halves(read(log, options=Options(compass=number))):
             yield {"compass": number} | row
 
 
-def compare_halves(deployment: xr.Dataset, peers: str = "") -> Iterator[Row]:
+def compare_halves(deployment: xr.Dataset) -> Iterator[Row]:
     """Fit every method to the first half of a log; yield its scores on the second half, nT."""
     bare = observations(deployment, ())
     half = float(np.median(bare.time))
@@ -179,8 +178,6 @@ def compare_halves(deployment: xr.Dataset, peers: str = "") -> Iterator[Row]:
             "high": found.scales[1],
         }
         yield row | errors(corrected.total - data.reference, rms(corrected.sigma))
-    if peers and early.attitude is not None and early.reference_ned is not None:
-        yield from _magfits(deployment, early, late.part(known), peers)
 
 
 def errors(error: FloatArray, sigma: float) -> Row:
@@ -205,28 +202,6 @@ def _directions(data: Observations) -> FloatArray:
     turned = Rotation.from_euler("ZYX", np.column_stack([heading, pitch, roll])).inv().apply(earth)
     found[known] = turned / np.linalg.norm(turned, axis=1)[:, None]
     return found
-
-
-def _magfits(deployment: xr.Dataset, early: Observations, late: Observations, peers: str) -> Iterator[Row]:
-    """Yield the scores of MAVProxy's magfit, fitted and tested on the samples of the other methods."""
-    time = deployment["time"].to_numpy()
-    current = np.zeros(len(time))
-    if "battery_current" in deployment:
-        current = np.nan_to_num(deployment["battery_current"].to_numpy())
-    known, attitude, earth = early.directed()
-    arrays = {
-        "field": early.field[known], "reference": early.reference[known], "attitude": np.degrees(attitude),
-        "reference_ned": earth.mean(axis=0), "current": np.interp(early.time[known], time, current),
-    }  # fmt: skip
-    for name, answer in ask_peers(peers, arrays, "magfit").items():
-        if "failed" in answer:
-            yield {"method": name, "failed": answer["failed"][:60]}
-            continue
-        A, T, K = (np.array(answer[key]) for key in "ATK")
-        by_current = np.outer(np.interp(late.time, time, current), K)
-        error = np.linalg.norm((late.field - T) @ A.T + by_current, axis=1) - late.reference
-        scales = np.linalg.svd(A, compute_uv=False)
-        yield {"method": name, "low": scales[-1], "high": scales[0]} | errors(error, np.nan)
 
 
 # ---- diagnosis, with an independent check ------------------------------------------------------------------
@@ -341,12 +316,12 @@ STUDIES = {
 def main() -> None:
     """Print the tables of the parts."""
     chosen = command_line(
-        __doc__, STUDIES, data=DATA, log=[DATA / "ardusub" / "small.tlog"], peers=PEERS, out=Path, workers=2
+        __doc__, STUDIES, data=DATA, log=[DATA / "ardusub" / "small.tlog"], out=Path, workers=2
     )
     warnings.simplefilter("ignore")
     cases: dict[str, list[tuple[Any, ...]]] = {
         "seaglider": [(*choice, chosen.data) for choice in SEAGLIDER_CHOICES],
-        "halves": [(log, chosen.peers) for log in chosen.log],
+        "halves": [(log,) for log in chosen.log],
         "diagnose": [(name, chosen.data) for name in VEHICLES],
         "survey": [(chosen.data,)],
     }

@@ -1,4 +1,4 @@
-"""Measure the accuracy of the navigator's position on simulated maps, next to its bound and other programs.
+"""Measure the accuracy of the navigator's position on simulated maps, next to its bound.
 
     python tools/navigation.py [--runs 100] [--part accuracy] ... [--out FILE.parquet]
 
@@ -10,7 +10,6 @@ smoothed      flights on a rough map, and on that map without its short waveleng
 dived         gliders that dive under a map from 90 m, without and with its continuation
 calibrations  gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         processor time of an update, of 100,000 samples, and of the start
-peers         Stone Soup on the same measurements (--peers PYTHON)
 
 Errors are those of the second half of each run, in m. *ratio* is the median of error / bound of the same run,
 *all* the RMS of all errors over the RMS of all bounds, *lost* the fraction of the runs in which the truth was
@@ -20,8 +19,6 @@ outside the 99.99 % ellipse for half an hour, and *NEES/2* is 1 if the claimed c
 from __future__ import annotations
 
 import argparse
-import subprocess
-import tempfile
 import time as clock
 from itertools import product
 from pathlib import Path
@@ -36,7 +33,6 @@ from voyages import (
     START,
     VEHICLES,
     Map,
-    blocks,
     calibrated,
     carried,
     dived,
@@ -50,7 +46,6 @@ from voyages import (
 
 from magbridge.estimation.residual import rms
 from magbridge.field.continuation import smoothed
-from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank
 from magbridge.navigate.batch import navigate
@@ -59,7 +54,6 @@ from magbridge.navigate.model import Block, prior, transition
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))
 STARTS = {"narrow": 0.2, "wide": 1.0}
 """1-sigma of the initial position, in correlation lengths of the map."""
-PARTICLES = 20_000
 LEVEL_NT = 60.0
 """Offset of the field in a misinformed run, nT."""
 ROUGH = Map(40, 1000, rough=True)
@@ -106,45 +100,6 @@ def run_smoothed(seed: int) -> list[Row]:
         name = f"without wavelengths below {length:.0f} m"
         rows.append({"map": name} | sail(ds, smoothed(raw, length), options).score())
     return rows
-
-
-def run_stone_soup(kind: Map, start: str, python: str, seed: int) -> list[Row]:
-    """Compare the navigator with Stone Soup's Kalman and particle filters on the same measurements."""
-    grid = synthetic(kind, seed % 10)
-    options = with_options(GLIDER, start_sigma=STARTS[start] * grid.correlation_length)
-    ds = track_over(grid, options, 1000 + seed)
-    score = sail(ds, grid, options).score()
-    found = list(blocks(ds, grid, options))
-    moved, before = [], (int(START * 1e6), 0.0)
-    for block, travelled in found:
-        moved.append(transition(options, (block.time_us - before[0]) * 1e-6, travelled - before[1]))
-        before = block.time_us, travelled
-    per_latitude, per_longitude = metres_per_degree(PLACE[0])
-    x, P = prior(options)
-    given: dict[str, Any] = {
-        "prior_x": x, "prior_P": P, "F": np.stack([F for F, _ in moved]),
-        "Q": np.stack([Q for _, Q in moved]) + 1e-12 * np.eye(6),
-        "position": [separation(*PLACE, b.latitude, b.longitude) for b, _ in found],
-        "anomaly": [b.anomaly for b, _ in found], "variance": [b.variance for b, _ in found],
-        "slope": [(b.slope_north, b.slope_east) for b, _ in found], "map": grid.anomaly,
-        "north": (grid.latitude - PLACE[0]) * per_latitude,
-        "east": (grid.longitude - PLACE[1]) * per_longitude, "particles": PARTICLES, "seed": seed,
-    }  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder:
-        files = Path(folder) / "given.npz", Path(folder) / "made.npz"
-        np.savez(files[0], **given)
-        subprocess.run([python, Path(__file__).with_name("stone_soup.py"), *files], check=True)
-        theirs = dict(np.load(files[1]))
-    when = np.array([b.time_us for b, _ in found]) * 1e-6
-    second_half = when > 0.5 * (when[0] + when[-1])
-    away = np.stack([np.interp(when, ds["time"], ds[f"away_{axis}"]) for axis in ("north", "east")], axis=1)
-    row: Row = {"bound": score["bound"], "ours": score["drms"], "ours_nees": score["nees"]}
-    for name in ("ekf", "particles"):
-        error = (theirs[f"{name}_x"][:, :2] - away)[second_half]
-        spread = theirs[f"{name}_P"][second_half, :2, :2] + 1e-6 * np.eye(2)
-        squared = np.einsum("ki,ki->k", error, np.linalg.solve(spread, error[:, :, None])[:, :, 0])
-        row |= {name: float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), f"{name}_nees": squared.mean() / 2}
-    return [row | {"milliseconds": 1e3 * float(theirs["particles_seconds"]) / len(found)}]
 
 
 # ---- the parts: columns and cases of each ------------------------------------------------------------------
@@ -225,19 +180,6 @@ STUDIES = {
             "s": Column("seconds", np.mean, ".0f"),
         },
     ),
-    "peers": Study(
-        run_stone_soup,
-        ("kind", "start"),
-        {
-            name: Column(source, form=form)
-            for name, source, form in (
-                ("bound, m", "bound", ".0f"), ("magbridge", "ours", ".0f"), ("NEES/2", "ours_nees", ".2f"),
-                ("EKF", "ekf", ".0f"), ("its NEES/2", "ekf_nees", ".2f"),
-                ("particles", "particles", ".0f"), ("their NEES/2", "particles_nees", ".2f"),
-                ("ms/update", "milliseconds", ".1f"),
-            )
-        },
-    ),
 }  # fmt: skip
 
 
@@ -251,7 +193,6 @@ def cases_of(part: str, options: argparse.Namespace) -> list[tuple[Any, ...]]:
         "watch": product(("carried", "misled"), MAPS[:4]),
         "misinformed": product(("level", "half"), MAPS[:4]),
         "unmapped": [one for one in surveys if one[0] in options.vehicle],
-        "peers": product((MAPS[2], MAPS[0]), STARTS, [options.peers] * bool(options.peers)),
     }
     seeds = range(options.first, options.first + options.runs)
     return [(*kind, seed) for kind in kinds.get(part, [()]) for seed in seeds]
@@ -280,7 +221,7 @@ def show_speed() -> None:
 def main() -> None:
     """Run the parts, and print their tables."""
     options = command_line(
-        __doc__, part=[*STUDIES, "speed"], runs=100, first=0, vehicle=list(VEHICLES), peers="", out=Path,
+        __doc__, part=[*STUDIES, "speed"], runs=100, first=0, vehicle=list(VEHICLES), out=Path,
         workers=2,
     )  # fmt: skip
     out = options.out

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from itertools import product
 from typing import Any
 
-import harmonica as hm
 import numpy as np
 import xarray as xr
 from studies import Column, Row, Study, consistent, percentile
@@ -45,10 +43,6 @@ PLACES = 600
 """Number of test places of the map along the track, and between the tracks."""
 TRACK_DISTANCE_LENGTHS = 0.4
 """Standard deviation of a place's distance from the track, north and east, in lengths of the field."""
-MAX_PEER_SAMPLES, PEER_BLOCK_SAMPLES = 2_500, 50
-"""Maximum number of samples for equivalent sources, and samples of a held-out stretch that selects them."""
-PEER_DEPTHS, PEER_DAMPINGS = (0.5, 1.0, 2.0), (1e-3, 1e-1, 1.0, 10.0)
-"""Depths of the sources in lengths of the field, and dampings of their fit, from which to select."""
 
 
 def run(hours: float, crust: float, length: float, noise: str, drift: float, glider: int) -> Iterator[Row]:
@@ -95,7 +89,7 @@ def errors(calibration: Calibration, part: xr.Dataset) -> tuple[FloatArray, Floa
 
 
 def score_map(twin: Twin, done: Result, size: float, length: float) -> Row:
-    """Return the errors of a survey's map, next to an oracle's map and harmonica's equivalent sources.
+    """Return the errors of a survey's map, next to an oracle's map.
 
     The score excludes each map's mean error along the track: the reference bias, which no survey determines.
     """
@@ -107,9 +101,8 @@ def score_map(twin: Twin, done: Result, size: float, length: float) -> Row:
     true = crust.anomaly(places + shift)
     anomaly, sigma = done.gridded.evaluate(places)
     known = _oracle_map(twin, done, places, size, length, crust.anomaly(place + shift))
-    errors = (one - true for one in (anomaly, known, _equivalent_sources(done, places, length)))
-    ours, ideal, peer = (error - error[:PLACES].mean() for error in errors)
-    row: Row = {"peer": rms(peer) / rms(ours)}
+    ours, ideal = (error - error[:PLACES].mean() for error in (anomaly - true, known - true))
+    row: Row = {}
     for name, half in (("along", slice(PLACES)), ("between", slice(PLACES, None))):
         row[f"map_{name}"] = rms(ours[half]) / rms(ideal[half])
         row[f"map_{name}_sigma"] = rms((ours / sigma)[half])
@@ -128,24 +121,6 @@ def _oracle_map(
     return np.asarray(field.basis(places) @ w)
 
 
-def _equivalent_sources(done: Result, places: FloatArray, length: float) -> FloatArray:
-    """Return harmonica's map at places, nT, with the depth and damping that predict held-out data best."""
-    thin = slice(None, None, max(len(done.samples.value) // MAX_PEER_SAMPLES, 1))
-    place, value = done.samples.place[thin], done.samples.value[thin]
-    held = np.arange(len(value)) // PEER_BLOCK_SAMPLES % 5 == 0
-
-    def predict(rows: FloatArray, to: FloatArray, depth: float, damping: float) -> FloatArray:
-        sources = hm.EquivalentSources(damping=damping, depth=depth * length, block_size=length / 4.0)
-        where = place[rows, 1], place[rows, 0], np.zeros(int(rows.sum()))
-        mean = value[rows].mean()
-        found = sources.fit(where, value[rows] - mean)
-        return np.asarray(mean + found.predict((to[:, 1], to[:, 0], np.zeros(len(to)))))
-
-    choices = list(product(PEER_DEPTHS, PEER_DAMPINGS))
-    missed = [rms(predict(~held, place[held], *choice) - value[held]) for choice in choices]
-    return predict(np.ones(len(value), bool), places, *choices[int(np.argmin(missed))])
-
-
 STUDY = Study(
     run,
     ("hours", "crust", "length", "noise", "drift"),
@@ -161,7 +136,6 @@ STUDY = Study(
         "between": Column("map_between"),
         "map / sigma: along": Column("map_along_sigma"),
         "between tracks": Column("map_between_sigma"),
-        "harmonica / map": Column("peer"),
         "s": Column("seconds", np.median, ".1f"),
     },
 )

@@ -15,7 +15,7 @@ quantile at 1 %, divided among all causes and their independent hypotheses. The 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import chdtrc
 from study.deployment import Background, Injected, compare, project, whiten
+from study.names import EQUIVALENT
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import CAUSES
@@ -35,13 +36,6 @@ from magbridge.diagnose.survey import load_survey
 DRAWS = 400
 SIZES = np.linspace(1.0, 12.0, 45)
 """Signal-to-noise ratios at which the probability of detection is computed."""
-EQUIVALENT = {"clock_offset": "filter_lag"}
-"""Causes that count as one: in a uniform field, filter lag and clock offset have the same signature."""
-
-
-def cause_names(causes: Iterable[str]) -> set[str]:
-    """Return the set of cause names, with one name for equivalent causes."""
-    return {EQUIVALENT.get(cause, cause) for cause in causes}
 
 
 @dataclass(frozen=True, eq=False)
