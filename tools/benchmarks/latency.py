@@ -19,6 +19,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -27,6 +28,7 @@ import numpy as np
 from benchmarks.row import Row
 from benchmarks.workload import OPTIONS, TELEMETRY_HZ, Feed, write_config
 
+from magbridge.arrays import FloatArray
 from magbridge.logs import write
 from magbridge.mavlink import Codec, spec
 from magbridge.sensors import open_driver
@@ -66,15 +68,6 @@ LIBRARIES = "import numpy, cyclopts, pandas, xarray, scipy.linalg, scipy.optimiz
 """Imports with which a program would read the file, fit, and parse the command line."""
 
 
-class Sent(NamedTuple):
-    """Result of one repetition."""
-
-    latency: np.ndarray
-    """Latency of each frame, ms; NaN if the frame was lost."""
-    cpu: float
-    """Processor time of all threads, including the kernel's, s."""
-
-
 class Running(NamedTuple):
     """Process that runs between a pty and a socket."""
 
@@ -86,10 +79,6 @@ class Running(NamedTuple):
     """Time from the start of the process to its first datagram, s."""
     first: bytes
     """First datagram of the process."""
-
-    def write(self, frame: bytes) -> None:
-        """Send `frame` as the fluxgate."""
-        os.write(self.master, frame)
 
 
 @contextmanager
@@ -116,14 +105,10 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Running]:
         os.close(slave)
 
 
-def bridge_command(folder: Path) -> Callable[[str, int], list[str]]:
+def bridge_command(folder: Path, device: str, port: int) -> list[str]:
     """Return the command that starts the bridge of the workload."""
-
-    def command(device: str, port: int) -> list[str]:
-        config = write_config(folder, device, f"udpout:127.0.0.1:{port}")
-        return [str(BIN / "magbridge"), "run", "--config", str(config)]
-
-    return command
+    config = write_config(folder, device, f"udpout:127.0.0.1:{port}")
+    return [str(BIN / "magbridge"), "run", "--config", str(config)]
 
 
 def latency(folder: Path, repetitions: int) -> list[Row]:
@@ -132,37 +117,34 @@ def latency(folder: Path, repetitions: int) -> list[Row]:
     for hertz in RATES:
         bridge, echo = [], []
         with (
-            started(bridge_command(folder)) as live,
+            started(partial(bridge_command, folder)) as live,
             started(lambda device, port: [sys.executable, "-c", ECHO, device, str(port)]) as bare,
         ):
             feed, other = Feed(), Feed()
             for _ in range(repetitions):
                 bridge.append(play(live, feed, hertz, sequences_of_messages()))
                 echo.append(play(bare, other, hertz, _sequences_of_frames()))
-        rows += _rows(hertz, bridge, echo)
+        for name, q, most in (("p50", 50.0, 0.5), ("p99", 99.0, 1.0)):
+            ours, floor = (median(np.nanpercentile(late, q) for late, _ in runs) for runs in (bridge, echo))
+            rows.append(Row(f"latency at {hertz:,} Hz, {name}", ours, "ms", floor, "echo", most=most))
+        late = np.concatenate([late for late, _ in bridge])
+        rows.append(
+            Row(f"lost at {hertz:,} Hz, of {len(late):,}", int(np.isnan(late).sum()), "samples", most=0)
+        )
+        ours, floor = (median(cpu for _, cpu in runs) / (hertz * SECONDS) * 1e6 for runs in (bridge, echo))
+        what = f"processor time at {hertz:,} Hz, kernel and log included"
+        rows.append(Row(what, ours, "us", floor, "echo"))
     return rows
 
 
-def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
-    def quantile(runs: list[Sent], q: float) -> float:
-        return median([float(np.nanpercentile(run.latency, q)) for run in runs])
+def play(
+    running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]
+) -> tuple[FloatArray, float]:
+    """Send readings and telemetry for `SECONDS`; match the datagrams to the frames by sequence number.
 
-    count = sum(len(run.latency) for run in bridge)
-    rows = [
-        Row(f"latency at {hertz:,} Hz, {name}", quantile(bridge, q), "ms", quantile(echo, q), "echo",
-            most=most)
-        for name, q, most in (("p50", 50.0, 0.5), ("p99", 99.0, 1.0))
-    ]  # fmt: skip
-    lost = sum(int(np.isnan(run.latency).sum()) for run in bridge)
-    samples = hertz * SECONDS
-    rows.append(Row(f"lost at {hertz:,} Hz, of {count:,}", lost, "samples", most=0))
-    cpu = [median([run.cpu for run in runs]) / samples * 1e6 for runs in (bridge, echo)]
-    rows.append(Row(f"processor time at {hertz:,} Hz, kernel and log included", cpu[0], "us", cpu[1], "echo"))
-    return rows
-
-
-def play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], list[int]]) -> Sent:
-    """Send readings and telemetry for `SECONDS`; match the datagrams to the frames by sequence number."""
+    Return the latency of each frame, ms (NaN if it was lost), and the processor time of all threads and the
+    kernel, s.
+    """
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     received: list[tuple[float, bytes]] = []
     written: dict[int, float] = {}
@@ -192,7 +174,7 @@ def play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], 
                 send(feed.heartbeat(), running.peer)
         listen(due)
         written[sequence or 0] = clock()
-        running.write(frame)
+        os.write(running.master, frame)
     came: dict[int, float] = {}
     parsed, before = 0, -1
     while before < len(came) < len(written):  # a bridge that is late on a busy computer has lost nothing
@@ -204,7 +186,7 @@ def play(running: Running, feed: Feed, hertz: int, sequences: Callable[[bytes], 
         parsed = len(received)
     cpu = processor_time(running.process.pid) - cpu
     late = [1e3 * (came.get(sequence, np.nan) - when) for sequence, when in written.items()]
-    return Sent(np.array(late[round(WARM_UP * hertz) :]), cpu)
+    return np.array(late[round(WARM_UP * hertz) :]), cpu
 
 
 def sequences_of_messages() -> Callable[[bytes], list[int]]:
@@ -239,7 +221,7 @@ def start(folder: Path, repetitions: int) -> list[Row]:
     """Time the start of the bridge and of an interpreter with the necessary imports."""
     bridge, bare, memory = [], [], 0.0
     for _ in range(repetitions):
-        with started(bridge_command(folder)) as live:
+        with started(partial(bridge_command, folder)) as live:
             names = [message.name for message in Codec(255, 190).parse(live.first)]
             if "HEARTBEAT" not in names:
                 raise RuntimeError(f"the first datagram was {names}")
@@ -247,7 +229,7 @@ def start(folder: Path, repetitions: int) -> list[Row]:
             feed = Feed()
             for _ in range(round(SETTLE_S * START_HZ)):
                 live.link.sendto(feed.message(time.time_ns() // 1000), live.peer)
-                live.write(feed.reading(START_HZ))
+                os.write(live.master, feed.reading(START_HZ))
                 time.sleep(1.0 / START_HZ)
             memory = resident(live.process.pid)
         begun = time.perf_counter()
