@@ -6,6 +6,7 @@
     python3 tools/dev.py baseline --compare figures that changed since tools/baseline.json
     python3 tools/dev.py size               lines and modules of each part against its budget
     python3 tools/dev.py bench [ARG ...]    tools/bench.py
+    python3 tools/dev.py stations           third-party programs of the interoperability tests, into .peers
 
 The first call makes ``.venv`` and installs the locked dependencies and the checkout itself, editable, into
 it.
@@ -14,10 +15,13 @@ it.
 from __future__ import annotations
 
 import os
+import shutil
 import ssl
 import subprocess
 import sys
+import time
 import venv
+from difflib import unified_diff
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,13 +35,17 @@ CHECKS = (
     ("ruff", "format", "--check", "."),
     ("mypy",),
     ("lint-imports", "--no-cache"),
-    ("python", "tools/collection.py"),
     ("mkdocs", "build", "--quiet", "--site-dir", ".site"),
     ("python", "tools/prose.py", "--gate"),
     ("python", "tools/names.py", "--gate"),
     ("python", "tools/commits.py"),
     ("python", "tools/size.py", "--gate"),
 )
+
+
+STATIONS = ROOT / ".peers"
+PYTHON_STATIONS = "MAVProxy==1.8.75", "mavsdk==4.1.0", "pymavlink==2.4.50", "pyserial==3.5", "lxml==6.1.3"
+NODE_STATIONS = ("node-mavlink@2.3.0",)
 
 
 def call(*command: str | Path, **variables: str) -> int:
@@ -86,6 +94,48 @@ def install(extra: str) -> None:
     run(BIN / "python", "-m", "compileall", "-q", "magbridge", "sitl")
 
 
+def check_collection() -> None:
+    """Exit with the differences if two processes do not collect the same tests in the same order.
+
+    pytest-xdist's workers collect independently. If an identifier depends on the time, on random numbers or
+    on the order of a set, the run ends before the first test.
+    """
+    found: list[list[str]] = []
+    for seed in ("1", "2"):
+        time.sleep(3.0 * bool(found))  # longer than the resolution of a time stamp in an archive
+        command = [str(BIN / "python"), "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
+        variables = {**os.environ, "PYTHONHASHSEED": seed}
+        done = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True, check=False)
+        if done.returncode:
+            sys.exit(done.stdout[-4000:] + done.stderr[-4000:])
+        found.append([line for line in done.stdout.splitlines() if "::" in line])
+    if found[0] != found[1]:
+        print(*unified_diff(found[0], found[1], "first", "second", lineterm="", n=0), sep="\n")
+        sys.exit("the tests' identifiers differ between two processes: give the parameters ids")
+
+
+def install_stations() -> None:
+    """Install MAVProxy, MAVSDK, pymavlink's tools and node-mavlink in their pinned versions into ``.peers``.
+
+    Programs of the right version are kept. MAVProxy's maps and plots (1 GB), which the modules that the tests
+    load do not need, are left out.
+    """
+    python = STATIONS / "python" / SCRIPTS / "python"
+    if not python.exists():
+        venv.create(python.parents[1], with_pip=True)
+    pip = (python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps")
+    npm = ("npm", "install", "--silent", "--no-audit", "--no-fund", "--prefix", STATIONS / "node")
+    for kind, command, wanted in (("python", pip, PYTHON_STATIONS), ("node", npm, NODE_STATIONS)):
+        done = STATIONS / f"{kind}.txt"
+        if done.is_file() and done.read_text() == "\n".join(wanted):
+            continue
+        if kind == "node" and shutil.which("npm") is None:
+            print("npm is not here: node-mavlink is left out, and its test will be skipped")
+            continue
+        run(*command, *wanted)
+        done.write_text("\n".join(wanted))
+
+
 def main() -> None:
     """Run the command that the first argument names."""
     if sys.version_info < (3, 11):  # noqa: UP036 - users of an older version get a message
@@ -101,9 +151,12 @@ def main() -> None:
         install("dev")
         for command in CHECKS:
             run(BIN / command[0], *command[1:])
+        check_collection()
     elif what == "baseline":
         install("dev")
         run(BIN / "python", "tools/baseline.py", *arguments)
+    elif what == "stations":
+        install_stations()
     elif what == "size":
         run(sys.executable, "tools/size.py")
     elif what == "bench":

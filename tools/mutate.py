@@ -21,7 +21,7 @@ import random
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -73,8 +73,12 @@ OTHER: dict[type[ast.AST], type[ast.AST]] = {
 }  # fmt: skip
 
 
-def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str]]:
-    """Yield each node that can be changed, and its kind: operator, number, condition or statement."""
+Change = tuple[ast.AST, Callable[[random.Random], None]]
+"""Node, and the function that changes it in place."""
+
+
+def changes(tree: ast.Module) -> Iterator[Change]:
+    """Yield the possible changes of a tree: of operators, numbers, conditions and statements."""
     skipped: set[ast.AST] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.AnnAssign | ast.arg):
@@ -86,61 +90,40 @@ def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str]]:
         if isinstance(node, ast.JoinedStr) or names or types:
             skipped.update(ast.walk(node))
     for node in ast.walk(tree):
-        if node in skipped:
-            continue
-        match node:
-            case ast.Compare() if type(node.ops[0]) in OTHER:
-                yield node, "operator"
-            case ast.BinOp() | ast.AugAssign() | ast.BoolOp() if type(node.op) in OTHER:
-                yield node, "operator"
-            case ast.UnaryOp(op=ast.Not() | ast.USub()):
-                yield node, "unary"
-            case ast.Constant(value=bool() | int() | float()):
-                yield node, "number"
-            case ast.If() | ast.IfExp() | ast.While():
-                yield node, "condition"
-            case (
-                ast.Expr(value=ast.Call())
-                | ast.Raise()
-                | ast.AugAssign()
-                | ast.Assign(targets=[ast.Attribute()])
-            ):
-                yield node, "statement"
+        if node not in skipped and (function := change_of(node)):
+            yield node, function
 
 
-def change(tree: ast.Module, number: int, rng: random.Random) -> tuple[int, str]:
-    """Make change `number` in a tree, in place; return its line and its description."""
-    node, how = list(changes(tree))[number]
-    before = ast.unparse(node).splitlines()[0]
-    new: Any = node  # untyped, because the kind of the node decides its attributes
-    match node, how:
-        case ast.Compare(), _:
-            new.ops[0] = OTHER[type(node.ops[0])]()
-        case _, "operator":
-            new.op = OTHER[type(new.op)]()
-        case ast.UnaryOp(op=ast.USub()), _:
-            new.op = ast.UAdd()
-        case ast.UnaryOp(), _:
-            new.operand = ast.UnaryOp(ast.Not(), node.operand)
-        case ast.Constant(value=bool()), _:
-            new.value = not node.value
-        case ast.Constant(), _:
-            new.value = rng.choice([new.value + 1, new.value * 2 or 3, -new.value or 2])
-        case _, "condition":
-            new.test = ast.UnaryOp(ast.Not(), new.test)
-        case _:
-            _leave_out(tree, node)
-            return new.lineno, f"without {before}"
-    ast.fix_missing_locations(tree)
-    return new.lineno, f"{before}  ->  {ast.unparse(node).splitlines()[0]}"
+def change_of(node: Any) -> Callable[[random.Random], None] | None:
+    """Return the function that changes a node in place; None if the node cannot be changed."""
 
+    def number(rng: random.Random) -> None:
+        node.value = rng.choice([node.value + 1, node.value * 2 or 3, -node.value or 2])
 
-def _leave_out(tree: ast.Module, statement: Any) -> None:
-    """Replace a statement of a tree by ``pass``."""
-    for parent in ast.walk(tree):
-        for _, body in ast.iter_fields(parent):
-            if isinstance(body, list) and statement in body:
-                body[body.index(statement)] = ast.copy_location(ast.Pass(), statement)
+    def to(name: str, value: Any) -> Callable[[random.Random], None]:
+        return lambda _: setattr(node, name, value)
+
+    found: Callable[[random.Random], None] | None = None
+    match node:
+        case ast.Compare() if type(node.ops[0]) in OTHER:
+            found = to("ops", [OTHER[type(node.ops[0])](), *node.ops[1:]])
+        case ast.BinOp() | ast.AugAssign() | ast.BoolOp() if type(node.op) in OTHER:
+            found = to("op", OTHER[type(node.op)]())
+        case ast.UnaryOp(op=ast.USub()):
+            found = to("op", ast.UAdd())
+        case ast.UnaryOp(op=ast.Not()):
+            found = to("operand", ast.UnaryOp(ast.Not(), node.operand))
+        case ast.Constant(value=bool()):
+            found = to("value", not node.value)
+        case ast.Constant(value=int() | float()):
+            found = number
+        case ast.If() | ast.IfExp() | ast.While():
+            found = to("test", ast.UnaryOp(ast.Not(), node.test))
+        case (
+            ast.Expr(value=ast.Call()) | ast.Raise() | ast.AugAssign() | ast.Assign(targets=[ast.Attribute()])
+        ):
+            found = to("__class__", ast.Pass)
+    return found
 
 
 class Changed(MetaPathFinder, Loader):
@@ -203,7 +186,11 @@ def main() -> int:
         rng, own = random.Random(f"{chosen.seed} {module}"), 0
         for number in rng.sample(range(count), min(chosen.n, count)):
             tree = copy.deepcopy(whole)
-            line, what = change(tree, number, rng)
+            node, function = list(changes(tree))[number]
+            before, line = ast.unparse(node).splitlines()[0], getattr(node, "lineno", 0)
+            function(rng)
+            ast.fix_missing_locations(tree)
+            what = f"{before}  ->  {ast.unparse(node).splitlines()[0]}"
             ended = run(module, tests, tree, limit)
             own += ended == "seen"
             if ended != "seen":

@@ -1,7 +1,7 @@
 """Simulated worlds of the studies: random gliders with runs and a survey, and the paper's trials.
 
 The noise floor of a survey is the error of a calibration that knows the vehicle (:func:`oracle`);
-:class:`BestFit` and :class:`SurveyBound` are Cramér-Rao bounds for the vehicle's true model.
+:class:`BestFit` and :func:`survey_bound` are Cramér-Rao bounds for the vehicle's true model.
 """
 
 from __future__ import annotations
@@ -291,8 +291,15 @@ class BestFit:
         self.bound = np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + self.floor**2)
 
 
-class SurveyBound:
-    """Least error of the field on another survey after a calibration from a survey only.
+def survey_bound(
+    vehicle: Vehicle,
+    survey: xr.Dataset,
+    place: FloatArray,
+    crust: tuple[float, float],
+    noise: tuple[float, float],
+    other: xr.Dataset,
+) -> float:
+    """Return the least RMS error without bias on an `other` survey, over its noise floor.
 
     Vehicle and crustal field are estimated from a `survey` of n samples at `place` (n, 2), m. `crust` are
     amplitude (nT) and length (m) of a Gaussian field with a Gaussian covariance, which are known; `noise` is
@@ -304,44 +311,26 @@ class SurveyBound:
     :math:`P = (I + G^T K^{-1} G)^{-1}`. Neighbouring samples are averaged: :data:`MAX_COVARIANCE_SAMPLES`
     remain.
     """
+    (sigma, memory), (size, length), scale = noise, crust, _widths(vehicle, 0.05)
+    g, floor = _sensitivity(vehicle, survey, sigma)
+    step = -(-len(g) // MAX_COVARIANCE_SAMPLES)
+    n = len(g) // step
+    g, place, floor = (
+        part[: n * step].reshape(n, step, -1).mean(axis=1) for part in (g, place, floor[:, None])
+    )
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        survey: xr.Dataset,
-        place: FloatArray,
-        crust: tuple[float, float],
-        noise: tuple[float, float],
-    ) -> None:
-        self._vehicle, self._sigma, self._crust = vehicle, noise[0], crust
-        self._scale, memory = _widths(vehicle, 0.05), noise[1]
-        g, floor = _sensitivity(vehicle, survey, self._sigma)
-        step = -(-len(g) // MAX_COVARIANCE_SAMPLES)
-        n = len(g) // step
-        g, place, floor = (
-            one[: n * step].reshape(n, step, -1).mean(axis=1) for one in (g, place, floor[:, None])
-        )
+    def correlation(samples: int, distance: int) -> FloatArray:
+        lag = distance * np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+        return np.asarray(np.exp(-lag / memory) if memory else 1.0 * (lag == 0))
 
-        def alike(samples: int, apart: int) -> FloatArray:
-            lag = apart * np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
-            return np.asarray(np.exp(-lag / memory) if memory else 1.0 * (lag == 0))
-
-        R = alike(n, step)
-        np.fill_diagonal(R, alike(step, 1).mean())
-        self._G = g * self._scale
-        self._K = floor * floor.T * R + self._alike(place) + MAIN_FIELD_SIGMA_NT**2
-
-    def of_field(self, other: xr.Dataset) -> float:
-        """Return the least RMS error without bias on another survey, over the noise floor."""
-        h, floor = _sensitivity(self._vehicle, other, self._sigma)
-        G, H = self._G, (h - h.mean(axis=0)) * self._scale
-        P = np.linalg.inv(G.T @ np.linalg.solve(self._K, G) + np.eye(len(self._scale)))
-        return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (floor**2).sum()))
-
-    def _alike(self, place: FloatArray) -> FloatArray:
-        """Return the crustal field's covariance (n, n), nT², between places (n, 2), m."""
-        size, length = self._crust
-        return np.asarray(size**2 * np.exp(-0.5 * cdist(place, place, "sqeuclidean") / length**2))
+    R = correlation(n, step)
+    np.fill_diagonal(R, correlation(step, 1).mean())
+    field = size**2 * np.exp(-0.5 * cdist(place, place, "sqeuclidean") / length**2)
+    G, K = g * scale, floor * floor.T * R + field + MAIN_FIELD_SIGMA_NT**2
+    h, its_floor = _sensitivity(vehicle, other, sigma)
+    H = (h - h.mean(axis=0)) * scale
+    P = np.linalg.inv(G.T @ np.linalg.solve(K, G) + np.eye(len(scale)))
+    return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (its_floor**2).sum()))
 
 
 def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from studies import Column, Row, Study, consistent, percentile
-from study_worlds import MASSES, NOISES, GaussianRock, SurveyBound, drifted, fly_survey, oracle, true_field
+from study_worlds import MASSES, NOISES, GaussianRock, drifted, fly_survey, oracle, survey_bound, true_field
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
@@ -65,10 +65,10 @@ def run(hours: float, crust: float, length: float, noise: str, drift: float, gli
     with_runs, _, _ = errors(fit(observations(parts["calibration"], MASSES)).calibration, other)
     where = seen["latitude"].to_numpy(), seen["longitude"].to_numpy()
     place = np.stack(separation(*twin.world.origin, *where), axis=1)
-    best = SurveyBound(twin.vehicle, seen, place, (crust, length), NOISES[noise])
+    bound = survey_bound(twin.vehicle, seen, place, (crust, length), NOISES[noise], other)
     row |= {
         "ratio": rms(about) / floor,
-        "bound": best.of_field(other),
+        "bound": bound,
         "runs": float(np.std(with_runs)) / floor,
         "without_bias": rms(about / np.sqrt(np.maximum(sigma**2 - bias**2, 1e-6))),
         "with_bias": rms(error / sigma),

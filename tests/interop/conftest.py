@@ -13,7 +13,7 @@ import pytest
 from rig import Rig
 
 PEERS = Path(__file__).parents[2] / ".peers"
-MISSING = "not installed: python3 tools/stations.py"
+MISSING = "not installed: python3 tools/dev.py stations"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
