@@ -1,6 +1,7 @@
 """Measure in-flight calibration on simulated gliders that change after their calibration.
 
     python tools/live.py --seeds 10 --hours 12
+    python tools/live.py --nothing --seeds 4 --hours 24     a start without a calibration
 
 Each glider is calibrated by the runs of the paper's Table 1. It then surveys a crustal field of 60 nT on
 another day, with one change. The reference is the IGRF. A sample's telemetry is two seconds old, so a motion
@@ -12,11 +13,17 @@ normalised    normalised error of the published field, from the alarm on
 delay         samples until the alarm, over the delay of a detector that knows cause and calibration
 among, alone  fraction of the runs in which the true cause is among the named causes, or the only one
 false         number of alarms without a change
+
+With ``--nothing``, the gliders have no calibration. *Error* is then the published field's error without bias
+over the noise floor, in each stretch of the survey; *mean* is its mean error, which is not observable;
+*normalised* includes both.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +35,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.model import Calibration, Parameter
 from magbridge.columns import CHANNELS
 from magbridge.config import Align
 from magbridge.correction import Correction
@@ -39,7 +46,7 @@ from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
-from magbridge.learning.estimator import Nuisance
+from magbridge.learning.estimator import Nuisance, class_prior
 from magbridge.records import Quality, Reading
 from sitl import load, segments, simulate
 from sitl.dataset import channels, side_by_side
@@ -336,5 +343,54 @@ STUDY = Study(
 )
 
 
+# ---- a start without a calibration -------------------------------------------------------------------------
+
+STRETCH_ENDS_H = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.25, 3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0)
+SENSOR_NOISE_NT = 1.0
+
+
+def run_nothing(seed: int, hours: float) -> list[Row]:
+    """Return a row for each stretch of one glider's survey."""
+    log = sampled(fly("nothing", seed, hours)[1])
+    parameters = []
+    for name in MASSES:
+        low, high = float(log[name].min()), float(log[name].max())
+        parameters.append(Parameter(name, "", low, high, 0.5 * (low + high), 0.5 * (high - low)))
+    prior = class_prior(tuple(parameters))
+    seen = learn(Learner(prior), prior, log)
+    time, error = hours_of(log), seen.total - log["truth_total_field"].to_numpy()
+    rest = at_rest(seen.quality)
+    rows: list[Row] = []
+    for low, high in pairwise(STRETCH_ENDS_H):
+        here = rest & (time >= low) & (time < high)
+        if here.sum() > 10:
+            rows.append(
+                {
+                    "stretch": f"{low:g} to {high:g} h",
+                    "error": float(np.std(error[here])) / SENSOR_NOISE_NT,
+                    "mean": abs(float(np.mean(error[here]))), "sigma": float(np.median(seen.sigma[here])),
+                    "normalised": rms((error / seen.sigma)[here]),
+                }
+            )  # fmt: skip
+    return rows
+
+
+NOTHING = Study(
+    run_nothing,
+    ("stretch",),
+    {
+        "error / noise": Column("error"),
+        "maximum": Column("error", np.max),
+        "mean, nT": Column("mean", form=".0f"),
+        "sigma, nT": Column("sigma", form=".0f"),
+        "normalised": Column("normalised", rms),
+        "its maximum": Column("normalised", np.max),
+    },
+)
+
+
 if __name__ == "__main__":
-    STUDY.main(__doc__, seeds=10, first=0, hours=12.0, size=20.0, changes=list(CHANGES))
+    if "--nothing" in sys.argv:
+        NOTHING.main(__doc__, seeds=4, first=0, hours=24.0, nothing=False)
+    else:
+        STUDY.main(__doc__, seeds=10, first=0, hours=12.0, size=20.0, changes=list(CHANGES))

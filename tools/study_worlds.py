@@ -25,7 +25,6 @@ from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree
-from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf
 from magbridge.field.reference import reference_field
 from sitl import Twin, load, segments, simulate
@@ -166,15 +165,13 @@ class Trials:
 
     `parts` are trial 1, survey and trial 2; `corrected` (n,), nT, is by part, trial of the coefficients and
     method. By trial and method, `failed` is the reason of a failure, and `scales` the smallest and the
-    largest scale of A on its runs: a fit with small scales has a small residual. `anomaly` is the map that is
-    the reference of the fit.
+    largest scale of A on its runs: a fit with small scales has a small residual.
     """
 
     parts: dict[str, xr.Dataset]
     corrected: dict[tuple[str, str, str], FloatArray]
     failed: dict[tuple[str, str], str]
     scales: dict[tuple[str, str], tuple[float, float]]
-    anomaly: AnomalyGrid
 
     def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> FloatArray:
         """Return the error (n,), nT, of `method` with the coefficients of `trial`; NaN if the fit failed."""
@@ -221,7 +218,7 @@ def fly_trials(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: 
         scales[trial, method] = fitted.scales
         for part in (trial, "survey"):
             total[part, trial, method] = corrected(parts[part], fitted.calibration).total
-    return Trials(parts, total, failed, scales, twin.anomaly_map())
+    return Trials(parts, total, failed, scales)
 
 
 def _on_row_times(deployment: xr.Dataset) -> xr.Dataset:

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from attacks import ALLOWED, ATTACKS, Attack, run
 from checks import replays
-from extremes import events, feed, make_bridge
 from fed import FedBridge, named
+from fuzz import events, feed, make_bridge
 from rig import Rig
 from small import START, small_bridge
 
