@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -37,9 +36,7 @@ from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, samp
 from magbridge.logs.dataflash import OWN_SCALE, Flash, Records, read_binary, read_text
 from magbridge.logs.deployment import NOTES
 from magbridge.logs.fields import DEG_PER_RAD, FieldMap, field_maps, fields_of
-
-if TYPE_CHECKING:
-    from magbridge.logs.mapping import Options
+from magbridge.logs.mapping import Options
 
 MIN_GPS_STATUS = 3
 """Lowest ``GPS.Status`` of a three-dimensional fix."""

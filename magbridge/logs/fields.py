@@ -145,3 +145,13 @@ def degrees(written: ArrayLike) -> FloatArray:
     values = np.asarray(written, np.float64)
     whole = np.trunc(values / 100.0)
     return np.asarray(whole + (values - 100.0 * whole) / 60.0)
+
+
+def euler_deg(
+    w: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return roll, pitch and yaw (n,), deg, of the quaternions (n,) from body to world (3-2-1)."""
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.degrees(roll), np.degrees(pitch), np.degrees(yaw)

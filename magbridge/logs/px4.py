@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -28,16 +28,14 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, rate, sampled, symmetric
-from magbridge.logs.fields import field_maps, fields_of
+from magbridge.logs.fields import euler_deg, field_maps, fields_of
+from magbridge.logs.mapping import Options
 
 try:
     from pyulog import ULog
     from pyulog.exceptions import ULogException
 except ImportError:
     raise MissingExtra("pyulog", "formats") from None
-
-if TYPE_CHECKING:
-    from magbridge.logs.mapping import Options
 
 Table = dict[str, FloatArray]
 Topics = dict[str, dict[int, Table]]
@@ -174,8 +172,9 @@ def _calibration(device: float, parameters: Parameters) -> int | None:
 def _telemetry(topics: Topics) -> Iterator[Series]:
     """Yield attitude, the columns in :data:`PX4_FIELDS` and named debug values."""
     for attitude in topics.get("vehicle_attitude", {}).values():
-        for column, values in zip(("roll", "pitch", "heading"), _angles(attitude), strict=True):
-            yield _time(attitude), column, "deg", values
+        angles = euler_deg(*(attitude[f"q[{k}]"] for k in range(4)))
+        for column, values in zip(("roll", "pitch", "heading"), angles, strict=True):
+            yield _time(attitude), column, "deg", values % 360.0 if column == "heading" else values
     for topic in PX4_FIELDS:
         for number, table in topics.get(topic, {}).items():
             fixed = table.get("fix_type", np.full(len(table["timestamp"]), MIN_FIX_TYPE)) >= MIN_FIX_TYPE
@@ -188,15 +187,6 @@ def _telemetry(topics: Topics) -> Iterator[Series]:
         names = np.array([key.decode("ascii", "replace") for key in keys])
         for name in dict.fromkeys(names.tolist()):
             yield _time(table)[names == name], name, "1", table["value"][names == name]
-
-
-def _angles(attitude: Table) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return roll, pitch and heading (deg) of the quaternion (w, x, y, z) from body to north-east-down."""
-    w, x, y, z = (attitude[f"q[{k}]"] for k in range(4))
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.degrees(roll), np.degrees(pitch), np.degrees(heading) % 360.0
 
 
 def _time(table: Table) -> FloatArray:

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 import re
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -31,7 +31,8 @@ from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, sampled
 from magbridge.logs.deployment import NOTES, noted
-from magbridge.logs.fields import field_maps, fields_of
+from magbridge.logs.fields import euler_deg, field_maps, fields_of
+from magbridge.logs.mapping import Options
 
 try:
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -43,9 +44,6 @@ try:
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 except ImportError:
     raise MissingExtra("rosbags", "ros") from None
-
-if TYPE_CHECKING:
-    from magbridge.logs.mapping import Options
 
 STORAGES = {".mcap": McapReader, ".db3": Sqlite3Reader}
 """Suffix of a single file of a ROS 2 bag, outside a bag's folder -> its reader."""
@@ -60,13 +58,14 @@ EARTH = 15e3, 150e3
 TESLA = 1e-6, 1e-2
 """Range of the median magnitude in which a field is accepted as tesla, T."""
 FIELD_UNITS = ("G", "uT", "mG", "mT", "nT")
+MAGNETIC_FIELD = "sensor_msgs/MagneticField"
 
 
 class _Stream(NamedTuple):
     """Messages of one topic: times (n,), s, and values (n,) by name."""
 
     topic: str
-    kind: MessageKind
+    kind: str
     time: FloatArray
     values: dict[str, FloatArray]
 
@@ -82,7 +81,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         # rosbags raises these if the file, not a message, is damaged
         reason = str(error) or type(error).__name__
         raise FormatError(path, f"expected a ROS bag; it is damaged: {reason}") from None
-    fields = [stream for stream in streams if stream.kind is MESSAGE_KINDS[MAGNETIC_FIELD]]
+    fields = [stream for stream in streams if stream.kind == MAGNETIC_FIELD]
     if not fields:
         topics = " ".join(stream.topic for stream in streams) or "nothing that is read"
         raise FormatError(path, f"expected sensor_msgs/MagneticField; there is: {topics}")
@@ -112,10 +111,10 @@ def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetomete
 def _telemetry(streams: Sequence[_Stream]) -> Iterator[Series]:
     seen: dict[str, int] = {}
     for stream in streams:
-        if stream.kind is not MESSAGE_KINDS[MAGNETIC_FIELD]:
-            number = seen.setdefault(stream.kind.name, 0)
-            seen[stream.kind.name] += 1
-            for column, unit, values in stream.kind.columns(stream.topic, number, stream.values):
+        if stream.kind != MAGNETIC_FIELD:
+            number = seen.setdefault(stream.kind, 0)
+            seen[stream.kind] += 1
+            for column, unit, values in _columns(stream.kind, stream.topic, number, stream.values):
                 yield stream.time, column, unit, values
 
 
@@ -161,7 +160,7 @@ def _streams(bag: _Bag) -> tuple[list[_Stream], int]:
     found, lost = [], 0
     for topic, (connection, stamps, messages) in raw.items():
         if messages:
-            kind = MESSAGE_KINDS[_short(connection.msgtype)]
+            kind = _short(connection.msgtype)
             good, values = _decoded(bag, connection.msgtype, kind, messages)
             lost += len(messages) - len(good)
             if len(good):
@@ -175,9 +174,9 @@ def _short(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def _times(kind: MessageKind, recorded: FloatArray, messages: Sequence[bytes]) -> FloatArray:
+def _times(kind: str, recorded: FloatArray, messages: Sequence[bytes]) -> FloatArray:
     """Return the times (n,), s, of the headers, or of the recorder if a header is missing or empty."""
-    if not kind.header:
+    if kind.startswith("std_msgs/"):
         return recorded
     stamps = np.frombuffer(b"".join(one[: ROS_STAMP.itemsize] for one in messages), ROS_STAMP)
     header = stamps["s"] + stamps["ns"] * 1e-9
@@ -185,7 +184,7 @@ def _times(kind: MessageKind, recorded: FloatArray, messages: Sequence[bytes]) -
 
 
 def _decoded(
-    bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
+    bag: _Bag, name: str, kind: str, messages: Sequence[bytes]
 ) -> tuple[Sequence[int], dict[str, FloatArray]]:
     """Return the indices of the readable messages, and their values (n,) by name."""
     if (table := _doubles(bag, name, kind, messages)) is not None:
@@ -193,7 +192,7 @@ def _decoded(
     rows, good = [], []
     for k, data in enumerate(messages):
         try:
-            rows.append(kind.row(bag.deserialize(data, name)))
+            rows.append(_row(kind, bag.deserialize(data, name)))
             good.append(k)
         except (*ROSBAG_ERRORS, ValueError, IndexError, AssertionError):  # a damaged message
             continue
@@ -201,22 +200,21 @@ def _decoded(
     return good, {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
 
-def _doubles(
-    bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
-) -> dict[str, FloatArray] | None:
+def _doubles(bag: _Bag, name: str, kind: str, messages: Sequence[bytes]) -> dict[str, FloatArray] | None:
     """Return the values (n,) by name of messages that end with float64 numbers; None for other messages.
 
     The bytes before these numbers vary in length (name of the frame). The first and the last message, as
     rosbags reads them, verify the layout.
     """
-    size = 8 * kind.doubles
-    if not kind.doubles or any(len(one) < size + ROS_STAMP.itemsize for one in messages):
+    doubles = DOUBLES.get(kind, 0)
+    size = 8 * doubles
+    if not doubles or any(len(one) < size + ROS_STAMP.itemsize for one in messages):
         return None
     if bag.ros2 and any(one[:2] != LITTLE for one in messages):
         return None
-    table = np.frombuffer(b"".join(one[-size:] for one in messages), "<f8").reshape(-1, kind.doubles)
+    table = np.frombuffer(b"".join(one[-size:] for one in messages), "<f8").reshape(-1, doubles)
     for k in (0, -1):
-        row = kind.row(bag.deserialize(messages[k], name))
+        row = _row(kind, bag.deserialize(messages[k], name))
         if not np.array_equal(list(row.values()), table[k, : len(row)], equal_nan=True):
             return None
     return {key: table[:, k] for k, key in enumerate(row)}
@@ -224,11 +222,16 @@ def _doubles(
 
 CURRENT_NOTE = "BatteryState.current counted positive when discharging"
 FRAMES_HISTORY = f"ROS frames turned: ENU to NED, FLU to FRD; {CURRENT_NOTE}"
-MAGNETIC_FIELD = "sensor_msgs/MagneticField"
 FIX = "sensor_msgs/NavSatFix"
+IMU, ODOMETRY, JOINTS = "sensor_msgs/Imu", "nav_msgs/Odometry", "sensor_msgs/JointState"
+SERVOS = "mavros_msgs/RCOut"
 TOPIC = "@"
 """Placeholder for the name of the topic in the name of a column."""
 ROS_FIELDS = field_maps("ros")
+MESSAGE_KINDS = (MAGNETIC_FIELD, IMU, ODOMETRY, JOINTS, SERVOS, *ROS_FIELDS)
+"""Types of messages that are read. mavros publishes them; only ``RCOut`` is its own."""
+DOUBLES = {MAGNETIC_FIELD: 12, IMU: 37}
+"""Type of message -> number of float64 at its end, of which the first are the values of :func:`_row`."""
 ABSOLUTE = ("map", "earth", "utm", "enu")
 """Names of frames whose x axis points east."""
 
@@ -236,20 +239,47 @@ Values = Mapping[str, FloatArray]
 Columns = Iterator[tuple[str, str, FloatArray]]
 
 
-class MessageKind(NamedTuple):
-    """Type of message, with the functions that read its values and form its columns."""
+def _row(kind: str, m: Any) -> dict[str, float]:
+    """Return the values of a message of type `kind` by name; empty if it has none."""
+    if kind == MAGNETIC_FIELD:
+        return _axes("", m.magnetic_field)
+    if kind == IMU:
+        return _axes("q", m.orientation, "xyzw") | {"unknown": float(m.orientation_covariance[0])}
+    if kind == ODOMETRY:
+        pose, absolute = m.pose.pose, m.header.frame_id.rpartition("/")[2].lower() in ABSOLUTE
+        vectors = _axes("", pose.position) | _axes("q", pose.orientation, "xyzw")
+        return vectors | _axes("u", m.twist.twist.linear) | {"absolute": float(absolute), "unknown": 0.0}
+    if kind == JOINTS:
+        return dict(zip(m.name, map(float, m.position), strict=False))
+    if kind == SERVOS:
+        return {f"servo{k}": float(value) for k, value in enumerate(m.channels, 1)}
+    known = kind != FIX or m.status.status >= 0
+    return {one.field: float(getattr(m, one.field)) for one in ROS_FIELDS[kind]} if known else {}
 
-    name: str
-    """Name of the type."""
-    row: Callable[[Any], dict[str, float]]
-    """Function that returns the values of a message by name."""
-    columns: Callable[[str, int, Values], Columns]
-    """Function of the topic's name, its number among topics of this type (from 0), and all values by name. It
-    yields column, unit and values (n,). If several topics have one column, the first is used."""
-    header: bool = True
-    """True if the message begins with a ``std_msgs/Header``."""
-    doubles: int = 0
-    """Number of float64 at the end of the message, first the values of `row`; 0 for another layout."""
+
+def _axes(prefix: str, vector: Any, axes: str = "xyz") -> dict[str, float]:
+    """Return the components of a vector or a quaternion by name: `prefix` and axis."""
+    return {f"{prefix}{axis}": getattr(vector, axis) for axis in axes}
+
+
+def _columns(kind: str, topic: str, number: int, v: Values) -> Columns:
+    """Yield column, unit and values (n,) of a topic, the topic `number` (from 0) of its type.
+
+    If several topics have one column, the first is used.
+    """
+    if kind == IMU:
+        yield from _angles(v)
+    elif kind == ODOMETRY:
+        yield from _odometry(topic, number, v)
+    elif kind == JOINTS:  # rad, or m for a sliding joint: the message does not state the unit
+        yield from ((_name(name), "1", values) for name, values in v.items())
+    elif kind == SERVOS:
+        yield from ((name, "us", values) for name, values in v.items() if np.any(values))
+    else:
+        name = _name(topic)
+        for column, unit, values in fields_of(ROS_FIELDS[kind], v, number):
+            called = column.removesuffix("_temperature") if "temp" in name else column
+            yield called.replace(TOPIC, name), unit, values
 
 
 def _name(topic: str, *more: str) -> str:
@@ -258,30 +288,16 @@ def _name(topic: str, *more: str) -> str:
 
 def _angles(v: Values) -> Columns:
     """Yield roll, pitch and heading, deg, from the quaternion of FLU to ENU; nothing if it is not known."""
-    x, y, z, w = (v[f"q{axis}"] for axis in "xyzw")
+    w, x, y, z = (v[f"q{axis}"] for axis in "wxyz")
     norm = x * x + y * y + z * z + w * w
     known = (np.abs(norm - 1) < 0.1) & (v["unknown"] != -1)  # the first covariance is -1: no orientation
     if not known.any() or (np.abs(w) == 1.0).all():  # a constant identity is not an attitude
         return
-    x, y, z, w = (np.where(known, one, np.nan) for one in (x, y, z, w))
-    # elements of the rotation from FLU to ENU; FRD reverses y and z, NED swaps x and y and reverses z
-    down_x, down_y, down_z = -2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    east_x, north_x = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
-    yield "roll", "deg", np.degrees(np.arctan2(down_y, down_z))
-    yield "pitch", "deg", np.degrees(-np.arcsin(np.clip(down_x, -1, 1)))
-    yield "heading", "deg", np.degrees(np.arctan2(east_x, north_x)) % 360.0
-
-
-def _axes(prefix: str, vector: Any, axes: str = "xyz") -> dict[str, float]:
-    """Return the components of a vector or a quaternion by name: `prefix` and axis."""
-    return {f"{prefix}{axis}": getattr(vector, axis) for axis in axes}
-
-
-def _odometry_row(m: Any) -> dict[str, float]:
-    pose, linear = m.pose.pose, m.twist.twist.linear
-    absolute = float(m.header.frame_id.rpartition("/")[2].lower() in ABSOLUTE)
-    vectors = _axes("", pose.position) | _axes("q", pose.orientation, "xyzw") | _axes("u", linear)
-    return {**vectors, "absolute": absolute, "unknown": 0.0}
+    roll, pitch, yaw = euler_deg(*(np.where(known, one, np.nan) for one in (w, x, y, z)))
+    # FRD reverses y and z, so that pitch is nose up; NED swaps x and y, so that yaw counts from north
+    yield "roll", "deg", roll
+    yield "pitch", "deg", -pitch
+    yield "heading", "deg", (90.0 - yaw) % 360.0
 
 
 def _odometry(topic: str, number: int, v: Values) -> Columns:
@@ -298,52 +314,3 @@ def _odometry(topic: str, number: int, v: Values) -> Columns:
     yield "velocity_north", "m/s", north
     yield "velocity_east", "m/s", east
     yield from _angles(v)
-
-
-def _fields(name: str, *, header: bool = True) -> MessageKind:
-    """Return the type of message `name`, whose fields and columns :data:`ROS_FIELDS` lists."""
-    fields = ROS_FIELDS[name]
-
-    def row(message: Any) -> dict[str, float]:
-        known = name != FIX or message.status.status >= 0
-        return {one.field: float(getattr(message, one.field)) for one in fields} if known else {}
-
-    def columns(topic: str, number: int, v: Values) -> Columns:
-        for column, unit, values in fields_of(fields, v, number):
-            yield column.replace(TOPIC, _name(topic)), unit, values
-
-    return MessageKind(name, row, columns, header)
-
-
-def _temperature(topic: str, _: int, v: Values) -> Columns:
-    name = _name(topic)
-    yield name if "temp" in name else f"{name}_temperature", "degC", v["temperature"]
-
-
-MESSAGE_KINDS = {
-    kind.name: kind
-    for kind in (
-        MessageKind(MAGNETIC_FIELD, lambda m: _axes("", m.magnetic_field), lambda *_: iter(()), doubles=12),
-        MessageKind(
-            "sensor_msgs/Imu",
-            lambda m: _axes("q", m.orientation, "xyzw") | {"unknown": float(m.orientation_covariance[0])},
-            lambda _, __, v: _angles(v),
-            doubles=37,
-        ),
-        MessageKind("nav_msgs/Odometry", _odometry_row, _odometry),
-        MessageKind(
-            "sensor_msgs/JointState",
-            lambda m: dict(zip(m.name, map(float, m.position), strict=False)),
-            # rad, or m for a sliding joint: the message does not state the unit
-            lambda _, __, v: ((_name(name), "1", values) for name, values in v.items()),
-        ),
-        MessageKind("sensor_msgs/Temperature", lambda m: {"temperature": float(m.temperature)}, _temperature),
-        MessageKind(
-            "mavros_msgs/RCOut",
-            lambda m: {f"servo{k}": float(value) for k, value in enumerate(m.channels, 1)},
-            lambda _, __, v: ((name, "us", values) for name, values in v.items() if np.any(values)),
-        ),
-        *(_fields(name, header=not name.startswith("std_msgs/")) for name in ROS_FIELDS),
-    )
-}
-"""Name of each type of message that is read -> the type. mavros publishes them; only ``RCOut`` is its own."""

@@ -26,7 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -39,14 +39,12 @@ from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass, by_columns, choose, compass_notes, listed
 from magbridge.logs.deployment import CHANGES_SETTING, NOTES, deployment, sliced
 from magbridge.logs.fields import MAX_AGE, FieldMap, field_maps, fields_of
+from magbridge.logs.mapping import Options
 from magbridge.logs.telemetry_writer import POWER_CYCLE, FileWriter
 from magbridge.mavlink import Source, spec
 from magbridge.mavlink.messages import split_index
 from magbridge.mavlink.tlog import blocks
 from magbridge.records import Channel
-
-if TYPE_CHECKING:
-    from magbridge.logs.mapping import Options
 
 __all__ = ["FileWriter", "chunks"]
 

@@ -108,13 +108,10 @@ def _chunks(
     lines = _lines(file)
     header = list(islice(lines, LAYOUT_LINES))
     declared, added = options.declared, 0
-    if form := _sentence(header):
-        lines, added = _as_csv([*form.cells], form.row, chain(header, lines)), 1
-        guess = [*guess, *form.guess]
-        declared = replace(declared, columns={**form.declared, **declared.columns})
-    elif names := _json_names(header):
-        lines, added = _as_csv(names, partial(_json_row, names), chain(header, lines)), 1
-    header = list(islice(lines, LAYOUT_LINES)) if added else header
+    if capture := _capture(header):
+        lines, added = capture.as_csv(chain(header, lines)), 1
+        header, guess = list(islice(lines, LAYOUT_LINES)), [*guess, *capture.guess]
+        declared = replace(declared, columns={**capture.declared, **declared.columns})
     further = list(islice(lines, FURTHER))
     foreign = not metadata_path(path).is_file()
     layout, units, first_rows = header_of(path, header, declared, foreign=foreign)
@@ -165,71 +162,76 @@ def _marked(lines: Iterable[tuple[int, str]], first: int) -> Iterator[tuple[int,
             yield number, line, label
 
 
-class Sentence(NamedTuple):
-    """Form of the lines of a capture without headings."""
+class Capture(NamedTuple):
+    """Table in a capture without headings."""
 
-    pattern: re.Pattern[str]
-    cells: dict[str, str]
-    """Heading -> template (:meth:`re.Match.expand`) of the cell."""
-    others: tuple[str, ...] = ()
-    """Beginnings of other lines from the same senders, which are not rows."""
+    headings: Sequence[str]
+    row: Callable[[str], Sequence[object]]
+    """Function that returns the cells of a line: no cell for a line to skip, one cell for a damaged line."""
     declared: Mapping[str, ColumnSource] = {}
     guess: tuple[str, ...] = ()
 
-    def row(self, line: str) -> list[str]:
-        """Return the cells of a line: no cell for a line to skip, one cell for a damaged line."""
-        if match := self.pattern.fullmatch(line):
-            return [match.expand(template) for template in self.cells.values()]
-        return [] if line.startswith(self.others) else [line]
+    def as_csv(self, lines: Iterable[str]) -> Iterator[str]:
+        """Yield the lines of the capture as lines of CSV, the headings first."""
+        rows = (self.row(line.strip()) for line in lines if line.strip())
+        for cells_of_row in chain([self.headings], filter(None, rows)):
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerow(cells_of_row)
+            yield text.getvalue()
 
 
-def _motioncal(kind: str, count_nt: float) -> Sentence:
-    """Return the form of one `kind` of the lines for MotionCal, with the size of its unit, nT."""
-    pattern = kind + r":\s*" + r",\s*".join([r"(-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"] * 9) + r"\s*"
-    # the senders write a hundred lines a second, without times
-    declared = {"time": ColumnSource(heading="row [100 Hz]")}
-    declared |= {name: ColumnSource(scale=count_nt) for name in CHANNELS}
-    others = tuple({"Raw:", "Uni:", "Ori:", "Cal1:", "Cal2:"} - {f"{kind}:"})
-    cells = {f"{name} [nT]": rf"\{k}" for k, name in enumerate(CHANNELS, 7)}
-    guess = f"MotionCal's {kind}: lines, {count_nt:g} nT a count"
-    return Sentence(re.compile(pattern), cells, others, declared, (guess,))
-
-
-MOTIONCAL = _motioncal("Uni", NT_PER_UNIT["uT"]), _motioncal("Raw", 0.1 * NT_PER_UNIT["uT"])
-EXPLORER = Sentence(
-    re.compile(
-        r"\*(?P<year>\d\d)\.(?P<day>\d{3})/(?P<clock>[\d:.]+) F:(?P<field>[\d.]+)"
-        r"(?: S:(?P<signal>[-+\d.]+))?(?: D:(?P<depth>[-+\d.]+)m)?(?: A:(?P<altitude>[-+\d.]+)m)?.*"
-    ),
-    {
-        "time": r"20\g<year>-\g<day>T\g<clock>",
-        "total_field [nT]": r"\g<field>",
-        "signal": r"\g<signal>",
-        "depth [m]": r"\g<depth>",
-        "altitude [m]": r"\g<altitude>",
-    },
+MOTIONCAL = {
+    kind: re.compile(kind + r":\s*" + r",\s*".join([r"(-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"] * 9) + r"\s*")
+    for kind in ("Uni", "Raw")
+}
+"""Kind of the lines for MotionCal, the preferred one first -> pattern of a line."""
+COUNT_NT = {"Uni": NT_PER_UNIT["uT"], "Raw": 0.1 * NT_PER_UNIT["uT"]}
+"""Kind -> size of the unit of the field, nT."""
+EXPLORER = re.compile(
+    r"\*(?P<year>\d\d)\.(?P<day>\d{3})/(?P<clock>[\d:.]+) F:(?P<field>[\d.]+)"
+    r"(?: S:(?P<signal>[-+\d.]+))?(?: D:(?P<depth>[-+\d.]+)m)?(?: A:(?P<altitude>[-+\d.]+)m)?.*"
 )
+EXPLORER_CELLS = {
+    "time": r"20\g<year>-\g<day>T\g<clock>",
+    "total_field [nT]": r"\g<field>",
+    "signal": r"\g<signal>",
+    "depth [m]": r"\g<depth>",
+    "altitude [m]": r"\g<altitude>",
+}
+"""Heading -> template (:meth:`re.Match.expand`) of the cell."""
 MIN_LINE_FRACTION = 0.5
 """Fraction of the first lines above which a form of lines is recognised."""
 
 
-def _sentence(header: Sequence[str]) -> Sentence | None:
-    """Return the form of the lines of a capture that begins with these lines; None for other text."""
+def _capture(header: Sequence[str]) -> Capture | None:
+    """Return the table of a capture that begins with these lines; None for other text."""
     lines = [line.strip() for line in header if line.strip()]
-    uni, raw = ([one for one in lines if form.pattern.fullmatch(one)] for form in MOTIONCAL)
-    if (uni or raw) and len(uni) + len(raw) >= len(header) / 4:
-        return MOTIONCAL[0] if uni else MOTIONCAL[1]
-    is_explorer = sum(map(bool, map(EXPLORER.pattern.fullmatch, lines))) > MIN_LINE_FRACTION * len(lines)
-    return EXPLORER if is_explorer else None
-
-
-def _json_names(header: Sequence[str]) -> list[str]:
-    """Return the names in the JSON objects, an object a line, of a file that begins with these lines."""
-    lines = [line.strip() for line in header if line.strip()]
+    counts = {kind: sum(map(bool, map(pattern.fullmatch, lines))) for kind, pattern in MOTIONCAL.items()}
+    if sum(counts.values()) >= max(1, len(header) / 4):
+        kind = next(kind for kind, count in counts.items() if count)
+        cells_of = {f"{name} [nT]": rf"\{k}" for k, name in enumerate(CHANNELS, 7)}
+        skipped = tuple({"Raw:", "Uni:", "Ori:", "Cal1:", "Cal2:"} - {f"{kind}:"})
+        # the senders write a hundred lines a second, without times
+        declared = {"time": ColumnSource(heading="row [100 Hz]")}
+        declared |= {name: ColumnSource(scale=COUNT_NT[kind]) for name in CHANNELS}
+        guess = f"MotionCal's {kind}: lines, {COUNT_NT[kind]:g} nT a count"
+        return Capture([*cells_of], partial(_matched, MOTIONCAL[kind], cells_of, skipped), declared, (guess,))
+    if sum(map(bool, map(EXPLORER.fullmatch, lines))) > MIN_LINE_FRACTION * len(lines):
+        return Capture([*EXPLORER_CELLS], partial(_matched, EXPLORER, EXPLORER_CELLS, ()))
     objects = [one for line in lines if (one := _json(line)) is not None]
-    if len(objects) <= MIN_LINE_FRACTION * len(lines):
-        return []
-    return list(dict.fromkeys(name for one in objects for name in one))
+    if len(objects) > MIN_LINE_FRACTION * len(lines):
+        names = list(dict.fromkeys(name for one in objects for name in one))
+        return Capture(names, partial(_json_row, names))
+    return None
+
+
+def _matched(
+    pattern: re.Pattern[str], templates: Mapping[str, str], skipped: tuple[str, ...], line: str
+) -> list[str]:
+    """Return the cells of a line; `skipped` are the beginnings of lines from the same senders to skip."""
+    if match := pattern.fullmatch(line):
+        return [match.expand(template) for template in templates.values()]
+    return [] if line.startswith(skipped) else [line]
 
 
 def _json(line: str) -> dict[str, object] | None:
@@ -244,17 +246,6 @@ def _json(line: str) -> dict[str, object] | None:
 def _json_row(names: Sequence[str], line: str) -> list[object]:
     one = _json(line)
     return [line] if one is None else ["" if one.get(name) is None else one[name] for name in names]
-
-
-def _as_csv(
-    headings: list[str], row: Callable[[str], Sequence[object]], lines: Iterable[str]
-) -> Iterator[str]:
-    """Yield the lines of a capture as lines of CSV, the headings first; `row` returns the cells of a line."""
-    rows = (row(line.strip()) for line in lines if line.strip())
-    for cells_of_row in chain([headings], filter(None, rows)):
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerow(cells_of_row)
-        yield text.getvalue()
 
 
 class FileWriter:
