@@ -45,20 +45,6 @@ MAX_WAIT_RATIO = 10.0
 """Allowed ratio of elapsed time to allowed processor time; the disk and other processes may be slow."""
 
 
-class Raised(NamedTuple):
-    """Error as the child process sends it: a function that constructs the error, and its arguments."""
-
-    rebuild: Callable[..., BaseException]
-    arguments: tuple[Any, ...]
-
-    @classmethod
-    def from_exception(cls, error: BaseException) -> Raised:
-        """Return an error without its causes, because causes from other packages may not be picklable."""
-        how = error.__reduce__()
-        assert isinstance(how, tuple)
-        return cls(*how[:2])
-
-
 class GuardedJob(NamedTuple):
     """File to read, and a function that reads it and returns an iterable of picklable objects."""
 
@@ -116,8 +102,8 @@ class Guarded:
             while not self._received[k]:
                 self._receive()
             done, piece = self._received[k].popleft()
-            if isinstance(piece, Raised):
-                raise piece.rebuild(*piece.arguments)
+            if isinstance(piece, Exception):
+                raise piece
             if done:
                 return
             yield piece
@@ -137,7 +123,7 @@ class Guarded:
             done, piece = self._child.receive(job)
         except FormatError as error:
             self.close()
-            done, piece = True, Raised.from_exception(error)
+            done, piece = True, error.with_traceback(None)
         self._received[self._current].append((done, piece))
         self._current += done
         if self._current == len(self._jobs):
@@ -210,7 +196,7 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
 
 
 def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
-    """Read files in the child; send (False, object) for each object, then (True, None) or (True, Raised)."""
+    """Read files in the child; send (False, object) for each object, then (True, None) or (True, error)."""
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # HDF5 and dbdreader print messages
@@ -228,7 +214,7 @@ def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
             except BrokenPipeError:
                 raise
             except (MagbridgeError, OSError) as error:
-                end.send((True, Raised.from_exception(error)))
+                end.send((True, error))  # without its causes, which pickle leaves out
     except BrokenPipeError:  # the parent has stopped reading
         pass
 

@@ -18,8 +18,8 @@ import magbridge as mb
 from magbridge.arrays import plain
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.field.grid import AnomalyGrid
-from magbridge.logs.draw import draw_corrected
 from magbridge.pictures import literal
+from magbridge.plot import draw_corrected
 
 mpl.use("Agg")
 log = demo_log()

@@ -99,7 +99,7 @@ def correct(
                 drawn.append(corrected[list(CORRECTED)])
     if plot:
         from magbridge.logs.deployment import join
-        from magbridge.logs.draw import draw_corrected
+        from magbridge.plot import draw_corrected
 
         draw_corrected(join(drawn), plot)
     cli.note_losses(*pieces)

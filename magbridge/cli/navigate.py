@@ -76,10 +76,7 @@ def navigate(
     from magbridge.logs import write
     from magbridge.navigate.batch import navigate as find_way
 
-    if known is None or calibration is None:
-        deployment = _scalar(files, heading_reference, reading)
-    else:
-        deployment = _corrected(files, known, calibration, heading_reference, reading)
+    deployment = _with_total_field(files, known, calibration, heading_reference, reading)
     options = options or _options_for(deployment, known)
     if map is None:
         from magbridge.navigate.own_survey import localise
@@ -108,28 +105,26 @@ def _options_for(deployment: xr.Dataset, known: mb.Calibration | None) -> Naviga
     return with_level(NavigationOptions(), level)
 
 
-def _scalar(
-    files: tuple[Path, ...], heading_reference: cli.Heading, reading: cli.ReadingOptions
-) -> xr.Dataset:
-    """Return the logs as one, with its total field; WrongUse: ``total_field`` is missing."""
-    log = cli.read_log(files, reading, heading_reference)
-    if "total_field" not in log:
-        raise WrongUse(f"{log.attrs['source']}: expected a column total_field, or --calibration cal.json")
-    return log
-
-
-def _corrected(
+def _with_total_field(
     files: tuple[Path, ...],
-    known: mb.Calibration,
-    calibration: Path,
+    known: mb.Calibration | None,
+    calibration: Path | None,
     heading_reference: cli.Heading,
     reading: cli.ReadingOptions,
 ) -> xr.Dataset:
-    """Return the logs as one, corrected with the calibration `known` from the file `calibration`."""
+    """Return the logs as one, corrected with `known`, the calibration of the file `calibration`, if given.
+
+    WrongUse: there is neither a calibration nor a column ``total_field``.
+    """
     from magbridge.columns import CHANNELS
     from magbridge.rows import correct_rows
 
-    deployment = cli.read_log(files, reading, heading_reference, CHANNELS)
+    deployment = cli.read_log(files, reading, heading_reference, CHANNELS if known is not None else ())
+    if known is None or calibration is None:
+        if "total_field" not in deployment:
+            source = deployment.attrs["source"]
+            raise WrongUse(f"{source}: expected a column total_field, or --calibration cal.json")
+        return deployment
     cli.complain_all(cli.warnings_of(known, calibration))
     cli.note_missing(known, deployment)
     cli.note_settings(deployment.attrs)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isfinite
 
 TIERS = {"10 min": (600.0, 1.0), "2 h": (7_200.0, 10.0), "24 h": (86_400.0, 120.0)}
@@ -151,7 +151,7 @@ class Alarm:
     text: str
     """`key`, `text`: Identifier of the alarm, and its text on the page."""
     since: float
-    last: float
+    last: float = field(compare=False)
     """`since`, `last`: Time at which the condition last began, and at which it was last present, s."""
     active: bool = True
     """True while the condition is present."""
@@ -175,23 +175,6 @@ class Alarm:
         return text.partition(":")[0] if colon else self.key
 
 
-@dataclass(frozen=True, slots=True)
-class AlarmGroup:
-    """Alarms that have one cause."""
-
-    cause: str
-    text: str
-    """Texts of the alarms, joined by semicolons; texts of active alarms come first."""
-    active: bool
-    """True if at least one alarm of the group is active."""
-    acknowledged: bool
-    """True if a user has acknowledged all alarms of the group."""
-    started_s: float
-    """Time at which the newest alarm of the group began, s of the receiver's clock."""
-    count: int
-    """Number of times that the most frequent alarm of the group has begun."""
-
-
 class Alarms:
     """Alarms of one vehicle."""
 
@@ -203,22 +186,22 @@ class Alarms:
         return iter(sorted(self._alarms.values(), key=lambda alarm: alarm.since, reverse=True))
 
     @property
-    def groups(self) -> list[AlarmGroup]:
-        """Alarms grouped by cause; the cause with the newest alarm comes first."""
+    def groups(self) -> list[Alarm]:
+        """Alarms of each cause as one alarm, whose key is the cause; the newest comes first.
+
+        The texts of active alarms stand first. The group is acknowledged if all its alarms are, and has the
+        count of its most frequent alarm.
+        """
         found: dict[str, list[Alarm]] = {}
         for alarm in self:
             found.setdefault(alarm.cause, []).append(alarm)
-        return [
-            AlarmGroup(
-                cause,
-                "; ".join(dict.fromkeys(one.text for one in sorted(alarms, key=lambda one: not one.active))),
-                any(one.active for one in alarms),
-                all(one.acknowledged for one in alarms),
-                alarms[0].since,
-                max(one.count for one in alarms),
-            )
-            for cause, alarms in found.items()
-        ]
+        together = []
+        for cause, alarms in found.items():
+            texts = dict.fromkeys(one.text for one in sorted(alarms, key=lambda one: not one.active))
+            active, seen = any(one.active for one in alarms), all(one.acknowledged for one in alarms)
+            last, count = max(one.last for one in alarms), max(one.count for one in alarms)
+            together.append(Alarm(cause, "; ".join(texts), alarms[0].since, last, active, count, seen))
+        return together
 
     @property
     def unseen(self) -> int:

@@ -47,7 +47,11 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
         "link": link,
         "bridge": state.bridge,
         "measured": words.measured(state),
-        "health": {name: text for name, (text, _) in words.health(state, now_s).items()},
+        "health": {
+            name: text
+            for facts in (words.health, words.losses)
+            for name, (text, _) in facts(state, now_s).items()
+        },
         "navigation": {name: text for name, (text, _) in words.whereabouts(state, now_s).items()},
         "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
         "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
@@ -124,7 +128,7 @@ class Page:
         """Show another bridge: build all panels of the page again."""
         self._bridge = bridge
         self._state = self._station.fleet.states.get(bridge) or BridgeState() if bridge else BridgeState()
-        moment, state = monotonic_s(), self._state
+        state = self._state
         self._body.clear()
         with self._body:
             with ui.element().classes(f"{GRID} md:grid-cols-[18rem_minmax(0,1fr)]"):
@@ -137,9 +141,12 @@ class Page:
                     self._alarms = panels.AlarmPanel(self._station, state, sound=self._sound)
                     self._flags = panels.Flags()
                 with ui.element().classes(f"{GRID} sm:grid-cols-2 content-start"):
-                    self._health = panels.Health(state, moment)
+                    self._health = panels.FactPanel("Bridge", words.health, "status")
+                    self._losses = panels.FactPanel("Losses", words.losses, "status")
             self._sensors = panels.SensorPanel()
-            self._navigation = panels.NavigationPanel(state, moment)
+            title = "Position by the field; innovation and bias in nT"
+            grid = f"{GRID} md:grid-cols-3 gap-y-1"
+            self._navigation = panels.FactPanel(title, words.whereabouts, "navigation", grid)
             self._learning = panels.LearningPanel(self._station, state)
             with ui.element().classes(f"{GRID} lg:grid-cols-[minmax(0,2fr)_minmax(0,3fr)] items-start"):
                 self._track = TrackMap(self._background)
@@ -163,8 +170,8 @@ class Page:
         self._offer(list(states))
         state, moment = self._state, monotonic_s()
         self._show_stream(state, moment)
-        shown = self._figures, self._rose, self._flags, self._health, self._sensors, self._navigation
-        for panel in (*shown, self._learning, self._texts, self._parameters):
+        shown = self._figures, self._rose, self._flags, self._health, self._losses, self._sensors
+        for panel in (*shown, self._navigation, self._learning, self._texts, self._parameters):
             panel.show(state, moment)
         self._sound = self._alarms.sound
         self._alarms.show(state, moment)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib.resources import files
 from math import cos, nan, radians, sin
@@ -16,7 +16,7 @@ from magbridge.link.parameters import alignment, file_rate, learning, rates, tel
 from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.monitor import words
-from magbridge.monitor.history import AlarmGroup
+from magbridge.monitor.history import Alarm
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import (
@@ -93,24 +93,37 @@ class Flags:
                     ui.label(f"{name}, {since}").classes(f"text-xs {MUTED}")
 
 
-class Health:
-    """Panels of the bridge's health and of its lost samples, frames and bytes."""
+Facts = Callable[[BridgeState, float], Mapping[str, tuple[str, bool]]]
+"""Function of :mod:`.words` that returns name -> text, and True if it is normal."""
 
-    def __init__(self, state: BridgeState, now_s: float) -> None:
-        facts = list(words.health(state, now_s))
-        with card("Bridge"):
-            self._labels = [fact(name) for name in facts[:8]]
-        with card("Losses"):
-            self._labels += [fact(name) for name in facts[8:]]
+
+class FactPanel:
+    """Panel of texts from the last message of one kind, in red where they are not normal.
+
+    `source` is the message, by the name of an attribute of :class:`.BridgeState`. Without one, the panel is
+    hidden, unless it is of the bridge's own status.
+    """
+
+    def __init__(
+        self, title: str, facts: Facts, source: str, grid: str = "w-full flex flex-col gap-2"
+    ) -> None:
+        self._facts, self._source = facts, source
+        with (
+            ui.element().classes("w-full") as self._box,
+            card(title) as self.card,
+            ui.element().classes(grid),
+        ):
+            self._labels = [fact(name) for name in facts(BridgeState(), 0.0)]
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the last MAG_STATUS: faults in red, an old status in italics."""
-        old = "no status" in words.silence(state, now_s)
-        for label, (text, well) in zip(self._labels, words.health(state, now_s).values(), strict=True):
-            label.set_text(text if state.status else "–")
-            label.style(slanted(old))
-            if not old:
-                label.style(f"color: {INK if well or not state.status else RED}")
+        """Show the texts; those of an old MAG_STATUS in italics."""
+        there, of_status = bool(getattr(state, self._source)), self._source == "status"
+        self._box.set_visibility(there or of_status)
+        facts = self._facts(state, now_s)
+        show_facts(self._labels, facts if there else dict.fromkeys(facts, ("–", True)))
+        is_old = of_status and "no status" in words.silence(state, now_s)
+        for label in self._labels:
+            label.style(slanted(is_old) if is_old else "font-style: normal")
 
 
 class SensorPanel:
@@ -133,23 +146,6 @@ class SensorPanel:
                 with ui.column().classes("w-full gap-0"):
                     ui.label(name).classes("font-medium")
                     show_facts([fact(quantity) for quantity in row], row)
-
-
-class NavigationPanel:
-    """Panel of the position filter; hidden if the bridge does not navigate by the field."""
-
-    def __init__(self, state: BridgeState, now_s: float) -> None:
-        with (
-            ui.element().classes("w-full") as self._box,
-            card("Position by the field; innovation and bias in nT"),
-            ui.element().classes(f"{GRID} md:grid-cols-3 gap-y-1"),
-        ):
-            self._labels = [fact(name) for name in words.whereabouts(state, now_s)]
-
-    def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the last MAG_NAVIGATION."""
-        self._box.set_visibility(bool(state.navigation))
-        show_facts(self._labels, words.whereabouts(state, now_s))
 
 
 class Texts:
@@ -237,14 +233,14 @@ class Row:
                 self._times = ui.label().classes(f"text-xs {MUTED}")
             self._seen: ui.button | None = None
 
-    def show(self, alarm: AlarmGroup) -> None:
+    def show(self, alarm: Alarm) -> None:
         """Show text and start of the alarms, and a button until a user acknowledges them."""
         color = RED if alarm.active else AMBER
         self.box.style(f"border-color: {'transparent' if alarm.acknowledged else color}")
         self._text.set_text(alarm.text)
         times = f", {alarm.count} times" if alarm.count > 1 else ""
         over = "since" if alarm.active else "over; at"
-        self._times.set_text(f"{over} {clock(alarm.started_s)} UTC{times}")
+        self._times.set_text(f"{over} {clock(alarm.since)} UTC{times}")
         if alarm.acknowledged and self._seen is not None:
             self._seen.delete()
             self._seen = None
@@ -319,15 +315,15 @@ LEARNING_COMMANDS = {
 }
 
 
-class LearningPanel:
+class LearningPanel(FactPanel):
     """Panel of the online calibration (learning) of a bridge; hidden if the bridge does not learn."""
 
     def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
-        self._box = ui.element().classes("w-full").props(f'role=region aria-label="{TITLE}"')
-        with self._box, card(TITLE):
-            with ui.element().classes(f"{GRID} md:grid-cols-2 gap-x-12 gap-y-1"):
-                self._labels = [fact(name) for name in words.learnt(state)]
+        grid = f"{GRID} md:grid-cols-2 gap-x-12 gap-y-1"
+        super().__init__(TITLE, lambda state, _: words.learnt(state), "learning", grid)
+        self._box.props(f'role=region aria-label="{TITLE}"')
+        with self.card:
             with ui.row().classes("gap-x-4"):
                 self._buttons = [
                     button(name, partial(self._confirm, name)).tooltip(meaning)
@@ -335,10 +331,9 @@ class LearningPanel:
                 ]
             self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
 
-    def show(self, state: BridgeState, _now_s: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the last MAG_LEARNING, and the error of the last command."""
-        self._box.set_visibility(bool(state.learning))
-        show_facts(self._labels, words.learnt(state))
+        super().show(state, now_s)
         for one in self._buttons:
             one.set_enabled(DO in state.parameters)
         self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")

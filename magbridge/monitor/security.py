@@ -8,17 +8,14 @@ such requests. On any other address, the whole network can reach the page, so a 
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from hmac import compare_digest
-from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
-from typing import Any
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import urlsplit
 
-Scope = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
-Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 POLICY = {
     "default-src": "'self'",
@@ -40,9 +37,8 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 """Headers of every response: the page loads nothing from other sites, and no site may frame it."""
+NOT_STORED = {"Cache-Control": "no-store"}
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
-MAX_COOKIE_CHARACTERS = 4096
-"""Number of characters of a cookie header that the guard parses."""
 
 
 def is_loopback(host: str) -> bool:
@@ -63,7 +59,7 @@ class Guard:
     * with 401 if the token is missing or wrong.
     """
 
-    def __init__(self, app: App, host: str, port: int, token: str = "") -> None:
+    def __init__(self, app: ASGIApp, host: str, port: int, token: str = "") -> None:
         self._app, self._port, self._token = app, port, token
         self._loopback = is_loopback(host)
         self._names = LOCAL_NAMES | {host}
@@ -74,14 +70,11 @@ class Guard:
         if scope["type"] not in {"http", "websocket"}:
             await self._app(scope, receive, send)
             return
-        headers = {
-            name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
-        }
-        refusal = self._refusal(scope, headers)
-        if refusal is None and self._token and not self._known(headers):
-            offered = dict(parse_qsl(scope.get("query_string", b"").decode("latin-1"))).get("token", "")
-            if scope["type"] == "http" and _same(offered, self._token):
-                await self._admit(scope, send)
+        asked = HTTPConnection(scope)
+        refusal = self._refusal(asked)
+        if refusal is None and self._token and not _same(asked.cookies.get(self._cookie, ""), self._token):
+            if scope["type"] == "http" and _same(asked.query_params.get("token", ""), self._token):
+                await self._admission(asked)(scope, receive, send)
                 return
             refusal = 401, "a token is required: open the address that magbridge monitor printed"
         if refusal is None:
@@ -90,18 +83,20 @@ class Guard:
             await receive()  # the "connect" event; closing before acceptance makes the response a 403
             await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
         else:
-            await _answer(send, refusal[0], f"magbridge: {refusal[1]}\n".encode())
+            status, reason = refusal
+            answer = PlainTextResponse(f"magbridge: {reason}\n", status, HEADERS | NOT_STORED)
+            await answer(scope, receive, send)
 
-    def _refusal(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
+    def _refusal(self, asked: HTTPConnection) -> tuple[int, str] | None:
         """Return HTTP status and reason if a request comes from another site; None if from this page."""
-        host = headers.get("host", "")
+        headers, host = asked.headers, asked.headers.get("host", "")
         if not self._is_this_page(host):
             return 421, "not a name of this page: use its address"
         if "origin" in headers and _parts(headers["origin"]) != _parts(f"//{host}"):
             return 403, "asked for by another site"
         site, mode = headers.get("sec-fetch-site", "none"), headers.get("sec-fetch-mode", "")
-        link = mode == "navigate" and headers.get("sec-fetch-dest") == "document" and scope["path"] == "/"
-        if site not in {"none", "same-origin"} and not (link and scope.get("method") == "GET"):
+        link = mode == "navigate" and headers.get("sec-fetch-dest") == "document" and asked["path"] == "/"
+        if site not in {"none", "same-origin"} and not (link and asked.get("method") == "GET"):
             return 403, "asked for by another site"
         return None
 
@@ -115,40 +110,25 @@ class Guard:
             return False
         return name in self._names or (not self._loopback and _is_address(name))
 
-    def _known(self, headers: Mapping[str, str]) -> bool:
-        try:
-            morsel = SimpleCookie(headers.get("cookie", "")[:MAX_COOKIE_CHARACTERS]).get(self._cookie)
-        except CookieError:
-            return False
-        return morsel is not None and _same(morsel.value, self._token)
-
-    async def _admit(self, scope: Scope, send: Send) -> None:
-        """Redirect the browser to the address without the token, and set a cookie with the token."""
-        query = [pair for pair in parse_qsl(scope["query_string"].decode("latin-1")) if pair[0] != "token"]
-        place = "/" + scope["path"].lstrip("/") + (f"?{urlencode(query)}" if query else "")
+    def _admission(self, asked: HTTPConnection) -> Response:
+        """Return a redirection to the address without the token, with a cookie that holds the token."""
+        query = asked.url.remove_query_params("token").query
+        place = "/" + asked["path"].lstrip("/") + (f"?{query}" if query else "")
         cookie = f"{self._cookie}={self._token}; HttpOnly; SameSite=Strict; Path=/"
-        await _answer(send, 303, b"", Location=place, **{"Set-Cookie": cookie})
+        return RedirectResponse(place, 303, HEADERS | NOT_STORED | {"Set-Cookie": cookie})
 
 
 def _with_headers(send: Send) -> Send:
-    async def sending(message: MutableMapping[str, Any]) -> None:
+    async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+            headers = MutableHeaders(scope=message)
             # omit the headers with which socket.io grants access to any site
-            given = [
-                pair for pair in message["headers"] if not pair[0].lower().startswith(b"access-control-")
-            ]
-            message = {**message, "headers": [*given, *own]}
+            for name in [name for name in headers if name.startswith("access-control-")]:
+                del headers[name]
+            headers.update(HEADERS)
         await send(message)
 
     return sending
-
-
-async def _answer(send: Send, status: int, text: bytes, **headers: str) -> None:
-    headers = {"Content-Type": "text/plain; charset=utf-8", "Cache-Control": "no-store", **HEADERS, **headers}
-    pairs = [(name.encode("latin-1"), value.encode("latin-1", "replace")) for name, value in headers.items()]
-    await send({"type": "http.response.start", "status": status, "headers": pairs})
-    await send({"type": "http.response.body", "body": text})
 
 
 def _same(secret: str, expected: str) -> bool:

@@ -152,7 +152,6 @@ def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
     field = ({} if _late(state.sampled, state.interval, now_s) else state.field).get
     get = state.status.get
     sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
-    losses = {name: get(counter, 0) for name, counter in LOSS_TEXTS.items()}
     return {
         "Sensor": (_word(MAG_PORT_STATE, sensor), sensor == MAG_PORT_STATE.OK),
         "Autopilot": (_word(MAG_PORT_STATE, autopilot), autopilot == MAG_PORT_STATE.OK),
@@ -168,12 +167,19 @@ def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
             True,
         ),
         "Uptime": (duration(get("uptime", 0)), True),
+    }
+
+
+def losses(state: BridgeState, _now_s: float) -> dict[str, tuple[str, bool]]:
+    """Return the losses of bridge and link: name of an item -> its text, and True if it is normal."""
+    counts = {name: state.status.get(counter, 0) for name, counter in LOSS_TEXTS.items()}
+    return {
         "Messages lost on the link": (
             f"{_figure(state.lost)} of {_figure(state.lost + state.received)}",
             not state.lost,
         ),
         # skipped bytes are normal: the bridge may join a stream in the middle of a frame
-        **{name: (_figure(count), not count or name.startswith("Bytes")) for name, count in losses.items()},
+        **{name: (_figure(count), not count or name.startswith("Bytes")) for name, count in counts.items()},
     }
 
 
