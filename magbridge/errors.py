@@ -18,7 +18,6 @@ built-in error of its kind::
 
 from __future__ import annotations
 
-import copyreg
 from pathlib import Path
 
 __all__ = [
@@ -34,7 +33,17 @@ class MagbridgeError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the values, too: the sentence in ``args`` is not what the constructor takes."""
-        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
+        return _rebuilt, (type(self), self.args, self.__dict__)
+
+
+def _rebuilt(
+    kind: type[MagbridgeError], args: tuple[object, ...], values: dict[str, object]
+) -> MagbridgeError:
+    """Rebuild an error from its pickled values."""
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(values)
+    return error
 
 
 class WrongUse(MagbridgeError):

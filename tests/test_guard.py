@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from magbridge import guard
-from magbridge.errors import FormatError, MissingExtra
+from magbridge.errors import FormatError, WriteError
 from magbridge.guard import Guarded, GuardedJob, guarded
 
 
@@ -82,7 +82,7 @@ def test_one_line_whatever_happens(
     "error",
     [
         FormatError("a.nc", "expected a number", row=3, column="x"),
-        MissingExtra("pyulog", "formats"),
+        WriteError("a.nc", "No space left on device"),
         OSError(5, "Input/output error", "a.nc"),
     ],
 )

@@ -77,8 +77,11 @@ def add(
         )
     if logs:
         cli.logs_to_read(tuple(logs))
+    if made and date is None:
+        raise WrongUse(f"{made[0]}: expected --date YYYY-MM-DD, the day on which its deployment began")
     plans = {file: read_fleet(file) for file in described}
-    calibrations = _calibrations(made, date)
+    calibrations = [mb.load(file) for file in made]
+    start = dt.datetime.combine(date, dt.time(), dt.UTC).timestamp() if date else 0.0
     there = open_catalogue(catalogue, create=True)
     added, new, given, lines = 0, 0, 0, list[str]()
     if vehicle and (parameter or serial):
@@ -93,7 +96,7 @@ def add(
         for name, part, paths in parts:
             count, notes = add_logs(there, name, part, paths)
             new, lines = new + count, lines + notes
-        for start, calibration in calibrations:
+        for calibration in calibrations:
             given += add_calibration(there, vehicle, this, start, calibration)
     cli.complain_all(lines)
     facts = {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines}
@@ -107,14 +110,6 @@ def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
     for file in files:
         kinds.get(file.suffix.lower(), kinds[""]).append(file)
     return kinds[".toml"], kinds[".json"], kinds[""]
-
-
-def _calibrations(files: Sequence[Path], date: dt.date | None) -> list[tuple[float, mb.Calibration]]:
-    """Return the start of the deployment, s since 1970, and the calibration in each file."""
-    if files and date is None:
-        raise WrongUse(f"{files[0]}: expected --date YYYY-MM-DD, the day on which its deployment began")
-    start = dt.datetime.combine(date, dt.time(), dt.UTC).timestamp() if date else 0.0
-    return [(start, mb.load(file)) for file in files]
 
 
 @fleet.command

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.fitting.fit import Fit
 from magbridge.calibration.fitting.pose import DEPARTURE, Known, Mounting
 from magbridge.calibration.model import Calibration, Noise, Reference
 from magbridge.calibration.terms import Polynomial
@@ -32,9 +33,6 @@ from magbridge.fleet.register import (
 )
 from magbridge.version import __version__
 from magbridge.wording import counted
-
-if TYPE_CHECKING:
-    from magbridge.calibration.fitting.fit import Fit
 
 
 def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> list[Lesson]:

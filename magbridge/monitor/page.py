@@ -38,6 +38,7 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
     def utc(moment: float) -> str:
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall + moment))
 
+    health = words.health(state, now_s) | words.losses(state, now_s)
     about: dict[str, Any] = {
         "made": utc(now_s),
         "magbridge": __version__,
@@ -47,11 +48,7 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
         "link": link,
         "bridge": state.bridge,
         "measured": words.measured(state),
-        "health": {
-            name: text
-            for facts in (words.health, words.losses)
-            for name, (text, _) in facts(state, now_s).items()
-        },
+        "health": {name: text for name, (text, _) in health.items()},
         "navigation": {name: text for name, (text, _) in words.whereabouts(state, now_s).items()},
         "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
         "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
