@@ -24,9 +24,8 @@ from scipy.optimize import least_squares
 from studies import Column, Row, Study, consistent
 from study_worlds import METHODS, NOISES, SCORES, BestFit, Glider, glider, true_field
 
-from magbridge.calibration.fitting.fit import fit
+from magbridge import fit, observations
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.planning.plan import (
     Limits,

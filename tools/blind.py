@@ -10,7 +10,6 @@ written to the folder ``--out``.
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,12 +34,11 @@ from study.ideal import ideal
 from study.names import judge
 from study.table import KNOWN, lines
 
+from magbridge import Calibration, diagnose
 from magbridge.arrays import BoolArray
-from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
-from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
 from sitl.inject import HiddenEffect
 
@@ -138,7 +136,6 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
 
 def case(entry: Row) -> Row:
     """Hide the effects of an entry, diagnose the log, and return the row with the ideal results."""
-    began = time.process_time()
     number, noise, names = entry["number"], entry["noise"], entry["names"]
     deployment = deployment_of(number, noise, entry.get("reference", "true"))
     background = Background.of(deployment, number, noise, entry["losses"])
@@ -165,7 +162,7 @@ def case(entry: Row) -> Row:
         row["theory"] = [ideal(hidden[0], background, ds, result.outcome.look_elsewhere)]
     if entry["part"] == "charted":
         row["gain"] = harm(tuple(one.hidden for one in hidden), background, ds, result)
-    return row | {"seconds": time.process_time() - began}
+    return row
 
 
 def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:

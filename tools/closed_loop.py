@@ -20,13 +20,12 @@ from functools import partial
 import numpy as np
 from msgspec.structs import replace
 from referee import ArduPilot, Autopilot, Px4
-from referee.loop import Passage, Run, sail
+from referee.loop import Passage, sail
 from studies import Column, Row, Study
 from voyages import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 
 LOST_S, BACK_S = 600.0, 300.0
 """Durations of GPS reception at the start and at the end of a run, s."""
-FOLLOWS = "dead reckoning by "
 MAPS = (Map(20, 1000), Map(60, 2000))
 STREAMS = {
     "speed": ("VFR_HUD",),
@@ -74,36 +73,31 @@ def run(pair: str, telemetry: str, chart: int, seed: int, hours: float) -> list[
     grid, way = synthetic(kind, seed % 10), passage(kind, seed, hours)
     options = replace(GLIDER, start_sigma=0.2 * grid.correlation_length)
 
-    def sailed(obeys: bool) -> tuple[Run, Autopilot]:
-        make = partial(AUTOPILOTS[autopilot], streams=STREAMS[telemetry], obeys=obeys)
-        return sail(way, grid, options, fix, make)[:2]
-
-    using, pilot = sailed(True)
-    ignoring, _ = sailed(False)
+    make = partial(AUTOPILOTS[autopilot], streams=STREAMS[telemetry])
+    using, _, _ = sail(way, grid, options, fix, partial(make, obeys=True))
+    ignoring, _, _ = sail(way, grid, options, fix, partial(make, obeys=False))
     end = hours * HOUR - BACK_S
     lost = (using.seconds > LOST_S) & (using.seconds < end)
     fed = lost & (using.sent > 0)
     fed &= np.cumsum(fed) > LOST_S  # after it has converged
     fed = fed if fed.any() else lost
-    reported = [text for second, text in using.texts if FOLLOWS in text and second < end]
     far = np.flatnonzero(np.hypot(*using.autopilot[using.seconds > end].T) > 3.0 * 2.5)
     bridge = rms(using.error[lost])
     return [
         {
             "map": str(kind),
-            "follows": reported[-1].removeprefix(FOLLOWS).partition(":")[0] if reported else "",
             "bridge": bridge, "ratio": bridge / rms(ignoring.error[lost]),
             "own": rms(np.hypot(*using.autopilot[fed].T)), "alone": rms(np.hypot(*ignoring.autopilot[fed].T)),
             "claimed": rms(using.claimed[fed]),
             "normalised": rms(using.autopilot[fed] / using.claimed[fed, None]),
-            "back": float(far[-1] + 1 if far.size else 0), "fixes": float(sum(pilot.taken.values())),
+            "back": float(far[-1] + 1 if far.size else 0),
         }
     ]  # fmt: skip
 
 
 STUDY = Study(
     run,
-    ("pair", "telemetry", "map", "follows"),
+    ("pair", "telemetry", "map"),
     {
         "bridge, m": Column("bridge", form=".0f"),
         "ratio": Column("ratio"),
@@ -112,7 +106,6 @@ STUDY = Study(
         "claimed": Column("claimed", form=".0f"),
         "normalised": Column("normalised"),
         "back, s": Column("back", np.max, ".0f"),
-        "fixes": Column("fixes", form=".0f"),
     },
 )
 

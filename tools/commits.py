@@ -9,7 +9,6 @@ Standard library only.
 
 from __future__ import annotations
 
-import argparse
 import re
 import subprocess
 import sys
@@ -67,11 +66,10 @@ def commits(span: str) -> list[tuple[str, str]]:
 
 def main() -> int:
     """Run the check; return the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("span", nargs="?", default="origin/HEAD..HEAD", metavar="RANGE")
-    parser.add_argument("--file", type=Path)
-    options = parser.parse_args()
-    found = [("message", options.file.read_text())] if options.file else commits(options.span)
+    if sys.argv[1:2] == ["--file"]:
+        found = [("message", Path(sys.argv[2]).read_text())]
+    else:
+        found = commits(sys.argv[1] if sys.argv[1:] else "origin/HEAD..HEAD")
     faults = [(name, text.split("\n")[0], problem(text)) for name, text in found]
     for name, subject, fault in faults:
         if fault:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+import tomllib
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -27,32 +28,7 @@ DIALECT, ENUMS_FILE = XML.with_name("dialect.py"), XML.with_name("enums.py")
 DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
 INCLUDED = "all.xml"
 """Dialect of all messages, because any message of an autopilot can be a parameter or be in a log."""
-ENUMS: dict[str, tuple[str, ...]] = {
-    "FIRMWARE_VERSION_TYPE": ("OFFICIAL",),
-    "GLOBAL_POSITION_SRC": ("MAGNETIC",),
-    "MAG_CAUSE": (),
-    "MAG_LEARNING_STATE": (),
-    "MAG_LOG_STATE": (),
-    "MAG_NAVIGATION_STATE": (),
-    "MAG_PORT_NAME": (),
-    "MAG_PORT_STATE": (),
-    "MAG_RAW_FLAGS": (),
-    "MAV_AUTOPILOT": ("GENERIC", "ARDUPILOTMEGA", "INVALID", "PX4"),
-    "MAV_CMD": (
-        "GET_MESSAGE_INTERVAL", "SET_MESSAGE_INTERVAL", "REQUEST_MESSAGE",
-        "REQUEST_PROTOCOL_VERSION", "REQUEST_AUTOPILOT_CAPABILITIES", "EXTERNAL_POSITION_ESTIMATE",
-        "PREFLIGHT_CALIBRATION", "FIXED_MAG_CAL", "FIXED_MAG_CAL_FIELD", "FIXED_MAG_CAL_YAW",
-        "DO_START_MAG_CAL", "DO_ACCEPT_MAG_CAL", "DO_CANCEL_MAG_CAL",
-    ),
-    "MAV_ESTIMATOR_TYPE": ("VISION",),
-    "MAV_FRAME": ("GLOBAL", "LOCAL_NED", "BODY_FRD", "LOCAL_FRD"),
-    "MAV_PARAM_TYPE": ("REAL32",),
-    "MAV_PROTOCOL_CAPABILITY": ("PARAM_FLOAT", "COMMAND_INT", "FTP", "MAVLINK2", "PARAM_ENCODE_C_CAST"),
-    "MAV_RESULT": (),
-    "MAV_SEVERITY": (),
-    "MAV_STATE": ("ACTIVE", "CRITICAL"),
-    "MAV_TYPE": ("GCS", "SUBMARINE", "ONBOARD_CONTROLLER"),
-}  # fmt: skip
+ENUMS: dict[str, list[str]] = tomllib.loads(Path(__file__).with_name("enums.toml").read_text("utf-8"))
 """Enumerations that the code uses, and the entries that it needs; an empty tuple selects all entries."""
 
 

@@ -19,22 +19,18 @@ import numpy as np
 import xarray as xr
 from studies import Column, Row, Study
 
+from magbridge import fit, observations, save
 from magbridge.arrays import FloatArray
 from magbridge.bridge.events import Event, StartEvent, standstill
 from magbridge.bridge.pipeline import set_up
-from magbridge.calibration.file import save
-from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import unfiltered
-from magbridge.calibration.fitting.observe import observations
 from magbridge.config import load as load_config
 from magbridge.records import Channel, Quality
-from sitl.dataset import segments
+from sitl import load, segments, simulate
 from sitl.mission import CrissCross
 from sitl.replay.emulation import emulate, start_us
 from sitl.replay.listener import Listener
 from sitl.replay.setup import bridge_toml
-from sitl.scenario import load
-from sitl.twin import simulate
 
 MASSES = ("battpos", "ballast")
 CHANNELS = ("mag_x", "mag_y", "mag_z")

@@ -24,11 +24,10 @@ import xarray as xr
 from studies import Row, Study, in_order, show
 from study_worlds import MASSES, SCORES, BestFit, Glider
 
+from magbridge import Calibration, fit, observations
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.pose import Known, Mounting
-from magbridge.calibration.model import Calibration, Noise, Reference
+from magbridge.calibration.model import Noise, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms

@@ -35,13 +35,12 @@ from segments import segment
 from studies import command_line, show, table
 from ulogs import ulog_of
 
-from magbridge import config, logs
+from magbridge import MagbridgeError, config, logs
 from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.run import FileServer
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.model import Boresight, CalibratedSensor, Parameter, Run
-from magbridge.errors import MagbridgeError
 from magbridge.field import read
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid

@@ -28,9 +28,8 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import HEADINGS
 from magbridge.estimation.residual import rms
 from magbridge.field.reference import earth_field
-from sitl import load
+from sitl import Twin, load
 from sitl.dataset import channels, side_by_side
-from sitl.twin import Twin
 
 TILT_SIGMA_DEG = 0.1
 """1-sigma of the white noise of simulated roll and pitch, deg."""

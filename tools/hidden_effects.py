@@ -21,15 +21,12 @@ from measured import VEHICLES, joined
 from studies import DATA, Column, Row, Study, show
 from study.names import judge
 
+from magbridge import Calibration, diagnose, fit, observations
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration
 from magbridge.diagnose.improvement import corrected
 from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.noise import autoregressive_order
 from magbridge.diagnose.problem import Problem, pose
-from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import load_survey
 from magbridge.estimation.residual import rms
 

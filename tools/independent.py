@@ -14,11 +14,8 @@ import xarray as xr
 from studies import Column, Row, Study, show
 from study.names import judge
 
+from magbridge import Calibration, diagnose, fit, observations
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration
-from magbridge.diagnose.run import diagnose
 
 UNITS = {
     "mag_x": "nT", "mag_y": "nT", "mag_z": "nT", "reference_field": "nT", "roll": "deg", "pitch": "deg",

@@ -31,14 +31,12 @@ import xarray as xr
 from studies import Column, Row, Study
 from study_worlds import MASSES
 
+from magbridge import Calibration, Correction, fit, observations
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration, Parameter
+from magbridge.calibration.model import Parameter
 from magbridge.columns import CHANNELS
 from magbridge.config import Align
-from magbridge.correction import Correction
 from magbridge.estimation.residual import rms
 from magbridge.estimation.sequential import ALARM_LOG_RATIO
 from magbridge.estimation.track_process import TRACK_STATES

@@ -25,18 +25,17 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from studies import DATA, Column, Row, Study, command_line, show
 
+from magbridge import MagbridgeError, diagnose, fit, observations, read
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.fit import Fit, fit
+from magbridge.calibration.fitting.fit import Fit
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.parameter_choice import best_parameters
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.run import diagnose
-from magbridge.errors import CalibrationError, MagbridgeError
+from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
-from magbridge.logs import Options, read
+from magbridge.logs import Options
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.info import movers
 from magbridge.survey.read import read_table

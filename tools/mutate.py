@@ -21,6 +21,7 @@ import random
 import signal
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.abc import Loader, MetaPathFinder
@@ -33,32 +34,7 @@ from typing import Any
 from studies import command_line, show, table
 
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = {
-    "align": "test_align.py",
-    "correction": "test_correction.py",
-    "estimation/gaussian_field": "estimation/test_gaussian_field.py",
-    "estimation/information": "estimation/test_information.py",
-    "estimation/kalman": "estimation/test_kalman.py",
-    "estimation/noise": "estimation/test_noise.py",
-    "estimation/optimise": "estimation/test_optimise.py",
-    "calibration/correct": "calibration/test_correct.py",
-    "calibration/effects": "calibration/test_effects.py",
-    "calibration/heading": "calibration/test_heading.py",
-    "calibration/kernel": "calibration/test_correct.py",
-    "calibration/model": "calibration/test_correct.py calibration/test_file.py",
-    "learning/estimator": "learning/test_bank.py learning/test_start.py",
-    "diagnose/evidence": "diagnose/test_evidence.py",
-    "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
-    "health/checks": "health/test_monitor.py health/test_consistency.py",
-    "health/consistency": "health/test_consistency.py",
-    "health/direction": "health/test_direction.py",
-    "health/scatter": "health/test_monitor.py",
-    "health/trend": "health/test_monitor.py health/test_consistency.py",
-    "link/estimates": "link/test_fixes.py bridge/test_heading.py",
-    "link/telemetry": "link/test_telemetry.py",
-    "sensors/clock": "sensors/test_clock.py",
-    "bridge/sensor": "bridge/test_sensor_line.py bridge/test_two_sensors.py",
-}
+TESTS: dict[str, list[str]] = tomllib.loads((ROOT / "tools" / "mutation.toml").read_text("utf-8"))
 """Test files that must detect a change to each module."""
 SLOWER = 5.0
 """Factor on the tests' normal duration after which a change counts as detected, because the tests hang."""
@@ -176,7 +152,7 @@ def main() -> int:
     shown = table("Changes", "module", "may be changed", "tried", "seen", left=("module",))
     tried = seen = 0
     for module in chosen.names:
-        tests = [f"tests/{one}" for one in TESTS[module].split()]
+        tests = [f"tests/{one}" for one in TESTS[module]]
         whole = ast.parse((ROOT / f"magbridge/{module}.py").read_text())
         count = len(list(changes(whole)))
         began = time.monotonic()

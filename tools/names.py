@@ -10,7 +10,6 @@ only.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import re
 import sys
@@ -116,13 +115,9 @@ def gate() -> int:
 
 def main() -> int:
     """Run the check; return the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("package", nargs="?", type=Path, default=ROOT / "magbridge")
-    parser.add_argument("--gate", action="store_true")
-    options = parser.parse_args()
-    if options.gate:
+    if "--gate" in sys.argv:
         return gate()
-    findings = check(options.package)
+    findings = check(Path(sys.argv[1]) if sys.argv[1:] else ROOT / "magbridge")
     for kind in findings:
         print(*findings[kind], sep="\n")
     print(", ".join(f"{len(found)} {kind}" for kind, found in findings.items()), file=sys.stderr)

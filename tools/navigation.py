@@ -150,7 +150,6 @@ STUDIES = {
         {
             "right and valid": Column("right", np.mean, ".1%"),
             "wrong and valid": Column("wrong", np.mean, ".1%"),
-            "95 % of runs": Column("wrong", percentile(95), ".1%"),
         },
     ),
     "dived": Study(
@@ -158,7 +157,6 @@ STUDIES = {
         ("map",),
         {
             "error, m: median": Column("error", form=".0f"),
-            "90 %": Column("error", percentile(90), ".0f"),
             "maximum": Column("error", np.max, ".0f"),
             "NEES/2": Column("nees"),
             "valid": Column("valid", np.mean, ".0%"),

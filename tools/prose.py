@@ -9,7 +9,6 @@ matches. Standard library only.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import io
 import re
@@ -147,14 +146,10 @@ def gate() -> int:
 
 def main() -> int:
     """Run the check; return the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("paths", nargs="*", type=Path)
-    parser.add_argument("--gate", action="store_true")
-    options = parser.parse_args()
-    if options.gate:
+    if "--gate" in sys.argv:
         return gate()
     total = words = 0
-    for path in options.paths:
+    for path in map(Path, sys.argv[1:]):
         for file in [path] if path.is_file() else sorted([*path.rglob("*.md"), *path.rglob("*.py")]):
             count, findings = check(file)
             for line, rule, text, advice in findings:

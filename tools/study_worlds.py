@@ -17,21 +17,18 @@ import xarray as xr
 from scipy.spatial.distance import cdist
 from studies import Column, percentile
 
+from magbridge import Calibration, fit, observations, reference_field
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.igrf import igrf
-from magbridge.field.reference import reference_field
-from sitl import Twin, load, segments, simulate
+from sitl import Scenario, Twin, load, segments, simulate
 from sitl.dataset import at_rest, channels, corrected
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
-from sitl.scenario import Scenario
 
 MASSES = ("battpos", "ballast")
 NOISES = {"1 nT white": (1.0, 0.0), "5 nT AR(1)": (5.0, 10.0)}

@@ -16,15 +16,12 @@ from scipy.stats import chi2
 from studies import Row
 from study_worlds import MASSES, METHODS, true_field
 
+from magbridge import Correction, correct_rows, fit, observations, read_grid
 from magbridge.arrays import BoolArray, FloatArray, IntArray
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.correction import Correction
 from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree, offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.deadreckoning import DeadReckoning
@@ -33,7 +30,6 @@ from magbridge.navigate.model import Block, Collector, block_length
 from magbridge.navigate.navigator import Navigator
 from magbridge.navigate.options import NavigationOptions, at_depth, informed
 from magbridge.navigate.own_survey import localise
-from magbridge.rows import correct_rows
 from sitl import Twin, load, segments, simulate
 from sitl.dataset import at_rest
 from sitl.signals import autoregressive

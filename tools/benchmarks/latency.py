@@ -32,8 +32,7 @@ from magbridge.arrays import FloatArray
 from magbridge.logs import write
 from magbridge.mavlink import Codec, spec
 from magbridge.sensors import open_driver
-from sitl.scenario import load
-from sitl.twin import simulate
+from sitl import load, simulate
 
 ECHO = """
 import os, select, socket, sys

@@ -11,14 +11,11 @@ from benchmarks.row import Row, in_own_process, processor_time
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
+from magbridge import fit, observations, save, write
 from magbridge.calibration.correct import CORRECTED_AT_ONCE, correct
-from magbridge.calibration.file import save
-from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.terms import full_order
 from magbridge.estimation.residual import residuals_of
-from magbridge.logs import write
 from sitl import load, segments, simulate
 from sitl.mission import CrissCross
 
@@ -31,7 +28,7 @@ NIGHTLY, MONTHLY = 10.0, 1.0
 FITTED = """
 import json, resource, sys, time
 from benchmarks.offline import many
-from magbridge.calibration.fitting.fit import fit
+from magbridge import fit
 data = many(int(sys.argv[1]))
 begun = time.process_time()
 fit(data)
@@ -48,8 +45,7 @@ long_survey(Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3]))
 DIAGNOSED = """
 import json, resource, sys, time
 from pathlib import Path
-from magbridge import load, read
-from magbridge.diagnose.run import diagnose
+from magbridge import diagnose, load, read
 folder = Path(sys.argv[1])
 survey, calibration = read(folder / "survey.nc"), load(folder / "calibration.json")
 begun = time.monotonic()

@@ -13,15 +13,12 @@ import numpy as np
 import xarray as xr
 from effects import EFFECTS, FOREIGN
 
+from magbridge import Calibration, fit, observations, reference_field
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.correct import regressors
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration
 from magbridge.diagnose.problem import floor
 from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate
 from sitl.inject import HiddenEffect, disturb
 from sitl.mission import CrissCross, Spirals

@@ -176,10 +176,10 @@ def ideal(
     Returns
     -------
     dict
-        Probabilities: ``alone``, only the truth is named; ``inside``, the set of names has the truth;
-        ``first``, each cause is named first. ``size``: mean size of the set. ``half``, ``sure``:
-        signal-to-noise ratio of 50 and 95 % detection. ``here``: p-value in this log's noise for each of
-        :data:`SIZES`. ``left``: signal-to-noise ratio that each cause's best hypotheses leave.
+        Probabilities: ``alone``, only the truth is named; ``inside``, the set of names has the truth.
+        ``half``, ``sure``: signal-to-noise ratio of 50 and 95 % detection. ``here``: p-value in this log's
+        noise for each of :data:`SIZES`. ``left``: signal-to-noise ratio that each cause's best hypotheses
+        leave.
     """
     name = EQUIVALENT.get(hidden.hidden.name, hidden.hidden.name)
     spans, S, noise = information(hidden, background, ds)
@@ -195,8 +195,6 @@ def ideal(
     return {
         "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * bool(own),
         "inside": float(np.mean(inside[me])) * bool(own),
-        "size": float(np.mean(inside.sum(axis=0))),
-        "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
         **found_at(p_values(draws, tests, look_elsewhere)),
         "here": np.median(p_values(Draws(S, noise), tests, look_elsewhere), axis=1).tolist(),
         "left": left_by_causes(draws, competing),
