@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from math import nan, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 from magbridge.link.output import Announcer, Timers
 from magbridge.mavlink import Message, spec
@@ -15,15 +15,29 @@ from magbridge.mavlink.messages import MESSAGES
 __all__ = ["VehicleClock", "VehicleState"]
 
 CLOCK_EXCHANGES = 32
-"""Number of the latest TIMESYNC exchanges in the fit."""
+"""Number of the latest TIMESYNC exchanges in the fit, and of earlier blocks of as many exchanges, of each of
+which the fit keeps the fastest: 17 minutes at one exchange a second."""
 JITTER_US = 200.0
 """Standard deviation of the offset from the fastest exchange, µs."""
+WANDER, DRIFT_SIGMA = 1e-6, 1e-4
+"""Error of the line at an earlier exchange for each µs of age, and prior 1-sigma of the drift, µs/µs."""
+EXCESS_SIGMA = 0.5 * CLOCK_EXCHANGES**0.5
+"""Standard deviation of an offset for each µs by which its round trip exceeds the fastest. Half of the excess
+is the error of one exchange; a queue in one direction is common to a whole block."""
 STEP_US, DRIFT = 20_000, 500e-6
-"""Thresholds (µs, µs/µs) for a clock that was set: two offsets differ by more than half of both round trips,
-plus STEP_US, plus DRIFT times the time between the exchanges."""
+"""Thresholds (µs, µs/µs) for a clock that was set: an offset differs from the line by more than half of both
+round trips, plus STEP_US, plus DRIFT times the time since the last exchange."""
 SPAN_US = 10_000_000
 """Shortest time from the first to the last exchange for an estimate of the drift, µs."""
 PENDING = 8
+
+
+class Exchange(NamedTuple):
+    """TIMESYNC exchange: middle of the round trip on the bridge's clock, offset, and round trip, µs."""
+
+    middle_us: int
+    offset_us: int
+    trip_us: int
 
 
 class VehicleClock:
@@ -35,9 +49,12 @@ class VehicleClock:
     -----
     An exchange sent at ``ts``, answered with the vehicle's ``tc`` and received at ``tr`` gives
     ``offset = tc - (ts + tr) / 2``, with an error of at most half the round trip ``tr - ts``. An exchange
-    slower than the fastest recent one was delayed in an unknown direction. So a straight line is fitted to
-    the last exchanges with the weights ``1 / sigma^2``, where ``sigma = JITTER + (rtt - min rtt) / 2``
-    (Cristian, 1989, uses only the fastest exchange).
+    slower than the fastest one was delayed in an unknown direction (Cristian, 1989, uses only the fastest
+    exchange). So a straight line is fitted with the weights ``1 / sigma^2``, where
+    ``sigma = JITTER + EXCESS_SIGMA * (trip - min trip) + WANDER * age``. A link may be slow for minutes, as
+    when a radio is full. So the fastest exchange of each earlier block stays in the fit. The stated sigma
+    also counts the scatter about the line, and an error of the fastest exchange uniform in half its round
+    trip.
     """
 
     def __init__(self) -> None:
@@ -46,9 +63,12 @@ class VehicleClock:
     def reset(self) -> None:
         """Discard all exchanges and the estimate, because the vehicle's clock restarted or was set."""
         self._asked: deque[int] = deque(maxlen=PENDING)
-        self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=CLOCK_EXCHANGES)
+        self._exchanges: deque[Exchange] = deque(maxlen=CLOCK_EXCHANGES)
+        self._fastest: deque[Exchange] = deque(maxlen=CLOCK_EXCHANGES)
+        self._count = 0
         self._base_us = self._middle_us = 0
         self._offset, self._slope = 0.0, 0.0
+        self._span_us = 0
         self.sigma = nan
 
     @property
@@ -59,7 +79,7 @@ class VehicleClock:
     @property
     def drift_ppm(self) -> float:
         """Rate error of the vehicle's clock against the bridge's, ppm, positive if fast; NaN if unknown."""
-        return self._slope * 1e6 if self._slope else nan
+        return self._slope * 1e6 if self._span_us >= SPAN_US else nan
 
     def ask(self, now_us: int) -> int:
         """Record a TIMESYNC request sent at `now_us` (µs); return its field ``ts1`` (ns)."""
@@ -77,33 +97,48 @@ class VehicleClock:
         sent_us = ts1 // 1000
         trip_us = now_us - sent_us
         middle_us = sent_us + trip_us // 2
-        offset_us = tc1 // 1000 - middle_us
+        new = Exchange(middle_us, tc1 // 1000 - middle_us, trip_us)
         if self.known:
-            then_us, was_us, fastest_us = min(self._exchanges, key=lambda one: one[2])
-            allowed_us = STEP_US + (trip_us + fastest_us) / 2 + DRIFT * (middle_us - then_us)
-            if abs(offset_us - was_us) > allowed_us:
+            fastest_us = min(one.trip_us for one in self._exchanges)
+            allowed_us = STEP_US + (trip_us + fastest_us) / 2 + DRIFT * (middle_us - self._middle_us)
+            if abs(new.offset_us - self.offset_us(middle_us)) > allowed_us:
                 self.reset()
-        self._exchanges.append((middle_us, offset_us, trip_us))
+        if len(self._exchanges) == CLOCK_EXCHANGES:
+            self._keep_fastest(self._exchanges[0])
+        self._exchanges.append(new)
         self._fit()
 
+    def _keep_fastest(self, old: Exchange) -> None:
+        """Keep an exchange that leaves the latest ones if it is the fastest of its block."""
+        if self._count % CLOCK_EXCHANGES == 0:
+            self._fastest.append(old)
+        elif old.trip_us < self._fastest[-1].trip_us:
+            self._fastest[-1] = old
+        self._count += 1
+
     def _fit(self) -> None:
-        fastest = min(trip for _, _, trip in self._exchanges)
-        self._middle_us, self._base_us, _ = self._exchanges[-1]
-        s = sx = sy = sxx = sxy = 0.0
-        for middle, offset, trip in self._exchanges:
+        exchanges = (*self._fastest, *self._exchanges)
+        fastest = min(one.trip_us for one in exchanges)
+        self._middle_us, self._base_us, _ = exchanges[-1]
+        self._span_us = self._middle_us - exchanges[0].middle_us
+        # weighted sums of the normal equations, with the prior of the drift; x, y from the last exchange
+        s = sx = sy = sxy = syy = 0.0
+        sxx = DRIFT_SIGMA**-2
+        for middle, offset, trip in exchanges:
             x, y = float(middle - self._middle_us), float(offset - self._base_us)
-            weight = (JITTER_US + (trip - fastest) / 2) ** -2
+            weight = (JITTER_US + EXCESS_SIGMA * (trip - fastest) + WANDER * abs(x)) ** -2
             s += weight
             sx += weight * x
             sy += weight * y
             sxx += weight * x * x
             sxy += weight * x * y
+            syy += weight * y * y
         determinant = s * sxx - sx * sx
-        self._slope = 0.0
-        if self._middle_us - self._exchanges[0][0] >= SPAN_US and determinant > 0.0:
-            self._slope = (s * sxy - sx * sy) / determinant
-        self._offset = (sy - self._slope * sx) / s
-        self.sigma = sqrt(1.0 / s) * 1e-6
+        self._slope = (s * sxy - sx * sy) / determinant
+        self._offset = (sxx * sy - sx * sxy) / determinant
+        # chi^2 of the residuals, at least its expectation
+        square = max((syy - self._offset * sy - self._slope * sxy) / max(len(exchanges) - 2, 1), 1.0)
+        self.sigma = sqrt(square * sxx / determinant + fastest * fastest / 12.0) * 1e-6
 
     def offset_us(self, t_us: int) -> float:
         """Return vehicle clock minus bridge clock (µs) at `t_us` of the bridge clock; 0 while unknown."""

@@ -141,9 +141,14 @@ def exchange(
     offset_us: float,
     slow: float = 300.0,
     drift_ppm: float = 0.0,
+    queue_us: float = 0.0,
 ) -> None:
-    """Update the clock with a request and its reply over a link with a random delay each way."""
+    """Update the clock with a request and its reply over a link with a random delay each way.
+
+    `queue_us`: further delay of the request.
+    """
     there, back = (slow + rng.expovariate(1 / 2000) for _ in range(2))
+    there += queue_us
     asked = clock.ask(now_us)
     vehicle_us = now_us + there + offset_us + drift_ppm * 1e-6 * (now_us - START)
     clock.answer(round(vehicle_us * 1000), asked, round(now_us + there + back))
@@ -163,6 +168,21 @@ def test_offset_through_jitter(drift_ppm: float) -> None:
     assert abs(errors[-1]) < 3000
     assert abs(clock.drift_ppm - drift_ppm) < 30
     assert clock.sigma < 1e-3
+
+
+@pytest.mark.parametrize("fast", [60, 0])
+def test_a_link_that_is_slow_one_way_for_minutes(fast: int) -> None:
+    """A full radio delays requests by up to 1.5 s: the earlier fast exchanges hold, and sigma is honest."""
+    rng, clock, offset, drift_ppm = random.Random(4), VehicleClock(), 3_000_000, 20.0
+    errors, normalised = [], []
+    for i in range(500):
+        now = START + 1_000_000 * i
+        exchange(clock, rng, now, offset, 300.0, drift_ppm, rng.uniform(3e5, 1.5e6) if i >= fast else 0.0)
+        if i >= 30:
+            errors.append(abs(clock.offset_us(now) - offset - drift_ppm * i))
+            normalised.append(errors[-1] * 1e-6 / clock.sigma)
+    assert max(errors) < (5_000 if fast else 500_000)
+    assert max(normalised) < 4.0
 
 
 def test_foreign_and_old_answers_are_ignored() -> None:
