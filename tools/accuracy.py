@@ -22,7 +22,7 @@ import xarray as xr
 from msgspec.structs import replace
 from scipy.optimize import least_squares
 from studies import Column, Row, Study, consistent
-from study_worlds import METHODS, NOISES, SCORES, BestFit, Glider, glider, true_field
+from study_worlds import METHODS, NOISES, SCORES, Glider, best_fit, glider, true_field
 
 from magbridge import fit, observations
 from magbridge.calibration.fitting.observations import Observations
@@ -66,7 +66,7 @@ def run(
     flown = glider(load("random_glider").replace(masses=names, instrument=instrument), seed, names)
     scores: dict[str, dict[str, Any]] = {method: calibrate(method, flown, names, seed) for method in methods}
     for at_sigma, name in ((0.5, "oracle"), (TAPE_SIGMA_M, "oracle, positions to 5 cm")) if oracles else ():
-        best = BestFit(flown.vehicle, flown.runs, flown.survey, sigma, memory, at_sigma)
+        best = best_fit(flown.vehicle, flown.runs, flown.survey, sigma, memory, at_sigma)
         scores[f"{name}: bound"] = {"ratio": rms(best.bound) / rms(best.floor)}
     if oracles:
         A, T = ellipsoid(flown.runs)

@@ -140,7 +140,8 @@ def case(entry: Row) -> Row:
     deployment = deployment_of(number, noise, entry.get("reference", "true"))
     background = Background.of(deployment, number, noise, entry["losses"])
     hidden = [background.hide(name, entry["wanted"], number + 7919 * k) for k, name in enumerate(names)]
-    whole = hidden[0].ds if len(hidden) == 1 else background.measure(*(one.hidden for one in hidden))
+    effects = tuple(one.hidden for one in hidden)
+    whole = hidden[0].ds if len(hidden) == 1 else deployment.measure(effects, number)
     ds = background.log(whole)
     removed = names if entry["part"] == "unknown" else ()
     table = {name: cause for name, cause in CAUSES.items() if name not in removed}
@@ -161,7 +162,7 @@ def case(entry: Row) -> Row:
     if entry["part"] in PREDICTED and names != ("outliers",):
         row["theory"] = [ideal(hidden[0], background, ds, result.outcome.look_elsewhere)]
     if entry["part"] == "charted":
-        row["gain"] = harm(tuple(one.hidden for one in hidden), background, ds, result)
+        row["gain"] = harm(effects, background, ds, result)
     return row
 
 

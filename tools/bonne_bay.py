@@ -14,11 +14,12 @@ diagnosed against the true field, the map continued down to the glider, and the 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 
 import numpy as np
 from studies import Column, Row, Study
 from study.deployment import CHARTS
-from study_worlds import MASSES, METHODS, PAPER, TRIALS, Trials, fly_trials, measure_trials, true_field
+from study_worlds import MASSES, PAPER, TRIALS, Trials, fly_trials, measure_trials, true_field
 
 from magbridge import diagnose, fit, observations
 from magbridge.estimation.residual import rms
@@ -29,27 +30,23 @@ FIRST_SEED = 29
 """Number of a simulated world whose errors are near the paper's."""
 
 
-def run(seed: int, at_depth: bool) -> list[Row]:
-    """Simulate one world; return a row for each trial and method, with the paper's values."""
+def run(seed: int, at_depth: bool) -> Iterator[Row]:
+    """Simulate one world; yield a row for each trial and method, with the paper's values."""
     flight = fly_trials(seed, at_depth=at_depth)
     survey = flight.parts["survey"]
-    reference_error = rms(survey["reference_field"].to_numpy() - true_field(survey))
-    rows: list[Row] = []
-    for trial in TRIALS:
-        for method in METHODS:
-            low, high = flight.scales.get((trial, method), (np.nan, np.nan))
-            paper_runs, paper_survey = PAPER.get((trial, method), (np.nan, np.nan))
-            rows.append(
-                {
-                    "trial": trial, "method": method,
-                    "failed": flight.failed.get((trial, method), ""),
-                    "runs": flight.rms(trial, trial, method), "paper_runs": paper_runs,
-                    "survey": flight.rms("survey", trial, method), "paper_survey": paper_survey,
-                    "low": low, "high": high, "map": reference_error,
-                    "signature": float(has_signature(flight)),
-                }
-            )  # fmt: skip
-    return rows
+    known = {"map": rms(survey["reference_field"].to_numpy() - true_field(survey))}
+    known["signature"] = float(has_signature(flight))
+    for (trial, method), fitted in flight.fits.items():
+        row: Row = {"trial": trial, "method": method}
+        if isinstance(fitted, str):
+            row["failed"] = fitted
+        else:
+            row["low"], row["high"] = fitted.scales
+        paper_runs, paper_survey = PAPER.get((trial, method), (np.nan, np.nan))
+        yield row | known | {
+            "runs": flight.rms(trial, trial, method), "paper_runs": paper_runs,
+            "survey": flight.rms("survey", trial, method), "paper_survey": paper_survey,
+        }  # fmt: skip
 
 
 def has_signature(flight: Trials) -> bool:
@@ -58,7 +55,7 @@ def has_signature(flight: Trials) -> bool:
     One ellipsoid has a large error, a parameterised fit is at least twice as good on its runs as on the
     survey, and trial 1's survey is worse than trial 2's.
     """
-    method = "auto" if any((trial, "cubic") in flight.failed for trial in TRIALS) else "cubic"
+    method = "auto" if any(isinstance(flight.fits[trial, "cubic"], str) for trial in TRIALS) else "cubic"
     runs, survey = ([flight.rms(part or trial, trial, method) for trial in TRIALS] for part in ("", "survey"))
     nominal = min(flight.rms(trial, trial, "nominal") for trial in TRIALS)
     is_worse_on_survey = all(after >= 2.0 * before for before, after in zip(runs, survey, strict=True))

@@ -141,27 +141,25 @@ def main() -> None:
     if sys.version_info < (3, 11):  # noqa: UP036 - users of an older version get a message
         sys.exit("magbridge needs Python 3.11 or newer")
     what, *arguments = sys.argv[1:] or ["help"]
-    if what == "demo":
-        install("analysis")
-        run(BIN / "magbridge", "demo", *arguments)
+    programs: dict[str, tuple[str | Path, ...]] = {
+        "demo": (BIN / "magbridge", "demo"),
+        "baseline": (BIN / "python", "tools/baseline.py"),
+        "bench": (BIN / "python", "tools/bench.py"),
+    }
+    if what in (*programs, "test", "check"):
+        install("analysis" if what == "demo" else "dev")
+    if what in programs:
+        run(*programs[what], *arguments)
     elif what == "test":
-        install("dev")
         run_tests(BIN / "python", *arguments)
     elif what == "check":
-        install("dev")
         for command in CHECKS:
             run(BIN / command[0], *command[1:])
         check_collection()
-    elif what == "baseline":
-        install("dev")
-        run(BIN / "python", "tools/baseline.py", *arguments)
     elif what == "stations":
         install_stations()
     elif what == "size":
         run(sys.executable, "tools/size.py")
-    elif what == "bench":
-        install("dev")
-        run(BIN / "python", "tools/bench.py", *arguments)
     else:
         sys.exit(__doc__)
 

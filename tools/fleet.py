@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 import xarray as xr
 from studies import Row, Study, in_order, show
-from study_worlds import MASSES, SCORES, BestFit, Glider
+from study_worlds import MASSES, SCORES, Glider, best_fit
 
 from magbridge import Calibration, fit, observations
 from magbridge.arrays import FloatArray
@@ -130,7 +130,7 @@ def run(flight: Flight, counts: tuple[int, ...], known: Known) -> Iterator[Row]:
             except CalibrationError as error:
                 yield row | {"failed": str(error)}
         if count:
-            best = BestFit(vehicle, part, survey, 1.0, widths=flight.widths())
+            best = best_fit(vehicle, part, survey, 1.0, widths=flight.widths())
             ratio = rms(best.bound) / rms(best.floor)
             yield {"runs": count, "prior": "bound", "vehicle": flight.vehicle, "ratio": ratio}
 

@@ -2,7 +2,7 @@
 
     python tools/fuzz.py mavlink digitizer -n 1000000 -o fuzz
     python tools/fuzz.py --kind file --seconds 600 -o fuzz
-    python tools/fuzz.py bridge -n 2000           a million events with extreme values
+    python tools/fuzz.py bridge -n 500            a million events with extreme values
 
 The undamaged inputs come from magbridge's writers and the emulators. The tool changes bits, bytes and
 numbers, and moves, doubles or cuts off pieces. Input k of a seed is equal in every run. The output folder
@@ -23,7 +23,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from small import START, bridge_text, polynomial, small_bridge
+from small import START, aligned, bridge_text, polynomial, small_bridge
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
 
@@ -40,7 +40,7 @@ from magbridge.bridge.events import Event
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.run import FileServer
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.model import Boresight, CalibratedSensor, Parameter, Run
+from magbridge.calibration.model import CalibratedSensor, Parameter, Run
 from magbridge.field import read
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid
@@ -170,15 +170,9 @@ FLOATS = (
     float("nan"), float("inf"), float("-inf"), 0.0, -0.0, 1e-45, -1e-45, 3.4e38, -3.4e38, 1e30, 1.0, -1.0,
 )  # fmt: skip
 TEXTS = (
-    b"",
-    b"battpos",
-    b"\xff\xfe\x00\x01",
-    b"heading",
-    b"MB_LEARN_CMD",
-    b"MB_AGE_BATTPOS",
-    b"MB_R_FIELD",
-    b"\x00" * 8,
-)
+    b"", b"battpos", b"\xff\xfe\x00\x01", b"heading", b"MB_LEARN_CMD", b"MB_AGE_BATTPOS", b"MB_R_FIELD",
+    bytes(8),
+)  # fmt: skip
 CELLS = (
     "nan", "0", "-0", "1e-320", "1e308", "-1e308", "1e9", "inf", "-inf", "9" * 300, "-1", "4294967296", "",
 )  # fmt: skip
@@ -187,9 +181,17 @@ PLAUSIBLE = {
     "roll": 0.1, "pitch": -0.4, "yaw": 0.0, "vx": 0.4, "vy": 0.0, "vz": 0.0, "airspeed": 0.5,
     "groundspeed": 0.6, "autopilot": 3, "system_status": 4, "flags": 831, "target_system": 1,
     "target_component": 191, "tc1": 0, "frame_id": 20, "child_frame_id": 12, "param_index": -1,
-    "param_type": 9, "jamming_state": 1, "spoofing_state": 1, "z": 5.0,
+    "param_type": 9, "jamming_state": 1, "spoofing_state": 1, "z": 5.0, "lon": -579_000_000,
+    "longitude": -579_000_000,
 }  # fmt: skip
-BORESIGHT = Boresight((0.0, 0.0, 0.0), ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4)))
+MOVING: dict[str, Callable[[int], float]] = {
+    "lat": lambda step: 495_000_000 + 2 * step,
+    "latitude": lambda step: 495_000_000 + 2 * step,
+    "x": lambda step: 0.022 * step,
+    "time_boot_ms": lambda step: 50 * step,
+    "fix_type": lambda step: 1 if step // GPS_PERIOD % 2 else 3,
+}
+"""Plausible values of fields, and functions of the step that return them."""
 COMMANDS = 0, 400, 410, 511, 512, 520, 42424, 43003
 HANDLED = (
     "ATTITUDE", "AUTOPILOT_VERSION", "COMMAND_ACK", "COMMAND_INT", "COMMAND_LONG", "EKF_STATUS_REPORT",
@@ -214,10 +216,9 @@ def make_bridge(folder: Path, seed: int = 0) -> Pipeline:
     longitude, latitude = np.linspace(-58.2, -57.6, 61), np.linspace(49.2, 49.8, 61)
     anomaly = 100.0 * np.sin(longitude[None] * 90.0) * np.cos(latitude[:, None] * 70.0)
     write_grid(AnomalyGrid(longitude, latitude, anomaly), folder / "grid.nc")
-    battery = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
     more = BRIDGE.format(**VARIANTS[seed % len(VARIANTS)])
     publish = "MAG_FIELD", "MAG_RAW", "MAG_NAVIGATION", "HIGHRES_IMU"
-    return small_bridge(folder, publish, battery=battery, more=more, boresight=BORESIGHT)
+    return small_bridge(folder, publish, more=more, boresight=aligned(1e-4))
 
 
 def _number(code: str, rng: random.Random) -> float | int:
@@ -234,27 +235,12 @@ def _limits(code: str) -> tuple[int, int]:
     return (-(1 << size - 1), (1 << size - 1) - 1) if code.islower() else (0, (1 << size) - 1)
 
 
-def _plausible(name: str, step: int) -> float | None:
-    """Return a plausible value of the field `name` at a step, or None if no value is defined for it."""
-    if name in ("lat", "latitude"):
-        return 495_000_000 + 2 * step
-    if name in ("lon", "longitude"):
-        return -579_000_000
-    if name == "x":
-        return 0.022 * step
-    if name == "time_boot_ms":
-        return 50 * step
-    if name == "fix_type":
-        return 1 if step // GPS_PERIOD % 2 else 3
-    return PLAUSIBLE.get(name)
-
-
 def _frame(codecs: dict[tuple[int, int], Codec], rng: random.Random, step: int, extreme: float) -> bytes:
     """Return a valid frame in which a fraction `extreme` of the fields has an extreme value."""
     layout = spec(rng.choice(HANDLED) if rng.random() < 0.9 else rng.choice(ANY))
     values: dict[str, object] = {}
     for name, field in layout.fields.items():
-        value = _plausible(name, step)
+        value = MOVING[name](step) if name in MOVING else PLAUSIBLE.get(name)
         single = not field.count and field.code != "s"
         if value is not None and single and rng.random() >= extreme:
             low, high = _limits(field.code)
@@ -277,11 +263,7 @@ def _frame(codecs: dict[tuple[int, int], Codec], rng: random.Random, step: int, 
 
 def _line(step: int, rng: random.Random, extreme: float) -> bytes:
     """Return a sensor's line: a plausible reading, or with probability `extreme` one with extreme cells."""
-    cells = [
-        f"{rng.gauss(15_000.0, 50.0):.1f}",
-        f"{rng.gauss(2000.0, 50.0):.1f}",
-        f"{rng.gauss(47_600.0, 50.0):.1f}",
-    ]
+    cells = [f"{rng.gauss(mean, 50.0):.1f}" for mean in (15_000.0, 2000.0, 47_600.0)]
     cells += ["4.0", f"{step * 0.1:.1f}", str(step)]
     if rng.random() < extreme:
         for place in rng.sample(range(6), rng.randint(1, 6)):
@@ -319,14 +301,14 @@ def feed(bridge: Pipeline, files: FileServer, event: Event) -> None:
 
 
 def _bridge(folder: Path) -> Read:
-    """Return a function that feeds a bridge with 500 events of extreme values, which the bytes seed."""
+    """Return a function that feeds a bridge with 2,000 events, most of them extreme; the bytes seed them."""
 
     def read(data: bytes) -> object:
         OptionalParts.propagate = True
         seed = int.from_bytes(hashlib.sha256(data).digest()[:4], "big")
         bridge = make_bridge(folder, seed)
         files = FileServer(bridge.component.metadata, folder, lambda: 1e9, lambda _: None)
-        for event in events(500, seed):
+        for event in events(2000, seed):
             feed(bridge, files, event)
         files.close()
         return bridge

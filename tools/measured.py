@@ -170,12 +170,8 @@ def compare_halves(deployment: xr.Dataset) -> Iterator[Row]:
         data = observations(deployment, names)
         data = data.part(np.isin(data.time, late.time[known]))
         corrected = correct(found.calibration, data.field, data.parameters, data.time)
-        row = {
-            "method": label,
-            "parameters": " ".join(names),
-            "low": found.scales[0],
-            "high": found.scales[1],
-        }
+        low, high = found.scales
+        row = {"method": label, "parameters": " ".join(names), "low": low, "high": high}
         yield row | errors(corrected.total - data.reference, rms(corrected.sigma))
 
 

@@ -44,15 +44,9 @@ PERMANENT_NT, INDUCED_NT, EDDY_NT_S = 600.0, 60.0, 8.0
 NO_LAG_S = 1e-3
 """1-sigma of the lag, s: the simulation has none."""
 METHODS = (
-    "this fit",
-    "true priors",
-    "least squares",
-    "ridge",
-    "band-passed ridge",
-    "least squares, all",
-    "ridge, all",
-    "same half",
-)
+    "this fit", "true priors", "least squares", "ridge", "band-passed ridge", "least squares, all",
+    "ridge, all", "same half",
+)  # fmt: skip
 
 
 def flight(seed: int, hidden: bool) -> ScalarSeries:

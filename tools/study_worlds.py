@@ -1,13 +1,13 @@
 """Simulated worlds of the studies: random gliders with runs and a survey, and the paper's trials.
 
 The noise floor of a survey is the error of a calibration that knows the vehicle (:func:`oracle`);
-:class:`BestFit` and :func:`survey_bound` are Cramér-Rao bounds for the vehicle's true model.
+:func:`best_fit` and :func:`survey_bound` are Cramér-Rao bounds for the vehicle's true model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from studies import Column, percentile
 
 from magbridge import Calibration, fit, observations, reference_field
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
@@ -156,25 +156,21 @@ PAPER = {
 """The paper's errors on the calibration runs and on the survey, nT RMS (section 4 and Table 2)."""
 
 
-@dataclass(frozen=True)
-class Trials:
-    """Simulated deployment of the paper, and the results of each method.
+class Trials(NamedTuple):
+    """Simulated deployment of the paper: trial 1, survey and trial 2, and the fits by trial and method.
 
-    `parts` are trial 1, survey and trial 2; `corrected` (n,), nT, is by part, trial of the coefficients and
-    method. By trial and method, `failed` is the reason of a failure, and `scales` the smallest and the
-    largest scale of A on its runs: a fit with small scales has a small residual.
+    A refused fit is the text of its reason. A fit with small scales of A has a small residual.
     """
 
     parts: dict[str, xr.Dataset]
-    corrected: dict[tuple[str, str, str], FloatArray]
-    failed: dict[tuple[str, str], str]
-    scales: dict[tuple[str, str], tuple[float, float]]
+    fits: dict[tuple[str, str], Fit | str]
 
     def error(self, part: str, trial: str, method: str, against: str = "reference_field") -> FloatArray:
         """Return the error (n,), nT, of `method` with the coefficients of `trial`; NaN if the fit failed."""
-        known = self.parts[part][against].to_numpy()
-        found: FloatArray = self.corrected.get((part, trial, method), np.full(known.shape, np.nan))
-        return np.asarray(found - known)
+        known, fitted = self.parts[part][against].to_numpy(), self.fits[trial, method]
+        if isinstance(fitted, str):
+            return np.full(known.shape, np.nan)
+        return np.asarray(corrected(self.parts[part], fitted.calibration).total - known)
 
     def rms(self, part: str, trial: str, method: str) -> float:
         """Return the RMS of :meth:`error` against the reference, nT."""
@@ -202,20 +198,14 @@ def measure_trials(twin: Twin, *, at_depth: bool = False) -> dict[str, xr.Datase
 
 def fly_trials(seed: int, methods: Sequence[str] = tuple(METHODS), *, at_depth: bool = False) -> Trials:
     """Simulate the paper's deployment; calibrate it on both trials with each method."""
-    twin = Twin.draw(load("bonne_bay"), seed)
-    parts = measure_trials(twin, at_depth=at_depth)
-    total, failed, scales = {}, {}, {}
+    flown = Trials(measure_trials(Twin.draw(load("bonne_bay"), seed), at_depth=at_depth), {})
     for trial, method in product(TRIALS, methods):
-        used = () if method == "nominal" else MASSES
+        data = observations(flown.parts[trial], () if method == "nominal" else MASSES)
         try:
-            fitted = fit(observations(parts[trial], used), method, **METHODS[method])
+            flown.fits[trial, method] = fit(data, method, **METHODS[method])
         except CalibrationError as error:
-            failed[trial, method] = str(error)
-            continue
-        scales[trial, method] = fitted.scales
-        for part in (trial, "survey"):
-            total[part, trial, method] = corrected(parts[part], fitted.calibration).total
-    return Trials(parts, total, failed, scales)
+            flown.fits[trial, method] = str(error)
+    return flown
 
 
 def _on_row_times(deployment: xr.Dataset) -> xr.Dataset:
@@ -239,17 +229,29 @@ def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
     return np.asarray(np.linalg.norm(np.linalg.solve(D, (raw - T)[..., None])[..., 0], axis=1))
 
 
-class BestFit:
-    r"""Fit that reaches the Cramér-Rao bound, the least error that the calibration data allow.
+class Bound(NamedTuple):
+    """Standard deviation of the corrected total field, and of its noise alone (the floor), (n,) nT."""
+
+    bound: FloatArray
+    floor: FloatArray
+
+
+def best_fit(
+    vehicle: Vehicle,
+    calibration: xr.Dataset,
+    survey: xr.Dataset,
+    sigma: float,
+    memory: float = 0.0,
+    at_sigma: float = 0.05,
+    widths: FloatArray | None = None,
+) -> Bound:
+    r"""Return the Cramér-Rao bound, the least error that the calibration data allow, on a survey.
 
     `vehicle` is the truth: dipoles with a permanent moment, a three-axis induced moment and a position each.
     The prior is the distribution that such vehicles are drawn from, or `widths` (k,): 1-sigma of soft iron
     (9), hard iron (3, nT), and of each mass moment (3, A m²), volume (3, m³) and place (3, m). The masses'
     positions are known to `at_sigma`, m. `sigma` is the noise of a channel, nT, and `memory` the samples over
     which its correlation falls by e.
-
-    `bound` (n,), nT, is the standard deviation of the survey's corrected total field, noise included; `floor`
-    (n,), nT, that of the noise alone.
 
     Notes
     -----
@@ -260,29 +262,18 @@ class BestFit:
     noise's memory, the information is :math:`\sum \mathbf g \mathbf g^T` plus the prior's (Kay 1993,
     *Estimation Theory*, ch. 3 and 15).
     """
-
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        calibration: xr.Dataset,
-        survey: xr.Dataset,
-        sigma: float,
-        memory: float = 0.0,
-        at_sigma: float = 0.05,
-        widths: FloatArray | None = None,
-    ) -> None:
-        # θ in units of its prior's 1-sigma, so that the information is well scaled
-        scale = _widths(vehicle, at_sigma) if widths is None else widths
-        g, learned_floor = _sensitivity(vehicle, calibration, sigma)
-        # whiten the noise of consecutive samples; runs are independent
-        g = g / learned_floor[:, None] * scale
-        phi = np.exp(-1 / memory) if memory else 0.0
-        follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
-        g = np.where(follows, (g - phi * np.roll(g, 1, axis=0)) / np.sqrt(1 - phi**2), g)
-        covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
-        h, self.floor = _sensitivity(vehicle, survey, sigma)
-        h = h * scale
-        self.bound = np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + self.floor**2)
+    # θ in units of its prior's 1-sigma, so that the information is well scaled
+    scale = _widths(vehicle, at_sigma) if widths is None else widths
+    g, learned_floor = _sensitivity(vehicle, calibration, sigma)
+    # whiten the noise of consecutive samples; runs are independent
+    g = g / learned_floor[:, None] * scale
+    phi = np.exp(-1 / memory) if memory else 0.0
+    follows = (np.diff(calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
+    g = np.where(follows, (g - phi * np.roll(g, 1, axis=0)) / np.sqrt(1 - phi**2), g)
+    covariance = np.linalg.inv(g.T @ g + np.eye(len(scale)))
+    h, floor = _sensitivity(vehicle, survey, sigma)
+    h = h * scale
+    return Bound(np.sqrt(np.einsum("ni,ij,nj->n", h, covariance, h) + floor**2), floor)
 
 
 def survey_bound(
@@ -301,7 +292,7 @@ def survey_bound(
 
     Notes
     -----
-    As :class:`BestFit`, with crustal field and bias in the covariance K of the magnitudes:
+    As :func:`best_fit`, with crustal field and bias in the covariance K of the magnitudes:
     :math:`P = (I + G^T K^{-1} G)^{-1}`. Neighbouring samples are averaged: :data:`MAX_COVARIANCE_SAMPLES`
     remain.
     """

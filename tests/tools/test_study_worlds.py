@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from study_worlds import TRIALS, BestFit, Trials, fly_trials
+from study_worlds import TRIALS, Trials, best_fit, fly_trials
 
 from sitl import Twin, load, segments, simulate
 from sitl.mission import CrissCross, Spirals
@@ -56,11 +56,11 @@ def test_no_calibration_beats_the_noise_and_more_knowledge_helps(
     short_flight: tuple[Vehicle, xr.Dataset, xr.Dataset],
 ) -> None:
     vehicle, calibration, survey = short_flight
-    best = BestFit(vehicle, calibration, survey, 1.0)
+    best = best_fit(vehicle, calibration, survey, 1.0)
     assert np.all(best.bound > best.floor)
-    vague = BestFit(vehicle, calibration, survey, 1.0, at_sigma=0.5)
+    vague = best_fit(vehicle, calibration, survey, 1.0, at_sigma=0.5)
     assert np.all(vague.bound >= best.bound - 1e-9)
-    fewer = BestFit(vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
+    fewer = best_fit(vehicle, calibration.isel(time=slice(0, None, 2)), survey, 1.0)
     assert np.all(fewer.bound >= best.bound - 1e-9)
 
 
@@ -75,7 +75,7 @@ def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: p
         for name in ("calibration", "survey")
     )
     u, v = (field / np.linalg.norm(field, axis=1, keepdims=True) for field in (u, v))
-    best = BestFit(Vehicle(), parts["calibration"], parts["survey"], sigma=5.0)
+    best = best_fit(Vehicle(), parts["calibration"], parts["survey"], sigma=5.0)
     expected = 25.0 * (1 + np.einsum("ni,ij,nj->n", v, np.linalg.inv(u.T @ u), v))
     np.testing.assert_allclose(best.floor, 5.0)
     np.testing.assert_allclose(best.bound**2, expected, rtol=1e-6)

@@ -238,13 +238,9 @@ class Background(NamedTuple):
         e, J = compare(clean, deployment.calibration)
         return cls(deployment, number, noise, rows, e, whiten(J[rows], noise, rows))
 
-    def measure(self, *hidden: HiddenEffect) -> xr.Dataset:
-        """Return the log with hidden effects, without noise and lost samples."""
-        return self.deployment.measure(hidden, self.number)
-
     def show(self, hidden: HiddenEffect) -> Injected:
         """Return an effect with its signature and the log in which it is hidden."""
-        ds = self.measure(hidden)
+        ds = self.deployment.measure((hidden,), self.number)
         d = compare(ds, self.deployment.calibration)[0] - self.residual
         return Injected(hidden, whiten(d[self.rows], self.noise, self.rows), ds)
 

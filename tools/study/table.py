@@ -64,14 +64,13 @@ def chance(rows: Sequence[Row], key: str) -> str:
     return f"{100 * np.mean(values):.0f} %" if values else "-"
 
 
-def detection_curve(rows: Sequence[Row], size: FloatArray | float) -> FloatArray:
-    """Return the ideal detector's mean chance to find the rows' effects at a signal-to-noise."""
-    theory = [theory for row in rows for theory in row["theory"]]
-    if not theory:
-        return np.full(np.shape(size), np.nan)
-    half, sure = np.array([(one["half"], one["sure"]) for one in theory]).T
-    width = (sure - half) / norm.ppf(0.95)
-    return np.asarray(norm.cdf((np.asarray(size)[..., None] - half) / width).mean(axis=-1))
+def detection(rows: Sequence[Row], size: float) -> float:
+    """Return the ideal detector's mean chance to find the rows' effects at a signal-to-noise ratio."""
+    ends = np.array([(theory["half"], theory["sure"]) for row in rows for theory in row["theory"]])
+    if not len(ends):
+        return np.nan
+    half, sure = ends.T
+    return float(np.mean(norm.cdf((size - half) / (sure - half) * norm.ppf(0.95))))
 
 
 def needed_size(rows: Sequence[Row]) -> tuple[float, float, float] | None:
@@ -112,7 +111,7 @@ def lines(rows: Sequence[Row]) -> list[str]:
     single = of("ladder", "named", "gain", "loud")
     for size in sorted({row["wanted"] for row in single}):
         own = [row for row in single if row["wanted"] == size]
-        ideal = f"{100 * detection_curve(known, size):.0f} %"
+        ideal = f"{100 * detection(known, size):.0f} %"
         table.append((f"S/N {size:g}: found", ideal, share(own, "found")))
     if factor := needed_size(known):
         middle, low, high = (100 * (f - 1) for f in factor)
