@@ -53,11 +53,7 @@ BANK_DEG = 6.0
 
 
 def run(
-    masses: int,
-    noise: str,
-    seed: int,
-    methods: tuple[str, ...] = (*METHODS, TAPE),
-    oracles: bool = True,
+    masses: int, noise: str, seed: int, methods: tuple[str, ...] = (*METHODS, TAPE), oracles: bool = True
 ) -> Iterator[Row]:
     """Simulate a glider with some moving masses, calibrate by every method, and score on the survey."""
     sigma, memory = NOISES[noise]

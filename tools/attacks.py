@@ -232,7 +232,6 @@ def main() -> int:
                     worst += fails
                     row = (f"{lost:.1%}", f"{out:.1%}", f"{got / 1e3:.1f} kB", reported + " FAILS" * fails)
                     shown.add_row(attack.name, link, *row)
-                    print(attack.name, *row, sep=" | ", flush=True)
                 if any(KEY[::-1][:6] in path.read_bytes() for path in rig.logs):
                     worst += 1
                     shown.add_row("the key that was sent is in the log: FAILS", link, "", "", "", "")

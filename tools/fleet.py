@@ -20,9 +20,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import xarray as xr
 from studies import Row, Study, in_order, show
-from study_worlds import MASSES, SCORES, Glider, best_fit
+from study_worlds import MASSES, SCORES, Glider, best_fit, glider
 
 from magbridge import Calibration, fit, observations
 from magbridge.arrays import FloatArray
@@ -33,8 +32,7 @@ from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.fleet.hierarchy import FLEET_LEVELS
 from magbridge.fleet.learn import Lesson, learn_fleet
-from sitl import load, segments, simulate
-from sitl.dataset import at_rest
+from sitl import load
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
 
 REFITTED = {"fixed iron": 50.0, "soft iron": 1e-3, "place": 0.005, "moment": 0.1}
@@ -75,13 +73,10 @@ class Flight(NamedTuple):
             mass=mass,
         )
 
-    def fly(self) -> tuple[xr.Dataset, xr.Dataset, Vehicle]:
-        """Return calibration runs and survey, both without samples of moving masses, and the vehicle."""
-        vehicle = self.state()
-        scenario = load("random_glider").replace(vehicle=vehicle, masses=MASSES)
-        seed = OFFSET * (1 + self.seed) + 1000 * self.vehicle + self.number
-        parts = segments(simulate(scenario, seed))
-        return at_rest(parts["calibration"], MASSES), at_rest(parts["survey"], MASSES), vehicle
+    def fly(self) -> Glider:
+        """Return the vehicle with its calibration runs and its survey."""
+        scenario = load("random_glider").replace(vehicle=self.state(), masses=MASSES)
+        return glider(scenario, OFFSET * (1 + self.seed) + 1000 * self.vehicle + self.number)
 
     def widths(self) -> FloatArray:
         """Return the 1-sigma (k,) of the vehicle's changes since its last state, by a refit or a power-up."""
@@ -99,7 +94,7 @@ class Flight(NamedTuple):
 
 def lesson(flight: Flight) -> Lesson | str:
     """Return the fit of a deployment as input of the fleet's prior, or the reason of its failure."""
-    runs, _, _ = flight.fly()
+    runs = flight.fly().runs
     try:
         found = fit(observations(runs, MASSES))
     except CalibrationError as error:
@@ -116,10 +111,10 @@ def lesson(flight: Flight) -> Lesson | str:
 
 def run(flight: Flight, counts: tuple[int, ...], known: Known) -> Iterator[Row]:
     """Calibrate a vehicle's last deployment with some of its runs, each with and without the prior."""
-    runs, survey, vehicle = flight.fly()
-    flown, labels = Glider(vehicle, runs, survey), np.unique(runs["run"])
+    flown = flight.fly()
+    label = flown.runs["run"].to_numpy()
     for count in counts:
-        part = runs.isel(time=np.isin(runs["run"], labels[:count]))
+        part = flown.runs.isel(time=np.isin(label, np.unique(label)[:count]))
         for name, prior in {"none": None, "fleet": known}.items():
             if not count and prior is None:
                 continue
@@ -130,7 +125,7 @@ def run(flight: Flight, counts: tuple[int, ...], known: Known) -> Iterator[Row]:
             except CalibrationError as error:
                 yield row | {"failed": str(error)}
         if count:
-            best = best_fit(vehicle, part, survey, 1.0, widths=flight.widths())
+            best = best_fit(flown.vehicle, part, flown.survey, 1.0, widths=flight.widths())
             ratio = rms(best.bound) / rms(best.floor)
             yield {"runs": count, "prior": "bound", "vehicle": flight.vehicle, "ratio": ratio}
 

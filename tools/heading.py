@@ -93,8 +93,7 @@ def simulated(name: str, seed: int) -> Iterator[Row]:
     else:
         corner = CUTOFF_HZ if name == "gliders, filter" else 0.0
         scenario = load("random_glider").replace(telemetry=exact, instrument={"corner": corner})
-        flown = glider(scenario, seed)
-        learned, survey = flown.runs, flown.survey
+        _, learned, survey = glider(scenario, seed)
     offset_deg = RUN_OFFSET_DEG if name == "gliders, tilt offsets" else 0.0
     level = survey  # without errors of roll and pitch
     learned, survey = (with_tilt_errors(log, rng, offset_deg) for log in (learned, survey))

@@ -177,15 +177,11 @@ STUDY = Study(
 )  # fmt: skip
 
 
-SUMMARY = Study(
-    run, ("foreign",),
-    {
-        "found": Column("found", np.sum, ".0f"), "right first": Column("right", np.sum, ".0f"),
-        "in the set": Column("in_set", np.sum, ".0f"), "alone": Column("alone", np.sum, ".0f"),
-        "a second name": Column("second", np.sum, ".0f"), "a name": Column("a_name", np.sum, ".0f"),
-        "later part worse by more than 2 %": Column("worse", np.sum, ".0f"),
-    },
-)  # fmt: skip
+COUNTS = {
+    "found": "found", "right first": "right", "in the set": "in_set", "alone": "alone",
+    "a second name": "second", "a name": "a_name", "later part worse by more than 2 %": "worse",
+}  # fmt: skip
+SUMMARY = Study(run, ("foreign",), {name: Column(source, np.sum, ".0f") for name, source in COUNTS.items()})
 
 
 if __name__ == "__main__":

@@ -177,9 +177,7 @@ def compare_halves(deployment: xr.Dataset) -> Iterator[Row]:
 
 def errors(error: FloatArray, sigma: float) -> Row:
     """Return the RMS and median of an error (n,), nT, and the claimed `sigma` over the RMS."""
-    return {
-        "rms": rms(error), "median": float(np.median(np.abs(error))), "claimed": sigma / rms(error),
-    }  # fmt: skip
+    return {"rms": rms(error), "median": float(np.median(np.abs(error))), "claimed": sigma / rms(error)}
 
 
 def has_known_direction(late: Observations, early: Observations) -> BoolArray:

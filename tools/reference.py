@@ -164,17 +164,12 @@ def columns() -> Iterator[str]:
 
 def python() -> str:
     """Return the Markdown page of the public Python names."""
-    from magbridge import __all__ as names  # noqa: PLC0415
+    import magbridge  # noqa: PLC0415
 
-    public = (name for name in names if not name.startswith("_") and name != "plot")
+    public = (name for name in magbridge.__all__ if not name.startswith("_") and name != "plot")
+    entries = (f"::: magbridge.{magbridge._HOMES[name]}.{name}\n" for name in public)  # noqa: SLF001
     header = "::: magbridge\n    options: {members: false}\n"
-    return "\n".join(("# Python", "", header, *map(_entry, public), "::: magbridge.plot\n"))
-
-
-def _entry(name: str) -> str:
-    from magbridge import _HOMES  # noqa: PLC0415 - where each name is defined
-
-    return f"::: magbridge.{_HOMES[name]}.{name}\n"
+    return "\n".join(("# Python", "", header, *entries, "::: magbridge.plot\n"))
 
 
 def messages() -> Iterator[str]:

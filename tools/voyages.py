@@ -42,9 +42,7 @@ HOUR = 3600.0
 SPEEDS = (0.35, 0.25, 0.5)
 """Speeds of successive runs, m/s."""
 GLIDER = NavigationOptions(current_sigma=0.05, bias_sigma=0.5, bias_time=1800.0, map_sigma=1.0, interval=40.0)
-"""Options for a glider with an `auto` calibration, which leaves a slow error of 0.5 nT (tools/accuracy.py).
-
-It moves 14 m in 40 s: less than 2 % of any correlation length here."""
+"""Options for a glider, which moves 14 m in 40 s: less than 2 % of any correlation length here."""
 OUTSIDE = float(chi2.ppf(0.9999, 2))
 """Squared Mahalanobis distance of the 99.99 % ellipse, beyond which the filter is wrong."""
 
