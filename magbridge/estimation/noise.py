@@ -27,8 +27,8 @@ OUTLIER_SIGMA = 5.0
 million samples."""
 CLIP_SIGMA = 3.0
 """Robust standard deviations at which residuals are clipped before the autocorrelation is estimated."""
-MIN_SLOW_AUTOCORRELATION = 0.2
-"""Smallest autocorrelation of neighbours at which noise may have a slow and a white part."""
+SHORT_MEMORY = 0.2
+"""Smallest autocorrelation of the slow part with which its search begins."""
 MIN_LOG_LIKELIHOOD_GAIN = 5.0
 """Gain in log likelihood that a white part must bring over an AR(1) process alone."""
 MAX_AUTOCORRELATION = 0.99
@@ -239,13 +239,12 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> N
     """Return the noise as a slow and a white part, if that is likelier than the given AR(1) process.
 
     The correlation time of noise is a property of the sensor. At a high sampling rate, the slow part of
-    neighbours is nearly equal. An AR(1) process alone then underestimates the slow or the white part.
+    neighbours is nearly equal. An AR(1) process alone then underestimates the slow or the white part. A small
+    slow part in white noise of many samples hardly shows in neighbours, but it limits the mean.
 
     `e` (n,): Residuals, nT. `steps` (n,): sampling intervals since the previous sample. `noise`: the result
     of :func:`estimate_noise`.
     """
-    if noise.autocorrelation < MIN_SLOW_AUTOCORRELATION:
-        return noise
     e, rho = _clipped(e), noise.autocorrelation
     longest = float(np.isfinite(steps).sum()) + 2.0
 
@@ -260,7 +259,7 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> N
         return float(np.exp(-np.exp(-x[0]))), float(1.0 / (1.0 + np.exp(-x[1])))
 
     bounds = [(np.log(1.0), np.log(longest)), (-12.0, 6.0)]
-    starts = ((-1.0 / np.log(rho), 0.05), (longest / 20.0, 0.3))
+    starts = ((-1.0 / np.log(max(rho, SHORT_MEMORY)), 0.05), (longest / 20.0, 0.3))
     answers = [
         minimize(
             lambda x: negative_log_likelihood(*shape(x)), np.log(start), method="L-BFGS-B", bounds=bounds

@@ -104,6 +104,19 @@ def test_a_slow_part_is_believed_only_where_it_is_likelier() -> None:
     assert again.sigma == pytest.approx(80.0**0.5, rel=0.15)
 
 
+def test_a_small_slow_part_is_found_where_neighbours_hardly_show_it() -> None:
+    """10 samples a second: 0.4 nT over 100 s in 1 nT of white noise."""
+    n, rho = 10 * N, np.exp(-1e-3)
+    rng, steps = np.random.default_rng(3), np.r_[np.inf, np.ones(n - 1)]
+    slow = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, 0.4, n))
+    e = slow + rng.normal(0.0, 1.0, n)
+    neighbours = estimate_noise(e, steps, 0.0)
+    assert neighbours.autocorrelation < 0.2
+    found = fit_slow_and_white(e, steps, neighbours)
+    assert -0.1 / np.log(found.autocorrelation) == pytest.approx(100.0, rel=0.6)
+    assert found.white == pytest.approx(1.0 / 1.16, abs=0.05)
+
+
 def test_correlation_of_many_runs_needs_memory_that_is_linear_in_the_samples() -> None:
     runs = 40_000 // 100
     values = np.vstack([drawn(0.8, seed=k)[:100, None] for k in range(runs)])
