@@ -102,11 +102,13 @@ class Guarded:
             while not self._received[k]:
                 self._receive()
             done, piece = self._received[k].popleft()
-            if isinstance(piece, Exception):
-                raise piece
-            if done:
+            if not done:
+                yield piece
+            elif piece is None:
                 return
-            yield piece
+            else:
+                rebuild, arguments = piece
+                raise rebuild(*arguments)
 
     def close(self) -> None:
         """End the child process."""
@@ -123,7 +125,7 @@ class Guarded:
             done, piece = self._child.receive(job)
         except FormatError as error:
             self.close()
-            done, piece = True, error.with_traceback(None)
+            done, piece = True, error.__reduce__()[:2]
         self._received[self._current].append((done, piece))
         self._current += done
         if self._current == len(self._jobs):
@@ -196,7 +198,7 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
 
 
 def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
-    """Read files in the child; send (False, object) for each object, then (True, None) or (True, error)."""
+    """Read files in the child; send (False, object) for each, then (True, None or an error's parts)."""
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # HDF5 and dbdreader print messages
@@ -214,7 +216,7 @@ def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
             except BrokenPipeError:
                 raise
             except (MagbridgeError, OSError) as error:
-                end.send((True, error))  # without its causes, which pickle leaves out
+                end.send((True, error.__reduce__()[:2]))  # its causes may not be picklable
     except BrokenPipeError:  # the parent has stopped reading
         pass
 

@@ -118,7 +118,10 @@ class Catalogue(ABC):
         WriteError: the disk is full, or the folder may not be written to. PortError: the server does not
         answer, or rejects the rows.
         """
-        keyed = {_key(row): {name: row[name] for name in CATALOGUE_TABLES[table]} for row in rows}
+        keyed = {}
+        for row in rows:
+            content = msgspec.json.encode(row, order="sorted", enc_hook=plain)
+            keyed[sha256(content).hexdigest()] = {name: row[name] for name in CATALOGUE_TABLES[table]}
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0
 
     def add_tables(self, tables: Mapping[str, Iterable[Row]]) -> int:
@@ -253,7 +256,3 @@ def open_catalogue(location: str | Path, results: Path | None = None, *, create:
     except ImportError:
         raise MissingExtra("psycopg", "postgres") from None
     return PostgresCatalogue(str(location), results or Path("fleet-results"), create=create)
-
-
-def _key(row: Row) -> str:
-    return sha256(msgspec.json.encode(row, order="sorted", enc_hook=plain)).hexdigest()
