@@ -30,10 +30,10 @@ sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
 import grids
 import numpy as np
 import xarray as xr
-from flash import Log
-from segments import segment
+from log_files import Log
+from log_files import segment
 from studies import command_line, show, table
-from ulogs import ulog_of
+from log_files import ulog_of
 
 from magbridge import MagbridgeError, config, logs
 from magbridge.bridge.events import Event

@@ -7,7 +7,7 @@ from itertools import count, pairwise
 
 import pytest
 from checks import replays
-from ears import Ear, ftp
+from devices import Ear, ftp
 from rig import Rig
 
 from magbridge.link.files import FTP_HEADER, Opcode

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from checks import soon
 from devices import serial_line, udp_socket
-from standstill import standstill
+from machine import standstill
 
 from magbridge.bridge.devices import SerialPort
 from magbridge.bridge.events import HostClock, LiveEdge

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Command
-from flash import Log
+from log_files import Log
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
-from disks import full_disk
+from machine import full_disk
 
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from commands import Command
 from demos import demo
-from disks import full_disk
+from machine import full_disk
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save

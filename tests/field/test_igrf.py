@@ -8,7 +8,7 @@ import numpy as np
 import ppigrf
 import pytest
 import xarray as xr
-from pace import cost
+from machine import cost
 
 from magbridge.errors import OutOfRange
 from magbridge.field import igrf as module

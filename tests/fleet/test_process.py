@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Command
-from disks import full_disk
 from fleets import catalogue_of, content, fly
+from machine import full_disk
 
 from magbridge.calibration.file import decode_calibration, load
 from magbridge.errors import WriteError

@@ -9,8 +9,6 @@ import pytest
 
 from magbridge.cli import main
 
-__all__ = ["Command", "Output"]
-
 
 class Output(NamedTuple):
     """Text that a command printed to stdout and stderr."""

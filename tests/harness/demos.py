@@ -14,8 +14,6 @@ from magbridge.calibration.model import Calibration
 from sitl import load, simulate
 from sitl.dataset import segments
 
-__all__ = ["MASSES", "Demo", "demo", "demo_log"]
-
 MASSES = ("battpos", "ballast")
 
 

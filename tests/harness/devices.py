@@ -1,4 +1,4 @@
-"""Simulated devices at the two ends of a bridge: a fluxgate on a pty and an autopilot on a socket or pty."""
+"""Simulated devices at the ends of a bridge: a fluxgate on a pty, an autopilot, and a ground station."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from magbridge.mavlink import Codec, Message
+from magbridge.link.files import FTP_HEADER
+from magbridge.mavlink import Codec, Message, Signing
 from magbridge.records import Reading
 from sitl.fluxgate import open_encoder
 
@@ -276,3 +277,32 @@ class Autopilot:
                 return
             self._peer = peer or self._peer
             yield from self._ear.parse(data)
+
+
+def ftp(opcode: int, data: bytes, sequence: int, size: int = 0, offset: int = 0) -> dict[str, object]:
+    """Return the fields of an FTP request to the bridge."""
+    header = FTP_HEADER.pack(sequence, 0, opcode, size or len(data), 0, 0, offset)
+    return {"target_system": 1, "target_component": 191, "payload": (header + data).ljust(251, b"\0")}
+
+
+class Ear:
+    """Ground station that stores what it receives; it sends to `peer`, or to the latest sender."""
+
+    def __init__(self, system: int, key: bytes | None = None, peer: tuple[str, int] | None = None) -> None:
+        self.codec, self.ear = Codec(system, 190, Signing(key) if key else None), Codec(0, 0)
+        self.line, self.peer = udp_socket(0.0), peer
+        self.received: list[Message] = []
+
+    def send_message(self, name: str, **fields: object) -> None:
+        """Send a message, if the peer is known."""
+        self.codec.now_us = time.time_ns() // 1000
+        if self.peer is not None:
+            self.line.sendto(self.codec.pack(name, **fields), self.peer)
+
+    def of(self, name: str, mark: int = 0) -> list[Message]:
+        """Receive what has arrived; return the messages `name` received since `mark`."""
+        with suppress(BlockingIOError):
+            while True:
+                data, self.peer = self.line.recvfrom(65536)
+                self.received += self.ear.parse(data)
+        return [one for one in self.received[mark:] if one.name == name]

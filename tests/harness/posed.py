@@ -16,20 +16,6 @@ from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.survey import MAX_LAG, Survey, TelemetryChannel
 
-__all__ = [
-    "FIELD",
-    "T0",
-    "calibrated",
-    "candidate",
-    "missed",
-    "regressors_of",
-    "right",
-    "surveyed",
-    "thinned",
-    "walk",
-]
-
-
 FIELD, T0 = 5e4, 1.7e9
 """Reference field, nT, and start of a survey, s since 1970 UTC."""
 

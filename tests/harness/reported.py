@@ -10,8 +10,6 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import page
 from magbridge.diagnose.report.page import report_html
 
-__all__ = ["page_of", "section"]
-
 NO_PICTURES = dict.fromkeys(("measured", "terms", "channels", "spectrum", "track"))
 """Empty figures of the report, because drawing them takes a second."""
 

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from devices import SENSOR_HZ, TRUTH, TURN, Autopilot, Fluxgate, udp_socket
+from machine import standstill
 from small import aligned, polynomial
-from standstill import standstill
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter

@@ -11,8 +11,6 @@ import xarray as xr
 from magbridge import logs
 from magbridge.logs import Options
 
-__all__ = ["NOON", "lines", "read"]
-
 NOON = 1_651_665_600.0
 """2022-05-04T12:00:00Z, s since 1970."""
 

@@ -7,15 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flash import Log
+from log_files import Log, Output, segment, ulog_of
 from scipy.spatial.transform import Rotation
-from segments import segment
-from ulogs import Output, ulog_of
 
 from magbridge.arrays import FloatArray
 from magbridge.field.igrf import igrf
-
-__all__ = ["FIELD", "T0", "ardupilot", "bag", "engineer", "pixhawk", "slocum"]
 
 T0 = 1_700_000_000
 PLACE = 45.0, -63.0

@@ -14,8 +14,6 @@ from magbridge.calibration.terms import full_order
 from magbridge.field.grid import AnomalyGrid
 from magbridge.learning import Learner
 
-__all__ = ["FIELD", "MASS", "World", "calibration", "error_of", "grid_of", "learn"]
-
 MASS = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
 ORDER = full_order(1, 2)
 FIELD = 50_000.0

@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 from checks import records
-from devices import TRUTH
-from ears import Ear, ftp
+from devices import TRUTH, Ear, ftp
 from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as version_1
 from rig import Rig

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flash import KINDS, Log, described
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from log_files import KINDS, Log, described
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
 from magbridge import logs

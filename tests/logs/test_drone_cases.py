@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flash import Log
+from log_files import Log
 
 from magbridge import logs
 from magbridge.errors import FormatError

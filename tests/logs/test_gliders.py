@@ -10,7 +10,7 @@ import numpy as np
 import ppigrf
 import pytest
 import xarray as xr
-from segments import CRC, segment
+from log_files import CRC, segment
 
 from magbridge import logs
 from magbridge.errors import FormatError

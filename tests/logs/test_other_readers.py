@@ -12,7 +12,7 @@ import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
-from ulogs import Output, ulog_of
+from log_files import Output, ulog_of
 
 from magbridge import logs
 from magbridge.logs.fields import MAX_AGE

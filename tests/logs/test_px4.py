@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ulogs import Output, ulog_of
+from log_files import Output, ulog_of
 
 from magbridge import logs
 from magbridge.errors import FormatError

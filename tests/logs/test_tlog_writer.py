@@ -11,7 +11,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
-from standstill import standstill
+from machine import standstill
 
 from magbridge.logs import tlog
 from magbridge.logs.tlog import TlogWriter

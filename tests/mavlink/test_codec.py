@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from pace import cost
+from machine import cost
 from pymavlink.dialects.v20 import all as upstream
 
 from magbridge.mavlink import BAD_DATA, Codec, Message, Signing, spec

@@ -1,13 +1,14 @@
-"""Detect pauses in which this machine ran no process, so that no test counts a pause as a fault."""
+"""Measure pauses and processor time of this machine, and limit its disk, so that tests hold on any machine."""
 
 from __future__ import annotations
 
 import os
+import resource
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
-
-__all__ = ["Standstill", "standstill"]
 
 NAP = 0.01
 """Time between two readings of the clock, s."""
@@ -51,3 +52,31 @@ def _late(last: float, now: float) -> list[tuple[float, float]]:
 def standstill() -> Standstill:
     """Return the monitor of this machine's pauses; it starts with the first call."""
     return Standstill()
+
+
+def cost(work: Callable[[], object]) -> float:
+    """Return the processor time of `work`, in units of a loop of 100,000 additions."""
+    units = []
+    for part in (_loop, _loop, work, _loop):
+        begun = time.process_time()
+        part()
+        units.append(time.process_time() - begun)
+    return units[2] / max(min(units[0], units[1], units[3]), 1e-6)
+
+
+def _loop() -> float:
+    total = 0.0
+    for k in range(100_000):
+        total += k
+    return total
+
+
+@contextmanager
+def full_disk(room: int) -> Iterator[None]:
+    """Limit the size of every file to `room` bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
