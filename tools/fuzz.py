@@ -30,10 +30,8 @@ sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
 import grids
 import numpy as np
 import xarray as xr
-from log_files import Log
-from log_files import segment
+from log_files import Log, segment, ulog_of
 from studies import command_line, show, table
-from log_files import ulog_of
 
 from magbridge import MagbridgeError, config, logs
 from magbridge.bridge.events import Event

@@ -22,7 +22,6 @@ from magbridge.bridge.check import findings
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import set_up
 from magbridge.config import load
-from magbridge.errors import ConfigError
 from magbridge.field.igrf import igrf
 from magbridge.link.estimates import NO_ATTITUDE, nmea_sentences
 from magbridge.mavlink import Codec, Message
@@ -189,17 +188,6 @@ def test_nmea_sentences() -> None:
     magnetic_only = nmea_sentences(pose._replace(heading=nan, declination=nan), START)
     assert magnetic_only.startswith(b"$HCHDG,0.0,0.0,E,,*")
     assert magnetic_only.count(b"$") == 1
-
-
-@pytest.mark.parametrize(("line", "key"), [('send = "gps"', "heading.send"), ("rat = 1", "heading.rat")])
-def test_wrong_keys_are_named(tmp_path: Path, line: str, key: str) -> None:
-    with pytest.raises(ConfigError, match=key):
-        load(bridge_with(tmp_path, line))
-
-
-def test_a_wrong_nmea_port_is_found_before_anything_is_opened(tmp_path: Path) -> None:
-    path = bridge_with(tmp_path, 'nmea = "udp:nowhere"')
-    assert any(one.fatal and "heading.nmea" in one.text for one in findings(path))
 
 
 def test_sentences_and_messages_through_real_sockets(tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from magbridge.bridge.learning import LearningService, keep, kept_path
 from magbridge.bridge.pipeline import Pipeline, set_up
 from magbridge.calibration.file import calibration_id, load
 from magbridge.config import load as load_config
-from magbridge.errors import ConfigError
 from magbridge.learning.alarms import CAUSE_UNITS
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.enums import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
@@ -170,22 +169,6 @@ def test_it_is_off_unless_asked_for(tmp_path: Path) -> None:
     assert waiting.learning.learner.samples == 0
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ('reference = "emag2.nc"', "learning.reference: no such file"),
-        ('prior = "class.json"', "learning.prior: no such file"),
-        ("ranges = {battpos = [1.0, -1.0]}", "ranges.battpos"),
-        ("max_rate = 0.0", "learning.max_rate"),
-        ("speed = 3", "learning.speed"),
-    ],
-)
-def test_a_wrong_key_is_one_line(tmp_path: Path, text: str, why: str) -> None:
-    """The error message of a wrong key has one line and names the key."""
-    with pytest.raises(ConfigError, match=why):
-        bridge(tmp_path, f"[learning]\n{text}\n")
-
-
 def test_the_causes_bits_are_those_of_the_dialect() -> None:
     """The bits of the causes have the order of the dialect's enumeration."""
     assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSE_UNITS)
@@ -225,17 +208,6 @@ def test_the_same_bytes_on_another_number_of_cores(name: str) -> None:
     command = [sys.executable, "-c", THREADS, name, "nowhere.toml"]
     reported = subprocess.run(command, env=free, capture_output=True, text=True, check=True).stdout
     assert reported.splitlines()[-1] == "{1}"
-
-
-def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, command: Command) -> None:
-    """Without a start, `correct` prints one line and writes no file."""
-    bridge(tmp_path)
-    log, out = tmp_path / "log.csv", tmp_path / "out.nc"
-    log.write_text("time,mag_x,mag_y,mag_z\n1,2,3,4\n", encoding="utf-8")
-    words = "expected --calibration cal.json, or --learn"
-    assert words in command.refuses("correct", log, "-o", out, code=2)
-    assert "--learn" in command.refuses("correct", log, "--config", "bridge.toml", "-o", out, code=2)
-    assert not out.exists()
 
 
 # ---- the learned calibration as a file ---------------------------------------------------------------------

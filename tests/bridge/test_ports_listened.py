@@ -164,21 +164,6 @@ def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("init --driver none", "expected one of ascii, digitizer, hmr2300, rm3100, twinleaf"),
-        ("init --option x", "expected NAME=VALUE"),
-        ("init --calibration none.json", "none.json: expected a file, there is none"),
-        ("drivers none", "expected one of ascii"),
-        ("run --check --config none.toml", "none.toml: expected a file, there is none"),
-    ],
-)
-def test_what_is_wrong_is_one_line(arguments: str, words: str, command: Command) -> None:
-    code = 1 if "none.json" in arguments or "none.toml" in arguments else 2
-    assert words in command(*arguments.split(), code=code).err
-
-
-@pytest.mark.parametrize(
     ("typed", "words"),
     [
         (b"hmr2300\nloop://\n\n7\nbattpos [in]\n", "bridge.toml: written; next: magbridge run --check"),

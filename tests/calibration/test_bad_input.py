@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,13 +78,6 @@ def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
     assert words in output
     assert output.startswith("bad.csv: ")
     assert not Path("cal.json").exists()
-
-
-def test_a_log_is_known_by_its_file(runs: xr.Dataset, command: Command) -> None:
-    """The message names the file of a log and its stated source."""
-    write(runs.drop_vars("mag_x"), "bad.nc")
-    output = command.refuses("calibrate", "bad.nc", *PARAMETERS, "-o", "cal.json")
-    assert output.startswith("bad.nc (simulated: demo): column 'mag_x': expected this column")
 
 
 def test_a_column_of_strings(good: tuple[Path, Path], command: Command) -> None:
@@ -165,24 +157,3 @@ def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Comma
         "one.csv, two.csv: one calibration does not fit all logs: together the fit collapses, each on its "
     )
     assert not Path("cal.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("edit", "words"),
-    [
-        (lambda text: text[:500], "truncated"),
-        (lambda text: re.sub(r'"format": *\d+', '"format":99', text), "newer magbridge"),
-        (lambda text: text.replace('"coefficients":[', '"coefficients":["x",').replace(
-            '"coefficients": [', '"coefficients": ["x",'), "coefficients"),
-    ],
-    ids=["truncated", "newer", "by hand"],
-)  # fmt: skip
-def test_a_bad_calibration(
-    edit: Callable[[str], str], words: str, good: tuple[Path, Path], command: Command
-) -> None:
-    log, cal = good
-    Path("bad.json").write_text(edit(cal.read_text()))
-    output = command.refuses("correct", log, "--calibration", "bad.json", "-o", "x.csv")
-    assert words in output
-    assert "bad.json" in output
-    assert not Path("x.csv").exists()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gliders import Gliders
+from posed import EFFECTS
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
@@ -61,24 +62,6 @@ def stepped(
     one_by_one = Effect.batch(effect, series)
     np.testing.assert_allclose(effect.batch(series), one_by_one, rtol=1e-6, atol=1e-9)
     return one_by_one.T
-
-
-EFFECTS = (
-    ChannelEffect(channel="warm", origin=3.0),
-    ChannelEffect(channel="warm", origin=3.0, lag=40.0, stages=2, on="scale"),
-    PowersEffect(channel="warm", centre=0.1, scale=0.7, order=3),
-    SourcesEffect(channel="p", centre=-0.8, scale=0.2, apart=1.25, count=5),
-    LegendreEffect(exponents=(4,)),
-    PlayEffect(channel="p", width=0.4, centre=0.2, scale=0.5),
-    PlayEffect(channel="warm", width=0.4, centre=0.2, scale=0.5, order=2),
-    ClockEffect(sign=-1.0),
-    TimeEffect(shape="step", start=START + 501.0),
-    TimeEffect(shape="drift", start=START + 700.0, period=300.0, order=2),
-    TimeEffect(shape="tone", start=START, period=17.3),
-    RateEffect(on="eddy"),
-    ResponseEffect(unit=4e4, power=3),
-    ResponseEffect(unit=4e4, axis=1, knee=-2e4),
-)
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda one: one.kind)

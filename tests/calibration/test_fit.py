@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from gliders import Glider, Gliders, codes
-from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, METHODS, fit
@@ -20,7 +19,7 @@ from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.information import GaussianInformation
-from magbridge.estimation.noise import Whitening, estimate_noise, fit_slow_and_white, whiten
+from magbridge.estimation.noise import Whitening, whiten
 from magbridge.estimation.optimise import normal_equations
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.estimation.residual import ResidualSamples, residuals
@@ -321,19 +320,6 @@ def test_slow_and_white_noise_are_whitened_in_any_blocks() -> None:
     whitening = Whitening(steps, 0.95, 0.3)
     np.testing.assert_allclose(np.vstack([whitening.apply(part) for part in np.array_split(X, 7)]), white)
     assert np.log(whitening.variance).sum() == pytest.approx(np.linalg.slogdet(C)[1])
-
-
-@pytest.mark.parametrize("interval", [0.5, 4.0])
-def test_the_memory_of_noise_is_a_time_at_any_rate(interval: float) -> None:
-    """A slow part of 8 nT with 60 s of correlation and 4 nT white: a fifth of the variance is white."""
-    rng = np.random.default_rng(4)
-    n, rho = int(40_000 / interval), np.exp(-interval / 60.0)
-    slow = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, 8.0, n))
-    steps = np.r_[np.inf, np.ones(n - 1)]
-    e = slow + rng.normal(0.0, 4.0, n)
-    found = fit_slow_and_white(e, steps, estimate_noise(e, steps, 0.0))
-    assert -interval / np.log(found.autocorrelation) == pytest.approx(60.0, rel=0.25)
-    assert found.white == pytest.approx(0.2, abs=0.04)
 
 
 def test_what_the_model_lacks_is_in_its_sigmas(glider: Gliders) -> None:

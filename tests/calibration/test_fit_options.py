@@ -23,8 +23,6 @@ from magbridge.calibration.fitting.solve import check_scales
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError, FormatError, NoSolutionError
-from magbridge.estimation.information import GaussianInformation
-from magbridge.estimation.priors import Prior
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.field.reference import about_mean, other_units
 from magbridge.logs import read, write
@@ -43,27 +41,6 @@ def test_rescaled_coefficients_are_the_same_field() -> None:
     after = monomials(positions, new, exponents) @ changed.reshape(-1, 9)
     np.testing.assert_allclose(after[:, 6:], before[:, 6:], atol=1e-9)
     np.testing.assert_allclose(after[:, :6] / 51_000.0, before[:, :6] / 48_000.0, atol=1e-12)
-
-
-def test_information_is_the_posterior_without_its_prior() -> None:
-    rng = np.random.default_rng(1)
-    root = rng.normal(size=(3, 5))
-    J, h = root.T @ root, rng.normal(size=5)
-    E, offset = rng.normal(size=(5, 5)), rng.normal(size=5)
-    prior = Prior(np.diag(rng.uniform(0.5, 2.0, 5)), E, offset)
-    known = np.linalg.inv(E @ np.linalg.inv(prior.precision) @ E.T)
-    P = np.linalg.inv(J + known)
-    reported = GaussianInformation.from_posterior(P @ (h + known @ offset), P, offset, np.linalg.inv(known))
-    np.testing.assert_allclose(reported.precision, J, atol=1e-8)
-    np.testing.assert_allclose(reported.vector, h, atol=1e-8)
-
-
-def test_an_unknown_direction_is_not_told() -> None:
-    J = np.diag([4.0, 9.0])
-    v = np.array([1.0, 0.0])
-    reported = GaussianInformation(J, J @ np.array([2.0, 3.0])).blurred(v, 10.0)
-    np.testing.assert_allclose(np.linalg.inv(reported.precision), np.linalg.inv(J) + 100.0 * np.outer(v, v))
-    np.testing.assert_allclose(np.linalg.solve(reported.precision, reported.vector), [2.0, 3.0])
 
 
 def test_two_runs_are_enough_for_a_vehicle_that_is_known(glider: Gliders) -> None:

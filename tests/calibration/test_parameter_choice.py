@@ -21,7 +21,6 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.parameter_choice import best_parameters, lines, undeclared
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
-from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment
@@ -224,21 +223,6 @@ def test_seaglider_dives_held_out(real_data: Path) -> None:
     assert 0.85 < rms(moving) / rms(nominal) < 1.02
     # each sigma includes the bias of the IGRF: 145 nT, in addition to 88
     assert 0.4 < np.nanstd(normalised) < 1.0
-
-
-def test_two_runs_at_least(glider: Gliders) -> None:
-    runs = glider(0, 2).runs
-    with pytest.raises(CalibrationError, match="expected 2 runs"):
-        hold_runs_out(runs.part(np.asarray(runs.runs) == 0), "nominal")
-
-
-def test_held_out_runs_are_near_the_floor(glider: Gliders) -> None:
-    """Holding out inner runs (the outermost would be extrapolation) costs a little; sigma includes it."""
-    runs = glider(0, 1).runs
-    few = runs.part(np.asarray(runs.runs) < 4)
-    error, normalised = hold_runs_out(few, "auto", 1)
-    assert np.isfinite(error[np.asarray(few.runs) < 4]).all()
-    assert np.nanmedian(np.abs(normalised)) < 1.5
 
 
 # ---- The messages of the fit -------------------------------------------------------------------------------

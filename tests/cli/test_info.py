@@ -108,21 +108,6 @@ def test_columns_are_declared_on_the_command_line(command: Command) -> None:
     assert float(read("ours.csv")["mag_x"][0]) == 30e6
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("--column", "mag_x"), 2, '--column mag_x: expected NAME="THEIRS [unit]"'),
-        (("--columns", "none.toml"), 1, "none.toml: expected a file, there is none"),
-        (("--column", "mag_x=Q"), 1, "column 'Q': expected this column; there are: mag_x"),
-    ],
-)
-def test_what_is_declared_wrongly_is_one_line(
-    arguments: tuple[str, ...], code: int, words: str, command: Command
-) -> None:
-    write(made("log", [START], {"mag_x": [1.0]}), "log.parquet")
-    assert words in command.refuses("convert", "log.parquet", "-o", "x.csv", *arguments, code=code)
-
-
 TAKE_LOGS = "calibrate convert correct diagnose info navigate plan replay simulate survey"
 
 

@@ -25,9 +25,12 @@ from magbridge.errors import DataError, WriteError
 from magbridge.field.geodesy import offset, wrap
 from magbridge.logs import write
 
+Plain = tuple[xr.Dataset, Calibration]
+Found = tuple[DiagnosisResult, Path]
+
 
 @pytest.fixture(scope="module")
-def plain() -> tuple[xr.Dataset, Calibration]:
+def plain() -> Plain:
     return demo().survey, demo().calibration
 
 
@@ -37,15 +40,13 @@ def some(ds: xr.Dataset, count: int) -> xr.DataArray:
 
 
 @pytest.fixture(scope="module")
-def found(
-    plain: tuple[xr.Dataset, Calibration], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[DiagnosisResult, Path]:
+def found(plain: Plain, tmp_path_factory: pytest.TempPathFactory) -> Found:
     """Return a diagnosis and the folder to which it was written."""
     folder = tmp_path_factory.mktemp("found")
     return diagnose([plain[0]], plain[1], folder, remarks=["a<b>.csv: fitted to this log"]), folder
 
 
-def test_the_demonstrations_survey_is_plain(found: tuple[DiagnosisResult, Path]) -> None:
+def test_the_demonstrations_survey_is_plain(found: Found) -> None:
     """The report and the findings also state the properties of the log."""
     assert found[0].diagnosis.verdict == "nothing_found"
     remarks = json.loads((found[1] / "findings.json").read_text())["remarks"]
@@ -53,9 +54,7 @@ def test_the_demonstrations_survey_is_plain(found: tuple[DiagnosisResult, Path])
     assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (found[1] / "report.html").read_text()
 
 
-def test_where_one_file_cannot_be_written_none_is(
-    found: tuple[DiagnosisResult, Path], tmp_path: Path
-) -> None:
+def test_where_one_file_cannot_be_written_none_is(found: Found, tmp_path: Path) -> None:
     (tmp_path / "report.html").mkdir()
     (tmp_path / "findings.json").write_text("of an earlier diagnosis")
     with pytest.raises(WriteError, match=r"report\.html: cannot be written: Is a directory"):
@@ -64,9 +63,7 @@ def test_where_one_file_cannot_be_written_none_is(
     assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
 
 
-def test_a_full_disk_names_the_file_that_has_no_room(
-    found: tuple[DiagnosisResult, Path], tmp_path: Path
-) -> None:
+def test_a_full_disk_names_the_file_that_has_no_room(found: Found, tmp_path: Path) -> None:
     sizes = {path.name: path.stat().st_size for path in found[1].iterdir()}
     largest = sizes.pop("report.html")
     enough = max(sizes.values())
@@ -80,18 +77,18 @@ def test_a_full_disk_names_the_file_that_has_no_room(
         assert not list(tmp_path.iterdir())
 
 
-def test_a_number_beyond_all_measure_is_not_a_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_number_beyond_all_measure_is_not_a_reading(plain: Plain) -> None:
     wild = plain[0].assign(mag_x=plain[0]["mag_x"].where(some(plain[0], 10), 1e300))
     assert diagnose([wild], plain[1]).diagnosis.verdict == "nothing_found"
 
 
-def test_how_old_a_parameter_was_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_how_old_a_parameter_was_is_not_telemetry(plain: Plain) -> None:
     """A bridge's log has the age of a parameter, to which the field cannot respond."""
     aged = plain[0].assign(age_battpos=plain[0]["time"] % 3.0)
     assert load_survey([aged], plain[1]).channels.keys() == load_survey([plain[0]], plain[1]).channels.keys()
 
 
-def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_sample_that_is_given_twice_is_one(plain: Plain) -> None:
     ds, calibration = plain
     again = np.sort([*range(ds.sizes["time"]), *range(5, 500, 20)])
     once, twice = load_survey([ds], calibration), load_survey([ds.isel(time=again)], calibration)
@@ -120,18 +117,14 @@ def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibratio
         (lambda ds: ds.assign_attrs(sensor="another"), "sensor 'another', but the calibration is of 'one'"),
     ],
 )
-def test_one_line(
-    plain: tuple[xr.Dataset, Calibration], change: Callable[[xr.Dataset], xr.Dataset], message: str
-) -> None:
+def test_one_line(plain: Plain, change: Callable[[xr.Dataset], xr.Dataset], message: str) -> None:
     calibration = replace(plain[1], sensor=CalibratedSensor("one"))
     with pytest.raises(DataError, match=message) as caught:
         diagnose([change(plain[0])], calibration)
     assert "\n" not in str(caught.value)
 
 
-def test_an_effects_channel_that_holds_nothing_is_reported_to_be_empty(
-    plain: tuple[xr.Dataset, Calibration],
-) -> None:
+def test_an_effects_channel_that_holds_nothing_is_reported_to_be_empty(plain: Plain) -> None:
     ds, calibration = plain
     warm = ChannelEffect(cause="temperature_offset", channel="warmth")
     extended = replace(
@@ -144,25 +137,23 @@ def test_an_effects_channel_that_holds_nothing_is_reported_to_be_empty(
         diagnose([ds.assign(warmth=np.nan * ds["battpos"])], extended)
 
 
-def test_a_log_given_twice_is_refused(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_log_given_twice_is_refused(plain: Plain) -> None:
     with pytest.raises(DataError, match="given twice"):
         diagnose([plain[0]], plain[1], training_logs=[plain[0].copy()])
 
 
-def test_a_hundred_samples_are_few_but_enough(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_hundred_samples_are_few_but_enough(plain: Plain) -> None:
     assert diagnose([plain[0].isel(time=slice(0, 100))], plain[1]).diagnosis.verdict == "nothing_found"
 
 
-def test_telemetry_that_stands_still_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_telemetry_that_stands_still_is_not_telemetry(plain: Plain) -> None:
     ds = plain[0]
     still = ds.assign({name: 0.0 * ds[name] + ds[name].mean() for name in ("sensor_temperature", "depth")})
     found = diagnose([still], plain[1]).diagnosis
     assert {"temperature_offset", "pressure_offset"} <= set(found.isolability.untestable)
 
 
-def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
-    plain: tuple[xr.Dataset, Calibration],
-) -> None:
+def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(plain: Plain) -> None:
     """An autopilot's log begins before its first attitude; a reference is there without a position."""
     ds, calibration = plain
     late = {name: ds[name].where(some(ds, 9)) for name in ("roll", "pitch", "heading")}
@@ -175,7 +166,7 @@ def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
     assert diagnose([ds.assign(late | never)], calibration).diagnosis.verdict == "nothing_found"
 
 
-def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_track_across_the_date_line_is_one_track(plain: Plain) -> None:
     ds, calibration = plain
     moved = wrap((ds["longitude"] - ds["longitude"].mean()).to_numpy() + 180.0)
     assert moved.min() < -179.0 < 179.0 < moved.max()
@@ -185,7 +176,7 @@ def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Cali
     np.testing.assert_allclose(there, here, atol=1e-4)
 
 
-def test_a_place_is_in_metres_on_the_ellipsoid(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_place_is_in_metres_on_the_ellipsoid(plain: Plain) -> None:
     """On a sphere, positions would be wrong by 56 m in 10 km at the equator."""
     ds, calibration = plain
     track = np.linspace([-5e3, 10e3], [5e3, -10e3], ds.sizes["time"])
@@ -196,24 +187,20 @@ def test_a_place_is_in_metres_on_the_ellipsoid(plain: tuple[xr.Dataset, Calibrat
     np.testing.assert_allclose(survey.place[:, :2], track - np.median(track, axis=0), atol=0.1)
 
 
-def test_without_dives_no_dives_are_reported_as_held_out(
-    plain: tuple[xr.Dataset, Calibration],
-) -> None:
+def test_without_dives_no_dives_are_reported_as_held_out(plain: Plain) -> None:
     ds, calibration = plain
     assert load_survey([ds], calibration).parts == "dives"
     assert load_survey([ds.drop_vars(["depth", "run"])], calibration).parts == "eighths of the log"
 
 
-def test_another_magnetometer_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_another_magnetometer_is_not_telemetry(plain: Plain) -> None:
     """A second magnetometer would explain any change of the Earth's field."""
     ds, calibration = plain
     both = ds.assign(second=ds["mag_x"].assign_attrs(units="nT"))
     assert "second" not in load_survey([both], calibration).channels
 
 
-def test_the_command_line_says_it_in_one_line(
-    plain: tuple[xr.Dataset, Calibration], command: Command
-) -> None:
+def test_the_command_line_says_it_in_one_line(plain: Plain, command: Command) -> None:
     save(plain[1], "cal.json")
     write(plain[0].isel(time=slice(0, 3)), "three.nc")
     output = command.refuses("diagnose", "three.nc", "--calibration", "cal.json", "-o", "out")
@@ -221,9 +208,7 @@ def test_the_command_line_says_it_in_one_line(
     assert not Path("out").exists()
 
 
-def test_a_channel_that_repeats_its_reading_is_known_where_it_was_read(
-    plain: tuple[xr.Dataset, Calibration],
-) -> None:
+def test_a_channel_that_repeats_its_reading_is_known_where_it_was_read(plain: Plain) -> None:
     """A time that occurs twice has no slope, so that no row was complete."""
     ds, calibration = plain
     time = ds["time"].to_numpy()

@@ -7,18 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posed import FIELD, T0, calibrated, regressors_of, surveyed, walk
+from posed import EFFECTS, FIELD, T0, calibrated, regressors_of, surveyed, walk
 
 from magbridge.calibration.correct import Corrector, correct
 from magbridge.calibration.effects import (
     ChannelEffect,
     ClockEffect,
-    LegendreEffect,
     PlayEffect,
     PowersEffect,
     RateEffect,
     ResponseEffect,
-    SourcesEffect,
     TimeEffect,
 )
 from magbridge.calibration.file import decode_calibration, encode_calibration
@@ -29,25 +27,6 @@ from magbridge.diagnose.problem import pose, samples_of
 from magbridge.diagnose.survey import Survey, TelemetryChannel
 from magbridge.errors import FormatError
 from magbridge.estimation.residual import residuals
-
-EFFECTS: list[Effect] = [
-    ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),
-    ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
-    PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
-    SourcesEffect(cause="actuator_order", channel="p", centre=-1.1, scale=0.2, apart=1.25, count=12),
-    LegendreEffect(cause="actuator_order", exponents=(4,)),
-    PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
-    PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5, order=3),
-    ClockEffect(),
-    ClockEffect(cause="filter_lag", sign=-1.0),
-    TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
-    TimeEffect(cause="offset_drift", shape="drift", start=T0, period=500.0, order=2),
-    TimeEffect(cause="interference_tone", shape="tone", start=T0, period=17.3),
-    RateEffect(cause="channel_skew", on="skew"),
-    RateEffect(cause="eddy_current", on="eddy"),
-    ResponseEffect(cause="nonlinearity", unit=FIELD, power=3),
-    ResponseEffect(cause="saturation", unit=FIELD, axis=2, knee=35_000.0),
-]
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Test the search on artificial residuals."""
+"""Test the search on artificial residuals, and the evidence that it compares."""
 
 from __future__ import annotations
 
@@ -9,12 +9,22 @@ import pytest
 from numpy.typing import NDArray
 from posed import calibrated, candidate, missed, right, surveyed
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
 from magbridge.calibration.effects import TimeEffect
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.reference import ReferenceBias
 from magbridge.diagnose.columns import Candidate, GridPoint
-from magbridge.diagnose.evidence import ODDS, bayes_factor_threshold
+from magbridge.diagnose.evidence import (
+    ODDS,
+    Information,
+    bayes_factor_threshold,
+    evidence_of,
+    log_bayes,
+    log_odds,
+    score,
+)
+from magbridge.diagnose.joint import RIDGE, fit_joint
 from magbridge.diagnose.leftover import varying
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.run import accept, odds_over_random_walk
@@ -26,6 +36,15 @@ def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
     """Return a candidate fault with one coefficient that adds x (n,) times `width`, nT."""
     effects = (TimeEffect(cause=cause, shape="step", start=0.0),)
     return candidate(cause, width * x, width=np.array([width]), effects=effects)
+
+
+def turning(n: int) -> tuple[Problem, list[Candidate], NDArray[np.float64]]:
+    """Return the problem of three turns, candidates for a drift and steps, and the time (n,) from 0 to 1."""
+    turn, t = np.linspace(0.0, 6.0 * np.pi, n), np.linspace(0.0, 1.0, n)
+    directions = np.column_stack([0.4 * np.cos(turn), 0.4 * np.sin(turn), np.full(n, 0.9)])
+    problem = pose(surveyed(directions, np.linspace(-1.0, 1.0, n)), calibrated(np.zeros(9), 1e-6))
+    steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
+    return problem, [fault("offset_drift", t, 10.0), *steps], t
 
 
 @pytest.mark.parametrize(("functions", "rough", "warm"), [(60, 20.0, 60.0), (150, 6.0, 15.0)])
@@ -56,15 +75,11 @@ def test_flicker_noise_gets_no_name_and_a_step_in_white_noise_its_own(
 ) -> None:
     """Noise of power 1/f down to the length of the log is slower than any autoregression of 13 samples."""
     n, rng = 6000, np.random.default_rng(0)
-    turn, t = np.linspace(0.0, 6.0 * np.pi, n), np.linspace(0.0, 1.0, n)
-    directions = np.column_stack([0.4 * np.cos(turn), 0.4 * np.sin(turn), np.full(n, 0.9)])
-    problem = pose(surveyed(directions, np.linspace(-1.0, 1.0, n)), calibrated(np.zeros(9), 1e-6))
+    problem, candidates, t = turning(n)
     white, power = rng.normal(size=(n, 3)), 1.0 + 0.3 / np.maximum(np.fft.rfftfreq(n), 1.0 / n)
     coloured = np.fft.irfft(np.fft.rfft(white, axis=0) * np.sqrt(power)[:, None], n, axis=0)
     read = np.sum(problem.jacobian[:, 6:] * (coloured if noise == "flicker" else white), axis=1)
     problem = replace(problem, residual=read + size * (t > 0.5))
-    steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
-    candidates = [fault("offset_drift", t, 10.0), *steps]
     outcome = beside_slow_noise(search(problem, candidates, 2), candidates, 2)
     assert {h.candidate.cause for h in outcome.chosen} == named
     slow = outcome.problem.slow_noise(outcome.fit.z)
@@ -77,8 +92,8 @@ def test_a_further_cause_must_predict_better_than_a_free_description() -> None:
     candidates = [fault(cause, shape, 10.0) for cause, shape in shapes.items()]
     signal = 5.0 * shapes["offset_step"] + 1.0 * shapes["current_field"]
     problem = replace(right(n), residual=signal + rng.normal(size=n))
-    for score, expected in ((-np.inf, {"offset_step", "current_field"}), (np.inf, {"offset_step"})):
-        found = search(problem, candidates, 2, lambda *_, score=score: score)
+    for worth, expected in ((-np.inf, {"offset_step", "current_field"}), (np.inf, {"offset_step"})):
+        found = search(problem, candidates, 2, lambda *_, worth=worth: worth)
         assert {one.candidate.cause for one in found.chosen} == expected
 
 
@@ -115,13 +130,9 @@ def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
 def test_a_slow_cause_is_separated_from_a_random_walk_only_where_it_is_clear(walks: bool) -> None:
     """A walk that passes for a drift may be noise; a step of S/N 40 in white noise is none."""
     n, rng = 3000, np.random.default_rng(0)
-    turn, t = np.linspace(0.0, 6.0 * np.pi, n), np.linspace(0.0, 1.0, n)
-    directions = np.column_stack([0.4 * np.cos(turn), 0.4 * np.sin(turn), np.full(n, 0.9)])
-    problem = pose(surveyed(directions, np.linspace(-1.0, 1.0, n)), calibrated(np.zeros(9), 1e-6))
+    problem, candidates, t = turning(n)
     noise, walk = rng.normal(size=n), np.cumsum(rng.normal(size=n)) / np.sqrt(n)
     problem = replace(problem, residual=noise + (walk if walks else 80.0 / np.sqrt(n) * (t > 0.5)))
-    steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
-    candidates = [fault("offset_drift", t, 10.0), *steps]
     outcome = beside_slow_noise(search(problem, candidates, 2), candidates, 2)
     (named,) = outcome.chosen
     assert (odds_over_random_walk(outcome, named) > ODDS) != walks
@@ -163,32 +174,27 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
         assert accept(problem, search(problem, [alike], 1))[0] == named
 
 
-@pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])
-def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float, named: bool) -> None:
-    """A payload's current at S/N 14 or more, with leads that a moving mass separates."""
+@pytest.mark.parametrize(
+    ("follows", "waves", "named"),
+    [(0.0, 0, True), (0.2, 0, True), (1.0, 0, False), (0.0, 3, False), (0.0, 20, False)],
+)
+def test_a_name_whose_size_follows_something_else_or_varies_in_time_is_not_asserted(
+    follows: float, waves: int, named: bool
+) -> None:
+    """A payload's current, with leads that a moving mass separates, or beside one without telemetry."""
     problem, rng = right(ROWS), np.random.default_rng(10)
     drawn = np.where(np.sin(np.arange(ROWS) / 3.0) > 0.3, 1.0, 0.0)
     place = problem.survey.channels["p"].values
-    away = drawn * (1.0 + follows * place / np.std(place[drawn > 0.0]))
-    problem = replace(problem, residual=1.5 * away + rng.normal(size=ROWS))
+    power = 1.0 + follows * place / np.std(place[drawn > 0.0])
+    if waves:
+        power += 0.8 * np.cos(np.pi * waves * np.arange(ROWS) / ROWS)
+    problem = replace(problem, residual=1.5 * drawn * power + rng.normal(size=ROWS))
     name = candidate("a", drawn, channel="amps")
     outcome = search(problem, [name], 1)
     assert [h.candidate for h in outcome.chosen] == [name]
-    assert accept(problem, outcome)[0] == named
-
-
-@pytest.mark.parametrize("waves", [3, 20])
-def test_a_name_whose_size_varies_in_time_is_not_asserted(waves: int) -> None:
-    """A payload without telemetry that is switched with a logged one, but not always to the same power."""
-    problem, rng = right(ROWS), np.random.default_rng(10)
-    drawn = np.where(np.sin(np.arange(ROWS) / 3.0) > 0.3, 1.0, 0.0)
-    power = 1.0 + 0.8 * np.cos(np.pi * waves * np.arange(ROWS) / ROWS)
-    problem = replace(problem, residual=1.5 * drawn * power + rng.normal(size=ROWS))
-    outcome = search(problem, [candidate("a", drawn, channel="amps")], 1)
-    assert len(outcome.chosen) == 1
     asserted, rest = accept(problem, outcome)
-    assert not asserted
-    assert rest is not None
+    assert asserted == named
+    assert named or rest is not None
 
 
 @pytest.mark.parametrize("of_iron", [False, True])
@@ -225,3 +231,109 @@ def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem
     assert described.covers([squeezed])
     slow = replace(squeezed, spectra=np.ones((1, squeezed.size)))
     assert varying(problem, slow, {"pressure_offset": 2.0}) is None
+
+
+# ---- The evidence of a likelihood ratio, given the prior of its coefficients -------------------------------
+
+
+def sized(cause: str, size: int = 1, **more: object) -> Candidate:
+    """Return a candidate with a given number of coefficients."""
+    return candidate(cause, np.zeros((1, size)), **more)
+
+
+def test_evidence_asks_its_price() -> None:
+    """The evidence accepts many ratios or one; it is zero without free coefficients."""
+    np.testing.assert_allclose(
+        log_bayes(np.array([2.0, 3.0, 60.0]), 3), [0.0, 0.0, 28.5 - 1.5 * np.log(20.0)]
+    )
+    assert log_bayes(60.0, 3) < log_bayes(60.0, 1)
+    assert log_bayes(60.0, 0) == 0.0
+
+
+def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
+    """Compare with the integral over half a Gaussian prior of the likeliest size."""
+    estimate = 1.8
+    size = np.sqrt(estimate**2 - 1.0)
+    b = np.linspace(0.0, 12.0, 20_001)
+    prior = np.sqrt(2.0 / np.pi) / size * np.exp(-0.5 * (b / size) ** 2)
+    exact = np.log(np.trapezoid(prior * np.exp(b * estimate - 0.5 * b**2), b))
+    one_sided = evidence_of(sized("filter_lag", positive=True), estimate**2, 1)
+    assert one_sided == pytest.approx(exact, abs=0.06)
+    assert one_sided - log_bayes(estimate**2, 1) == pytest.approx(np.log(2.0), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("one", "least"),
+    [
+        (sized("filter_lag", positive=True), 0.08),
+        (sized("map_error", 6, spectra=np.array([np.ones(6), 2.0 ** -np.arange(6)])), 0.0),
+    ],
+)
+def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: float) -> None:
+    """Where there is none, no more than the level is found; of a single number, no less either."""
+    S = np.diag(30.0 ** -np.linspace(0.0, 1.0, one.size)) * 100.0
+    draws = np.random.default_rng(5).standard_normal((2000, one.size)) * np.sqrt(np.diag(S))
+    ratios = [score(Information(S, b, np.zeros((0, 0))), slice(None), one).ratio for b in draws]
+    assert least <= np.mean(one.tail * chi2.sf(ratios, 1) < 0.1) < 0.12
+
+
+def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
+    """The evidence of a cause does not depend on a free shape, which has its own prior."""
+    step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
+    look_elsewhere = {"offset_step": 1.0, "map_error": 1.0}
+    worth = log_odds(225.0, [step, chart], look_elsewhere, 25.0) - log_odds(
+        200.0, [chart], look_elsewhere, 0.0
+    )
+    assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
+
+
+def test_a_score_is_the_ratio_its_evidence_and_the_shrunk_estimate() -> None:
+    S, b = np.array([[4.0, 1.0], [1.0, 9.0]]), np.array([6.0, -3.0])
+    info = Information(S, b, np.zeros((1, 2)))
+    one = sized("late", 2)
+    found = score(info, slice(0, 2), one)
+    assert found.ratio == pytest.approx(b @ np.linalg.solve(S, b))
+    assert found.evidence == pytest.approx(float(log_bayes(found.ratio, 2)))
+    np.testing.assert_allclose(found.estimate, np.linalg.solve(S + np.eye(2), b))
+    assert evidence_of(one, 12.0, 2) == float(log_bayes(12.0, 2)), "a size of either sign has two tails"
+    positive = score(info, slice(1, 2), sized("late", 1, positive=True))
+    assert (positive.ratio, positive.evidence, positive.freedom) == (0.0, 0.0, 1)
+    assert positive.estimate.tolist() == [0.0]
+
+
+def test_the_prior_of_coefficients_of_one_size_is_that_of_their_spectrum() -> None:
+    S, b = np.diag([5.0, 5.0]), np.array([20.0, -15.0])
+    spectrum = np.array([[2.0, 1.0]])
+    found = score(Information(S, b, np.zeros((1, 2))), slice(0, 2), sized("map_error", 2, spectra=spectrum))
+    precision = b / found.estimate - np.diag(S)
+    assert precision[1] / precision[0] == pytest.approx(2.0, rel=1e-6)
+
+
+# ---- calibration, effects and noise at once ----------------------------------------------------------------
+
+
+def test_numbers_of_one_size_that_say_the_same_share_what_they_say() -> None:
+    """Two causes with a common size each, a column double or empty: only their sizes distinguish them."""
+    rng = np.random.default_rng(4)
+    a, b = np.sin(np.arange(ROWS) / 7.0), np.sign(np.sin(np.arange(ROWS) / 40.0))
+    problem = replace(right(ROWS), residual=3.0 * a - 2.0 * b + rng.normal(size=ROWS))
+    twice = [np.column_stack([x, x, 0.0 * x]) for x in (a, b)]
+    fit = fit_joint(problem, [x.__getitem__ for x in twice], 1, spectra=[np.ones((1, 3)), np.ones((1, 3))])
+    np.testing.assert_allclose(fit.coefficients, [1.5, 1.5, 0.0, -1.0, -1.0, 0.0], atol=0.1)
+
+
+def test_a_likelihood_is_the_gaussian_s_less_what_the_priors_cost() -> None:
+    """White noise at its likeliest size, and an effect that no noise with a memory takes for its own."""
+    rng = np.random.default_rng(5)
+    column = rng.choice([-1.0, 1.0], (ROWS, 1))
+    y = 3.0 * column[:, 0] + rng.normal(size=ROWS)
+    problem = replace(right(ROWS), residual=y)
+    fits = [fit_joint(problem, [], 1), fit_joint(problem, [column.__getitem__], 1)]
+    naive = [
+        -0.5 * ROWS * (np.log(2.0 * np.pi * np.mean(residual**2)) + 1.0)
+        for residual in (fit.residual for fit in fits)
+    ]
+    gained = fits[1].log_likelihood - fits[0].log_likelihood
+    assert gained == pytest.approx(naive[1] - naive[0] - 0.5 * RIDGE * fits[1].coefficients[0] ** 2, rel=0.05)
+    assert gained > 200.0
+    assert fits[1].coefficients[0] == pytest.approx(3.0, abs=0.2)

@@ -38,16 +38,25 @@ def flown() -> Problem:
     return pose(replace(survey, channels=channels), calibrated(np.zeros(18)))
 
 
+def along(problem: Problem, axis: str) -> FloatArray:
+    """Return the response (n,) of the residual to 1 nT along an axis, or along the field."""
+    if axis == "field":
+        return np.ones(N)
+    return np.asarray(-problem.jacobian[:, 6 + "xyz".index(axis)] / problem.reference_jacobian)
+
+
+def warmed(problem: Problem) -> tuple[Problem, FloatArray]:
+    """Return the problem with a slow temperature as its only channel, and the temperature."""
+    warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
+    channel = TelemetryChannel(warmth, "degC", ("temperature",))
+    return replace(problem, survey=replace(problem.survey, channels={"warmth": channel})), warmth
+
+
 @pytest.mark.parametrize(("lag", "axis"), [(0.0, "z"), (30.0, "x"), (8.0, "field")])
 def test_series_lag_axis_and_size_of_a_signal_are_reported(flown: Problem, lag: float, axis: str) -> None:
     survey = flown.survey
     q = lagged(survey.time, survey.channels["throttle"].values, lag)
-    u = (
-        np.ones(N)
-        if axis == "field"
-        else -flown.jacobian[:, 6 + "xyz".index(axis)] / flown.reference_jacobian
-    )
-    signal = 20.0 * q * u
+    signal = 20.0 * q * along(flown, axis)
     noise = np.random.default_rng(6).normal(size=N)
     found = seen(flown, signal + noise)
     assert (found.channel, found.lag, found.axis) == ("throttle", lag, axis)
@@ -80,28 +89,21 @@ def test_the_axis_of_what_is_slow_is_reported_though_it_follows_nothing(axis: st
         correlated(np.random.default_rng(4).normal(size=(N, 1)), 0.997)[:, 0], "h", ("position",)
     )
     problem = pose(replace(survey, channels=survey.channels | {"hours": hours}), calibrated(np.zeros(18)))
-    u = (
-        np.ones(N)
-        if axis == "field"
-        else -problem.jacobian[:, 6 + "xyz".index(axis)] / problem.reference_jacobian
-    )
     slow = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
-    found = seen(problem, 34.0 * slow * u)
+    found = seen(problem, 34.0 * slow * along(problem, axis))
     assert (found.channel, found.axis) == (None, axis)
 
 
 def test_a_slow_series_that_explains_all_is_followed(flown: Problem) -> None:
     """For any slow signal the remainder is not slow."""
-    warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
-    survey = replace(flown.survey, channels={"warmth": TelemetryChannel(warmth, "degC", ("temperature",))})
+    problem, warmth = warmed(flown)
     signal = 20.0 * warmth + np.random.default_rng(6).normal(size=N)
-    assert seen(replace(flown, survey=survey), signal)[:2] == ("warmth", 0.0)
+    assert seen(problem, signal)[:2] == ("warmth", 0.0)
 
 
 def test_a_cause_does_not_follow_a_channel_of_the_other_causes(flown: Problem) -> None:
-    warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
-    survey = replace(flown.survey, channels={"warmth": TelemetryChannel(warmth, "degC", ("temperature",))})
-    problem, own = replace(flown, survey=survey), 4.0 * np.random.default_rng(6).normal(size=N)
+    problem, warmth = warmed(flown)
+    own = 4.0 * np.random.default_rng(6).normal(size=N)
     assert seen(problem, own + 20.0 * warmth).channel == "warmth"
     assert seen(problem, own + 20.0 * warmth, own).channel is None
 

@@ -1,4 +1,4 @@
-"""Measure pauses and processor time of this machine, and limit its disk, so that tests hold on any machine."""
+"""Measure pauses and processor time of this machine, and limit its disk, so that tests hold everywhere."""
 
 from __future__ import annotations
 

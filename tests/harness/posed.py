@@ -10,6 +10,17 @@ from numpy.typing import NDArray
 from small import polynomial
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.effects import (
+    ChannelEffect,
+    ClockEffect,
+    LegendreEffect,
+    PlayEffect,
+    PowersEffect,
+    RateEffect,
+    ResponseEffect,
+    SourcesEffect,
+    TimeEffect,
+)
 from magbridge.calibration.model import Calibration, Parameter
 from magbridge.calibration.terms import Effect, LogSeries
 from magbridge.diagnose.columns import Candidate
@@ -18,6 +29,25 @@ from magbridge.diagnose.survey import MAX_LAG, Survey, TelemetryChannel
 
 FIELD, T0 = 5e4, 1.7e9
 """Reference field, nT, and start of a survey, s since 1970 UTC."""
+EFFECTS: list[Effect] = [
+    ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),
+    ChannelEffect(cause="temperature_scale", channel="heat", origin=3.0, lag=50.0, on="scale"),
+    PowersEffect(cause="unmodelled_actuator", channel="heat", centre=3.0, scale=2.0, order=3),
+    SourcesEffect(cause="actuator_order", channel="p", centre=-1.1, scale=0.2, apart=1.25, count=12),
+    LegendreEffect(cause="actuator_order", exponents=(4,)),
+    PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5),
+    PlayEffect(cause="hysteresis", channel="p", width=0.3, centre=0.1, scale=0.5, order=3),
+    ClockEffect(),
+    ClockEffect(cause="filter_lag", sign=-1.0),
+    TimeEffect(cause="offset_step", shape="step", start=T0 + 200.0),
+    TimeEffect(cause="offset_drift", shape="drift", start=T0, period=500.0, order=2),
+    TimeEffect(cause="interference_tone", shape="tone", start=T0, period=17.3),
+    RateEffect(cause="channel_skew", on="skew"),
+    RateEffect(cause="eddy_current", on="eddy"),
+    ResponseEffect(cause="nonlinearity", unit=FIELD, power=3),
+    ResponseEffect(cause="saturation", unit=FIELD, axis=2, knee=35_000.0),
+]
+"""Effects of every kind, of a mass p and a channel heat, for a log that begins at T0."""
 
 
 def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:

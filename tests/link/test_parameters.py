@@ -68,22 +68,12 @@ def test_set(link: Line) -> None:
     assert link.component.parameters.changed() == {"MB_GAP_FACTOR": 4.0}
 
 
-@pytest.mark.parametrize("value", [0.5, -1.0, 1e6, nan, inf, -inf, 3.4e38])
-def test_out_of_range_is_refused_and_reported(link: Line, value: float) -> None:
-    received = write(link, "MB_GAP_FACTOR", value)
-    assert [v.param_value for v in link.only(received, "PARAM_VALUE")] == [2.5]
-    text = "".join(link.texts(received))
-    assert text.startswith("MB_GAP_FACTOR: ")
-    assert text.endswith("is not within 1.01 to 1000")
-    assert link.component.parameters.changed() == {}
-
-
-def test_refusals_are_reported_once_a_second(link: Line) -> None:
+def test_what_is_out_of_range_is_refused_and_reported_once_a_second(link: Line) -> None:
     """Each request gets the value; a later request gets it again."""
-    received = [
-        message for value in (0.5, 0.5, 0.25, 0.5, 0.75) for message in write(link, "MB_GAP_FACTOR", value)
-    ]
-    assert len(link.only(received, "PARAM_VALUE")) == 5
+    wrong = (0.5, 0.5, -1.0, 1e6, nan, inf, -inf, 3.4e38, 0.75)
+    received = [message for value in wrong for message in write(link, "MB_GAP_FACTOR", value)]
+    assert [one.param_value for one in link.only(received, "PARAM_VALUE")] == [2.5] * len(wrong)
+    assert link.component.parameters.changed() == {}
     assert "".join(link.texts(received)) == "MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000"
     assert "".join(link.texts(link.to(2))) == "MB_GAP_FACTOR: 0.75 is not within 1.01 to 1000"
     for later in (4, 6):

@@ -65,16 +65,6 @@ def test_a_log_in_another_order_is_refused() -> None:
         counted(T0 - np.arange(300.0))
 
 
-def test_an_impossible_value_is_not_known() -> None:
-    depth = np.where(np.arange(300) % 100 == 7, -1e300, 5.0)
-    whole = deployment("log.csv", T0 + np.arange(300.0), {"depth": depth})
-    (read,) = checked("log.csv", [(whole, range(1, 301))])
-    np.testing.assert_array_equal(read["depth"], np.where(depth < 0, np.nan, 5.0))
-    assert passed_over(read.attrs) == {"values_dropped": 3}
-    (line,) = named_losses(read.attrs)
-    assert line == "log.csv: row 8, column 'depth': expected m, at most 100000, not -1e+300"
-
-
 @given(time=st.lists(st.integers(0, 9), max_size=12))
 def test_no_longer_series_of_times_could_be_kept(time: list[int]) -> None:
     best = [1] * len(time)

@@ -43,6 +43,7 @@ STAMPS = {
     "ROS 1": ("%time,field.header.seq", f"{NOON * 1e9 + 5e8:.0f},1", f"{NOON * 1e9 + 15e8:.0f},2"),
     "ms": ("time [ms]", f"{NOON * 1e3 + 500:.0f}", f"{NOON * 1e3 + 1500:.0f}"),
     "us by its size": ("timestamp", f"{NOON * 1e6 + 5e5:.0f}", f"{NOON * 1e6 + 15e5:.0f}"),
+    "a telephone's ns": ("time", f"{NOON * 1e9 + 5e8:.0f}", f"{NOON * 1e9 + 15e8:.0f}"),
     "GPS week": ("GPS Week,TOW [s]", f"2208,{GPS % 604800 + 0.5}", f"2208,{GPS % 604800 + 1.5}"),
     "GPS week, ms": (
         "GWk,GMS", f"2208,{GPS % 604800 * 1e3 + 500:.0f}", f"2208,{GPS % 604800 * 1e3 + 1500:.0f}"
@@ -117,13 +118,6 @@ def test_the_answer_is_heeded(tmp_path: Path) -> None:
     text = "date,time,mag_x\n040522,120000,1\n040522,120001,2\n"
     log = read(tmp_path, text, column=["time=time [%d%m%y %H%M%S]"])
     assert log["time"].values.tolist() == [NOON, NOON + 1]
-
-
-def test_nanoseconds_under_our_own_name_are_known_by_their_size(tmp_path: Path) -> None:
-    """Telephone recorders write nanoseconds."""
-    log = read(tmp_path, f"time,mag_x\n{NOON * 1e9:.0f},1\n{NOON * 1e9 + 1e9:.0f},2\n")
-    np.testing.assert_allclose(log["time"], [NOON, NOON + 1], atol=1e-6)
-    assert "ns since 1970, by its size" in log.attrs["guessed"]
 
 
 def test_times_of_day_are_of_a_day_that_is_given(tmp_path: Path) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from math import log, sqrt
+from math import atan2, cos, degrees, log, radians, sin, sqrt
 
 import numpy as np
 import pytest
-from voyages import blocks, track_over
+from msgspec.structs import replace
+from voyages import OUTSIDE, PLACE, Map, blocks, misled, sail, track_over
 
+from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.attitude import AttitudeFilter, exponential, rotation
+from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.estimate import Estimate
-from magbridge.navigate.model import Block
-from magbridge.navigate.options import NavigationOptions, with_level
+from magbridge.navigate.model import Block, transition
+from magbridge.navigate.options import NavigationOptions, wider_level, with_level
 from magbridge.navigate.record import NavigationState, Rival
 
 HOUR_US = 3_600_000_000
@@ -108,3 +112,127 @@ def test_another_position_widens_the_covariance_and_one_that_is_likelier_means_l
     assert widened == pytest.approx((1.0 - share) * P + share * (9.0 + 3000.0**2))
     estimate.update(*measured[40])
     assert (estimate.state is NavigationState.LOST) == (share > 0.5)
+
+
+# ---- Integrity: what the filter claims ---------------------------------------------------------------------
+
+
+PERIOD = 700.0
+
+
+@pytest.fixture(scope="module")
+def alike() -> AnomalyGrid:
+    """Return a map on which every place has a twin 700 m away, which no measurement can distinguish."""
+    per_latitude, per_longitude = metres_per_degree(PLACE[0])
+    metres = np.arange(-6_000.0, 6_001.0, 50.0)
+    waves = np.cos(2.0 * np.pi * metres / PERIOD)
+    return AnomalyGrid(
+        PLACE[1] + metres / per_longitude,
+        PLACE[0] + metres / per_latitude,
+        40.0 * (waves[:, None] + waves[None, :]),
+    )
+
+
+def test_indistinguishable_places_are_never_valid(alike: AnomalyGrid, options: NavigationOptions) -> None:
+    """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
+    claimed = replace(options, start_sigma=40.0)
+    run = sail(track_over(alike, claimed, 3, hours=2.0), alike, claimed)
+    assert np.median(run.error) < 100.0
+    assert not run.valid.any()
+
+
+def test_a_start_as_wide_as_its_rivals_needs_none(grid: AnomalyGrid, options: NavigationOptions) -> None:
+    """What narrows it down is then the field alone: it is valid as soon as one place is left."""
+    wide = replace(options, start_sigma=1500.0)
+    run = sail(track_over(grid, wide, 4, hours=3.0), grid, wide)
+    tracking = run.state == NavigationState.TRACKING
+    assert run.valid.any()
+    assert run.valid.sum() > 0.9 * tracking.sum()
+    assert not (run.valid & (run.nees > OUTSIDE)).any()
+
+
+@pytest.mark.parametrize("level", [60.0, -60.0])
+def test_a_calibration_that_is_off_is_not_answered_by_another_place(
+    grid: AnomalyGrid, options: NavigationOptions, level: float
+) -> None:
+    """60 nT where 1 nT is claimed: lost at once, and the level found with the place, not instead of it."""
+    ds = track_over(grid, options, 11, hours=3.0)
+    run = sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
+    assert NavigationState.LOST in run.state
+    assert not (run.valid & (run.nees > OUTSIDE)).any()
+
+
+def test_a_misled_filter_does_not_stand_by_it() -> None:
+    hours_valid, hours_lost = misled(Map(30, 1500), 6)
+    assert hours_lost > 0.0
+    assert hours_valid < 0.5
+
+
+def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: NavigationOptions) -> None:
+    loose = wider_level(options, grid.rms)
+    assert loose.bias_sigma == grid.rms
+    assert wider_level(loose, grid.rms) == loose
+    wander = [transition(o, 20.0, 7.0)[1][4, 4] for o in (options, loose)]
+    assert wander[1] == pytest.approx(wander[0], rel=0.01)
+
+
+# ---- Attitude from rates and the field's direction while the autopilot's is wrong; gaps in telemetry -------
+
+
+MAIN = np.array([18_000.0, -5_000.0, 48_000.0])
+
+
+def flown(*, wrong: bool) -> tuple[float, float, float]:
+    """Return errors (deg) of the filter's and the autopilot's heading after two minutes, and the sigma (deg).
+
+    The aircraft turns left and right. From 60 s on, the autopilot's bias and attitude are wrong if `wrong`.
+    """
+    rng = np.random.default_rng(4)
+    attitude, filter_ = np.eye(3), AttitudeFilter()
+    for tick in range(1200):
+        time = 0.1 * tick
+        rates = np.array([0.2 * sin(time), 0.1 * cos(0.7 * time), 0.15 * sin(0.2 * time)])
+        attitude = attitude @ exponential(rates * 0.1)
+        bad = wrong and time > 60.0
+        bias = radians(3.0) * np.array([1.0, -1.0, 2.0]) if bad else np.zeros(3)
+        tilt = rotation(radians(15.0), radians(-10.0), radians(40.0)) if bad else np.eye(3)
+        claimed = tilt @ attitude
+        angles = (
+            atan2(claimed[2, 1], claimed[2, 2]),
+            -np.arcsin(claimed[2, 0]),
+            atan2(claimed[1, 0], claimed[0, 0]),
+        )
+        later = rates + np.array([0.2 * cos(time), -0.07 * sin(0.7 * time), 0.03 * cos(0.2 * time)]) * 0.05
+        filter_.rotate(time, time, angles, later + bias, vouched=not bad)
+        filter_.gyro(time + 0.05, later)
+        filter_.direct(time, attitude.T @ MAIN + rng.normal(0.0, 100.0, 3), MAIN)
+    true = atan2(attitude[1, 0], attitude[0, 0])
+    own, autopilot = ((degrees(yaw - true) + 180.0) % 360.0 - 180.0 for yaw in (filter_.heading, angles[2]))
+    assert filter_.agrees is not wrong
+    return own, autopilot, degrees(filter_.heading_sigma)
+
+
+def test_the_heading_holds_while_the_autopilot_is_wrong() -> None:
+    own, autopilot, sigma = flown(wrong=True)
+    assert abs(autopilot) > 25.0
+    assert abs(own) < min(6.0, 3.0 * sigma)
+
+
+def test_the_autopilot_is_used_while_it_is_right() -> None:
+    own, autopilot, _ = flown(wrong=False)
+    assert abs(autopilot) < 0.1
+    assert abs(own) < 3.0
+
+
+@pytest.mark.parametrize("reports", [1, 5])
+def test_a_turn_during_a_gap_is_uncertain_by_the_speed_times_the_gap(reports: int) -> None:
+    """Reports that have waited arrive at once; their changes belong to the gap."""
+    where = DeadReckoning()
+    where.telemetry(0.0, {"heading": 0.0, "speed": 20.0})
+    where.telemetry(1.0, {"heading": 0.0, "speed": 20.0})
+    for number in range(1, reports + 1):
+        where.telemetry(6.0 + 0.01 * number, {"heading": 90.0 * number / reports, "speed": 20.0})
+    noise = where.noise
+    # the velocity changes by 20 sqrt(2) m/s at an unknown moment of 5 s
+    assert sqrt(noise.nn + noise.ee) >= 0.95 * 20.0 * sqrt(2.0) * 5.0 / sqrt(12.0)
+    assert sqrt(noise.nn + noise.ee) < 20.0 * 5.0
