@@ -1,7 +1,5 @@
 """Test the alignment: interpolation, ages, and a flag for each reason that makes a sample uncertain."""
 
-from __future__ import annotations
-
 from math import inf, nan
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test bridge.toml: accepted settings, and a message of one line for every other."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -1,7 +1,5 @@
 """Test alignment and calibration together: the sigma includes every uncertainty."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import hypot, nan
 

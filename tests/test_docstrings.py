@@ -1,7 +1,5 @@
 """Test that docstrings state an array's shape, the errors raised, and the meaning of a constant."""
 
-from __future__ import annotations
-
 import ast
 import re
 from functools import cache

@@ -1,7 +1,5 @@
 """Test that wrong samples have a flag, for each fault of sensor, telemetry and computer in a survey."""
 
-from __future__ import annotations
-
 import pytest
 from faults import FAULTS, Flight, prepare, score, stalls
 

@@ -1,7 +1,5 @@
 """Test that a file is complete or missing, whatever happens to the process that writes it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

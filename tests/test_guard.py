@@ -1,7 +1,5 @@
 """Test that a reader that hangs, crashes or exhausts the memory ends in one line."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Test the public names: they exist, are loaded only on use, and do what the docstring states."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Test the service, the adapter's udev rule, the container and the BlueOS extension."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

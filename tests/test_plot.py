@@ -1,7 +1,5 @@
 """Test the plots for notebooks: drawn on given or new axes, with the right values."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path

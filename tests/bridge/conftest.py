@@ -1,7 +1,5 @@
 """Fixtures of the fault tests: bridges with a simulated sensor and autopilot, and the record of results."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

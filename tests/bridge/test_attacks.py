@@ -1,7 +1,5 @@
 """Test a running bridge under the attacks of tools/attacks.py and under one combined attack."""
 
-from __future__ import annotations
-
 import select
 import socket
 from collections.abc import Callable, Iterator

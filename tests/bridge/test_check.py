@@ -1,7 +1,5 @@
 """Test ``run --check``, which lists the errors of a configuration, and ``--live``, which tests the ports."""
 
-from __future__ import annotations
-
 import os
 import pty
 import select

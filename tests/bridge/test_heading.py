@@ -1,7 +1,5 @@
 """Test the live heading: its computation from the corrected vector, and its messages."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Test ``[learning]``: messages to a station, and equal results live, in a replay and offline."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -3,8 +3,6 @@
 Every test waits for a normal state, causes a fault, and checks the published messages, the recovery time and
 the losses. Then a test replays the log."""
 
-from __future__ import annotations
-
 import signal
 import time
 from collections.abc import Callable

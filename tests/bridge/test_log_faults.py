@@ -1,7 +1,5 @@
 """Test faults of the log and abrupt ends: full disk, deleted folder, kill -9, several bridges or files."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

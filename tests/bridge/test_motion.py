@@ -1,7 +1,5 @@
 """Test which telemetry dead reckoning uses, and when and how the bridge sends fixes to the autopilot."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test live navigation: fixes from telemetry and samples, in the message that the autopilot uses."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace

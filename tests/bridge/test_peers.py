@@ -1,7 +1,5 @@
 """Test a link with many peers: which peers get replies, and that none blocks the frames of another."""
 
-from __future__ import annotations
-
 import os
 import select
 import socket

@@ -1,7 +1,5 @@
 """Test a bridge without ports: its log after a restart, its input values, and its log corrected again."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Test the ports of a link with slow, disturbing and absent readers."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import select

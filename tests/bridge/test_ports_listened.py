@@ -1,7 +1,5 @@
 """Test that the bridge identifies the device on a serial line by its bytes, on real pseudo-terminals."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """Test the bridge's position with GNSS receivers that are wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """Test faults that need their own bridge: no devices, another device, link, clock or key, or a reader."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Test the interpretation of the sensor's line: half a line, rare readings, another instrument."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

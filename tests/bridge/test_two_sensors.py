@@ -1,7 +1,5 @@
 """Test a bridge with two sensors: ids, messages, comparison, and compensation of a scalar sensor."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

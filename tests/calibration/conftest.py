@@ -1,7 +1,5 @@
 """Fixture of the calibration tests: a cached function that makes a simulated glider."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import pytest

@@ -1,7 +1,5 @@
 """Test that bad calibration data give exit code 1, one clear line and no file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test the correction against a naive implementation, and live against batch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """Test each effect's regressors against its equation, on short logs with a known result."""
 
-from __future__ import annotations
-
 from math import exp, nan
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test exported calibrations: C code gives Python's field, and the autopilots' formulae give theirs."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

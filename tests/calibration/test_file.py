@@ -1,7 +1,5 @@
 """cal.json: a written file is read back, and an inconsistent one gives one clear line."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

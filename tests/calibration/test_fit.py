@@ -1,7 +1,5 @@
 """Test fits: derivatives, recovered parameters, errors out of sample near the noise floor, sigmas."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Test options of a fit: known iron, a free mean, a range of support."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Test the heading with its standard deviation, and the boresight from roll and pitch only."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test that a survey without runs and map separates the vehicle's field from the crustal field."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Test a real aircraft's calibration flight: the claimed sigma is right at any sample rate."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

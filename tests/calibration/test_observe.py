@@ -1,7 +1,5 @@
 """Test the observations that are made from a deployment's columns."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr

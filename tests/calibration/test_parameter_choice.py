@@ -1,7 +1,5 @@
 """Test that ``--parameter auto`` selects the columns that move the field, and no others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test the predicted error of a mission, and the proposal of the next runs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fixtures of the command-line tests: the file of a simulated deployment, and its calibration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

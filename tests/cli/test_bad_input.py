@@ -1,7 +1,5 @@
 """Test that a command rejects bad input with one clear line, its exit code, and no partial file."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

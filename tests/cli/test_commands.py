@@ -1,7 +1,5 @@
 """Test the results and messages of each command."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """Test ``magbridge info``, and declarations about a log on the command line."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fixtures of the diagnosis tests."""
 
-from __future__ import annotations
-
 import pytest
 from demos import demo
 from study import deployment

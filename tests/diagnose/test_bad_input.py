@@ -1,7 +1,5 @@
 """Test that `diagnose` reports an unusable deployment in one line that names the required column."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

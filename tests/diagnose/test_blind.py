@@ -1,7 +1,5 @@
 """Test some hidden effects of finer physics than the detector's; ``tools/blind.py`` is the full study."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

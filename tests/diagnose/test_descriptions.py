@@ -1,7 +1,5 @@
 """Test the descriptions of residuals without a named cause."""
 
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 

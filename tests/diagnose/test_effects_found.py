@@ -1,7 +1,5 @@
 """Test the effects that a diagnosis adds: equal bits live and in batch, and right derivatives."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Test the uncertainty of an extended calibration, and the improvement that held-out dives show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

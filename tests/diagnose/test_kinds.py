@@ -1,7 +1,5 @@
 """Test the kinds of telemetry series, and that no named cause contradicts a kind."""
 
-from __future__ import annotations
-
 import ast
 from dataclasses import replace
 from inspect import getsource

@@ -1,7 +1,5 @@
 """Test the diagnosis on measured logs, which have effects that the simulation lacks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

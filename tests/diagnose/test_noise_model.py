@@ -1,7 +1,5 @@
 """Test the autoregressive noise model, its filter and its standard deviation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

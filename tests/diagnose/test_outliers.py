@@ -1,7 +1,5 @@
 """Test that wrong samples are distinguished from a passing source, and good neighbours are kept."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test that the columns of the search equal the regressors of the live correction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Test the sentences of the report, the findings and the page."""
 
-from __future__ import annotations
-
 import json
 import re
 from base64 import b64decode

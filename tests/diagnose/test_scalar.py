@@ -1,7 +1,5 @@
 """Test the findings for a scalar magnetometer: lag, heading error, and the channel that disturbs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

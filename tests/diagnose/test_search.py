@@ -1,7 +1,5 @@
 """Test the search on artificial residuals, and the evidence that it compares."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

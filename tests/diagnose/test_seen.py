@@ -1,7 +1,5 @@
 """Test the reported properties of a signal of unknown cause, and a residual far from white noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fixtures of the documentation tests: small files with the names that the pages use."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

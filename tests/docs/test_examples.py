@@ -1,7 +1,5 @@
 """Test the code that the documentation shows: run it, or parse it."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Test that the page on the architecture shows the existing layers, modules and types."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Test the templates in ``examples/``, installed and used as by a contributor."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Test the Gaussian field and its normal equations against dense algebra and Laplace's equation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.sparse import csr_array

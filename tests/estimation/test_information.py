@@ -1,7 +1,5 @@
 """Test Gaussian information and the solver against dense integrals and an independent optimiser."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

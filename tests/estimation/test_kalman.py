@@ -1,7 +1,5 @@
 """Test the Kalman filter against least squares, and the sequential test against densities of scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import multivariate_normal
 

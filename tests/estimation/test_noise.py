@@ -1,7 +1,5 @@
 """Test that the estimated size and autocorrelation of noise equal the simulated ones, despite outliers."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test a base station's variation in calibrations and surveys on a day with a varying field."""
 
-from __future__ import annotations
-
 import json
 from datetime import UTC, datetime
 from pathlib import Path

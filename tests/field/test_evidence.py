@@ -1,7 +1,5 @@
 """Test that units, names, reference system and range identify axes and columns, not their order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test the spline of an anomaly map against scipy's spline and finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline

@@ -1,7 +1,5 @@
 """Test the main field against another program, published values, and the properties of a potential field."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import numpy as np

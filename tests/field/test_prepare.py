@@ -1,7 +1,5 @@
 """Test map preparation: continuation against the field of a real source, the merge, the mask, the kernel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

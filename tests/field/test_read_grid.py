@@ -1,7 +1,5 @@
 """Read one anomaly map from every format; refuse files that are not maps."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Test equation 4, the reference of the total field."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr

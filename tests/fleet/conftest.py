@@ -1,7 +1,5 @@
 """Fixtures of the fleet tests: the simulated logs of two vehicles, and their processed catalogue."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test the catalogue: unique rows for any number of writers; one line for a newer or damaged catalogue."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Test that the hierarchical model equals a dense Gaussian, with consistent sigmas."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Test that a catalogue on a server equals one in a folder, with several simultaneous writers."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Test processing: a deployment's rows, faults of a log, a killed and repeated run, and two workers."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Checks and limits that the fault tests share."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from itertools import zip_longest

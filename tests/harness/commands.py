@@ -1,7 +1,5 @@
 """Run a command as a user types it, and return its output or the line of its error message."""
 
-from __future__ import annotations
-
 import json
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The simulated deployments of the demo and their calibrations, each made once in a process."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

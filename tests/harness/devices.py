@@ -1,7 +1,5 @@
 """Simulated devices at the ends of a bridge: a fluxgate on a pty, an autopilot, and a ground station."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pty

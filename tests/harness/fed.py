@@ -1,7 +1,5 @@
 """Feed events to a bridge without ports, and read the messages that it sends."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small vehicles with one moving mass, and a fleet.toml of two of them."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Random gliders with moving dipoles: calibration runs (Table 1 of the paper) and a survey."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

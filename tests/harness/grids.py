@@ -1,7 +1,5 @@
 """Write one anomaly map in each third-party format that magbridge reads."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path

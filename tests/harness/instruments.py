@@ -1,7 +1,5 @@
 """Connect each driver to its emulated instrument; one TIO device has the protocol of the first generation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from magbridge.sensors import Driver, open_driver, tio

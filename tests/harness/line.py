@@ -1,7 +1,5 @@
 """Connect the bridge's MAVLink component to a ground station by encoded frames, without ports."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any

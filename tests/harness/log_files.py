@@ -1,7 +1,5 @@
 """Write logs in the formats of ArduPilot (bytes or text), of a Slocum (segments) and of PX4 (ULog)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from struct import Struct, pack

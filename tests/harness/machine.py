@@ -1,7 +1,5 @@
 """Measure pauses and processor time of this machine, and limit its disk, so that tests hold everywhere."""
 
-from __future__ import annotations
-
 import os
 import resource
 import threading

@@ -1,7 +1,5 @@
 """Read the pages of the documentation and their code blocks."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Tracks over a field with anomalies, for tests of bridge and autopilot in closed loop."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Make problems of a diagnosis, and candidates for them, without a simulation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Render the report of a diagnosis for tests."""
 
-from __future__ import annotations
-
 from html import unescape
 from unittest.mock import patch
 

@@ -5,8 +5,6 @@ within :meth:`Rig.until`. Nothing happens in the background, so a test states it
 in which they occur.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

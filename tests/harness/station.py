@@ -1,7 +1,5 @@
 """Run ``magbridge monitor`` as a process, and request its page as a browser does."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -5,8 +5,6 @@ microseconds in a file. (A time namespace shifts only the monotonic clocks, and 
 clock would affect all its processes.)
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Write a text file and read it as a log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

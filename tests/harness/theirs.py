@@ -1,7 +1,5 @@
 """Write small logs in third-party formats, of a vehicle that turns through all attitudes."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any

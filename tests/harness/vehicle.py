@@ -1,7 +1,5 @@
 """Feed hand-made autopilot messages to the bridge's navigation, and collect its messages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from passages import OPTIONS, PLACE, hills

@@ -1,7 +1,5 @@
 """Simulate in-flight calibration: a glider turns, dives and moves its mass over a smooth field."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import nan
 

@@ -1,7 +1,5 @@
 """Test that attitude-dependent errors widen sigma, and that a fast flight over an anomaly does not."""
 
-from __future__ import annotations
-
 from functools import partial
 from math import nan
 

@@ -1,7 +1,5 @@
 """Test the detection of a wrong mounting, which the total field does not show."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from math import nan
 

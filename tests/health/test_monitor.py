@@ -1,7 +1,5 @@
 """Test that the monitor detects and reports each fault once, and does not flag a healthy sensor."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import nan
 

@@ -1,7 +1,5 @@
 """Fixtures of the interoperability tests: third-party programs, and a bridge to which they connect."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import time

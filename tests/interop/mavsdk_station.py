@@ -1,7 +1,5 @@
 """Run a MAVSDK ground station that prints JSON lines. Arguments: URL of the link, magbridge's XML."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sys

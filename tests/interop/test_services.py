@@ -1,7 +1,5 @@
 """Test files and parameters with third-party programs, through a router, and with old peers."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

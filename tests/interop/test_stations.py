@@ -1,7 +1,5 @@
 """Test that third-party ground stations find the bridge, set its parameters, and read its messages."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Callable

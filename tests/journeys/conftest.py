@@ -1,7 +1,5 @@
 """Run the commands of the documentation's pages in a folder with a user's files."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test ten first hours: the commands of the documentation, word for word, on files like those of users."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

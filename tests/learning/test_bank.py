@@ -1,7 +1,5 @@
 """Test the bank of estimators: the selection, and what the baseline takes from the selected estimator."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

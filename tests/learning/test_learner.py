@@ -1,7 +1,5 @@
 """Test in-flight calibration: the equation of a sample equals the fit's; results of many samples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

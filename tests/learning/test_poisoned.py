@@ -1,7 +1,5 @@
 """Test wrong references: the published field keeps its accuracy, and the bridge reports the error."""
 
-from __future__ import annotations
-
 from math import nan
 
 import numpy as np

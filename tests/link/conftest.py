@@ -1,7 +1,5 @@
 """Fixtures of the MAVLink tests: the bridge's component connected to a ground station."""
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import pytest

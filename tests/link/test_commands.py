@@ -1,7 +1,5 @@
 """Test that commands are acknowledged to their sender."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import inf, nan
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test the component from the point of view of a ground station."""
 
-from __future__ import annotations
-
 import random
 from math import inf, nan
 from pathlib import Path

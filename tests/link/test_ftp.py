@@ -1,7 +1,5 @@
 """Test MAVLink FTP and the older log transfer, without a link: accepted and rejected requests."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test the access to every parameter by the parameter protocol."""
 
-from __future__ import annotations
-
 import itertools
 from math import inf, nan
 from pathlib import Path

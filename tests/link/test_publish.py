@@ -1,7 +1,5 @@
 """Test the messages of samples and of fixes that a station or an autopilot receives."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable
 from math import isfinite, isnan, nan

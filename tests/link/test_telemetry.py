@@ -1,7 +1,5 @@
 """Test that any field of any message can become a parameter."""
 
-from __future__ import annotations
-
 import time
 from math import nan
 from pathlib import Path

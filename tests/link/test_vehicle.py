@@ -1,7 +1,5 @@
 """Test an autopilot that appears, disappears and reboots, several autopilots, and its clock."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable
 from itertools import count

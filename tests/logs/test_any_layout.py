@@ -1,7 +1,5 @@
 """Test that a log in a random layout is read correctly or rejected with a question, never silently wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

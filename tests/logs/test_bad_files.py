@@ -1,7 +1,5 @@
 """Test that each bad file gives one line with file, row, column and the expected content."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """Test ArduPilot's logs: records as pymavlink reads them, and logs that were once silently read wrong."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Test that every written format can be read back, whole or in pieces."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Test the readers of Seaglider, SeaExplorer and Slocum logs."""
 
-from __future__ import annotations
-
 import datetime
 import gzip
 import shutil

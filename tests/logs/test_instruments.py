@@ -1,7 +1,5 @@
 """Test text files as instruments and their programs write them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

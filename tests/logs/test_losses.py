@@ -1,7 +1,5 @@
 """Test that bad rows are dropped, counted and named, and the other rows are read as without them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test that every column equals the result of another reader: xarray, pyulog or pymavlink."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from math import degrees

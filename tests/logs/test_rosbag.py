@@ -1,7 +1,5 @@
 """Test ROS bags: written by rosbags, read in magbridge's axes, and compared with rosbags' reader."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

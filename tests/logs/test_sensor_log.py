@@ -1,7 +1,5 @@
 """Test that a sensor's log gets a vehicle's telemetry at the sensor's times, with gaps counted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Test properties of single formats: their layout, their limits, and third-party files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

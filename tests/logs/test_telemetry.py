@@ -1,7 +1,5 @@
 """Test logs of live links: the telemetry of each row."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial

@@ -1,7 +1,5 @@
 """Test text files of other programs: the reader finds and reports what columns mean, or rejects the file."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import lzma

@@ -1,7 +1,5 @@
 """Test the times of text files: the reader finds what they count from, or asks for it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test the writing of tlogs: rotation, full and stalled disks, loss of power."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

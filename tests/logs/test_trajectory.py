@@ -1,7 +1,5 @@
 """Test netCDF files with different layouts of third-party programs, compared with xarray."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Test that any bytes in any pieces give messages or a counted loss."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from types import ModuleType

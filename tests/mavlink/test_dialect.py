@@ -1,7 +1,5 @@
 """Test that the XML, the generated table and pymavlink's classes agree."""
 
-from __future__ import annotations
-
 import importlib.util
 import random
 import subprocess

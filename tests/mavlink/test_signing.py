@@ -1,7 +1,5 @@
 """Test signatures in both directions with pymavlink, and a forged frame from the future."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import ModuleType
 from typing import Any

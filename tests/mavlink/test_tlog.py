@@ -1,7 +1,5 @@
 """Test that logs are read to their end, whatever their damage."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

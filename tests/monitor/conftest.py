@@ -1,7 +1,5 @@
 """Fixtures of the monitor's tests: a browser."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from typing import Any

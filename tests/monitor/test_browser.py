@@ -1,7 +1,5 @@
 """Test the page in a real browser: its view, its keyboard control, and its text for a screen reader."""
 
-from __future__ import annotations
-
 import math
 import re
 import socket

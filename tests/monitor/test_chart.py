@@ -1,7 +1,5 @@
 """Test the chart's curve, axis and marks, the stored history, and the map."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from math import inf, nan
 

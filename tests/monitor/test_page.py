@@ -1,7 +1,5 @@
 """Test the page of the real command in a browser, with real datagrams."""
 
-from __future__ import annotations
-
 import select
 import socket
 import sys

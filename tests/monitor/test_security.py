@@ -1,7 +1,5 @@
 """Test the access control with real requests and websockets, as a browser of another site sends them."""
 
-from __future__ import annotations
-
 import base64
 import http.client
 import os

@@ -1,7 +1,5 @@
 """Test the state of the page from the frames of a bridge."""
 
-from __future__ import annotations
-
 import csv
 import json
 from io import BytesIO

@@ -1,7 +1,5 @@
 """Fixtures of the navigation tests: options, and a map of the tool that prints the documented tables."""
 
-from __future__ import annotations
-
 import pytest
 from voyages import Map, synthetic
 

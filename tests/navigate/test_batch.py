@@ -1,7 +1,5 @@
 """Test a log against a map: the track, the backward pass, the findings, the rejections."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test the posterior Cramér-Rao bound in cases with a closed form."""
 
-from __future__ import annotations
-
 from dataclasses import replace as changed
 from math import hypot
 from pathlib import Path

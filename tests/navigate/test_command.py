@@ -1,7 +1,5 @@
 """Test `magbridge navigate` with a log or a plan, with maps of every kind, and its output."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

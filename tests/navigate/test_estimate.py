@@ -1,7 +1,5 @@
 """Test the rules of the estimate: what a start resets, the number of hypotheses, the search width."""
 
-from __future__ import annotations
-
 from math import atan2, cos, degrees, log, radians, sin, sqrt
 
 import numpy as np

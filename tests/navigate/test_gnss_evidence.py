@@ -1,7 +1,5 @@
 """Test the odds of a receiver's position by the field, at right and at false positions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from passages import AIRCRAFT, PLACE, START

@@ -1,7 +1,5 @@
 """Test that the navigator finds the vehicle or reports that it has not, and that replays are equal."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr

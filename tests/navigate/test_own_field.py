@@ -1,7 +1,5 @@
 """Test the likelihood of a track in an unmapped field, its bound, and the sampler that uses both."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal

@@ -1,7 +1,5 @@
 """Test localisation without a map, which bends the track to repeat the measured field at crossings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import xarray as xr

@@ -1,7 +1,5 @@
 """Test one filter and a bank against the written-out equations, each other, and brute force."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import msgspec

@@ -1,7 +1,5 @@
 """Test line protocols that the configuration describes."""
 
-from __future__ import annotations
-
 from functools import reduce
 from math import inf
 from operator import xor

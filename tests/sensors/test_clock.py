@@ -1,7 +1,5 @@
 """Test the device clock against simulated truth: drift, jitter, wraps, restarts, steps, losses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from math import nan

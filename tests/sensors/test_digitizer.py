@@ -1,7 +1,5 @@
 """Test the digitizer's frame, byte for byte, against its description."""
 
-from __future__ import annotations
-
 import ast
 from math import isnan
 from pathlib import Path

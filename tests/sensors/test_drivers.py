@@ -1,7 +1,5 @@
 """Test each driver with any bytes in any chunks, and with the output of its encoder."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Test the RM3100 driver on its registers, with the part's pitfalls and faults of the bus."""
 
-from __future__ import annotations
-
 import select
 import time
 from pathlib import Path

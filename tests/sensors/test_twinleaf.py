@@ -1,7 +1,5 @@
 """Test TIO packets that the tests build from the public description of the protocol."""
 
-from __future__ import annotations
-
 from struct import pack
 from typing import Any
 from zlib import crc32

@@ -1,7 +1,5 @@
 """Test that an encoder is the inverse of its driver, to the resolution of the instrument."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

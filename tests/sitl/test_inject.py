@@ -1,7 +1,5 @@
 """Test the physics of each injected effect, independently of the detector's model."""
 
-from __future__ import annotations
-
 import ast
 import json
 from dataclasses import replace

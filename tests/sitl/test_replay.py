@@ -1,7 +1,5 @@
 """Test replays, which send real bytes through a pty and a socket to the real bridge."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Test deployments of the digital twin: scenarios, seeds, missions and logs that drive it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test the simulated Earth field, crustal field and water."""
 
-from __future__ import annotations
-
 import choclo
 import numpy as np
 import pytest

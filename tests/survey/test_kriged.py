@@ -1,7 +1,5 @@
 """Test kriging from the nearest samples, for an area too large for nodes as fine as its field."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Test one map from raw logs: several vehicles, a base station, and the message for a bad log."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Test a scalar magnetometer on lines and ties: lag, lever arm and heading error from the survey only."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Test that corrected lines give a levelled map equal to the true field, with a valid sigma."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Test the programs of the gate: wording, names, commit messages, size."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Test that the emulated autopilots keep the real rules, and that the bridge does not diverge with them."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 from math import nan
 from typing import Any

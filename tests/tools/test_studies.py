@@ -1,7 +1,5 @@
 """Test that a study runs its cases, stores their rows, and tabulates them."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
