@@ -45,7 +45,7 @@ BOUND: Final = 5.0
 class Floor:
     """Estimate of the straight line below the points (x, y), with x in s and y in µs.
 
-    `slope`: slope of the line, µs/s.
+    `slope`, `slope_sigma`: slope of the line and its standard deviation, µs/s.
     `delay`: running mean of the points' height above the line, µs.
     `lowest`: lowest point (x, y) of the last complete block, or of the present one.
 
@@ -69,7 +69,7 @@ class Floor:
     def restart(self, x: float, y: float) -> None:
         """Start a new line at the point (`x`, `y`), with the present slope as the prior mean of its slope."""
         self._prior = self.slope
-        self._sigma = self._prior_sigma
+        self.slope_sigma = self._prior_sigma
         self._points: list[tuple[float, float]] = []
         self._x, self._y = x, y
         self._drop = 0.0
@@ -89,7 +89,7 @@ class Floor:
 
     def tolerance(self, x: float) -> float:
         """Return the difference from the line (µs) that a point at `x` may have."""
-        return TOLERANCE + 3.0 * self._sigma * abs(x - self._x)
+        return TOLERANCE + 3.0 * self.slope_sigma * abs(x - self._x)
 
     def add(self, x: float, y: float, above: float, limit: float) -> float:
         """Add the point (`x`, `y`), `above` µs above the line; fit the line after each complete block.
@@ -140,7 +140,7 @@ class Floor:
         information = sxx + (self.scatter / self._prior_sigma) ** 2
         slope = self._prior + (sxy - self._prior * sxx) / information
         self.slope = max(-BOUND * self._prior_sigma, min(slope, BOUND * self._prior_sigma))
-        self._sigma = max(self.scatter / information**0.5, WANDER * self._prior_sigma)
+        self.slope_sigma = max(self.scatter / information**0.5, WANDER * self._prior_sigma)
         self._x, self._y, self._drop = x, y, 0.0
 
 
@@ -152,6 +152,8 @@ RESTART: Final = 1e6
 the instrument was restarted."""
 HALF: Final = 0.6
 """Delay of a reading, as a fraction of the period, beyond which an earlier reading is missing."""
+MARGIN: Final = 0.1
+"""Largest error of the line, as a fraction of the period, where late readings differ from missing ones."""
 BASELINE: Final = 1 << 16
 """Number of readings after which the mean interval between readings is computed again."""
 MIN_INTERVAL_READINGS: Final = 16
@@ -200,9 +202,10 @@ class DeviceClock:
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Reading]:
         """Return the readings of one chunk, which arrived at `arrival_us` (µs), with their host times.
 
-        The times increase, except after a step of a clock. Only the last reading updates the line, because
-        the earlier readings waited for the last one. Readings that queued up during a stall of the host may
-        come in several chunks; only the last chunk then ends with a reading without delay.
+        The times increase, except after a step of a clock. With a steady rate, no time is later than the
+        arrival, except for steps of 4 µs between readings of one time. Only the last reading updates the
+        line, because the earlier readings waited for the last one. Readings that queued up during a stall of
+        the host may come in several chunks; only the last chunk then ends with a reading without delay.
         """
         last = len(readings) - 1
         stamped = []
@@ -214,16 +217,17 @@ class DeviceClock:
                     waited = (last - index) * self._period
                 elif not 0.0 <= waited < 60.0:  # a restart or a wrap between the two readings
                     waited = 0.0
-            stamped.append(self.update(reading, arrival_us - int(waited * 1e6), index == last))
+            stamped.append(self.update(reading, arrival_us, int(waited * 1e6) if index < last else None))
         return stamped
 
-    def update(self, reading: Reading, arrival_us: int, informative: bool = True) -> Reading:
+    def update(self, reading: Reading, arrival_us: int, waited_us: int | None = None) -> Reading:
         """Return a reading with its time on the host's clock.
 
         `arrival_us`: time of arrival on the host's clock, µs.
-        `informative`: True if the reading updates the relation between the clocks; False for a reading that
-            waited for a later one.
+        `waited_us`: time for which the reading waited for a later one, µs. None: it did not wait, so that it
+            updates the relation between the clocks.
         """
+        limit_us, arrival_us, informative = arrival_us, arrival_us - (waited_us or 0), waited_us is None
         device_time, sequence = reading.device_time, reading.sequence
         if not abs(device_time) < MAX_DEVICE_TIME_S:
             device_time = nan
@@ -241,11 +245,14 @@ class DeviceClock:
         elif self._period:
             time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, informative)
             missing += unseen
+            time_us = min(time_us, limit_us)
         else:
             time_us = float(arrival_us)
         self._arrival_us, self._device_time = arrival_us, device_time
         out_us = int(time_us) & ~3
-        if out_us <= self._out_us and not stepped:
+        # a restart of the line alone must not decrease the times: only a step of the host's clock leaves the
+        # last time in the future
+        if out_us <= self._out_us and not (stepped and self._out_us > limit_us + TOLERANCE):
             out_us = self._out_us + 4
         self._out_us, self.stepped = out_us, stepped
         return replace(reading, time_us=out_us, missing=0 if restarted else missing, restarted=restarted)
@@ -320,10 +327,16 @@ class DeviceClock:
         x = self._count * self._period
         y = arrival_us - origin_us - 1e6 * x
         above = y - floor.value_at(x)
+        # no reading is sent after its arrival, so a reading late by less than a period proves no loss; the
+        # margin covers the scatter of the line and its error since the last reading, because each reading
+        # below the line lowers the line
+        slope_error = 3.0 * floor.slope_sigma * self._period * (1 + missing)
+        margin = min(8.0 * floor.scatter + slope_error, MARGIN * period_us)
+        beats = int((above + margin) // period_us)
         limit = max(HALF * period_us, TOLERANCE)
-        if -limit <= above <= limit + 10.0 * floor.delay:
-            above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if informative else 0.0
-        beats = round(above / period_us)
+        if -limit <= above and (not beats or above <= limit + 10.0 * floor.delay):
+            late = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if informative else 0.0
+            beats = round(late / period_us)
         if beats:
             self._count += beats
             x += beats * self._period

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from magbridge.arrays import FloatArray
 from magbridge.records import Reading
-from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock
 
 EPOCH = 1_700_000_000_000_000
@@ -254,16 +253,6 @@ def test_a_backlog_in_pieces_is_dated_as_before(piece: int) -> None:
     assert np.abs(error_us(made, true)).max() < 10
 
 
-def test_the_clock_of_a_driver() -> None:
-    clock = DeviceClock.for_driver(open_driver("hmr2300", {"rate": 10}))
-    assert [update(clock, nan, EPOCH + k * 100_000 + 7_000 * (k % 2)).time_us - EPOCH for k in range(4)] == [
-        0,
-        100_000,
-        200_000,
-        300_000,
-    ]
-
-
 EVENTS: Any = st.tuples(
     st.one_of(st.just(nan), st.floats(0, 5_000), st.floats(-1e9, 1e10)),
     st.integers(-(10**7), 10**8),
@@ -332,3 +321,16 @@ def test_a_shift_of_the_phase_is_followed() -> None:
     made = stamps(DeviceClock(period=1.0), np.full(true.size, nan), arrivals(true, 2e-3))
     assert sum(stamp.missing for stamp in made) == 0
     assert np.abs(error_us(made, true)[-100:]).max() < 20_000
+
+
+@pytest.mark.parametrize("delay", [0.05, 0.087, 0.096])
+def test_a_late_line_is_not_a_missing_reading(delay: float) -> None:
+    """At 10 Hz, a line every 7 s arrives late by most of a period; no reading is younger than its arrival."""
+    true = np.arange(0.0, 60.0, 0.1)
+    late = np.where(np.arange(true.size) % 70 == 69, delay, 0.0)
+    arrived = arrivals(true + late, 3e-4)
+    made = stamps(DeviceClock(period=0.1), np.full(true.size, nan), arrived)
+    assert flags(made) == (0, 0, 0)
+    assert (error_us(made, arrived) <= 10.0).all()
+    assert np.abs(error_us(made, true)).max() < 10_000
+    assert all(b.time_us > a.time_us for a, b in pairwise(made))
