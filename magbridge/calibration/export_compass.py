@@ -6,8 +6,9 @@ The autopilots correct with a symmetric matrix, an offset, and a vector times th
     PX4        b = M (h + COMP I - OFF)                     G, G/kA
 
 magbridge corrects with ``b = R A(x) (h - T(x))``. So ``M = A`` and ``OFS = -T``, and a parameter in ampere
-whose field is linear gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects and the
-boresight R; the export reports the resulting error.
+gives ``MOT = -A dT/dI``, where T is the best straight line over the calibrated range of the current. The
+autopilot cannot represent moving masses, curved T(I), effects and the boresight R; the export reports the
+resulting error.
 
 A Seaglider corrects counts of its compass in axes with y and z reversed, and levels the result with roll and
 pitch::
@@ -41,6 +42,8 @@ OFF = (0, 1), (0, 2), (1, 2)
 """Row and column of the entries of a symmetric matrix off its diagonal."""
 FLOAT, INTEGER = 9, 6
 """Values of MAV_PARAM_TYPE in a QGroundControl parameter file: REAL32 and INT32."""
+RANGE_POINTS = 41
+"""Number of currents at which the straight line is fitted."""
 MAX_OFFSET_MG = 1_800.0
 """Largest length of the offset with which ArduPilot arms (COMPASS_OFFS_MAX), mG."""
 
@@ -50,11 +53,11 @@ class Compass:
     """Part of a calibration that an autopilot's compass model can represent."""
 
     matrix: FloatArray
-    """(3, 3): Symmetric matrix A at the middle of each parameter's range and zero current."""
+    """(3, 3): Symmetric matrix A at the middle of each parameter's range, averaged over the current's."""
     offset: FloatArray
-    """(3,): T at the middle of each parameter's range and zero current, nT."""
+    """(3,): T at the middle of each parameter's range, by its straight line at zero current, nT."""
     current: FloatArray | None
-    """(3,): dT/dI, nT/A; None if no parameter is a current."""
+    """(3,): Slope dT/dI of the straight line, nT/A; None if no parameter is a current."""
     lost: tuple[str, ...]
     """Description of each part that the format cannot represent, with the resulting error if it is known."""
 
@@ -62,34 +65,35 @@ class Compass:
 def compass_of(calibration: Calibration) -> Compass:
     """Return the part of a calibration that an autopilot's compass model can represent."""
     currents = [k for k, one in enumerate(calibration.parameters) if usual(one.unit) == "A"][:1]
-    # expand about the middle of each range, and about no current: T(I) = T + I dT/dI
-    middle = _middle(calibration)
-    middle[currents] = 0.0
-    matrix, offset = matrix_and_offset(calibration, middle)
-    current = None
-    if currents:
-        step = np.zeros(len(middle))
-        step[currents] = 1.0
-        current = matrix_and_offset(calibration, middle + step)[1] - offset
+    # T(I) = T + I dT/dI, the best line over the calibrated range: the tangent at no current would extrapolate
+    along = np.tile(_middle(calibration), (RANGE_POINTS, 1))
+    for k in currents:
+        along[:, k] = np.linspace(calibration.parameters[k].low, calibration.parameters[k].high, RANGE_POINTS)
+    A, T = calibration.matrices(along)
+    matrix = A.mean(axis=0)
+    columns = np.column_stack([np.ones(RANGE_POINTS), along[:, currents]])
+    offset, *slopes = np.linalg.lstsq(columns, T, rcond=None)[0]
     lost = []
-    # the error of this expansion is largest at the corners of the ranges
-    corners = product(*((one.low, one.high) for one in calibration.parameters))
-    field = calibration.reference.field * np.eye(3)
-    worst = 0.0
-    for corner in corners:
-        there, shift = matrix_and_offset(calibration, np.array(corner))
-        held = offset + (current * corner[currents[0]] if current is not None else 0.0)
-        worst = max(worst, float(np.linalg.norm(shift - held) + np.linalg.norm((there - matrix) @ field, 2)))
+    # the error of this line, along the current and at the ends of the other ranges
+    ranges = (
+        np.linspace(one.low, one.high, RANGE_POINTS if k in currents else 2)
+        for k, one in enumerate(calibration.parameters)
+    )
+    points = np.array(list(product(*ranges)))
+    A, T = calibration.matrices(points)
+    held = offset + points[:, currents] @ np.reshape(slopes, (-1, 3))
+    field = calibration.reference.field * (A - matrix)
+    worst = float((np.linalg.norm(T - held, axis=1) + np.linalg.norm(field, 2, axis=(1, 2))).max())
     if worst > 1.0:
         names = ", ".join(one.name for k, one in enumerate(calibration.parameters) if k not in currents)
-        what = f"the field of {names or 'the current beyond its first order'}"
-        lost.append(f"{what}: up to {worst:.0f} nT at the ends of its range")
+        what = f"the field of {names or 'the current beyond a straight line'}"
+        lost.append(f"{what}: up to {worst:.0f} nT in its range")
     lost += [f"an effect: {type(one).__name__}" for one in calibration.effects]
     if calibration.boresight is not None:
         angle = float(np.degrees(np.linalg.norm(calibration.boresight.rotation)))
         lost.append(f"the boresight, a turn of {angle:.1f} deg: set the compass' orientation")
     lost.append("uncertainties and flags")
-    return Compass(matrix, offset, current, tuple(lost))
+    return Compass(matrix, offset, slopes[0] if slopes else None, tuple(lost))
 
 
 def matrix_and_offset(calibration: Calibration, values: FloatArray) -> tuple[FloatArray, FloatArray]:

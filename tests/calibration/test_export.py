@@ -155,6 +155,25 @@ def test_autopilots_correct_as_we_do(current: bool) -> None:
     np.testing.assert_allclose(theirs * 1e5, ours, atol=0.01)
 
 
+def test_a_current_gets_the_best_line_of_its_calibrated_range() -> None:
+    """Noise bends a cubic whose field is linear over 2 to 18 A; its tangent at 0 A is an extrapolation."""
+    slopes, noise, n = np.array([40.0, -20.0, 30.0]), 50.0, 1_000
+    current = np.linspace(2.0, 18.0, n)
+    offset = np.outer(current, slopes) + np.random.default_rng(1).normal(0.0, noise, (n, 3))
+    coefficients = np.zeros((4, 9))
+    coefficients[:, 6:] = np.polynomial.polynomial.polyfit((current - 10.0) / 8.0, offset, 3)
+    calibration = made(Parameter("battery_current", "A", 2.0, 18.0, 10.0, 8.0), turned=False)
+    compass = compass_of(replace(calibration, coefficients=coefficients.ravel()))
+    sigma = noise / (np.sqrt(n) * current.std())
+    found = read_parameters(ardupilot(compass)[0]) | read_parameters(px4(compass))
+    for name in ("COMPASS_MOT_{}", "CAL_MAG0_{}COMP"):  # -dT/dI in mG/A and G/kA
+        slope = [-100.0 * found[name.format(axis)] for axis in "XYZ"]
+        np.testing.assert_allclose(slope, slopes, rtol=0, atol=4.0 * sigma)
+    curve, *_ = compass.lost
+    assert curve.startswith("the field of the current beyond a straight line: up to ")
+    assert int(curve.split("up to ")[1].split()[0]) < 10.0 * noise / np.sqrt(n)
+
+
 def test_what_an_autopilot_cannot_hold_is_reported(tmp_path: Path) -> None:
     save(made(*TWO), tmp_path / "cal.json")
     lost = " ".join(compass_of(load(tmp_path / "cal.json")).lost)
