@@ -21,12 +21,11 @@ import msgspec
 
 from magbridge.config import Align
 from magbridge.one_time import OneTime
-from magbridge.records import Quality, Reading, Vector
+from magbridge.records import NEVER, Quality, Reading, Vector
 
-__all__ = ["NEVER", "Aligner", "Input", "Sample", "Track"]
+__all__ = ["Aligner", "Input", "Sample", "Track"]
 
 
-NEVER: Final = -(1 << 62)
 TRACK_LENGTH: Final = 1024
 """Number of telemetry values that are stored for each parameter: enough for 20 s at 50 Hz."""
 

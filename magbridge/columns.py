@@ -140,10 +140,12 @@ YEAR_1980 = 315_532_800.0
 def counts_from_boot(deployment: xr.Dataset) -> bool:
     """Return True if the times of a deployment count from a boot and their date is unknown.
 
-    This is so if the log states ``time_reference = boot``, or states no reference and ends before 1980.
+    This is so if the log states ``time_reference = boot``. A reader states ``utc`` for dates and for counts
+    since an epoch. Only numbers without a stated reference are taken for a count from a boot by their size:
+    if they end before 1980.
     """
     time = deployment["time"].values
-    reference = deployment.attrs.get("time_reference")
+    reference = deployment.attrs.get("time_reference", "utc" if time.dtype.kind == "M" else None)
     return reference == "boot" or bool(time.size and reference is None and time[-1] < YEAR_1980)
 
 
@@ -164,6 +166,7 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
             seconds = (time.values - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
             values = np.where(time.isnull(), np.nan, seconds)
             deployment = deployment.assign({name: (time.dims, values, time.attrs | COLUMNS[name]._asdict())})
+            deployment.attrs.setdefault("time_reference", "utc")
         elif time.dtype.kind not in "iuf":
             source = deployment.attrs.get("source", "the deployment")
             expected = f"expected times as numbers or datetime64, got {time.dtype}"

@@ -19,7 +19,7 @@ from math import isnan, nan
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.records import Vector
+from magbridge.records import NEVER, Vector
 
 __all__ = ["OneTime", "interpolate_to_rows"]
 
@@ -101,7 +101,7 @@ class OneTime:
     def __init__(self) -> None:
         self.variance = 0.0
         self.settled: Vector | None = None
-        self._us, self._step = 0, 0.0
+        self._us, self._step = NEVER, 0.0
         self._field, self._delay = (nan, nan, nan), (0.0, 0.0, 0.0)
         self._out, self._slope, self._lever = (nan, nan, nan), (nan, nan, nan), (nan, nan, nan)
 
@@ -118,7 +118,7 @@ class OneTime:
         out, slope, lever = field, (nan, nan, nan), (nan, nan, nan)
         self.variance, self.settled = 0.0, None
         x, y, z = field
-        if self._us and step > 0.0 and (x_late or y_late or z_late):
+        if self._us != NEVER and step > 0.0 and (x_late or y_late or z_late):
             (x_then, y_then, z_then), (x_was, y_was, z_was), before = self._field, self._delay, self._slope
             x_slope = _slope(x - x_then, step + delay[0] - x_was, before[0])
             y_slope = _slope(y - y_then, step + delay[1] - y_was, before[1])

@@ -11,7 +11,16 @@ from typing import Final
 
 import msgspec
 
-__all__ = ["MAX_DEVICE_TIME_S", "MAX_MEASURED_NT", "Channel", "Corrected", "Quality", "Reading", "Vector"]
+__all__ = [
+    "MAX_DEVICE_TIME_S",
+    "MAX_MEASURED_NT",
+    "NEVER",
+    "Channel",
+    "Corrected",
+    "Quality",
+    "Reading",
+    "Vector",
+]
 
 Vector = tuple[float, float, float]
 
@@ -19,6 +28,8 @@ MAX_MEASURED_NT: Final = 1e9
 """Largest field or sigma that can be a measurement, nT (1 T)."""
 MAX_DEVICE_TIME_S: Final = 1e11
 """Largest time of an instrument, s: one beyond 3,000 years is an error of transmission."""
+NEVER: Final = -(1 << 62)
+"""Time of an event that has not happened yet, µs; times before 1970 are negative."""
 
 
 class Quality(IntFlag):

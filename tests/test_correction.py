@@ -13,6 +13,7 @@ from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import (
+    Boresight,
     CalibratedRange,
     CalibratedSensor,
     Calibration,
@@ -25,6 +26,7 @@ from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.errors import FormatError
 from magbridge.filter_lag import LagCorrection
+from magbridge.logs.deployment import deployment
 from magbridge.records import Quality, Reading
 from magbridge.rows import correct_rows
 
@@ -46,6 +48,32 @@ def follows(channel: str, unit: str) -> Calibration:
 
 def total(position: float) -> float:
     return hypot(FIELD[0] - LINE * position, *FIELD[1:])
+
+
+@pytest.mark.parametrize("start", [0.0, -5_000.0, -145e6, -2.2e9])
+def test_times_of_any_sign_give_the_same_result(start: float, calibration: Calibration) -> None:
+    """The checks of field and direction, and their memory, do not depend on the sign of the time."""
+    n = 600
+    rng = np.random.default_rng(3)
+    jump = np.where(np.arange(n) > n // 2, 900.0, 0.0)
+    columns = {
+        f"mag_{axis}": value + rng.normal(0, 1, n) + jump for axis, value in zip("xyz", FIELD, strict=True)
+    }
+    columns |= {"battpos": 0.0 * jump, "roll": 0.0 * jump, "pitch": 0.0 * jump, "heading": 0.0 * jump}
+    fitted = replace(
+        calibration,
+        boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
+        noise=Noise(sensor=1.0),
+    )
+
+    def corrected(since: float) -> xr.Dataset:
+        log = deployment("log", since + 4.0 * np.arange(n), columns, attrs={"time_reference": "boot"})
+        return correct_rows(Correction(fitted), log)
+
+    expected, found = corrected(1.78e9), corrected(start)
+    assert (expected["quality"] != 0).any()
+    for name in ("total_field", "total_field_sigma", "quality"):
+        np.testing.assert_array_equal(found[name], expected[name])
 
 
 def test_a_position_that_was_never_sent_may_be_anywhere(calibration: Calibration) -> None:

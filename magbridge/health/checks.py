@@ -18,7 +18,7 @@ from __future__ import annotations
 from math import inf, isnan, log, nan, pi, sqrt
 from typing import TYPE_CHECKING, Final
 
-from magbridge.records import Vector
+from magbridge.records import NEVER, Vector
 
 if TYPE_CHECKING:
     from magbridge.health.scatter import Scatter  # which imports this module
@@ -163,7 +163,7 @@ class LevelCheck:
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
         self.is_wrong = False
-        self.until_us = 0
+        self.until_us = NEVER
         self._is_far = False
         self._wrong_samples = self._since_us = self._far_samples = 0
 

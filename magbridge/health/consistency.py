@@ -37,7 +37,7 @@ from magbridge.estimation.sequential import SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
 from magbridge.health.checks import Messages
 from magbridge.health.trend import TrendCheck
-from magbridge.records import Vector
+from magbridge.records import NEVER, Vector
 
 MIN_INTERVAL_S: Final = 1.0
 MAX_INTERVAL_S: Final = 4.0
@@ -145,7 +145,7 @@ class ConsistencyCheck:
     def restart(self) -> None:
         """Discard all evidence and the filter's state, for example after a change of the calibration."""
         self._begin_filter(0)
-        self._time_us, self._due_us, self._level = 0, 0, 0.0
+        self._time_us, self._due_us, self._level = NEVER, NEVER, 0.0
         self._pending: deque[TestedSample] = deque(maxlen=MAX_PENDING)
         self._outliers = 0
         self._last_unit = self._path_unit = np.zeros(3)
@@ -201,7 +201,7 @@ class ConsistencyCheck:
         seconds = 1e-6 * (time_us - self._time_us)
         # the first sample, a clock that goes back, and a calibration of other terms restart the check
         other_terms = len(self._filter.mean) != TRACK_STATES + len(errors)
-        if self._time_us == 0 or seconds < 0.0 or other_terms:
+        if self._time_us == NEVER or seconds < 0.0 or other_terms:
             self.restart()
             self._level, seconds = total, 0.0
             self._begin_filter(len(errors))

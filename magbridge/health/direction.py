@@ -18,7 +18,7 @@ from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, rem
 from typing import Final
 
 from magbridge.health.checks import Messages
-from magbridge.records import Quality
+from magbridge.records import NEVER, Quality
 
 INCLINED: Final = radians(10.0)
 """Inclination error that is flagged, rad: five sigmas of 2 deg. The attitude has 1.5 deg, the boresight 1,
@@ -49,12 +49,12 @@ class DirectionCheck:
         self._messages = messages or Messages()
         self.messages = self._messages.lines
         self._roll = self._pitch = self._yaw = nan
-        self._attitude_us = -MAX_DIRECTION_AGE_US
+        self._attitude_us = NEVER
         self._inclination = self._declination = nan
-        self._next_us = 0
+        self._next_us = NEVER
         self._tilted = self._turned = 0
         self._variance = 0.0
-        self._until_us = self._tilted_until_us = 0
+        self._until_us = self._tilted_until_us = NEVER
 
     def attitude(self, time_us: int, roll: float, pitch: float, yaw: float) -> None:
         """Set the vehicle's attitude (rad, forward-starboard-down axes, yaw from true north)."""

@@ -25,6 +25,7 @@ from typing import Final
 from magbridge.calibration.model import Noise
 from magbridge.field.geodesy import separation
 from magbridge.health.checks import Messages
+from magbridge.records import NEVER
 
 MIN_NOISE_NT: Final = 0.1
 """Lower bound of the sensor noise, nT, 1-sigma: no fluxgate has less."""
@@ -126,7 +127,7 @@ class Scatter:
         self._is_noisy = False
         self._max_lag_us = 0  # none while the speed is not known
         self._latitude = self._longitude = nan
-        self._position_us = self._checked_us = 0
+        self._position_us = self._checked_us = NEVER
         self._faster = 0  # positions in a row that show a higher speed
 
     def begin(self, variance: float) -> None:

@@ -28,6 +28,7 @@ from typing import Final, NamedTuple
 
 from magbridge.health.checks import Messages
 from magbridge.health.scatter import Scatter
+from magbridge.records import NEVER
 
 GATE_SIGMA: Final = 7.0
 """Innovation above which a sample is an outlier, in sigmas. Gaussian noise exceeds 5.5 once a month."""
@@ -209,7 +210,9 @@ class TrendCheck:
     def _begin(self, time_us: int, level: float, sigma: float, noise: float) -> None:
         """Restart the trend at a level (nT), but keep its slope and the jumps so far."""
         if self._now is None:
-            self._now = TrendState(time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, 0, 0)
+            self._now = TrendState(
+                time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, NEVER, NEVER
+            )
         # the slope at the new level is unknown
         p_slope = max(self._now.p_slope, self._slope_variance)
         self._now = self._now._replace(
@@ -299,5 +302,5 @@ class TrendCheck:
     def forget(self) -> None:
         """Forget all jumps, because a new calibration explains them."""
         if self._now is not None:
-            self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=0)
+            self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=NEVER)
         self._checkpoints.clear()

@@ -36,7 +36,7 @@ from magbridge.columns import TEMPERATURE
 from magbridge.estimation.sequential import ALARM_LOG_RATIO, SequentialTest
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.samples import LearnedTerms, LearningSample, Observation
-from magbridge.records import Quality, Vector
+from magbridge.records import NEVER, Quality, Vector
 
 CAUSE_UNITS: Final = {
     "offset_step": 20.0,
@@ -238,7 +238,7 @@ class DelayTest:
     """Page's test for telemetry that is late by about `delay_us` (µs)."""
 
     def __init__(self, delay_us: int) -> None:
-        self._delay_us, self._tested_us = delay_us, 0
+        self._delay_us, self._tested_us = delay_us, NEVER
         self._ratio = self._square = 0.0
         self.count, self._since_us = 0, 0
 

@@ -27,7 +27,7 @@ from magbridge.columns import TEMPERATURE
 from magbridge.errors import CalibrationError
 from magbridge.estimation.track_process import Course
 from magbridge.field.geodesy import separation
-from magbridge.records import Vector
+from magbridge.records import NEVER, Vector
 
 
 class Observation(NamedTuple):
@@ -113,7 +113,7 @@ class Intake:
     def __init__(self, max_rate: float) -> None:
         self._period_us = round(1e6 / max_rate)
         self._held: deque[LearningSample] = deque(maxlen=MAX_WAITING_SAMPLES)
-        self._last_us = self._looked_us = self._taken_us = self._reported_us = 0
+        self._last_us = self._looked_us = self._taken_us = self._reported_us = NEVER
         self._where: tuple[float, float] | None = None
         self._newest = False
         self._course = Course()
@@ -150,7 +150,8 @@ class Intake:
 
     def short(self, time_us: int) -> bool:
         """Record an unusable sample; return True if a notification about the lack of samples is due."""
-        self._last_us = self._last_us or time_us
+        if self._last_us == NEVER:
+            self._last_us = time_us
         if time_us - self._last_us <= SHORTAGE_US or self._reported_us == self._last_us:
             return False
         self._reported_us = self._last_us
@@ -158,7 +159,8 @@ class Intake:
 
     def moved(self, sample: LearningSample) -> Way:
         """Return distance, time and turn from the previous call's sample to `sample`."""
-        before, last_us = self._where or sample.where, self._last_us or sample.time_us
+        before = self._where or sample.where
+        last_us = sample.time_us if self._last_us == NEVER else self._last_us
         self._where, self._last_us = sample.where, sample.time_us
         north, east = separation(*before, *sample.where)
         seconds = max(sample.time_us - last_us, 0) * 1e-6

@@ -25,7 +25,9 @@ from magbridge.guard import Guarded, GuardedJob, guarded
 from magbridge.logs.checks import checked, increasing
 from magbridge.logs.compasses import by_columns
 from magbridge.logs.deployment import (
+    NOTES,
     join,
+    noted,
     passed_over,
     renamed,
     same_columns,
@@ -242,13 +244,16 @@ def _numbered(pieces: Iterable[Any]) -> Iterator[tuple[xr.Dataset, Sequence[int]
 
 
 def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
-    """Return the deployment with `date` (s since 1970 UTC) added to times that count from a boot."""
-    if date is None or not counts_from_boot(part):
-        return part
+    """Return the deployment with `date` (s since 1970 UTC) added to times that count from a boot.
 
-    moved = shifted(part, date)
-    moved.attrs.pop("time_reference", None)
-    return moved
+    Times with a date do not change; a note reports this.
+    """
+    if date is None:
+        return part
+    if not counts_from_boot(part):
+        unused = f"{part.attrs['source']}: --date was not used, because the log's times have a date"
+        return part.assign_attrs({NOTES: "\n".join([*noted(part.attrs), unused])})
+    return shifted(part, date).assign_attrs(time_reference="utc")
 
 
 def _origin(source: str) -> str:
@@ -315,6 +320,8 @@ class Writer:
         dataset = in_seconds(dataset)
         first = not self._columns
         if first:
+            if counts_from_boot(dataset):
+                dataset = dataset.assign_attrs(time_reference="boot")
             self._columns = {str(name): dict(dataset[name].attrs) for name in dataset.data_vars}
             self._last = float("-inf")
         for name in dataset.data_vars:

@@ -48,6 +48,7 @@ LEAPS = (
 """Start (s since 1970) of each lead of GPS time over UTC, and the lead (s); IERS Bulletin C 52."""
 EPOCHS = {
     "s": (0.0, 1.0),
+    "unix": (0.0, 1.0),  # s since 1970, also before 1980
     "ms": (0.0, 1e-3),
     "us": (0.0, 1e-6),
     "ns": (0.0, 1e-9),
@@ -60,6 +61,8 @@ EPOCHS = {
     "gps": (GPS_EPOCH, 1.0),
 }
 """Kind of a number -> s since 1970 of its zero, and s in its unit."""
+COUNTS = frozenset({"s", "ms", "us", "ns", "min", "h"})
+"""Kinds without an epoch: small numbers count from a boot, large ones from 1970."""
 SUMS = {"seconds and nanoseconds": (0.0, 1.0, 1e-9), "GPS week and seconds": (GPS_EPOCH, WEEK, 1.0)}
 """Kind of a pair of numbers, joined by a blank -> s since 1970 of its zero, and s in the unit of each."""
 SECONDS_OF_DAY, BY_HOUR = "date and seconds of the day", "date and HHMM.mmm"
@@ -108,9 +111,14 @@ class TimeFormat(NamedTuple):
         return self.kind not in EPOCHS
 
     @property
+    def is_dated(self) -> bool:
+        """Return True if the format states the date: a text with a date, or a count since an epoch."""
+        return not self.boot and self.kind not in COUNTS
+
+    @property
     def expected(self) -> str:
         """Return the expected content of a cell, for an error."""
-        if self.kind == "s":
+        if self.kind in {"s", "unix"}:
             return "seconds since 1970"
         return f"a time as {self.kind}" if self.is_text and self.kind != "iso" else "a time"
 
@@ -165,6 +173,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     ValueError: dates can be read in two ways; the message states the possible declarations.
     """
     unit = {"seconds": "s", "sec": "s", "hours": "h"}.get(unit, unit)
+    unit = "unix" if re.match("s(ec|econds)? since 1970", unit) else unit
     if "%" in unit:
         return TimeFormat(unit, zone=zone, boot="%d" not in unit and "%j" not in unit)
     if unit == "iso" or unit in SUMS:
@@ -202,7 +211,7 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, integers: bool) ->
     if kind == "s" and not unit and integers and step >= MIN_CLOCK_STEP and not is_unix_time:
         ways = " or ".join(f'--column time="{heading} [{one}]"' for one in ("ms", "us", "ns", "s"))
         raise ValueError(f"a count with steps of {step:g}, in a unit that the file does not tell: {ways}")
-    boot = bool(len(numbers)) and abs(since) < YEAR_1980 and heading != "time"
+    boot = bool(len(numbers)) and kind in COUNTS and abs(since) < YEAR_1980 and heading != "time"
     if boot:
         assumed = f"{assumed or f'in {kind}'}, from a start that the file does not tell"
     return TimeFormat(kind, assumed, boot)

@@ -16,6 +16,7 @@ from magbridge.columns import (
     COLUMNS,
     FURTHER_AXIS,
     NT_PER_UNIT,
+    counts_from_boot,
     factor,
     in_seconds,
     require,
@@ -329,14 +330,20 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
         if not pd.api.types.is_numeric_dtype(frame[name]):
             raise FormatError(FRAME_NAME, f"expected numbers, not {frame[name].dtype}", column=name)
         columns[name] = frame[name].to_numpy(float)
+    if not pd.api.types.is_numeric_dtype(time):
+        attrs.setdefault("time_reference", "utc")
     return deployment(FRAME_NAME, _seconds(time), columns, {**named, **(units or {})}, attrs)
 
 
 def to_frame(log: xr.Dataset) -> pd.DataFrame:
-    """Return a deployment as a data frame, indexed by UTC timestamps; units are in ``frame.attrs``."""
+    """Return a deployment as a data frame, indexed by UTC timestamps; units are in ``frame.attrs``.
+
+    Times that count from a boot remain s.
+    """
     log = in_seconds(log)
     frame = log.to_dataframe()
-    frame.index = pd.to_datetime(log["time"].to_numpy(), unit="s", utc=True).rename("time")
+    if not counts_from_boot(log):
+        frame.index = pd.to_datetime(log["time"].to_numpy(), unit="s", utc=True).rename("time")
     frame.attrs = {str(name): log[name].attrs.get("units", "") for name in log}
     return frame
 

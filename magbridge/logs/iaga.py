@@ -53,7 +53,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         except ValueError:
             raise FormatError(path, "expected a number of degrees", column=f"Geodetic {name}") from None
         columns[name] = np.full(len(time), (place + 180.0) % 360.0 - 180.0 if name == "longitude" else place)
-    attrs = {"observatory": header.get("iaga code", "")}
+    attrs = {"observatory": header.get("iaga code", ""), "time_reference": "utc"}
     read = deployment(path, time, columns, units, attrs)
     yield from sliced(with_losses(read, {"rows_dropped": len(fields) - len(whole)}), rows)
 

@@ -208,7 +208,7 @@ def _on_clock_of(vehicle: xr.Dataset, sensor: xr.Dataset, offset_s: float) -> xr
     if offset_s:
         sensor = shifted(sensor, offset_s)
         if from_boot and not vehicle_from_boot:
-            sensor.attrs.pop("time_reference", None)
+            sensor.attrs["time_reference"] = "utc"
     elif from_boot != vehicle_from_boot:
         which = "the sensor's" if from_boot else "the vehicle's"
         raise FormatError(

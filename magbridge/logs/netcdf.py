@@ -127,6 +127,8 @@ def _trajectory(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, 
     if any("magnetic" in text for text in stated):
         attrs.setdefault("heading_reference", "magnetic")
     ours = any("column" in variable.ncattrs() for variable in file.variables.values())
+    if " since " in str(getattr(clock, "units", "")):
+        attrs.setdefault("time_reference", "utc")
     rules = [] if ours else validity_of([one.name for one in columns], ())
     faults = Faults(path, strict=False)
     for row in range(0, total, rows):

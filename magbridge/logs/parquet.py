@@ -55,6 +55,8 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
         raise FormatError(path, f"{claimed}: expected a file that is not damaged")
     foreign = b"magbridge" not in (schema.metadata or {})
     layout, table = _layout(path, file, foreign=foreign)
+    if pa.types.is_timestamp(schema.field(layout.stamp[-1]).type):
+        attrs = {"time_reference": "utc"} | attrs
     attrs = {**attrs, **layout.attrs, **table.attrs}
     if foreign:
         attrs = with_guesses(path, attrs, [*layout.guesses, *table.guesses])

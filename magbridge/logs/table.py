@@ -94,7 +94,9 @@ class TableReader:
             self.guesses.append(f"time: {self._clock.assumed}")
         self.guesses += [*notes, *dated]
         self._is_from_boot = self._clock.boot and not dated
-        self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._is_from_boot else {}
+        self.attrs: dict[str, Any] = {}
+        if self._is_from_boot or dated or self._clock.is_dated:
+            self.attrs["time_reference"] = "boot" if self._is_from_boot else "utc"
         if self._declared.heading_reference:
             self.attrs["heading_reference"] = self._declared.heading_reference
 

@@ -33,6 +33,7 @@ from magbridge.navigate.integrity import Competitor, Unmapped, squared_mahalanob
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import NavigationOptions, wider_level
 from magbridge.navigate.record import Rival
+from magbridge.records import NEVER
 
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
@@ -163,7 +164,7 @@ class GnssMonitor:
         self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
         self._change = 0.0  # of the positions over the window against dead reckoning, in its errors
         self._reported = GnssReason.NONE
-        self._reported_us = -MAX_GNSS_AGE_US
+        self._reported_us = NEVER
         self.evidence = _FieldTest(grid, options)
 
     def rivals(self, time_us: int) -> list[Rival]:
@@ -366,7 +367,7 @@ class _FieldTest:
         self.limit = log(options.alarm_odds)
         self._grid, self._options = grid, wider_level(options, grid.rms)
         self._claimed = options
-        self._time_us = -MAX_GNSS_AGE_US
+        self._time_us = NEVER
         self._restart()
 
     def _restart(self) -> None:

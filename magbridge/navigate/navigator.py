@@ -24,7 +24,7 @@ from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
 from magbridge.navigate.model import Block, Collector, block_length, transition
 from magbridge.navigate.options import NavigationOptions, lasting_errors
 from magbridge.navigate.record import NavigationState, Reckoned, Record
-from magbridge.records import Corrected, Quality
+from magbridge.records import NEVER, Corrected, Quality
 
 __all__ = ["NO_POSITION_FLAGS", "Navigator"]
 
@@ -63,8 +63,8 @@ class Navigator:
         self.dropped = self.utc_offset_us = 0
         self._reckoning = DeadReckoning()
         self._collector = Collector(options, block_length(grid))
-        self._latest_us = 0
-        self._heading_error = -HEADING_AGE_US, 0.0  # time, µs; 1-sigma of the velocity, m/s
+        self._latest_us = NEVER
+        self._heading_error = NEVER, 0.0  # time, µs; 1-sigma of the velocity, m/s
 
     def fix(
         self, time_us: int, latitude: float, longitude: float, sigma: float | None = None

@@ -212,9 +212,8 @@ def test_files_that_disagree_are_not_mixed(first: str, second: str, expected: st
 
 @pytest.mark.parametrize("suffix", [".nc", ".parquet"])
 def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
-    dataset = deployment(
-        "made", [1.0], {"run": [3]}, attrs={"segments": "[]", "seed": 5}, long_names={"run": "the leg"}
-    )
+    attrs = {"segments": "[]", "seed": 5, "time_reference": "boot"}
+    dataset = deployment("made", [1.0], {"run": [3]}, attrs=attrs, long_names={"run": "the leg"})
     logs.write(dataset, tmp_path / f"log{suffix}")
     back = logs.read(tmp_path / f"log{suffix}")
     assert back["run"].attrs["long_name"] == "the leg"

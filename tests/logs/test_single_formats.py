@@ -164,7 +164,7 @@ def test_netcdf_packed_by_words_is_one_line(tmp_path: Path) -> None:
 
 def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> None:
     logs.write(deployment("made", [1.0], {}, attrs={"telemetry.a/b.max_age": 3.0}), tmp_path / "log.nc")
-    assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source", "history"}
+    assert logs.read(tmp_path / "log.nc").attrs.keys() == {"source", "history", "time_reference"}
 
 
 def test_longitudes_to_the_east_fit_a_telemetry_log(tmp_path: Path) -> None:

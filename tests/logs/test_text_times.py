@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from texts import NOON, lines, read
 
 from magbridge import logs
+from magbridge.columns import counts_from_boot, decoded, in_seconds
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import named_losses
+from magbridge.logs.deployment import from_frame, named_losses, to_frame
+from magbridge.logs.mapping import Options
 
 GPS = NOON - 315_964_800 + 18
 DAY = 86_400.0
@@ -69,7 +71,49 @@ def test_times_that_stand_in_many_ways(kind: str, tmp_path: Path) -> None:
     whole = kind == "a C program's"
     np.testing.assert_allclose(log["time"], np.floor(expected) if whole else expected, atol=2e-3)
     assert log["mag_x"].values.tolist() == [30_000.0, 30_001.0]
-    assert "time_reference" not in log.attrs
+    assert log.attrs.get("time_reference", "utc") == "utc"
+
+
+BEFORE_1980 = {
+    # heading and two cells: 1965-06-01 and 1972-06-01 at 12:00:00 and 12:00:01
+    "ISO": ("time", "{year}-06-01T12:00:00Z", "{year}-06-01T12:00:01Z"),
+    "slashes": ("time", "{year}/06/01 12:00:00", "{year}/06/01 12:00:01"),
+    "Unix": ("clock [unix]", "{since}", "{later}"),
+    "seconds since": ("clock [seconds since 1970-01-01]", "{since}", "{later}"),
+    "days": ("MJD", "{day:.9f}", "{next_day:.9f}"),
+}
+
+
+@pytest.mark.parametrize("year", [1965, 1972])
+@pytest.mark.parametrize("kind", BEFORE_1980)
+def test_a_date_before_1980_is_a_date(kind: str, year: int, tmp_path: Path) -> None:
+    since = pd.Timestamp(f"{year}-06-01T12:00Z").timestamp()
+    day, later = 40_587 + since / DAY, since + 1
+    names = {"year": year, "since": since, "later": later, "day": day, "next_day": day + 1 / DAY}
+    heading, *stamps = (text.format(**names) for text in BEFORE_1980[kind])
+    text = "".join([f"{heading},mag_x\n", *(f"{stamp},30000\n" for stamp in stamps)])
+    log = read(tmp_path, text)
+    np.testing.assert_allclose(log["time"], [since, later], atol=1e-4)
+    dated = read(tmp_path, text, date=1e9)
+    np.testing.assert_array_equal(dated["time"], log["time"])
+    assert "--date was not used" in dated.attrs["notes"]
+    for suffix in ("csv", "nc", "parquet"):
+        logs.write(log, tmp_path / f"again.{suffix}")
+        again = logs.read(tmp_path / f"again.{suffix}")
+        assert not counts_from_boot(again)
+        assert not counts_from_boot(in_seconds(decoded(again)))
+    assert not counts_from_boot(from_frame(to_frame(log)))
+
+
+def test_a_count_from_a_boot_stays_one(tmp_path: Path) -> None:
+    log = read(tmp_path, "time,mag_x\n0.5,30000\n1.5,30001\n")
+    for suffix in ("csv", "nc", "parquet"):
+        logs.write(log, tmp_path / f"again.{suffix}")
+        assert counts_from_boot(logs.read(tmp_path / f"again.{suffix}"))
+    assert counts_from_boot(from_frame(to_frame(log)))
+    date = pd.Timestamp("1972-06-01T00:00Z").timestamp()
+    dated = logs.read(tmp_path / "again.nc", options=Options(date=date))
+    assert (dated["time"].values.tolist(), counts_from_boot(dated)) == ([date + 0.5, date + 1.5], False)
 
 
 SINCE_A_START = {
