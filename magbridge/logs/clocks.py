@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import FloatArray
+from magbridge.columns import YEAR_1980
 from magbridge.logs.checks import MEDIAN_ROWS, boots
 
 DAY = 86_400.0
@@ -79,7 +80,6 @@ STEP, CERTAIN = 5e-4, 1e-4
 column named ``time``."""
 UNIX_TIME_RANGE_S = 3e8, 4.2e9
 """Range in which a count is recognised as Unix time by its size, s since 1970: 1979 to 2103."""
-YEAR_1980 = 315_532_800.0
 MIN_CLOCK_STEP = 10.0
 """Median step from which whole numbers probably count a finer unit than seconds since a boot."""
 DATE_ORDER = re.compile(r"\b(yyyy|yy|mm|dd)\W?(mm|dd)\W?(yyyy|yy|dd)\b", re.IGNORECASE)

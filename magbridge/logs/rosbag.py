@@ -27,7 +27,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import NT_PER_UNIT
+from magbridge.columns import NT_PER_UNIT, YEAR_1980
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.compasses import BootRun, Magnetometer, Series, pieces, sampled
 from magbridge.logs.deployment import NOTES, noted
@@ -51,8 +51,6 @@ ROSBAG_ERRORS = (AnyReaderError, ReaderError, SerdeError, TypesysError, sqlite3.
 ROS_STAMP = np.dtype([("", "V4"), ("s", "<i4"), ("ns", "<u4")])
 """Layout of the start of a message with a header: 4 bytes of sequence (ROS 1) or encapsulation, stamp."""
 LITTLE = b"\x00\x01"
-MIN_REAL_TIME_S = 315_532_800.0
-"""Earliest stamp of a real recording, s since 1970; the stamps of a simulation begin at 0."""
 EARTH = 15e3, 150e3
 """Range of a reading's median magnitude, nT: it spans a factor of ten, so that only one unit fits."""
 TESLA = 1e-6, 1e-2
@@ -87,7 +85,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         raise FormatError(path, f"expected sensor_msgs/MagneticField; there is: {topics}")
     notes: list[str] = []
     mags = [_magnetometer(number, stream, notes) for number, stream in enumerate(fields)]
-    boot = float(np.median(mags[0].time)) < MIN_REAL_TIME_S
+    boot = float(np.median(mags[0].time)) < YEAR_1980  # the stamps of a simulation begin at 0
     run = BootRun(mags, _telemetry(streams), None if boot else 0.0)
     attrs = {"values_dropped": lost, "history": "\n".join([FRAMES_HISTORY, *notes])}
     for part in pieces(path, rows, [run], attrs, options.compass if options else None):
