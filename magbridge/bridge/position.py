@@ -55,6 +55,11 @@ SUSPECT_US: Final = 900_000_000
 µs."""
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """Largest magnitudes of GLOBAL_POSITION_INT's lat and lon, 1e-7 deg."""
+NULL_E7: Final = 100_000
+"""Largest magnitude of both lat and lon of an unknown position, 1e-7 deg (1 km): without a fix, ArduPilot's
+position drifts about 0, 0."""
+FIRST_US: Final = 60_000_000
+"""Time after the first position in which a jump replaces the first positions, µs."""
 ALTITUDE_M: Final = -15_000.0, 100_000.0
 """Lowest and highest altitude for which the main field is computed, m; other altitudes count as 0."""
 
@@ -80,7 +85,7 @@ class Position:
         self._vector_where: tuple[float, float] | None = None  # for which the vector was checked
         self._model: NearbyField | None = None
         self._trusted: tuple[float, float] | None = None
-        self._trusted_us = self._jumped_us = 0
+        self._first_us = self._trusted_us = self._jumped_us = 0
 
     @property
     def place_and_depth(self) -> tuple[tuple[float, float] | None, float]:
@@ -97,11 +102,11 @@ class Position:
 
         An unknown or impossible position is ignored. After a jump that no vehicle's speed explains, main
         field and anomaly are unknown. They are known again when the vehicle is near the former track, or
-        has stayed beyond the jump for :data:`SUSPECT_US`.
+        has stayed beyond the jump for :data:`SUSPECT_US`. In the first minute, the new position is used.
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
-        # an autopilot that does not know its position sends 0, 0 or INT32_MAX
-        if not (lat or lon) or abs(lat) > LATITUDE_E7 or abs(lon) > LONGITUDE_E7:
+        # an autopilot that does not know its position sends one near 0, 0 or INT32_MAX
+        if max(abs(lat), abs(lon)) < NULL_E7 or abs(lat) > LATITUDE_E7 or abs(lon) > LONGITUDE_E7:
             return
         if not ALTITUDE_M[0] < altitude < ALTITUDE_M[1]:
             altitude = 0.0
@@ -117,11 +122,15 @@ class Position:
         if self._trusted is not None and not self._within_reach(
             self._trusted, (self._jumped_us or time_us) - self._trusted_us
         ):
-            if not self._jumped_us:
+            if not self._jumped_us and time_us - self._first_us < FIRST_US:
+                self._first_us = time_us
+            elif not self._jumped_us:
                 self._jumped_us = time_us
                 self._notify("the position jumps farther than the vehicle can move")
-            if time_us - self._jumped_us < SUSPECT_US:
+            if self._jumped_us and time_us - self._jumped_us < SUSPECT_US:
                 return
+        elif self._trusted is None:
+            self._first_us = time_us
         self._trusted, self._trusted_us, self._jumped_us = self._where, time_us, 0
 
     def _within_reach(self, trusted: tuple[float, float], elapsed_us: int) -> bool:

@@ -60,26 +60,29 @@ class Course:
 
 
 MAX_REFERENCE_STEP_NT = 20.0
-MAX_STEP_TIME_US = 60_000_000
-"""`MAX_REFERENCE_STEP_NT`, `MAX_STEP_TIME_US`: The main field changes by less than this step in this time."""
+STEP_TIME_US = 60_000_000
+"""`MAX_REFERENCE_STEP_NT`, `STEP_TIME_US`: The main field changes by less than this step in this time."""
 
 
 class ReferenceSteps:
     """Detector of steps in a reference along a track that the field lacks, as between two sheets of a map.
 
+    `reference`: the last known reference, nT; NaN before the first.
     `total`: sum of the detected steps, nT.
     """
 
     def __init__(self) -> None:
-        self.total = 0.0
-        self._reference, self._time_us = nan, 0
+        self.reference, self.total = nan, 0.0
+        self._time_us = 0
 
     def follow(self, time_us: int, reference: float) -> None:
-        """Compare a sample's reference, nT (NaN if unknown), with the previous; add a step to `total`."""
-        step = reference - self._reference
-        if abs(step) > MAX_REFERENCE_STEP_NT and time_us - self._time_us < MAX_STEP_TIME_US:
+        """Compare a sample's reference, nT (NaN if unknown), with the last known; add a step to `total`."""
+        if not isfinite(reference):
+            return
+        step, elapsed_us = reference - self.reference, time_us - self._time_us
+        if abs(step) > MAX_REFERENCE_STEP_NT * max(elapsed_us / STEP_TIME_US, 1.0):
             self.total += step
-        self._reference, self._time_us = reference, time_us
+        self.reference, self._time_us = reference, time_us
 
 
 class TrackProcess:

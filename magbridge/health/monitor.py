@@ -113,7 +113,10 @@ class HealthMonitor:
                 level.check(time_us, total, sigma, reference, reference_sigma, steady=True)
                 self.flags = IMPLAUSIBLE
             return 0.0
-        self._reference_steps.follow(time_us, reference)
+        steps = self._reference_steps
+        if isfinite(reference) and not isfinite(steps.reference):
+            self._consistency.restart()  # until now it tested the total field
+        steps.follow(time_us, reference)
         # order: a wrong field must not enter the trend, and an outlier not the consistency test
         steady = not quality & UNSTEADY
         variance = level.check(time_us, total, sigma, reference, reference_sigma, steady)
@@ -135,7 +138,8 @@ class HealthMonitor:
         consistency = self._consistency
         # the consistency check uses samples at rest that no other check has flagged
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, trend):
-            anomaly = total - reference + self._reference_steps.total if isfinite(reference) else total
+            # while the position is unknown, the last known main field
+            anomaly = total - steps.reference + steps.total if isfinite(steps.reference) else total
             course, speed = self._course.angle, trend.crossing_speed
             new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, speed, course, sensitivity())
             consistency.add(new)

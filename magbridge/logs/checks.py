@@ -41,6 +41,8 @@ MAX_MAGNITUDE = {
     "depth": 1e5,
 }
 """Largest magnitude of these columns, deg or m; a latitude of 4952.3 is in degrees and minutes."""
+NULL_POSITION_DEG = 0.01
+"""Largest magnitude of latitude and longitude of an unknown position, deg: ArduPilot's drifts about 0, 0."""
 MIN_VALUE = {
     "degC": -273.15, "K": 0.0, "Pa": -101325.0, "hPa": -1013.25, "mbar": -1013.25, "kPa": -101.325,
     "bar": -1.01325, "dbar": -10.1325,
@@ -412,7 +414,7 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
     """Return a mask (n,) of undeclared missing-value codes for each column (n,) that has any.
 
     A code is huge, or one of :data:`CODES` beyond all other values by half their range. A field is missing
-    if its axes are all 0 or the same code. A position at 0, 0 is missing: receivers without a fix write it.
+    if its axes are all 0 or the same code. A position near 0, 0 is missing: no fix.
     """
     found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
     for together in (CHANNELS, ("latitude", "longitude")):
@@ -420,6 +422,8 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
             first, *others = (columns[name] for name in together)
             alike = np.all([first == other for other in others], axis=0)
             alike &= (first == 0.0) | np.isin(first, CODES)
+            if together != CHANNELS:
+                alike |= np.maximum(abs(first), abs(others[0])) < NULL_POSITION_DEG
             found |= {name: found[name] | alike for name in together}
     return {name: wrong for name, wrong in found.items() if wrong.any()}
 

@@ -74,6 +74,20 @@ def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[float,
     assert isnan(position.main_field(START, START))
 
 
+def test_positions_of_an_autopilot_without_a_fix_are_unknown() -> None:
+    """A real ArduPilot sends positions that drift about 0, 0 until its first fix."""
+    reports: list[str] = []
+    position = Position(reports.append)
+    for second, place in enumerate([(0.0, 0.0), (1.3e-6, 3.3e-6), (1e-5, -3e-4), (49.5, -57.9)]):
+        assert isnan(position.main_field(START + second * SECOND, START))
+        update(position, *place, now_us=START + second * SECOND)
+    assert position.main_field(START + 3 * SECOND, START) > 50_000.0
+    # an origin that another vehicle left: the first minute decides
+    update(position, 51.5, -57.9, now_us=START + 30 * SECOND)
+    assert position.place_and_depth[0] == (51.5, -57.9)
+    assert reports == []
+
+
 def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
     reports: list[str] = []
     position = Position(reports.append)

@@ -29,9 +29,15 @@ class Flight:
         self.raw = np.rint(self.raw / steps) * steps
         self.quality = np.zeros(n, int)
 
-    def judge(self, reference: float = FIELD, speed: float = 0.0) -> tuple[IntArray, FloatArray, list[str]]:
-        """Return the flags (n,), the sigma (n,) and the messages; a speed of 0 (m/s) is not known."""
+    def judge(
+        self, reference: float | FloatArray = FIELD, speed: float = 0.0
+    ) -> tuple[IntArray, FloatArray, list[str]]:
+        """Return the flags (n,), the sigma (n,) and the messages; a speed of 0 (m/s) is not known.
+
+        `reference`: main field, nT, one or of each sample.
+        """
         judge = HealthMonitor(Noise(1.0))
+        references = np.broadcast_to(reference, len(self.raw)).tolist()
         flags: list[int] = []
         sigma: list[float] = []
         total = np.linalg.norm(self.raw, axis=1).tolist()
@@ -40,12 +46,24 @@ class Flight:
             if speed:
                 judge.set_position(k * PERIOD_US, 48.0 + speed * 4.0 * k / 111_200.0, -57.0)
             more = judge.check(
-                k * PERIOD_US, tuple(raw), tuple(raw), (total[k], SIGMA), quality, (reference, 145.0),
-                nan, 0.0, Sensitivity,
+                k * PERIOD_US, tuple(raw), tuple(raw), (total[k], SIGMA), quality,
+                (references[k], 145.0), nan, 0.0, Sensitivity,
             )  # fmt: skip
             flags.append(judge.flags)
             sigma.append((SIGMA**2 + more) ** 0.5)
         return np.array(flags), np.array(sigma), judge.messages
+
+
+@pytest.mark.parametrize("first", [nan, FIELD], ids=["at last", "at first"])
+def test_a_main_field_that_is_known_at_times_is_no_fault(first: float) -> None:
+    """A vehicle has its first position late, or positions at the surface only."""
+    flight = Flight(n=3000)
+    known = np.where(np.arange(3000) // 250 % 2 == 0, FIELD, nan)
+    known[:250] = first
+    flags, sigma, reported = flight.judge(known)
+    assert not flags.any()
+    assert reported == []
+    assert (sigma[200:] == SIGMA).all()
 
 
 def along(raw: FloatArray, by: float) -> FloatArray:
