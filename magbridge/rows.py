@@ -45,9 +45,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
         The field is in body axes. The anomaly is the total field minus the IGRF, NaN without a position or a
-        date. With roll and pitch, and a boresight in the calibration, the columns of
-        :data:`~magbridge.columns.HEADINGS` (deg) are added. ``level_sigma`` is there where the calibration
-        states one. All other columns are in nT, except
+        date, and at a date that the IGRF does not cover. With roll and pitch, and a boresight in the
+        calibration, the columns of :data:`~magbridge.columns.HEADINGS` (deg) are added. ``level_sigma`` is
+        there where the calibration states one. All other columns are in nT, except
         ``quality``, the bits of :class:`~magbridge.records.Quality`. A row without any channel is not a
         sample but telemetry: NaN there, with ``gap``.
 
@@ -55,8 +55,6 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     ------
     FormatError
         A channel is missing.
-    OutOfRange
-        A date that the IGRF does not cover.
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
@@ -67,12 +65,12 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
     level, age = np.full((2, len(results)), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
-    vectors, places = main_field(deployment), _places(deployment)
+    vectors, places = main_field(deployment, is_partial=True), _places(deployment)
     attitudes = _angles(deployment, "roll", "pitch", "heading")
     if correction.learner is None:
         main_fields = magnitude(vectors)
     else:
-        main_fields = _as_live(correction.held_field, deployment)
+        main_fields = _as_live(correction.held_field, deployment, vectors)
     known, tilt = main_fields.tolist(), _angles(deployment, "roll", "pitch")
     fields, values = np.full((len(results), 3), nan), np.full((len(results), len(correction.names)), nan)
     added = np.zeros(len(results))
@@ -157,13 +155,13 @@ def _places(deployment: xr.Dataset) -> list[tuple[float, float] | None]:
     return [(lat, lon) if isfinite(lat + lon) else None for lat, lon in zip(*both, strict=True)]
 
 
-def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:
-    """Return the main field (n,), nT, at every row as a bridge computes it; NaN where it is not known."""
+def _as_live(held: HeldField, deployment: xr.Dataset, vectors: FloatArray) -> FloatArray:
+    """Return the main field (n,), nT, at every row as a bridge computes it; NaN where `vectors` is."""
     depth = np.nan_to_num(_column(deployment, "depth"))
     utc_us = np.rint(np.asarray(deployment["time"].to_numpy(), float) * 1e6).astype(np.int64).tolist()
     found = np.full(len(depth), nan)
     for row, (place, down) in enumerate(zip(_places(deployment), depth.tolist(), strict=True)):
-        if place is not None:
+        if place is not None and vectors[row, 0] == vectors[row, 0]:
             found[row] = held.field_at((*place, down), utc_us[row])
     return found
 

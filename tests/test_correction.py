@@ -24,7 +24,8 @@ from magbridge.calibration.model import (
 )
 from magbridge.config import Align
 from magbridge.correction import Correction
-from magbridge.errors import FormatError
+from magbridge.errors import FormatError, OutOfRange
+from magbridge.field.reference import missing_anomaly, reference_field
 from magbridge.filter_lag import LagCorrection
 from magbridge.logs.deployment import deployment
 from magbridge.records import Quality, Reading
@@ -74,6 +75,21 @@ def test_times_of_any_sign_give_the_same_result(start: float, calibration: Calib
     assert (expected["quality"] != 0).any()
     for name in ("total_field", "total_field_sigma", "quality"):
         np.testing.assert_array_equal(found[name], expected[name])
+
+
+def test_outside_the_main_field_model_only_the_anomaly_is_missing(calibration: Calibration) -> None:
+    """A log that crosses 2030 keeps its anomaly up to there, and its total field throughout."""
+    n, end = 20, 1_893_456_000.0
+    columns = {f"mag_{axis}": np.full(n, value) for axis, value in zip("xyz", FIELD, strict=True)}
+    columns |= {"battpos": np.zeros(n), "latitude": np.full(n, 49.0), "longitude": np.full(n, -57.0)}
+    log = deployment("late.csv", end + 4.0 * (np.arange(n) - n // 2), columns)
+    found = correct_rows(Correction(calibration), log)
+    assert np.isfinite(found["total_field"]).all()
+    np.testing.assert_array_equal(np.isfinite(found["anomaly"]), np.arange(n) <= n // 2)
+    assert "outside the IGRF: time = 2030-01-01" in missing_anomaly(log)
+    assert missing_anomaly(log.isel(time=slice(0, 5))) == ""
+    with pytest.raises(OutOfRange, match="IGRF covers"):
+        reference_field(log)
 
 
 def test_a_position_that_was_never_sent_may_be_anywhere(calibration: Calibration) -> None:

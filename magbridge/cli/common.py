@@ -310,12 +310,13 @@ MAX_NAMED_LOSSES = 5
 
 
 @contextmanager
-def naming(deployment: xr.Dataset) -> Iterator[None]:
-    """Convert calibration and range errors in the block to a :class:`DataError` that names the logs."""
+def naming(source: xr.Dataset | Path) -> Iterator[None]:
+    """Convert calibration and range errors in the block to a :class:`DataError` that names the source."""
     try:
         yield
     except (CalibrationError, OutOfRange) as error:
-        raise DataError(f"{deployment.attrs['source']}: {error}") from error
+        name = source if isinstance(source, Path) else source.attrs["source"]
+        raise DataError(f"{name}: {error}") from error
 
 
 def warnings_of(calibration: mb.Calibration, file: Path) -> list[str]:

@@ -12,7 +12,7 @@ from cyclopts import Parameter, validators
 
 import magbridge as mb
 from magbridge.cli import common as cli
-from magbridge.columns import CHANNELS, CORRECTED, counts_from_boot
+from magbridge.columns import CHANNELS, CORRECTED
 from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.progress import track
 from magbridge.records import Quality
@@ -179,16 +179,16 @@ def _corrected(
 
     DataError: no row of the log has all channels.
     """
+    from magbridge.field.reference import missing_anomaly
     from magbridge.rows import correct_rows
 
-    correction, whole = None, False
+    correction, whole, lack = None, False, ""
     for part in parts:
         if correction is None:
             cli.note_missing(known, part)
-            if counts_from_boot(part):
-                lack = "its times count from the boot, so no anomaly is written; give --date YYYY-MM-DD"
-                cli.complain(f"{part.attrs['source']}: {lack}")
             correction = mb.Correction(known, learner=_learner(known, part, learn) if learn else None)
+        if not lack and (lack := missing_anomaly(part)):
+            cli.complain(f"{part.attrs['source']}: {lack}")
         if not whole:
             cli.refuse_unsuited(known, part)
         sampled = part[list(CHANNELS)].to_array().notnull()

@@ -225,14 +225,14 @@ def simulate(
     if reference is not None:
         telemetry = msgspec.structs.replace(chosen.telemetry, reference=reference)
         chosen = msgspec.structs.replace(chosen, telemetry=telemetry)
+    log = None
     with waiting("simulating"):
         if trajectory_from:
             log = mb.read(trajectory_from, options=reading.options)
             cli.note_losses(log.attrs)
             chosen = placed_at(log, chosen)
-            deployment = simulate_like(log, chosen, seed)
-        else:
-            deployment = simulate_scenario(chosen, seed)
+        with cli.naming(scenario):
+            deployment = simulate_like(log, chosen, seed) if log else simulate_scenario(chosen, seed)
     write(deployment, output)
     if map_output is not None:
         Twin.draw(chosen, seed).anomaly_map().save(map_output)

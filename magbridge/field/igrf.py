@@ -82,7 +82,11 @@ def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: Arra
     _refuse("longitude", lon, -180.0, 360.0, "deg, -180 to 360")
     start, end = model.epochs[0], model.epochs[-1]
     if bad := _outside(at, start, end):
-        raise OutOfRange("time", _date(bad[0]), f"the IGRF covers {_date(start)} to {_date(end)}")
+        raise OutOfRange(
+            "time",
+            _date(bad[0]),
+            f"the IGRF covers {_date(start)} to {_date(end)}; pip install -U ppigrf updates it",
+        )
     field = np.empty((lat.size, 3))
     for i in range(0, lat.size, IGRF_BLOCK_SAMPLES):
         part = slice(i, i + IGRF_BLOCK_SAMPLES)

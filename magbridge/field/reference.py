@@ -13,11 +13,11 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import CHANNELS, counts_from_boot, in_seconds
-from magbridge.errors import DataError, FormatError
+from magbridge.errors import DataError, FormatError, OutOfRange
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.igrf import igrf, magnitude
+from magbridge.field.igrf import coverage, igrf, magnitude
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -163,16 +163,35 @@ def other_units(channels: FloatArray, reference: float) -> str:
     )
 
 
-def main_field(deployment: xr.Dataset) -> FloatArray:
-    """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where no position or date is known."""
+def main_field(deployment: xr.Dataset, *, is_partial: bool = False) -> FloatArray:
+    """Return the IGRF at every sample, (n, 3) nT, north-east-down; NaN where no position or date is known.
+
+    If `is_partial`, it is also NaN at times that the IGRF does not cover. OutOfRange: else, for such a time.
+    """
     field = np.full((deployment.sizes["time"], 3), np.nan)
     if {"latitude", "longitude"} <= set(deployment.variables) and not counts_from_boot(deployment):
         longitude, latitude, depth = positions(deployment)
         known = np.isfinite(longitude) & np.isfinite(latitude)
+        time = deployment["time"].to_numpy()
+        if is_partial and known.any():
+            start, end = coverage()
+            known &= (time >= start) & (time <= end)
         if known.any():
-            time = deployment["time"].to_numpy()
             field[known] = igrf(longitude[known], latitude[known], depth[known], time[known])
     return field
+
+
+def missing_anomaly(deployment: xr.Dataset) -> str:
+    """Return why a corrected deployment has positions but no anomaly at some times; "" if it has one."""
+    if counts_from_boot(deployment):
+        return "its times count from the boot, so no anomaly is written; give --date YYYY-MM-DD"
+    if not {"latitude", "longitude"} <= set(deployment.variables):
+        return ""
+    try:
+        igrf(0.0, 0.0, 0.0, deployment["time"].to_numpy()[[0, -1]])
+    except OutOfRange as error:
+        return f"no anomaly and no declination are written for times outside the IGRF: {error}"
+    return ""
 
 
 def require_date(deployment: xr.Dataset) -> None:
