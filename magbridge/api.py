@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from magbridge.calibration.correct import CorrectedArrays, Corrector
 from magbridge.calibration.correct import correct as correct_arrays
 from magbridge.calibration.fitting.observe import observations
-from magbridge.columns import in_seconds
+from magbridge.datasets import standard_log
 from magbridge.errors import CalibrationError, WrongUse
 from magbridge.records import Corrected
 from magbridge.rows import correct_rows
@@ -78,7 +78,7 @@ def calibrate(
     from magbridge.calibration.fitting.fit import fit  # noqa: PLC0415 - scipy only where it is used
     from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns  # noqa: PLC0415
 
-    log = in_seconds(deployment)
+    log = standard_log(deployment)
     found = fit(observations(log, parameters, grid=grid), **options).calibration
     if not scalar:
         return found
@@ -148,7 +148,7 @@ def _corrected_log(calibration: Calibration, deployment: xr.Dataset) -> xr.Datas
     from magbridge.calibration.fitting.scalar_log import with_scalar  # noqa: PLC0415 - scipy only where it is used
     from magbridge.correction import Correction  # noqa: PLC0415 - as the other imports of this function
 
-    log = in_seconds(deployment)
+    log = standard_log(deployment)
     corrected = with_scalar(correct_rows(Correction(calibration), log), log, calibration.sensors)
     return corrected.assign_coords(time=deployment["time"])
 
@@ -167,8 +167,8 @@ def navigate(
     from magbridge.navigate import NavigationOptions, batch, own_survey  # noqa: PLC0415 - filterpy only where it is used
 
     if grid is None:
-        return own_survey.localise(in_seconds(deployment), options or NavigationOptions())
-    return batch.navigate(in_seconds(deployment), grid, options, **more)
+        return own_survey.localise(standard_log(deployment), options or NavigationOptions())
+    return batch.navigate(standard_log(deployment), grid, options, **more)
 
 
 def survey(
@@ -196,7 +196,7 @@ def survey(
 
     if not deployments:
         raise WrongUse("deployments: expected at least one Dataset, got none")
-    logs = [in_seconds(log) for log in deployments]
+    logs = [standard_log(log) for log in deployments]
     if scalar:
         return run.scalar_survey(logs, scalar, calibrations=calibrations, **options)
     return run.survey(run.samples_of(logs, calibrations))

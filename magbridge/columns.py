@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "HEADINGS", "NT_PER_UNIT",
-    "TEMPERATURE", "Column", "absent", "counts_from_boot", "decoded", "factor", "in_seconds", "may_be",
-    "require", "require_units", "usual",
+    "TEMPERATURE", "Column", "absent", "counts_from_boot", "decoded", "factor", "may_be", "require",
+    "require_units", "time_columns", "usual",
 ]  # fmt: skip
 
 
@@ -112,10 +112,19 @@ _SPELLINGS = {
         *(f"degree{s}_{to}" for s in ("", "s") for to in ("north", "east", "true")),
     ),
     "m": ("metres", "meters", "metre", "meter"),
+    "cm": ("centimetres", "centimeters", "centimetre", "centimeter"),
+    "mm": ("millimetres", "millimeters", "millimetre", "millimeter"),
+    "km": ("kilometres", "kilometers", "kilometre", "kilometer"),
     "m/s": ("m s-1",),
     "cm/s": ("cm s-1",),
-    "s": ("seconds", "sec"),
-    "degC": ("Celsius", "celsius", "degrees_Celsius", "degree_Celsius", "degree_C", "°C"),
+    "s": ("seconds", "second", "sec"),
+    "h": ("hours", "hour"),
+    "degC": ("celsius", "degrees_celsius", "degree_celsius", "degree_C", "deg_C", "deg C", "°C"),
+    "A": ("amperes", "ampere", "amps", "amp"),
+    "mA": ("milliamperes", "milliampere", "milliamps", "milliamp"),
+    "V": ("volts", "volt"),
+    "W": ("watts", "watt"),
+    "%": ("percent",),
     "nT": ("nanotesla", "ntesla", "gamma", "gammas"),
     "uT": ("microtesla", "utesla", "µtesla"),
     "mT": ("millitesla", "mtesla"),
@@ -125,10 +134,13 @@ _SPELLINGS = {
     "G": ("gauss", "Oe", "oersted"),  # an oersted is of the same size in air
     "rad": ("radian", "radians"),
     "in": ("inch", "inches"),
-    "cm3": ("cc", "cm^3", "cm³"),
+    "cm3": ("cc", "ccm", "mL", "ml", "millilitres", "milliliters", "millilitre", "milliliter"),
+    "L": ("l", "dm3", "litres", "liters", "litre", "liter"),
 }
-"""Unit of magbridge -> spellings of it in other programs' files."""
+"""Unit of magbridge -> spellings of it in other programs' files; powers as in ``cm3``."""
 _SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
+_CHARACTERS = str.maketrans({"²": "2", "³": "3", "\N{GREEK SMALL LETTER MU}": "\N{MICRO SIGN}"})
+_POWER = re.compile(r"(\^|\*\*)(?=[-\d])")
 
 
 MAX_NAMES = 60
@@ -149,32 +161,7 @@ def counts_from_boot(deployment: xr.Dataset) -> bool:
     return reference == "boot" or bool(time.size and reference is None and time[-1] < YEAR_1980)
 
 
-def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
-    """Return a deployment with its times, numbers or datetime64, converted to s since 1970-01-01 UTC.
-
-    FormatError: the times are missing, or are neither numbers nor datetime64.
-    """
-    import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
-
-    if "time" not in deployment.coords and "time" in deployment:
-        deployment = deployment.set_coords("time")
-    if "time" not in deployment.variables:
-        source = deployment.attrs.get("source", "the deployment")
-        raise FormatError(source, absent("time", map(str, deployment.variables)), column="time")
-    for name, time in _times(deployment).items():
-        if time.dtype.kind == "M":
-            seconds = (time.values - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
-            values = np.where(time.isnull(), np.nan, seconds)
-            deployment = deployment.assign({name: (time.dims, values, time.attrs | COLUMNS[name]._asdict())})
-            deployment.attrs.setdefault("time_reference", "utc")
-        elif time.dtype.kind not in "iuf":
-            source = deployment.attrs.get("source", "the deployment")
-            expected = f"expected times as numbers or datetime64, got {time.dtype}"
-            raise FormatError(source, expected, column=name)
-    return deployment
-
-
-def _times(deployment: xr.Dataset) -> dict[str, xr.DataArray]:
+def time_columns(deployment: xr.Dataset) -> dict[str, xr.DataArray]:
     """Return the columns of a deployment that contain times, by name."""
     return {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
 
@@ -186,7 +173,7 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
     """
     import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
 
-    for name, time in _times(deployment).items():
+    for name, time in time_columns(deployment).items():
         if time.dtype.kind == "M":
             continue
         seconds = np.where(np.isfinite(time.values), time.values, 0.0)
@@ -217,7 +204,7 @@ def factor(unit: str, column: str) -> float | None:
 
 def usual(unit: str) -> str:
     """Return a unit in the spelling of :data:`COLUMNS`, such as ``degC`` for ``Celsius``."""
-    unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
+    unit = _POWER.sub("", unit.strip().translate(_CHARACTERS))
     written_out = unit.lower().replace("-", "").replace(" ", "").replace("teslas", "tesla")
     return _SAME.get(unit) or (_SAME.get(written_out, unit) if len(written_out) > 4 else unit)
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
-from magbridge.columns import TEMPERATURE
+from magbridge.columns import TEMPERATURE, usual
 from magbridge.config import Align
 from magbridge.field.igrf import HeldField
 from magbridge.filter_lag import LagCorrection
@@ -58,6 +58,8 @@ class Correction:
         Object that applies the calibration in use to a sample.
     is_contradicted : bool
         True if another sensor contradicts the last sample; the learner then does not use the next sample.
+    is_suited : bool
+        True once :func:`~magbridge.rows.correct_rows` has seen that the log suits the calibration.
     is_learning : bool
         False while the learner gets no samples, because the computer is overloaded.
     """
@@ -71,7 +73,9 @@ class Correction:
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
         units = {parameter.name: parameter.unit for parameter in calibration.parameters}
         inputs = tuple(
-            Input(name, *ranges.get(name, (nan, nan)), MAX_AGE, units.get(name, "") not in NOT_MASS_UNITS)
+            Input(
+                name, *ranges.get(name, (nan, nan)), MAX_AGE, usual(units.get(name, "")) not in NOT_MASS_UNITS
+            )
             for name in calibration.channels
         )
         self._masses = [
@@ -92,6 +96,7 @@ class Correction:
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
         self._conditions = _unmodelled_conditions(calibration)
+        self.is_suited = False
         self.is_contradicted, self.is_learning = False, True
         cutoff_hz = calibration.sensor.filter_cutoff
         self._filter_lag = LagCorrection(cutoff_hz) if cutoff_hz else None

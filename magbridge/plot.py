@@ -18,7 +18,7 @@ import xarray as xr
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
-from magbridge.columns import in_seconds
+from magbridge.datasets import in_standard_units
 from magbridge.errors import MissingExtra, WrongUse
 from magbridge.estimation.residual import rms
 from magbridge.field.grid import AnomalyGrid
@@ -60,7 +60,7 @@ def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = No
     if column not in log:
         raise WrongUse(f"expected a column {column!r}, got a log without it; correct the log first")
     axes = _axes(ax)
-    _corrected_panel(axes, in_seconds(log), column)
+    _corrected_panel(axes, in_standard_units(log), column)
     axes.legend(frameon=False, fontsize="small")
     return axes
 

@@ -11,10 +11,12 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import vector_covariance
 from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
-from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, in_seconds, require
+from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, require, require_units
 from magbridge.correction import Correction
+from magbridge.datasets import standard_log
+from magbridge.errors import FormatError
 from magbridge.field.igrf import HeldField, magnitude
-from magbridge.field.reference import main_field
+from magbridge.field.reference import main_field, other_units
 from magbridge.records import Quality, Reading
 
 if TYPE_CHECKING:
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.model import Calibration
 
-__all__ = ["correct_rows"]
+__all__ = ["correct_rows", "refuse_unsuited"]
 
 
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
@@ -54,13 +56,19 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     FormatError
-        A channel is missing.
+        A channel is missing, times do not increase, or the log does not suit the calibration, as
+        :func:`refuse_unsuited` tests.
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
     given = deployment
-    deployment = in_seconds(given)
+    deployment = standard_log(given)
     require(deployment, CHANNELS)
+    if not correction.is_suited:
+        refuse_unsuited(correction.calibration, deployment)
+        # a piece of telemetry alone shows no unit of the channels: the next piece is tested, too
+        whole = deployment[list(CHANNELS)].to_array().notnull().all("variable")
+        correction.is_suited = bool(whole.any())
     correction.as_declared(deployment.attrs)
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
     level, age = np.full((2, len(results)), nan)
@@ -101,6 +109,22 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         coords={"time": given["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )
+
+
+def refuse_unsuited(calibration: Calibration, log: xr.Dataset) -> None:
+    """Check that a log suits a calibration.
+
+    FormatError: the log is of another sensor, a parameter is in another unit, or the channels are not in nT.
+    """
+    source, sensor = log.attrs.get("source", "the deployment"), str(log.attrs.get("sensor", ""))
+    if not calibration.sensor.may_be(sensor):
+        raise FormatError(
+            source, f"expected a log of sensor {calibration.sensor.name!r}, the calibration's, got {sensor!r}"
+        )
+    require_units(log, calibration.units)
+    channels = log[list(CHANNELS)].to_array().to_numpy().T
+    if wrong := other_units(channels, calibration.reference.field):
+        raise FormatError(source, wrong)
 
 
 def _column(deployment: xr.Dataset, name: str) -> FloatArray:

@@ -443,22 +443,3 @@ def note_settings(*pieces: Mapping[str, Any]) -> None:
                 "corrected with those of its start (magbridge replay follows them)"
             )
             return
-
-
-def refuse_unsuited(calibration: mb.Calibration, deployment: xr.Dataset) -> None:
-    """Check that a log suits a calibration.
-
-    FormatError: the log is of another sensor, or a parameter or a channel is in another unit.
-    """
-    from magbridge.columns import CHANNELS, require_units
-    from magbridge.field.reference import other_units
-
-    source, sensor = deployment.attrs["source"], str(deployment.attrs.get("sensor", ""))
-    if not calibration.sensor.may_be(sensor):
-        raise FormatError(
-            source, f"expected a log of sensor {calibration.sensor.name!r}, the calibration's, got {sensor!r}"
-        )
-    require_units(deployment, calibration.units)
-    channels = deployment[list(CHANNELS)].to_array().to_numpy().T
-    if wrong := other_units(channels, calibration.reference.field):
-        raise FormatError(source, wrong)

@@ -12,7 +12,7 @@ from cyclopts import Parameter, validators
 
 import magbridge as mb
 from magbridge.cli import common as cli
-from magbridge.columns import CHANNELS, CORRECTED
+from magbridge.columns import CHANNELS, CORRECTED, usual
 from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.progress import track
 from magbridge.records import Quality
@@ -189,8 +189,6 @@ def _corrected(
             correction = mb.Correction(known, learner=_learner(known, part, learn) if learn else None)
         if not lack and (lack := missing_anomaly(part)):
             cli.complain(f"{part.attrs['source']}: {lack}")
-        if not whole:
-            cli.refuse_unsuited(known, part)
         sampled = part[list(CHANNELS)].to_array().notnull()
         corrected = _with_log_columns(part, correct_rows(correction, part), known, file)
         yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
@@ -205,7 +203,9 @@ def _learner(known: mb.Calibration, log: xr.Dataset, settings: Config) -> Learne
     """Return a learner with the bridge's settings; without ``[telemetry]`` it uses the log's currents."""
     from magbridge.bridge.learning import open_learner
 
-    currents = tuple(str(name) for name in log.data_vars if log[name].attrs.get("units") == "A")
+    currents = tuple(
+        str(name) for name in log.data_vars if usual(str(log[name].attrs.get("units", ""))) == "A"
+    )
     learner = open_learner(settings, known, None if settings.telemetry else currents)
     assert learner is not None
     return learner

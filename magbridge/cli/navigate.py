@@ -128,7 +128,6 @@ def _with_total_field(
     cli.complain_all(cli.warnings_of(known, calibration))
     cli.note_missing(known, deployment)
     cli.note_settings(deployment.attrs)
-    cli.refuse_unsuited(known, deployment)
     return deployment.assign(correct_rows(mb.Correction(known), deployment).data_vars)
 
 

@@ -14,7 +14,7 @@ from magbridge.arrays import BoolArray
 from magbridge.calibration.effects import TimeEffect
 from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.model import Calibration
-from magbridge.columns import in_seconds
+from magbridge.datasets import standard_log
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.columns import Candidate, Group, absent_before, slices
@@ -252,8 +252,8 @@ def diagnose(
     """
     if not datasets:
         raise WrongUse("deployments: expected at least one Dataset, got none")
-    datasets = [in_seconds(dataset) for dataset in datasets]
-    training_logs = [in_seconds(dataset) for dataset in training_logs]
+    datasets = [standard_log(dataset) for dataset in datasets]
+    training_logs = [standard_log(dataset) for dataset in training_logs]
     causes = known() if causes is None else causes
     # one thread: for matrices this narrow more only wait, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):

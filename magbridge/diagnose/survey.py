@@ -14,13 +14,14 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.calibration.fitting.rounds import beside_motion
 from magbridge.calibration.model import Calibration
-from magbridge.columns import AGE, CHANNELS, require, require_units
+from magbridge.columns import AGE, CHANNELS, require
 from magbridge.errors import DataError
 from magbridge.field.geodesy import separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import positions, reference_field
 from magbridge.one_time import interpolate_to_rows
 from magbridge.records import MAX_MEASURED_NT
+from magbridge.rows import refuse_unsuited
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
@@ -415,15 +416,8 @@ def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
 ) -> dict[str, FloatArray]:
     """Return a log's numeric columns and reference; its axes are interpolated to the rows' times."""
-    source = str(ds.attrs.get("source", "deployment"))
-    sensor = str(ds.attrs.get("sensor", ""))
-    if not calibration.sensor.may_be(sensor):
-        raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
     require(ds, (*CHANNELS, *calibration.units))
-    require_units(ds, calibration.units)
-    once = np.unique(ds["time"], return_index=True)[1]
-    if once.size < ds.sizes["time"]:
-        ds = ds.isel(time=once)
+    refuse_unsuited(calibration, ds)
     time = ds["time"].to_numpy().astype(float)
     table = {
         str(name): column.to_numpy().astype(float)

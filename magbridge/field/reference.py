@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.columns import CHANNELS, counts_from_boot, in_seconds
+from magbridge.columns import CHANNELS, counts_from_boot
+from magbridge.datasets import in_standard_units
 from magbridge.errors import DataError, FormatError, OutOfRange
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
@@ -76,7 +77,7 @@ def reference_field(
     the map's at its own altitude. The main field changes by about 0.02 nT/m of depth, and anomalies of
     shallow crustal sources by far more.
     """
-    deployment = in_seconds(deployment)
+    deployment = in_standard_units(deployment)
     size = deployment.sizes["time"]
     given = np.array(np.broadcast_to(deployment.get("reference_field", np.nan), size), float)
     unknown = np.isnan(given)

@@ -18,11 +18,12 @@ from typing import Any, Self
 
 import xarray as xr
 
-from magbridge.columns import counts_from_boot, decoded, in_seconds, require
+from magbridge.columns import counts_from_boot, decoded, require
+from magbridge.datasets import in_standard_units, increasing
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
-from magbridge.logs.checks import checked, increasing
+from magbridge.logs.checks import checked
 from magbridge.logs.compasses import by_columns
 from magbridge.logs.deployment import (
     NOTES,
@@ -317,7 +318,7 @@ class Writer:
 
         FormatError: time does not increase, or a column was not in the first deployment.
         """
-        dataset = in_seconds(dataset)
+        dataset = in_standard_units(dataset)
         first = not self._columns
         if first:
             if counts_from_boot(dataset):

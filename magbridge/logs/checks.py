@@ -27,14 +27,13 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, usual
+from magbridge.datasets import YEAR_10000, disorder, disordered, expected_time
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
 from magbridge.logs.mapping import bare
 
 Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
-YEAR_10000 = 253_402_300_800.0
-"""Start of the year 10000, s since 1970; a later time is in another unit."""
 MAX_MAGNITUDE = {
     "latitude": 90.0,
     **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0),
@@ -58,18 +57,6 @@ MIN_ROWS_FOR_ISOLATION = 10
 """Fewest rows of a piece from which isolated groups are dropped."""
 LOOKAHEAD_ROWS = 64
 """Rows after a piece that are examined to decide whether its last times are too late."""
-
-
-def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf) -> None:
-    """Check that `time` (n,), s, is finite and increases, also from `previous`, the last time before it.
-
-    FormatError: it does not; the message names the first wrong row, counted from 1.
-    """
-    wrong = _wrong(time, previous)
-    if len(wrong):
-        k = int(wrong[0])
-        expected = _expected(float(time[k]), float(time[k - 1]) if k else previous)
-        raise FormatError(file, expected, row=k + 1, column="time")
 
 
 def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) -> Iterator[xr.Dataset]:
@@ -122,7 +109,7 @@ def _times(
     faults.count("time", len(time))
     time = np.where(np.isfinite(time), time, np.nan)  # an infinite time has no difference from another
     whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
-    if not len(_wrong(whole, previous)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
+    if not len(disordered(whole, previous)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
         return np.arange(len(time)), 0
     index = _rows_to_keep(whole, previous)
     then = [*whole[index].tolist(), np.inf]
@@ -133,7 +120,7 @@ def _times(
         k = int(wrong.argmax())
         place = int(np.searchsorted(index, k))
         before = float(time[index[place - 1]]) if place else previous
-        expected = _disorder(time) or _expected(float(time[k]), before, then[place])
+        expected = disorder(time) or expected_time(float(time[k]), before, then[place])
         faults.note("time", wrong, rows, expected, counted=False)
     return index, len(repeated)
 
@@ -174,33 +161,6 @@ def _possible(name: str, unit: str) -> tuple[float, float, str]:
         f"expected at least {least:g} {unit}, or nothing where it is not known" if least is not None else ""
     )
     return least or 0.0, np.inf, expected
-
-
-def _wrong(time: FloatArray, previous: float) -> IndexArray:
-    """Return the indices at which `time` (n,) is not a valid time, or does not increase from `previous`."""
-    return np.flatnonzero(~((np.diff(time, prepend=previous) > 0) & (np.abs(time) < YEAR_10000)))
-
-
-def _disorder(time: FloatArray) -> str:
-    """Return a message on the expected order if most times (n,) run backwards or are repeated; else ""."""
-    steps = np.diff(time)
-    if len(steps) > 1 and np.mean(steps < 0.0) > 0.5:
-        return "expected times that increase, they run backwards: sort the rows by time"
-    if len(steps) > 1 and np.mean(steps == 0.0) > 0.5:
-        each = round(len(time) / len(np.unique(time)))
-        remedy = 'if in whole seconds, give the rate, --column time="row [RATE Hz]"'
-        return f"expected a time for each row, {each} have the same: {remedy}"
-    return ""
-
-
-def _expected(time: float, previous: float, following: float = np.inf) -> str:
-    """Return a message on the time expected between `previous` and `following`, s, instead of `time`."""
-    if YEAR_10000 <= abs(time) < np.inf:
-        return f"expected seconds since 1970, not {time!r}"
-    if previous < time and following <= time:
-        return f"expected a time before {following!r}, not {time!r}"
-    wanted = f"time after {previous!r}" if np.isfinite(previous) else "finite time"
-    return f"expected a {wanted}, not {time!r}"
 
 
 def _rows_to_keep(time: FloatArray, previous: float) -> IndexArray:

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import YEAR_1980
+from magbridge.columns import YEAR_1980, usual
 from magbridge.logs.checks import MEDIAN_ROWS, boots
 
 DAY = 86_400.0
@@ -172,7 +172,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
 
     ValueError: dates can be read in two ways; the message states the possible declarations.
     """
-    unit = {"seconds": "s", "sec": "s", "hours": "h"}.get(unit, unit)
+    unit = usual(unit) if "%" not in unit else unit
     unit = "unix" if re.match("s(ec|econds)? since 1970", unit) else unit
     if "%" in unit:
         return TimeFormat(unit, zone=zone, boot="%d" not in unit and "%j" not in unit)

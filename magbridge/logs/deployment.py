@@ -17,11 +17,10 @@ from magbridge.columns import (
     FURTHER_AXIS,
     NT_PER_UNIT,
     counts_from_boot,
-    factor,
-    in_seconds,
     require,
     usual,
 )  # fmt: skip
+from magbridge.datasets import conversion, in_standard_units, standard_log
 from magbridge.errors import FormatError
 from magbridge.logs.mapping import ColumnMapping, ColumnSource, split
 from magbridge.records import Quality
@@ -96,9 +95,7 @@ def deployment(
     variables = {}
     for name, values in {"time": time, **columns}.items():
         unit = units.get(name, "")
-        scale = factor(unit, name)
-        if scale is None:
-            raise FormatError(file, f"expected {COLUMNS[name].units}, not {unit}", column=name)
+        scale = conversion(file, name, unit)
         array = np.asarray(values, dtype=np.float64)
         described = _describe(name, unit, long_names.get(name))
         variables[name] = ("time", array if scale == 1.0 else array * scale, described)
@@ -183,7 +180,7 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         for name in part.data_vars:
             own = part.variables[name].attrs
             attrs = described.setdefault(str(name), own)
-            if attrs.get("units") != own.get("units"):
+            if usual(attrs.get("units", "")) != usual(own.get("units", "")):
                 expected = f"expected {attrs.get('units')!r} as in the files before, not {own.get('units')!r}"
                 raise FormatError(part.attrs.get("source", ""), expected, column=str(name))
     alike = [same_columns(part, described) for part in parts]
@@ -318,7 +315,7 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
     Raises
     ------
     FormatError
-        The frame has no time, a column does not hold numbers, or a unit does not fit.
+        The frame has no time, times do not increase, a column does not hold numbers, or a unit does not fit.
     """
     named = dict(split(str(name)) for name in frame.columns)
     frame = frame.set_axis(list(named), axis=1)
@@ -332,7 +329,7 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
         columns[name] = frame[name].to_numpy(float)
     if not pd.api.types.is_numeric_dtype(time):
         attrs.setdefault("time_reference", "utc")
-    return deployment(FRAME_NAME, _seconds(time), columns, {**named, **(units or {})}, attrs)
+    return standard_log(deployment(FRAME_NAME, _seconds(time), columns, {**named, **(units or {})}, attrs))
 
 
 def to_frame(log: xr.Dataset) -> pd.DataFrame:
@@ -340,7 +337,7 @@ def to_frame(log: xr.Dataset) -> pd.DataFrame:
 
     Times that count from a boot remain s.
     """
-    log = in_seconds(log)
+    log = in_standard_units(log)
     frame = log.to_dataframe()
     if not counts_from_boot(log):
         frame.index = pd.to_datetime(log["time"].to_numpy(), unit="s", utc=True).rename("time")

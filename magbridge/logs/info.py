@@ -9,7 +9,8 @@ import xarray as xr
 from msgspec import to_builtins
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot, in_seconds
+from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot, usual
+from magbridge.datasets import in_standard_units
 from magbridge.field.igrf import magnitude
 from magbridge.logs.checks import states_validity
 from magbridge.logs.compasses import compasses_in
@@ -66,7 +67,7 @@ def info(log: xr.Dataset) -> dict[str, Any]:
         ``losses`` (a line each), ``notes``, ``compasses``, ``columns`` (name, unit, meaning, fraction known,
         lowest, highest, interval between changes), ``uses`` (command -> missing columns) and ``hints``.
     """
-    log = in_seconds(log)
+    log = in_standard_units(log)
     time = log["time"].to_numpy().astype(float)
     steps = np.diff(time)
     interval = float(np.median(steps)) if len(steps) else None
@@ -123,7 +124,7 @@ def movers(log: xr.Dataset) -> list[str]:
     return [
         name
         for name in telemetry(log)
-        if name not in reckoned and log[name].attrs.get("units", "1") not in STATES
+        if name not in reckoned and usual(log[name].attrs.get("units", "1")) not in STATES
         if not states_validity(name) and not _counts(log[name].to_numpy())
     ]
 
@@ -132,7 +133,7 @@ def conditions(log: xr.Dataset) -> list[str]:
     """Return the columns of temperature, pressure and depth that vary, and so may change the field."""
     reckoned = [name for name in CONDITION_COLUMNS if name in log and float(np.ptp(_known(log, name))) > 0.0]
     return reckoned + [
-        name for name in telemetry(log) if log[name].attrs.get("units", "1") in CONDITION_UNITS
+        name for name in telemetry(log) if usual(log[name].attrs.get("units", "1")) in CONDITION_UNITS
     ]
 
 

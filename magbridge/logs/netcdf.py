@@ -32,7 +32,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.columns import COLUMNS, factor
+from magbridge.columns import COLUMNS, factor, usual
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.files import systems_reason
 from magbridge.logs import seaglider
@@ -307,6 +307,8 @@ def _epoch(path: Path, variable: Any) -> tuple[float, float]:
     """Return the zero of a time variable, s since 1970, and the length of its unit, s."""
     units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
     unit = 1.0
+    if usual(units) == "s" and getattr(variable, "long_name", "") == COLUMNS["time"].long_name:
+        return 0.0, 1.0  # xarray wrote a Dataset of magbridge
     if nano := NANOSECONDS.match(units):  # netCDF4 does not know nanoseconds
         units, unit = f"seconds{units[nano.end() :]}", 1e-9
     days = [datetime(1970, 1, 1), datetime(1970, 1, 2)]

@@ -10,10 +10,10 @@ import xarray as xr
 from filterpy.kalman import rts_smoother
 
 from magbridge.arrays import FloatArray, RealArray
+from magbridge.datasets import increasing
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
-from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.findings import REFERENCES, findings_of, reference_track, with_errors

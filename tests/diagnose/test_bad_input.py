@@ -108,11 +108,11 @@ def test_a_sample_that_is_given_twice_is_one(plain: Plain) -> None:
         (lambda ds: ds.drop_vars("battpos"), "column 'battpos': expected this column"),
         (lambda ds: ds.isel(time=slice(0, 3)), "3 samples, at least 60"),
         (lambda ds: ds.assign(mag_y=ds["mag_y"] * np.nan), "'mag_y' has 0 numbers"),
-        (lambda ds: ds.assign({f"mag_{axis}": 0.0 * ds[f"mag_{axis}"] for axis in "xyz"}), "never change"),
-        (lambda ds: ds.assign({f"mag_{axis}": 1e-5 * ds[f"mag_{axis}"] for axis in "xyz"}), "in other units"),
+        (lambda ds: ds.assign({f"mag_{a}": 0.0 * ds[f"mag_{a}"] + 2e4 for a in "xyz"}), "never change"),
+        (lambda ds: ds.assign({f"mag_{axis}": 1e-5 * ds[f"mag_{axis}"] for axis in "xyz"}), "expected nT"),
         (lambda ds: ds.assign(battpos=100.0 * ds["battpos"]), "'battpos' is .* expected its unit"),
         (lambda ds: ds.assign(ballast=ds["ballast"].where(some(ds, 40), -9999.0)), "'ballast' is -9999"),
-        (lambda ds: ds.assign_attrs(sensor="another"), "sensor 'another', but the calibration is of 'one'"),
+        (lambda ds: ds.assign_attrs(sensor="another"), "sensor 'one', the calibration's, got 'another'"),
     ],
 )
 def test_one_line(plain: Plain, change: Callable[[xr.Dataset], xr.Dataset], message: str) -> None:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from texts import NOON, lines, read
 
 from magbridge import logs
-from magbridge.columns import counts_from_boot, decoded, in_seconds
+from magbridge.columns import counts_from_boot, decoded
+from magbridge.datasets import in_standard_units
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import from_frame, named_losses, to_frame
 from magbridge.logs.mapping import Options
@@ -101,7 +102,7 @@ def test_a_date_before_1980_is_a_date(kind: str, year: int, tmp_path: Path) -> N
         logs.write(log, tmp_path / f"again.{suffix}")
         again = logs.read(tmp_path / f"again.{suffix}")
         assert not counts_from_boot(again)
-        assert not counts_from_boot(in_seconds(decoded(again)))
+        assert not counts_from_boot(in_standard_units(decoded(again)))
     assert not counts_from_boot(from_frame(to_frame(log)))
 
 

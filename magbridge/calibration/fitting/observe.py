@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, in_seconds, require
+from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, require
+from magbridge.datasets import standard_log
 from magbridge.errors import CalibrationError
 from magbridge.field.geodesy import separation
 from magbridge.field.reference import earth_field, placed, positions, with_true_heading
@@ -58,7 +59,7 @@ def observations(
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
     # interpolate sequentially sampled channels first, because all other columns refer to the rows' times
-    ds = at_one_time(in_seconds(ds))
+    ds = at_one_time(standard_log(ds))
     columns = {name: _column(ds, name) for name in names}
     total, vector, model = earth_field(ds, grid)
     if "daily_variation" in ds:

@@ -26,7 +26,7 @@ from magbridge.calibration.scalar import (
     scalar_design,
     term_columns,
 )
-from magbridge.columns import CHANNELS, COLUMNS, require
+from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT, require, usual
 from magbridge.errors import DataError, FormatError
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.reference import reference_field
@@ -113,11 +113,11 @@ def calibrate_scalar(
 def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
     """Return a scalar magnetometer's reading (n,), nT; DataError: the column is not a total field in nT."""
     reading = ds[column].to_numpy().astype(float)
-    usual = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
-    if not 1e4 < usual < 1e5:
+    median = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
+    if not 1e4 < median < 1e5:
         source = ds.attrs.get("source", "the log")
         raise DataError(
-            f"{source}: column {column!r}: expected the total field in nT, got a median of {usual:g}"
+            f"{source}: column {column!r}: expected the total field in nT, got a median of {median:g}"
         )
     return reading
 
@@ -270,4 +270,4 @@ def moved_to_sensor(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dat
 
 def _is_field(column: xr.DataArray) -> bool:
     """Return True for a column in units of magnetic flux density: another sensor, not telemetry."""
-    return str(column.attrs.get("units", "")) in ("nT", "uT", "µT", "mT", "T", "G", "mG")
+    return usual(str(column.attrs.get("units", ""))) in NT_PER_UNIT

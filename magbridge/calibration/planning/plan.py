@@ -31,7 +31,8 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.columns import in_seconds, require_units
+from magbridge.columns import require_units
+from magbridge.datasets import standard_log
 from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import effective_fraction
 from magbridge.estimation.priors import polynomial_prior
@@ -321,7 +322,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     CalibrationError: the mission has no attitude or position. FormatError: it lacks a parameter of the
     calibration, or has it in another unit.
     """
-    mission = in_seconds(mission)
+    mission = standard_log(mission)
     require_units(mission, calibration.units)
     names = tuple(calibration.units)
     data = mission_samples(mission, names)

@@ -1,0 +1,135 @@
+"""Check and convert the Datasets that enter from Python.
+
+Readers of files return Datasets in standard units with increasing times; other programs may not.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.columns import COLUMNS, absent, factor, time_columns
+from magbridge.errors import FormatError, WrongUse
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "YEAR_10000", "conversion", "disorder", "disordered", "expected_time", "in_standard_units", "increasing",
+    "standard_log",
+]  # fmt: skip
+
+YEAR_10000 = 253_402_300_800.0
+"""Start of the year 10000, s since 1970; a later time is in another unit."""
+
+
+def standard_log(log: xr.Dataset) -> xr.Dataset:
+    """Return a log in standard units, as :func:`in_standard_units`, after a check that its times increase.
+
+    FormatError: they do not; the message names the first wrong row, counted from 1.
+    """
+    log = in_standard_units(log)
+    increasing(log.attrs.get("source", "the deployment"), log["time"].to_numpy())
+    return log
+
+
+def in_standard_units(log: xr.Dataset) -> xr.Dataset:
+    """Return a log with its columns converted to the units of :data:`~magbridge.columns.COLUMNS`.
+
+    Times may be ``datetime64``, or numbers of s since 1970-01-01 UTC or of a unit ``... since ...``.
+
+    WrongUse: `log` is not a Dataset. FormatError: the times are missing, or are neither numbers nor
+    ``datetime64``; a unit does not fit its column.
+    """
+    if not hasattr(log, "data_vars"):
+        convert = "; convert it with magbridge.from_frame" * hasattr(log, "iloc")
+        raise WrongUse(f"log: expected an xarray.Dataset, got {type(log).__name__}{convert}")
+    source = log.attrs.get("source", "the deployment")
+    if "time" not in log.coords and "time" in log:
+        log = log.set_coords("time")
+    if "time" not in log.variables:
+        raise FormatError(source, absent("time", map(str, log.variables)), column="time")
+    for name, given in time_columns(log).items():
+        time = _moments(source, given) if " since " in str(given.attrs.get("units", "")) else given
+        if time.dtype.kind in "Mm":  # xarray reads numbers of the unit s as timedelta64
+            zero = np.datetime64(0, "ns") if time.dtype.kind == "M" else np.timedelta64(0, "ns")
+            seconds = (time.values - zero) / np.timedelta64(1, "s")
+            values = np.where(time.isnull(), np.nan, seconds)
+            log = log.assign({name: (time.dims, values, time.attrs | COLUMNS[name]._asdict())})
+            if time.dtype.kind == "M":
+                log.attrs.setdefault("time_reference", "utc")
+        elif time.dtype.kind not in "iuf":
+            raise FormatError(
+                source, f"expected times as numbers or datetime64, got {time.dtype}", column=name
+            )
+    for key, column in log.variables.items():
+        name, unit = str(key), str(column.attrs.get("units", ""))
+        if (scale := conversion(source, name, unit)) != 1.0:
+            wanted = COLUMNS[name].units if name in COLUMNS else "nT"
+            scaled = column.dims, column.to_numpy() * scale, column.attrs | {"units": wanted}
+            log = log.assign({name: scaled})
+    return log
+
+
+def _moments(source: str, time: xr.DataArray) -> xr.DataArray:
+    """Return numbers of a unit ``... since ...`` as datetime64; FormatError: the unit cannot be read."""
+    import xarray as xr  # noqa: PLC0415 - the live path runs without it
+
+    try:
+        return xr.decode_cf(time.to_dataset(name="moments"))["moments"]
+    except ValueError:
+        expected = f"expected seconds since 1970, not {time.attrs['units']!r}"
+        raise FormatError(source, expected, column=str(time.name)) from None
+
+
+def conversion(source: str | Path, name: str, unit: str) -> float:
+    """Return the factor from a column's declared unit to its standard unit.
+
+    FormatError: the unit is of another quantity.
+    """
+    scale = factor(unit, name)
+    if scale is None:
+        raise FormatError(source, f"expected {COLUMNS[name].units}, not {unit}", column=name)
+    return scale
+
+
+def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf) -> None:
+    """Check that `time` (n,), s, is finite and increases, also from `previous`, the last time before it.
+
+    FormatError: it does not; the message names the first wrong row, counted from 1.
+    """
+    wrong = disordered(time, previous)
+    if len(wrong):
+        k = int(wrong[0])
+        expected = disorder(time) or expected_time(float(time[k]), float(time[k - 1]) if k else previous)
+        raise FormatError(file, expected, row=k + 1, column="time")
+
+
+def disordered(time: FloatArray, previous: float) -> IndexArray:
+    """Return the indices at which `time` (n,) is not a valid time, or does not increase from `previous`."""
+    return np.flatnonzero(~((np.diff(time, prepend=previous) > 0) & (np.abs(time) < YEAR_10000)))
+
+
+def disorder(time: FloatArray) -> str:
+    """Return a message on the expected order if most times (n,) run backwards or are repeated; else ""."""
+    steps = np.diff(time)
+    if len(steps) > 1 and np.mean(steps < 0.0) > 0.5:
+        return "expected times that increase, they run backwards: sort the rows by time"
+    if len(steps) > 1 and np.mean(steps == 0.0) > 0.5:
+        each = round(len(time) / len(np.unique(time)))
+        remedy = 'if in whole seconds, give the rate, --column time="row [RATE Hz]"'
+        return f"expected a time for each row, {each} have the same: {remedy}"
+    return ""
+
+
+def expected_time(time: float, previous: float, following: float = np.inf) -> str:
+    """Return a message on the time expected between `previous` and `following`, s, instead of `time`."""
+    if YEAR_10000 <= abs(time) < np.inf:
+        return f"expected seconds since 1970, not {time!r}"
+    if previous < time and following <= time:
+        return f"expected a time before {following!r}, not {time!r}"
+    wanted = f"time after {previous!r}" if np.isfinite(previous) else "finite time"
+    return f"expected a {wanted}, not {time!r}"
