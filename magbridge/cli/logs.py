@@ -196,9 +196,9 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or the name of a built-in scenario: demo, survey, bonne_bay or random_glider; comet
-        or seaglider, which need --trajectory-from; turn_on, warming, bolt, pump or battery, in which the
-        vehicle changes.
+        A scenario file (.toml; docs/files.md lists its keys), or the name of a built-in scenario: demo,
+        survey, bonne_bay or random_glider; comet or seaglider, which need --trajectory-from; turn_on,
+        warming, bolt, pump or battery, in which the vehicle changes.
     output
         The file to write.
     seed

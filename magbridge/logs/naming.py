@@ -258,7 +258,7 @@ def _without_texts(layout: Layout, rows: Rows) -> Layout:
     left: dict[int, str] = {}
     for k, name in enumerate(layout.names):
         present = set(cells_in(rows, k))
-        kept = name == "line" or (name in COLUMNS and name not in UNIT_CELL_COLUMNS)
+        kept = name in {"line", "line_type"} or (name in COLUMNS and name not in UNIT_CELL_COLUMNS)
         if not name or kept or not present:
             continue
         texts = [layout.number(cell) for cell in present]

@@ -212,6 +212,8 @@ class TableReader:
         if name == "line" and not pd.api.types.is_numeric_dtype(column):
             labels = column.astype("str").map(partial(line_number, known=self._lines), na_action="ignore")
             values = labels.to_numpy(np.float64, copy=True)
+        elif name == "line_type" and not pd.api.types.is_numeric_dtype(column):
+            values = column.astype("str").str.strip().str.upper().eq("TIE").to_numpy(np.float64)
         elif pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
             values = column.to_numpy(np.float64, copy=True)
         else:

@@ -65,6 +65,10 @@ def is_table(path: Path) -> bool:
     )
 
 
+TIE = "TIE", "1", "1.0"
+"""Cells of ``line_type`` that mark a tie line."""
+
+
 def read_table(path: Path) -> Samples:
     """Read the samples of a table: longitude, latitude (deg), anomaly (nT).
 
@@ -81,7 +85,7 @@ def read_table(path: Path) -> Samples:
     if lines:  # an empty cell is a line of its own
         line = np.unique(table[lines].astype(str).fillna(""), return_inverse=True)[1]
     kind = table["line_type"].astype(str).str.upper() if "line_type" in table else None
-    tie = np.zeros(len(value), bool) if kind is None else (kind == "TIE").to_numpy()
+    tie = np.zeros(len(value), bool) if kind is None else kind.isin(TIE).to_numpy()
     known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)
     if known.sum() < MIN_LOCATED_SAMPLES:
         raise FormatError(
@@ -170,7 +174,7 @@ def located(
         names = names.astype(str) if names.dtype.kind == "O" else names
         line = np.unique(names, return_inverse=True)[1].ravel()
         if "line_type" in ds:
-            tie = np.char.upper(ds["line_type"].to_numpy().astype(str)) == "TIE"
+            tie = np.isin(np.char.upper(ds["line_type"].to_numpy().astype(str)), TIE)
     time = np.asarray(ds["time"].to_numpy(), float)
     return Samples(place, depth, time, value, line, tie, origin), known
 

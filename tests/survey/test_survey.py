@@ -223,6 +223,17 @@ def table(tmp_path: Path) -> Path:
     return tmp_path / "lines.csv"
 
 
+def test_tie_lines_of_a_log_with_times_are_those_of_the_table(command: Command, table: Path) -> None:
+    heading, *rows = table.read_text().splitlines()
+    timed = [f"time,{heading}", *(f"{1.6e9 + k},{row}" for k, row in enumerate(rows))]
+    (table.parent / "timed.csv").write_text("\n".join(timed) + "\n")
+    found = [
+        command.json("survey", file, "-o", table.parent / "map.nc")
+        for file in (table, table.parent / "timed.csv")
+    ]
+    assert found[0]["misties_after_nT"] == pytest.approx(found[1]["misties_after_nT"], rel=1e-6)
+
+
 def test_command_makes_a_map_that_navigate_reads(command: Command, table: Path) -> None:
     """Write GeoTIFF, tracks and crossovers as well; the map equals the survey."""
     out = table.parent
