@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from magbridge.calibration.correct import CorrectedArrays, Corrector
 from magbridge.calibration.correct import correct as correct_arrays
 from magbridge.calibration.fitting.observe import observations
-from magbridge.datasets import standard_log
+from magbridge.calibration.model import Calibration
+from magbridge.datasets import expect, standard_log
 from magbridge.errors import CalibrationError, WrongUse
 from magbridge.records import Corrected
 from magbridge.rows import correct_rows
@@ -20,7 +21,6 @@ from magbridge.rows import correct_rows
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magbridge.calibration.model import Calibration
     from magbridge.field.grid import AnomalyGrid
     from magbridge.navigate.options import NavigationOptions
     from magbridge.survey.run import Result
@@ -127,7 +127,8 @@ def correct(
     FormatError
         The log lacks a column.
     """
-    if hasattr(field, "data_vars"):
+    expect("calibration", calibration, Calibration, "magbridge.load(path)")
+    if hasattr(field, "data_vars") or hasattr(field, "iloc"):
         return _corrected_log(calibration, cast("xr.Dataset", field))
     readings = np.asarray(field, float)
     if readings.shape[-1:] != (3,) or readings.ndim > 2:
@@ -196,6 +197,8 @@ def survey(
 
     if not deployments:
         raise WrongUse("deployments: expected at least one Dataset, got none")
+    for calibration in calibrations:
+        expect("calibrations", calibration, Calibration, "magbridge.load(path)")
     logs = [standard_log(log) for log in deployments]
     if scalar:
         return run.scalar_survey(logs, scalar, calibrations=calibrations, **options)

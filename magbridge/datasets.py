@@ -1,10 +1,11 @@
-"""Check and convert the Datasets that enter from Python.
+"""Check arguments that enter from Python, and convert Datasets.
 
 Readers of files return Datasets in standard units with increasing times; other programs may not.
 """
 
 from __future__ import annotations
 
+from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,12 +19,27 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "YEAR_10000", "conversion", "disorder", "disordered", "expected_time", "in_standard_units", "increasing",
-    "standard_log",
+    "YEAR_10000", "conversion", "disorder", "disordered", "expect", "expect_number", "expected_time",
+    "in_standard_units", "increasing", "standard_log",
 ]  # fmt: skip
 
 YEAR_10000 = 253_402_300_800.0
 """Start of the year 10000, s since 1970; a later time is in another unit."""
+
+
+def expect(name: str, value: object, kind: type, origin: str) -> None:
+    """Check that an argument is a `kind`, which the expression `origin` returns; WrongUse: it is not."""
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        got = type(value).__name__
+        raise WrongUse(f"{name}: expected {article} {kind.__name__}, as {origin} returns, got {got}")
+
+
+def expect_number(name: str, value: object, low: float, high: float, kind: type = Real) -> None:
+    """Check that an argument is a number from `low` to `high`; WrongUse: it is not."""
+    if not (isinstance(value, kind) and isinstance(value, Real) and low <= float(value) <= high):
+        what = "a whole number" if kind is Integral else "a number"
+        raise WrongUse(f"{name}: expected {what} from {low:g} to {high:g}, got {value!r}")
 
 
 def standard_log(log: xr.Dataset) -> xr.Dataset:
@@ -45,8 +61,8 @@ def in_standard_units(log: xr.Dataset) -> xr.Dataset:
     ``datetime64``; a unit does not fit its column.
     """
     if not hasattr(log, "data_vars"):
-        convert = "; convert it with magbridge.from_frame" * hasattr(log, "iloc")
-        raise WrongUse(f"log: expected an xarray.Dataset, got {type(log).__name__}{convert}")
+        remedy = "; convert it with magbridge.from_frame" * hasattr(log, "iloc")
+        raise WrongUse(f"log: expected an xarray.Dataset, got {type(log).__name__}{remedy}")
     source = log.attrs.get("source", "the deployment")
     if "time" not in log.coords and "time" in log:
         log = log.set_coords("time")

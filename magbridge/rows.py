@@ -13,7 +13,7 @@ from magbridge.calibration.correct import vector_covariance
 from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, require, require_units
 from magbridge.correction import Correction
-from magbridge.datasets import standard_log
+from magbridge.datasets import expect, standard_log
 from magbridge.errors import FormatError
 from magbridge.field.igrf import HeldField, magnitude
 from magbridge.field.reference import main_field, other_units
@@ -61,6 +61,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """
     import xarray as xr  # noqa: PLC0415 - the live path runs without it
 
+    expect("correction", correction, Correction, "magbridge.Correction(calibration)")
     given = deployment
     deployment = standard_log(given)
     require(deployment, CHANNELS)

@@ -104,3 +104,40 @@ def test_a_file_that_xarray_wrote_is_read_back(tmp_path: Path) -> None:
         seen = mb.observations(back, "battpos")
         np.testing.assert_array_equal(seen.time, LOG["time"])
         np.testing.assert_array_equal(seen.field, mb.observations(LOG, "battpos").field)
+
+
+SEEN = mb.observations(LOG, "battpos")
+FRAME = mb.to_frame(LOG)
+WRONG_ARGUMENTS: dict[str, tuple[Callable[..., object], tuple[object, ...], dict[str, object], str]] = {
+    "no file": (mb.read, ([],), {}, "paths: expected at least one file, got none"),
+    "no path": (mb.read, (None,), {}, "paths: expected a path or a sequence of paths, got None"),
+    "no paths": (mb.read, ([None],), {}, r"paths: expected a path or a sequence of paths, got \[None\]"),
+    "frame": (mb.correct_rows, (mb.Correction(INCHES), FRAME), {}, "got DataFrame; convert it with"),
+    "frame to correct": (mb.correct, (INCHES, FRAME), {}, "log: expected an xarray.Dataset, got DataFrame"),
+    "frame to observe": (mb.observations, (FRAME,), {}, "log: expected an xarray.Dataset, got DataFrame"),
+    "mapping": (mb.observations, ({"time": [0.0]},), {}, "log: expected an xarray.Dataset, got dict"),
+    "calibration": (mb.correct_rows, (INCHES, LOG), {}, "correction: expected a Correction, as"),
+    "path": (mb.correct, ("cal.json", LOG), {}, r"calibration: expected a Calibration, as .*load.* got str"),
+    "path of a plan": (mb.plan, ("cal.json", LOG), {}, "calibration: expected a Calibration"),
+    "path of a survey": (mb.survey, ([LOG], "cal.json"), {}, "calibrations: expected a Calibration"),
+    "path of a diagnosis": (mb.diagnose, ([LOG], "cal.json"), {}, "calibration: expected a Calibration"),
+    "log": (mb.fit, (LOG,), {}, "data: expected an Observations, as .*observations.* got Dataset"),
+    "misspelt option": (mb.fit, (SEEN,), {"postion_sigma": 1.0}, "did you mean position_sigma"),
+    "order 0": (mb.fit, (SEEN,), {"order": 0}, "order: expected a whole number from 1 to 6, got 0"),
+    "order -3": (mb.fit, (SEEN,), {"order": -3}, "order: expected a whole number from 1 to 6, got -3"),
+    "order 1.5": (mb.fit, (SEEN,), {"order": 1.5}, "order: expected a whole number from 1 to 6, got 1.5"),
+    "unknown bias": (mb.fit, (SEEN,), {"site_bias": np.nan}, "site_bias: expected a number from 0 to"),
+    "negative bias": (mb.calibrate, (LOG,), {"site_bias": -5.0}, "site_bias: expected a number from 0 to"),
+    "text": (mb.fit, (SEEN,), {"site_bias": "5"}, "site_bias: expected a number from 0 to 100000, got '5'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "options", "message"), WRONG_ARGUMENTS.values(), ids=WRONG_ARGUMENTS
+)
+def test_a_wrong_argument_is_named_in_one_line(
+    function: Callable[..., object], arguments: tuple[object, ...], options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(mb.MagbridgeError, match=message) as caught:
+        function(*arguments, **options)
+    assert "\n" not in str(caught.value)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter, validators
 
 import magbridge as mb
+from magbridge.calibration.fitting import FIT_RANGES
 from magbridge.cli import common as cli
 from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.files import digest
@@ -28,6 +29,14 @@ MAX_LISTED_CONTRIBUTIONS = 5
 """Largest number of contributions to a scalar magnetometer's reading that the summary lists."""
 ALL_COMPASSES = "all"
 """Value of ``--compass`` that requests a calibration of each compass."""
+
+
+def _range_check(option: str) -> validators.Number:
+    """Return a validator of an option of the fit."""
+    low, high = FIT_RANGES[option]
+    return validators.Number(gte=low, lte=high)
+
+
 SCALAR_REFERENCE_SIGMA_NT = 1.0
 """Default 1-sigma of a scalar magnetometer's reading as the reference field, nT."""
 
@@ -66,10 +75,10 @@ class ModelOptions:
     """
 
     parameter: tuple[str, ...] = ()
-    order: Annotated[cli.Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
+    order: Annotated[cli.Whole, Parameter(validator=_range_check("order"))] = 3
     method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto"
     vehicle: str = ""
-    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
+    position_sigma: Annotated[float, Parameter(validator=_range_check("position_sigma"))] = 0.0
     filter_cutoff: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0
     fleet: str = ""
     refit: str = ""
@@ -124,7 +133,7 @@ class ReferenceOptions:
     grid: Path | None = None
     base: cli.Base = None
     reference: Literal["mean", "scalar"] | None = None
-    site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None
+    site_bias: Annotated[float | None, Parameter(validator=_range_check("site_bias"))] = None
     heading_reference: cli.Heading = None
 
     def apply(self, deployment: xr.Dataset, scalar: str) -> tuple[xr.Dataset, float | None]:

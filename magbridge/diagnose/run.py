@@ -14,7 +14,7 @@ from magbridge.arrays import BoolArray
 from magbridge.calibration.effects import TimeEffect
 from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.model import Calibration
-from magbridge.datasets import standard_log
+from magbridge.datasets import expect, standard_log
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.columns import Candidate, Group, absent_before, slices
@@ -252,6 +252,7 @@ def diagnose(
     """
     if not datasets:
         raise WrongUse("deployments: expected at least one Dataset, got none")
+    expect("calibration", calibration, Calibration, "magbridge.load(path)")
     datasets = [standard_log(dataset) for dataset in datasets]
     training_logs = [standard_log(dataset) for dataset in training_logs]
     causes = known() if causes is None else causes

@@ -20,7 +20,7 @@ import xarray as xr
 
 from magbridge.columns import counts_from_boot, decoded, require
 from magbridge.datasets import in_standard_units, increasing
-from magbridge.errors import FormatError
+from magbridge.errors import FormatError, WrongUse
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
 from magbridge.logs.checks import checked
@@ -156,9 +156,11 @@ class _Files:
 
 
 def _paths(paths: Paths, options: Options) -> list[Path]:
-    several = [paths] if isinstance(paths, (str, os.PathLike)) else paths
+    several: Any = [paths] if isinstance(paths, (str, os.PathLike)) else paths
+    if not isinstance(several, Iterable) or not all(isinstance(one, (str, os.PathLike)) for one in several):
+        raise WrongUse(f"paths: expected a path or a sequence of paths, got {paths!r}")
     if not several:
-        raise ValueError("expected at least one file")
+        raise WrongUse("paths: expected at least one file, got none")
     checked = list(dict.fromkeys([*map(Path, several), *options.sensor_log]))
     for path in checked:
         format_of(path if is_bag(path) else existing(path))

@@ -7,3 +7,6 @@ warnings about undetermined quantities. Start reading at :func:`~.fit.fit`, then
 every fit. The package depends on the model and on :mod:`magbridge.estimation`, but not on log formats,
 MAVLink or the live bridge.
 """
+
+FIT_RANGES = {"order": (1, 6), "site_bias": (0.0, 1e5), "position_sigma": (0.0, 1e5)}
+"""Option of :func:`.fit.fit` -> its smallest and largest value; biases in nT, positions in m."""

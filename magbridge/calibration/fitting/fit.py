@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
+from inspect import signature
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from magbridge.calibration.fitting import FIT_RANGES
 from magbridge.calibration.fitting.checks import judged
 from magbridge.calibration.fitting.crossings import far_off, jumped, left_open, tells_rock
 from magbridge.calibration.fitting.direction import with_direction
@@ -17,8 +20,9 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.calibration.fitting.uncertainty import with_level
 from magbridge.columns import CHANNELS
+from magbridge.datasets import expect, expect_number
 from magbridge.diagnostics import Diagnostic
-from magbridge.errors import CalibrationError, NoSolutionError
+from magbridge.errors import CalibrationError, NoSolutionError, WrongUse
 from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
 from magbridge.wording import one_of
@@ -82,6 +86,8 @@ def fit(
     ------
     CalibrationError
         The data do not support the fit, or the method does not exist.
+    WrongUse
+        `data` are not observations, an option does not exist, or a value is outside its range.
 
     Notes
     -----
@@ -90,8 +96,12 @@ def fit(
     cases. If a log has more than :data:`MAX_FIT_SAMPLES` samples, the function fits every second, third ...
     sample. ``survey`` uses all samples, because it needs all passes over a place.
     """
+    expect("data", data, Observations, "magbridge.observations(log)")
     if method not in METHODS:
-        raise CalibrationError(f"method: {one_of(method, METHODS)}")
+        raise CalibrationError(f"method: {one_of(str(method), METHODS)}")
+    _check_options(
+        method, {"order": order, **options, **({"site_bias": site_bias} if site_bias is not None else {})}
+    )
     # without a true field, try the survey fit where the track separates the crustal field from the vehicle
     bias = _default_bias(data) if site_bias is None else site_bias
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
@@ -127,6 +137,17 @@ def fit(
             found = with_direction(found, data, headings=True)
         calibration = replace(found.calibration, conditions=data.conditions())
         return judged(replace(found, calibration=calibration), data)
+
+
+def _check_options(method: str, options: dict[str, Any]) -> None:
+    """Check the options of a method; WrongUse: a name is unknown, or a value is out of range."""
+    tried = ("auto", "survey") if method == "auto" else (method,)
+    names = {name for one in tried for name in signature(_function(one)).parameters} - {"data"}
+    for name, value in options.items():
+        if name not in names | {"order", "site_bias"}:
+            raise WrongUse(f"option of fit: {one_of(name, sorted(names))}")
+        if name in FIT_RANGES:
+            expect_number(name, value, *FIT_RANGES[name], Integral if name == "order" else Real)
 
 
 def _first_solution(

@@ -32,7 +32,7 @@ from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.columns import require_units
-from magbridge.datasets import standard_log
+from magbridge.datasets import expect, standard_log
 from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import effective_fraction
 from magbridge.estimation.priors import polynomial_prior
@@ -322,6 +322,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     CalibrationError: the mission has no attitude or position. FormatError: it lacks a parameter of the
     calibration, or has it in another unit.
     """
+    expect("calibration", calibration, Calibration, "magbridge.load(path)")
     mission = standard_log(mission)
     require_units(mission, calibration.units)
     names = tuple(calibration.units)
