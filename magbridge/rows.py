@@ -10,7 +10,13 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import vector_covariance
-from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
+from magbridge.calibration.heading import (
+    NO_HEADING_FLAGS,
+    UNIFORM_SIGMA_DEG,
+    heading,
+    model_declination_sigma,
+    published_covariance,
+)
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, TEMPERATURE, require, require_units
 from magbridge.correction import Correction
 from magbridge.datasets import expect, standard_log
@@ -105,6 +111,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     if tilt is not None and calibration.boresight is not None:
         samples = fields, values, added
         columns |= _headings(calibration, samples, results[:, 2:5], tilt, vectors, sigma, deployment)
+        flags = np.nan_to_num(columns["quality"]).astype(int) & NO_HEADING_FLAGS
+        least = np.where(flags != 0, UNIFORM_SIGMA_DEG, 0.0)
+        columns["heading_sigma"] = np.maximum(columns["heading_sigma"], least)
     return xr.Dataset(
         {name: ("time", column, COLUMNS[name]._asdict()) for name, column in columns.items()},
         coords={"time": given["time"]},

@@ -408,9 +408,11 @@ class LiveCheck:
         for key in sorted(needed.keys() | self._counts.keys(), key=lambda key: (key not in needed, key)):
             sender = f"{key[0]}:{key[1]}"
             self.arrived.append(Arrived(spec(key[2]).name, sender, self._rate(key), needed.get(key, 0.0)))
-        texts = [
-            text for severity, text in pipeline.component.announcer.texts if severity <= MAV_SEVERITY.WARNING
-        ]
+        said = pipeline.component.announcer.texts
+        # a later text replaces an earlier one of its subject, such as "field: stale telemetry" at the start
+        latest = {text.partition(": ")[0]: text for _, text in said}
+        texts = [text for severity, text in said if severity <= MAV_SEVERITY.WARNING]
+        texts = [text for text in texts if latest[text.partition(": ")[0]] == text]
         denied = streams.denied.values()
         for text in dict.fromkeys(texts):
             if text not in denied:

@@ -270,7 +270,7 @@ class Pipeline:
                 attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
         stream.publisher.publish(sample, corrected, anomaly, attitude, is_brief=is_brief)
         if is_main and self.heading is not None and self.heading.is_sending and not is_brief:
-            self.heading.send(attitude, sample.time_us, corrected.quality)
+            self.heading.send(attitude, sample.time_us)
         if self.recorder.active and self._raw_rate.hertz != 0:
             self.recorder.raw(self.component.codec.now_us, stream.publisher.raw_payload(sample))
         if is_main and self.learning is not None:

@@ -11,7 +11,12 @@ import numpy as np
 
 from magbridge.align import Sample
 from magbridge.calibration.correct import Corrector
-from magbridge.calibration.heading import heading_of_sample, model_declination_sigma
+from magbridge.calibration.heading import (
+    NO_HEADING_FLAGS,
+    UNIFORM_SIGMA_DEG,
+    heading_of_sample,
+    model_declination_sigma,
+)
 from magbridge.calibration.model import Calibration
 from magbridge.config import HeadingOutput
 from magbridge.errors import MagbridgeError
@@ -22,7 +27,7 @@ from magbridge.link.output import Rate
 from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, is_contradicted, own_time, sent_us
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
-from magbridge.records import Corrected, Quality, Vector
+from magbridge.records import Corrected, Vector
 
 if TYPE_CHECKING:
     from magbridge.field.igrf import NearbyField
@@ -210,10 +215,6 @@ MAX_SENT_SIGMA_DEG: Final = 30.0
 """Largest standard deviation of a heading that is sent to the autopilot or to NMEA receivers, deg."""
 MAX_WAITING: Final = 8
 """Most sets of NMEA sentences that wait for the bridge to send them."""
-NO_HEADING_FLAGS: Final = int(
-    Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT
-)
-"""Flags of samples whose heading is not sent to the autopilot or to NMEA receivers."""
 
 
 class LiveHeading:
@@ -294,6 +295,8 @@ class LiveHeading:
         )  # fmt: skip
         if isnan(magnetic):
             return NO_ATTITUDE
+        if corrected.quality & NO_HEADING_FLAGS:
+            sigma = UNIFORM_SIGMA_DEG
         return Attitude(magnetic, true, sigma, self._declination, roll, pitch, self._rates, tilt_sigma)
 
     def _tilt(self, elapsed: float, stated: float) -> tuple[float, float, float]:
@@ -324,12 +327,9 @@ class LiveHeading:
         sigma = model_declination_sigma(np.array([hypot(north, east)]), crustal)
         self._declination_sigma = sigma.item()
 
-    def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
-        """Send the heading of a sample at `time_us` (µs) if it is due and accurate enough.
-
-        `quality`: quality flags of the sample.
-        """
-        if quality & NO_HEADING_FLAGS or attitude.sigma > MAX_SENT_SIGMA_DEG:
+    def send(self, attitude: Attitude, time_us: int) -> None:
+        """Send the heading of a sample at `time_us` (µs) if it is due and accurate enough."""
+        if attitude.sigma > MAX_SENT_SIGMA_DEG:
             return
         utc_us = time_us + self._component.codec.utc_offset_us
         is_true = isfinite(attitude.heading)

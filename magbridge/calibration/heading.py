@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.records import Quality
 
 Components = Sequence[Any]
 """Components of a vector or matrix: numbers for one sample, arrays (n,) for n samples."""
@@ -47,6 +48,8 @@ MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
 """Term of the same error model that is inversely proportional to the horizontal field H, deg nT."""
 UNIFORM_SIGMA_DEG = 180.0 / sqrt(3.0)
 """Standard deviation of an unknown angle, uniform over a full turn, deg."""
+NO_HEADING_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT)
+"""Flags of samples whose heading is unknown: its sigma is that of a uniform angle."""
 MAX_ADDED_VARIANCE = 1e12
 """Largest variance that checks and moving masses may add to each axis, nT^2."""
 

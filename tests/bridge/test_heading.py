@@ -23,7 +23,7 @@ from magbridge.config import load
 from magbridge.field.igrf import igrf
 from magbridge.link.estimates import NO_ATTITUDE, nmea_sentences
 from magbridge.mavlink import Codec, Message
-from magbridge.records import Channel
+from magbridge.records import Channel, Quality
 
 PLACE = (49.5, -57.9)
 ROLL, PITCH, YAW = radians(8.0), radians(-20.0), radians(130.0)
@@ -92,6 +92,17 @@ def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Pa
     pose = last(messages, "ATTITUDE_QUATERNION_COV")
     assert pose["q"][0] ** 2 + pose["q"][3] ** 2 < 1.0
     assert sqrt(pose["covariance"][8]) == pytest.approx(radians(field["heading_sigma"]), rel=1e-5)
+
+
+def test_the_heading_of_an_implausible_sample_is_unknown(tmp_path: Path) -> None:
+    """The sensor fails; ATTITUDE_QUATERNION_COV has no flags that would say so."""
+    bridge = set_up(load(bridge_with(tmp_path)), StartEvent(START))
+    fed(bridge, *level_flight())
+    time_us = START + 4_000_000
+    messages = fed(bridge, attitude(time_us - 10_000), sample(time_us, 2.0 * body_field()))
+    assert last(messages, "MAG_FIELD")["flags"] & Quality.IMPLAUSIBLE
+    assert last(messages, "MAG_FIELD")["heading_sigma"] > 100.0
+    assert sqrt(last(messages, "ATTITUDE_QUATERNION_COV")["covariance"][8]) > radians(100.0)
 
 
 def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
