@@ -17,6 +17,7 @@ from magbridge.logs.mapping import declared
 from magbridge.logs.og import read_metadata
 from magbridge.navigate.options import NavigationOptions
 from magbridge.toml import convert
+from sitl import scenario
 
 SHELL = blocks("sh", "bash")
 SITE = "https://magbridge.github.io/magbridge/"
@@ -83,6 +84,8 @@ def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: P
         assert read_fleet(file)
     elif "[platform]" in block.text:
         assert read_metadata(file)
+    elif "[[mission]]" in block.text:
+        assert scenario.load(file)
     elif "[project]" in block.text:
         templates = ROOT.glob("examples/*/pyproject.toml")
         points = [tomllib.loads(one.read_text("utf-8"))["project"]["entry-points"] for one in templates]
