@@ -20,7 +20,7 @@ import xarray as xr
 
 from magbridge.columns import counts_from_boot, decoded, require
 from magbridge.datasets import in_standard_units, increasing
-from magbridge.errors import FormatError, WrongUse
+from magbridge.errors import FormatError, WriteError, WrongUse
 from magbridge.files import atomic_path, existing
 from magbridge.guard import Guarded, GuardedJob, guarded
 from magbridge.logs.checks import checked
@@ -341,3 +341,5 @@ class Writer:
             )
         except FormatError as error:  # it names the temporary file
             raise FormatError(self._path, error.expected, column=error.column) from None
+        except WriteError as error:
+            raise WriteError(self._path, error.reason) from None

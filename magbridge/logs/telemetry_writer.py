@@ -19,6 +19,7 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, CORRECTED
+from magbridge.errors import WriteError
 from magbridge.logs.deployment import lasting
 from magbridge.mavlink import Codec, Spec, pack_record, spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
@@ -47,7 +48,7 @@ class FileWriter:
     """Writer of successive deployments with the columns of the first."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("wb")
+        self._path, self._file = path, path.open("wb")
         self._autopilot = Codec(VEHICLE, AUTOPILOT)
         self._bridge = Codec(VEHICLE, BRIDGE)
         self._start_us = 0
@@ -55,9 +56,14 @@ class FileWriter:
         self._sequence = 0
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows; if `first`, write the declarations of the columns before."""
+        """Write the rows; if `first`, write the declarations of the columns before.
+
+        WriteError: a time before 1970, which the stamps of a .tlog cannot represent.
+        """
         columns = [str(name) for name in dataset.data_vars]
         times = np.round(dataset["time"].values * 1e6).astype(np.int64).tolist()
+        if times and times[0] < 0:
+            raise WriteError(self._path, "a .tlog has no times before 1970")
         if first:
             self._start_us = times[0] if times else 0
             self._declare(dataset)

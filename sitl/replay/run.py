@@ -142,6 +142,9 @@ def _play(
     """Replay a deployment by emulated devices, and compare the corrected field with the reference."""
     if deployment.sizes["time"] < 2:
         raise DataError(f"{deployment.attrs['source']}: one row: at least 2 needed")
+    if start_us(deployment) < 0:
+        source = deployment.attrs["source"]
+        raise DataError(f"{source}: a replay needs times after 1970; --date dates times from a boot")
     listener = Listener()
     stage = Stage(config, listener.receive, log)
     begun = time.monotonic()

@@ -10,7 +10,8 @@ import pytest
 import xarray as xr
 
 from magbridge import logs
-from magbridge.errors import FormatError
+from magbridge.columns import CHANNELS
+from magbridge.errors import FormatError, WriteError
 from magbridge.logs.deployment import deployment, join
 
 
@@ -160,6 +161,13 @@ def test_netcdf_packed_by_words_is_one_line(tmp_path: Path) -> None:
         file.createVariable("PUMP", "i2", ("N_MEASUREMENTS",)).scale_factor = "one"
     with pytest.raises(FormatError, match=r"a.nc: column 'PUMP': expected numbers as scale_factor"):
         logs.read(tmp_path / "a.nc")
+
+
+@pytest.mark.parametrize("suffix", ["tlog", "mcap"])
+def test_a_format_of_unsigned_stamps_refuses_times_before_1970(suffix: str, tmp_path: Path) -> None:
+    log = deployment("made", [-2.0, -1.0], {name: [1.0, 2.0] for name in CHANNELS})
+    with pytest.raises(WriteError, match=rf"log\.{suffix}: cannot be written: .* no times before 1970"):
+        logs.write(log, tmp_path / f"log.{suffix}")
 
 
 def test_an_attribute_whose_name_netcdf_forbids_is_left_out(tmp_path: Path) -> None:
