@@ -130,18 +130,20 @@ def correct(
     expect("calibration", calibration, Calibration, "magbridge.load(path)")
     if hasattr(field, "data_vars") or hasattr(field, "iloc"):
         return _corrected_log(calibration, cast("xr.Dataset", field))
-    readings = np.asarray(field, float)
+    try:
+        readings, values = np.asarray(field, float), np.asarray(channels, float)
+    except (TypeError, ValueError):
+        raise WrongUse("field, channels: expected numbers, got values that are not") from None
     if readings.shape[-1:] != (3,) or readings.ndim > 2:
         raise CalibrationError(f"field: expected shape (3,) or (n, 3), got {readings.shape}")
     moments = np.asarray(time)
     if moments.dtype.kind == "M":
         moments = (moments - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
     if readings.ndim == 1:
-        values = np.asarray(channels, float).ravel().tolist()
         x, y, z = readings.tolist()
-        return Corrector(calibration).step(round(float(moments) * 1e6), (x, y, z), values)
+        return Corrector(calibration).step(round(float(moments) * 1e6), (x, y, z), values.ravel().tolist())
     moments = np.broadcast_to(moments.astype(float), len(readings))
-    return correct_arrays(calibration, readings, np.asarray(channels, float), moments)
+    return correct_arrays(calibration, readings, values, moments)
 
 
 def _corrected_log(calibration: Calibration, deployment: xr.Dataset) -> xr.Dataset:

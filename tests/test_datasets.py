@@ -115,6 +115,8 @@ WRONG_ARGUMENTS: dict[str, tuple[Callable[..., object], tuple[object, ...], dict
     "frame": (mb.correct_rows, (mb.Correction(INCHES), FRAME), {}, "got DataFrame; convert it with"),
     "frame to correct": (mb.correct, (INCHES, FRAME), {}, "log: expected an xarray.Dataset, got DataFrame"),
     "frame to observe": (mb.observations, (FRAME,), {}, "log: expected an xarray.Dataset, got DataFrame"),
+    "text for numbers": (mb.correct, (INCHES, "abc"), {}, "field, channels: expected numbers"),
+    "number for names": (mb.observations, (LOG, 5), {}, "parameters: expected names of columns, got 5"),
     "mapping": (mb.observations, ({"time": [0.0]},), {}, "log: expected an xarray.Dataset, got dict"),
     "calibration": (mb.correct_rows, (INCHES, LOG), {}, "correction: expected a Correction, as"),
     "path": (mb.correct, ("cal.json", LOG), {}, r"calibration: expected a Calibration, as .*load.* got str"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import hypot
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.columns import CHANNELS, COLUMNS, TEMPERATURE, require
 from magbridge.datasets import standard_log
-from magbridge.errors import CalibrationError
+from magbridge.errors import CalibrationError, WrongUse
 from magbridge.field.geodesy import separation
 from magbridge.field.reference import earth_field, placed, positions, with_true_heading
 from magbridge.one_time import interpolate_to_rows
@@ -54,6 +54,8 @@ def observations(
     CalibrationError
         A column does not hold numbers, or a parameter is a column with another meaning.
     """
+    if not isinstance(parameters, Iterable):
+        raise WrongUse(f"parameters: expected names of columns, got {parameters!r}")
     parameters = (parameters,) if isinstance(parameters, str) else tuple(parameters)
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
