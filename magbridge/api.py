@@ -126,6 +126,8 @@ def correct(
         The field has another shape, or the number of channels differs from the calibration's.
     FormatError
         The log lacks a column.
+    WrongUse
+        An argument is of another type.
     """
     expect("calibration", calibration, Calibration, "magbridge.load(path)")
     if hasattr(field, "data_vars") or hasattr(field, "iloc"):

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "HEADINGS", "NT_PER_UNIT",
-    "TEMPERATURE", "Column", "absent", "counts_from_boot", "decoded", "factor", "may_be", "require",
-    "require_units", "time_columns", "usual",
+    "TEMPERATURE", "YEAR_1980", "Column", "absent", "counts_from_boot", "decoded", "factor", "may_be",
+    "require", "require_units", "time_columns", "usual",
 ]  # fmt: skip
 
 
@@ -162,7 +162,7 @@ def counts_from_boot(deployment: xr.Dataset) -> bool:
 
 
 def time_columns(deployment: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return the columns of a deployment that contain times, by name."""
+    """Return the columns (n,) of a deployment that contain times, by name."""
     return {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
 
 

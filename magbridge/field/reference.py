@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
-    "reference_field", "require_date", "separate_observatories", "sphere_radius", "with_daily_variation",
-    "with_true_heading",
+    "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "missing_anomaly", "other_units",
+    "placed", "positions", "reference_field", "require_date", "separate_observatories", "sphere_radius",
+    "with_daily_variation", "with_true_heading",
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
