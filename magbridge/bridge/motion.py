@@ -21,7 +21,7 @@ from magbridge.link.component import Component
 from magbridge.link.estimates import Pose, quaternion
 from magbridge.link.telemetry import AIRCRAFT, is_contradicted
 from magbridge.mavlink import Message, by_id
-from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_SEVERITY, MAV_TYPE
 from magbridge.navigate import Navigator
 from magbridge.navigate.attitude import AttitudeFilter
 from magbridge.navigate.deadreckoning import GLIDE
@@ -186,7 +186,7 @@ class Motion:
         self._filter = AttitudeFilter()
         self._main_field = np.zeros(3)  # north, east, down, nT, at the time _main_us
         self._main_us = -MAX_MAIN_FIELD_AGE_US
-        self._is_aircraft = self._armed = self._grounded = False
+        self._is_aircraft = self._armed = self._grounded = self._measures_wind = False
         self._landed_state = STATE_UNKNOWN
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
@@ -270,7 +270,10 @@ class Motion:
 
     def _heartbeat(self, message: Message, time_us: int) -> None:
         if message.component == self._component.peer[1]:
-            self._is_aircraft, self._armed = message["type"] in AIRCRAFT, bool(message["base_mode"] & ARMED)
+            kind, stack = message["type"], message["autopilot"]
+            self._is_aircraft, self._armed = kind in AIRCRAFT, bool(message["base_mode"] & ARMED)
+            is_ardupilot_boat = kind == MAV_TYPE.SURFACE_BOAT and stack == MAV_AUTOPILOT.ARDUPILOTMEGA
+            self._measures_wind = kind == MAV_TYPE.GROUND_ROVER or is_ardupilot_boat
             self._take_off_or_land(time_us)
 
     def _extended(self, message: Message, time_us: int) -> None:
@@ -292,6 +295,8 @@ class Motion:
         self._grounded = grounded
 
     def _speed(self, message: Message, time_us: int) -> None:
+        if self._measures_wind:  # the airspeed of a rover or an ArduPilot boat is not the speed of its medium
+            return
         speed = message["airspeed"]  # 0 of a vehicle that does not measure it
         is_ground = min(abs(speed - message["groundspeed"]), abs(speed - self._ground_speed)) < EQUAL_M_S
         if is_ground and speed > 0.0:

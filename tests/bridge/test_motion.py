@@ -173,6 +173,20 @@ def test_an_airspeed_that_is_the_speed_over_ground_is_not_used() -> None:
 
 
 @pytest.mark.parametrize(
+    ("kind", "stack", "used"),
+    [(10, PX4, False), (11, ARDUPILOT, False), (11, PX4, True), (12, ARDUPILOT, True)],
+    ids=["rover", "boat of ArduPilot", "other boat", "submarine"],
+)  # fmt: skip
+def test_the_airspeed_of_a_rover_is_wind(kind: int, stack: int, used: bool) -> None:
+    """A real ArduPilot Rover at rest in a wind of 4 m/s moved by dead reckoning; a right GPS was rejected."""
+    bench = made("EXTERNAL_POSITION_ESTIMATE", stack)
+    bench.receive("HEARTBEAT", autopilot=stack, type=kind)
+    bench.receive("ATTITUDE", yaw=0.0)
+    bench.receive("VFR_HUD", airspeed=4.0, groundspeed=0.1)
+    assert (source(bench) is MotionSource.SPEED) == used
+
+
+@pytest.mark.parametrize(
     ("report", "flags"),
     [("EKF_STATUS_REPORT", 1 | 128), ("ESTIMATOR_STATUS", 2 | 128), ("ESTIMATOR_STATUS", 1)],
 )
