@@ -104,7 +104,7 @@ def real_logs() -> list[Row]:
     """Return the figures of the logs of real vehicles: a Seaglider, an aircraft and an underwater robot."""
     dives = read(sorted((DATA / "seaglider_sg167").glob("p*.nc")))
     masses, normalised = measured.hold_runs_out(observations(dives, ("pitchCtl", "vbdCC")), "auto", 3)
-    nominal, _ = measured.hold_runs_out(observations(dives, ()), "nominal", 0)
+    nominal, _ = measured.hold_runs_out(observations(dives, ()), "nominal")
     fitted, found = measured.calibrate_and_diagnose(measured.flight(DATA))
     halves = measured.compare_halves(read(DATA / "ardusub" / "small.tlog", options=Options(compass="0")))
     figures = {

@@ -46,7 +46,7 @@ MIN_RUN_SAMPLES, MIN_HALF_SAMPLES = 30, 60
 MAX_DIRECTION_DEG = 8.0
 """Maximum angle between a tested field direction and the nearest direction in the fitted half, deg."""
 SEAGLIDER_CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
-    ("nominal", (), 0),
+    ("nominal", (), 1),
     ("auto", ("pitchCtl", "vbdCC"), 1),
     ("auto", ("pitchCtl", "vbdCC"), 3),
     ("cubic", ("pitchCtl", "vbdCC"), 3),
