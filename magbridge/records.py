@@ -15,6 +15,7 @@ __all__ = [
     "MAX_DEVICE_TIME_S",
     "MAX_MEASURED_NT",
     "NEVER",
+    "NULL_POSITION_DEG",
     "Channel",
     "Corrected",
     "Quality",
@@ -28,6 +29,9 @@ MAX_MEASURED_NT: Final = 1e9
 """Largest field or sigma that can be a measurement, nT (1 T)."""
 MAX_DEVICE_TIME_S: Final = 1e11
 """Largest time of an instrument, s: one beyond 3,000 years is an error of transmission."""
+NULL_POSITION_DEG: Final = 0.01
+"""Largest magnitude of latitude and longitude of an unknown position, deg: without a fix, ArduPilot's
+position drifts about 0, 0."""
 NEVER: Final = -(1 << 62)
 """Time of an event that has not happened yet, µs; times before 1970 are negative."""
 

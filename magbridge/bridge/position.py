@@ -27,7 +27,7 @@ from magbridge.link.output import Rate
 from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, is_contradicted, own_time, sent_us
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
-from magbridge.records import Corrected, Vector
+from magbridge.records import NULL_POSITION_DEG, Corrected, Vector
 
 if TYPE_CHECKING:
     from magbridge.field.igrf import NearbyField
@@ -60,9 +60,6 @@ SUSPECT_US: Final = 900_000_000
 µs."""
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """Largest magnitudes of GLOBAL_POSITION_INT's lat and lon, 1e-7 deg."""
-NULL_E7: Final = 100_000
-"""Largest magnitude of both lat and lon of an unknown position, 1e-7 deg (1 km): without a fix, ArduPilot's
-position drifts about 0, 0."""
 FIRST_US: Final = 60_000_000
 """Time after the first position in which a jump replaces the first positions, µs."""
 ALTITUDE_M: Final = -15_000.0, 100_000.0
@@ -111,7 +108,11 @@ class Position:
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
         # an autopilot that does not know its position sends one near 0, 0 or INT32_MAX
-        if max(abs(lat), abs(lon)) < NULL_E7 or abs(lat) > LATITUDE_E7 or abs(lon) > LONGITUDE_E7:
+        if (
+            max(abs(lat), abs(lon)) < 1e7 * NULL_POSITION_DEG
+            or abs(lat) > LATITUDE_E7
+            or abs(lon) > LONGITUDE_E7
+        ):
             return
         if not ALTITUDE_M[0] < altitude < ALTITUDE_M[1]:
             altitude = 0.0

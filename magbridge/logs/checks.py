@@ -31,6 +31,7 @@ from magbridge.datasets import YEAR_10000, disorder, disordered, expected_time
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
 from magbridge.logs.mapping import bare
+from magbridge.records import NULL_POSITION_DEG
 
 Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
@@ -40,8 +41,6 @@ MAX_MAGNITUDE = {
     "depth": 1e5,
 }
 """Largest magnitude of these columns, deg or m; a latitude of 4952.3 is in degrees and minutes."""
-NULL_POSITION_DEG = 0.01
-"""Largest magnitude of latitude and longitude of an unknown position, deg: ArduPilot's drifts about 0, 0."""
 MIN_VALUE = {
     "degC": -273.15, "K": 0.0, "Pa": -101325.0, "hPa": -1013.25, "mbar": -1013.25, "kPa": -101.325,
     "bar": -1.01325, "dbar": -10.1325,
