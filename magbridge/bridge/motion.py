@@ -329,16 +329,20 @@ class Motion:
             if is_contradicted(message):
                 self._contradicted_us = time_us
 
+    def _rise(self, time_us: int) -> None:
+        depth = self._frame.depth(time_us)
+        self._pass(time_us, depth=depth, height=-depth if self._is_aircraft else nan)
+
     def _global(self, message: Message, time_us: int) -> None:
-        self._pass(time_us, depth=self._frame.depth(time_us))
+        self._rise(time_us)
         self._track(message, time_us, None, (message["vx"] * 1e-2, message["vy"] * 1e-2))
 
     def _local(self, message: Message, time_us: int) -> None:
-        self._pass(time_us, depth=self._frame.depth(time_us))
+        self._rise(time_us)
         self._track(message, time_us, (message["x"], message["y"]), (message["vx"], message["vy"]))
 
     def _odometry(self, message: Message, time_us: int) -> None:
-        self._pass(time_us, depth=self._frame.depth(time_us))
+        self._rise(time_us)
         velocity = message["vx"], message["vy"], message["vz"]
         if message["child_frame_id"] == MAV_FRAME.BODY_FRD:
             velocity = rotate(message["q"], velocity)

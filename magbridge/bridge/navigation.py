@@ -386,9 +386,12 @@ class NavigationService:
         if UNKNOWN_MOTION not in (message["vel"], message["cog"]):
             # the vehicle has moved on since the receiver's measurement
             speed, course = message["vel"] * 1e-2, radians(message["cog"] * 1e-2)
-            moved = (GPS_AGE_S + self._delay(message, time_us)) * speed
+            delay, delay_sigma = self._delay(message, time_us)
+            moved = (GPS_AGE_S + delay) * speed
             latitude, longitude = offset(latitude, longitude, moved * cos(course), moved * sin(course))
-            accuracy = hypot(accuracy, GPS_AGE_SIGMA_S * speed) if accuracy > 0.0 else accuracy
+            accuracy = (
+                hypot(accuracy, GPS_AGE_SIGMA_S * speed, delay_sigma * speed) if accuracy > 0.0 else accuracy
+            )
         sigma = accuracy if accuracy > 0.0 else None
         self._notify(self.navigator.gnss_position(time_us, latitude, longitude, sigma))
         gnss = self.navigator.gnss
@@ -403,11 +406,14 @@ class NavigationService:
                 text, severity = f"GPS {word}: {GPS_REASONS[gnss.reason]}", MAV_SEVERITY.WARNING
             self._component.announcer.state("gps", text, severity)
 
-    def _delay(self, message: Message, time_us: int) -> float:
-        """Return how long a GPS_RAW_INT, received at `time_us` (µs), has waited, s; 0 if unknown."""
-        sent = sent_us(self._gps_time, message.payload, time_us, self._component.vehicle.clock)
-        delay = (time_us - sent) * 1e-6
-        return delay if delay < MAX_GPS_DELAY_S else 0.0
+    def _delay(self, message: Message, time_us: int) -> tuple[float, float]:
+        """Return how long a GPS_RAW_INT, received at `time_us` (µs), has waited, and its 1-sigma, s.
+
+        Both are 0 if unknown.
+        """
+        clock = self._component.vehicle.clock
+        delay = (time_us - sent_us(self._gps_time, message.payload, time_us, clock)) * 1e-6
+        return (delay, clock.sigma) if clock.known and delay < MAX_GPS_DELAY_S else (0.0, 0.0)
 
     def _notify(self, record: Record | None) -> None:
         """Send an update of the navigator, if any; also send a fix if fixes have no rate of their own."""

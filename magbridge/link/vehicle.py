@@ -24,9 +24,9 @@ WANDER, DRIFT_SIGMA = 1e-6, 1e-4
 EXCESS_SIGMA = 0.5 * CLOCK_EXCHANGES**0.5
 """Standard deviation of an offset for each µs by which its round trip exceeds the fastest. Half of the excess
 is the error of one exchange; a queue in one direction is common to a whole block."""
-STEP_US, DRIFT = 20_000, 500e-6
-"""Thresholds (µs, µs/µs) for a clock that was set: an offset differs from the line by more than half of both
-round trips, plus STEP_US, plus DRIFT times the time since the last exchange."""
+STEP_US, DRIFT, SET_SIGMA = 20_000, 500e-6, 3.0
+"""Thresholds (µs, µs/µs, 1) for a clock that was set: an offset differs from the line by more than half of
+both round trips, plus STEP_US, DRIFT times the time since the last exchange, and SET_SIGMA times sigma."""
 SPAN_US = 10_000_000
 """Shortest time from the first to the last exchange for an estimate of the drift, µs."""
 PENDING = 8
@@ -101,6 +101,7 @@ class VehicleClock:
         if self.known:
             fastest_us = min(one.trip_us for one in self._exchanges)
             allowed_us = STEP_US + (trip_us + fastest_us) / 2 + DRIFT * (middle_us - self._middle_us)
+            allowed_us += SET_SIGMA * self.sigma * 1e6
             if abs(new.offset_us - self.offset_us(middle_us)) > allowed_us:
                 self.reset()
         if len(self._exchanges) == CLOCK_EXCHANGES:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, hypot, isfinite, nan, radians, sin, tan
+from math import cos, hypot, isfinite, log, nan, radians, sin, tan
 from typing import NamedTuple
 
 from magbridge.field.geodesy import offset, separation
@@ -24,6 +24,9 @@ MIN_GAP_S, BURST_TIME_S = 1.0, 0.5
 waited arrive, s."""
 MIN_TURN_FRACTION = 0.25
 """Smallest change of velocity that counts as a turn, as a fraction of the speed; noise is smaller."""
+SURFACE_LAYER_M, MIN_LAYERS = 10.0, 0.1
+"""Height above the ground, m, below which the logarithmic profile of the wind is not resolved; the smallest
+change of height that counts, as a change of its logarithm: noise is smaller."""
 
 
 class MotionNoise(NamedTuple):
@@ -38,6 +41,8 @@ class MotionNoise(NamedTuple):
     """`nn`, `ne`, `ee`: covariance (m², north and east) of the motion between two reports of the velocity."""
     turns: float = 0.0
     """Sum of the squared changes of velocity in turns, (m/s)²."""
+    layers: float = 0.0
+    """Sum of the changes of an aircraft's height, as changes of its logarithm."""
 
     def growth_since(self, earlier: MotionNoise) -> MotionNoise:
         """Return the uncertainty of the motion since an earlier moment."""
@@ -72,6 +77,7 @@ class DeadReckoning:
         self.noise = MotionNoise()
         self.time = self._reported = nan
         self._velocity = self._steady = (0.0, 0.0)
+        self._ground = self._height = nan  # lowest height, and that of the last counted change, m
         self._gap = nan, 0.0, 0.0  # end of the last gap and its length, s; velocity changed since then, m/s
         self._heading = self._pitch = self._speed = nan
         self._dive = (nan, nan)  # time and depth since when the rate of depth is taken
@@ -114,15 +120,18 @@ class DeadReckoning:
         """Update position and velocity with the telemetry of `time`, s on any clock.
 
         `values` holds any of ``depth`` m; ``heading`` deg true, ``pitch`` deg, ``speed`` m/s through the
-        water; ``velocity_north velocity_east`` m/s; ``north east`` m, a local position; ``dr_latitude
-        dr_longitude`` deg, a dead-reckoned position. Only the changes of a position count. NaN counts as
-        missing. Without ``speed``, the speed is a glider's, from pitch and rate of depth.
+        water or air; ``height`` m, of an aircraft; ``velocity_north velocity_east`` m/s; ``north east`` m, a
+        local position; ``dr_latitude dr_longitude`` deg, a dead-reckoned position. Only the changes of height
+        and position count. NaN counts as missing. Without ``speed``, the speed is a
+        glider's, from pitch and rate of depth.
         """
         self.advance(time)
         values = {name: value for name, value in values.items() if isfinite(value)}
         if "depth" in values:
             self.depth = values["depth"]
             self._sink(time)
+        if "height" in values:
+            self._climb(values["height"])
         self._heading = values.get("heading", self._heading)
         self._pitch = values.get("pitch", self._pitch)
         self._speed = values.get("speed", self._speed)
@@ -160,7 +169,7 @@ class DeadReckoning:
         # Change of the velocity since the previous report.
         north, east = velocity[0] - self._velocity[0], velocity[1] - self._velocity[1]
         elapsed = min(time - self._reported, MAX_REPORT_INTERVAL_S)
-        nn, ne, ee, turns = self.noise
+        nn, ne, ee, turns, layers = self.noise
         if reported and elapsed > 0.0:
             # the motion so far was v₀ Δt: add half of the change
             self._shift(0.5 * north * elapsed, 0.5 * east * elapsed)
@@ -172,7 +181,7 @@ class DeadReckoning:
         if change > MIN_TURN_FRACTION * hypot(*self._steady):
             turns += change * change if self._steady != (0.0, 0.0) else 0.0
             self._steady = velocity
-        self.noise = MotionNoise(nn, ne, ee, turns)
+        self.noise = MotionNoise(nn, ne, ee, turns, layers)
         self._velocity = velocity
         if reported:
             self._reported = time
@@ -190,6 +199,24 @@ class DeadReckoning:
             return 0.0
         self._gap = end, length, before + change
         return ((before + change) ** 2 - before**2) * length * length / 12.0
+
+    def _climb(self, height: float) -> None:
+        """Count the layers of air between the last height and this one, m.
+
+        Notes
+        -----
+        The wind's mean profile is logarithmic in the height above the ground z (Stull 1988, section 9.7), so
+        that the wind changes by the same amount from 10 to 20 m as from 100 to 200 m. The lowest height so
+        far stands for the ground.
+        """
+        self._ground = min(height, self._ground) if isfinite(self._ground) else height
+        if not isfinite(self._height):
+            self._height = height
+        before, now = (z - self._ground + SURFACE_LAYER_M for z in (self._height, height))
+        layers = abs(log(now / before))
+        if layers > MIN_LAYERS:
+            self._height = height
+            self.noise = self.noise._replace(layers=self.noise.layers + layers)
 
     def _sink(self, time: float) -> None:
         since, depth = self._dive

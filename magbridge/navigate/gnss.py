@@ -28,9 +28,9 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank
-from magbridge.navigate.deadreckoning import Step
+from magbridge.navigate.deadreckoning import MotionNoise, Step
 from magbridge.navigate.integrity import Competitor, Unmapped, squared_mahalanobis
-from magbridge.navigate.model import Block, prior, transition
+from magbridge.navigate.model import NO_MOTION_NOISE, Block, changed_variance, prior, transition
 from magbridge.navigate.options import NavigationOptions, wider_level
 from magbridge.navigate.record import Rival
 from magbridge.records import NEVER
@@ -125,8 +125,8 @@ class Prediction(NamedTuple):
     """`current`, `current_sigma`, `heading_error`, `travelled`, `speed`: velocity error of dead reckoning
     (2,), m/s, and its 1-sigma on each axis; 1-sigma of the velocity because of a heading known to be poor,
     m/s; distance travelled since the start, m; speed, m/s."""
-    turns: float = 0.0
-    """:attr:`MotionNoise.turns` since the start."""
+    motion: MotionNoise = NO_MOTION_NOISE
+    """Uncertainty of the dead-reckoned motion since the start."""
     lost: bool = False
     informed: bool = False
     """`lost`, `informed`: True if the navigator is lost; True if the field has improved its position."""
@@ -290,11 +290,11 @@ class GnssMonitor:
             seconds = max((time_us - then.time_us) * 1e-6, 0.0)
             # the estimate of the current from before the positions were wrong
             known = then if self._trusted is None else self._trusted
-            # Velocity error of dead reckoning: the current's estimate, its change since, and turns.
+            # Velocity error of dead reckoning: the current's estimate, its change since, turns and climbs.
             age = max((time_us - known.time_us) * 1e-6, 0.0)
             changed = o.current_sigma * sqrt(min(2.0 * age / o.current_time, 1.0))
-            turned = o.motion_error * sqrt(prediction.turns - known.then.turns)
-            velocity_error = hypot(known.then.current_sigma, changed, turned, prediction.heading_error)
+            manoeuvred = sqrt(2.0 * changed_variance(o, prediction.motion.growth_since(known.then.motion)))
+            velocity_error = hypot(known.then.current_sigma, changed, manoeuvred, prediction.heading_error)
             if seconds * 1e6 > OUTAGE_US:
                 velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * prediction.speed)
             # Two receiver errors, the velocity error over the time, and the random walk add in quadrature.

@@ -34,14 +34,17 @@ from magbridge.navigate.deadreckoning import DeadReckoning, MotionNoise
 from magbridge.navigate.options import NavigationOptions
 
 __all__ = [
-    "NO_MOTION_NOISE", "N_STATES", "Block", "Collector", "average", "block_length", "measurement_row",
-    "prior", "resolution", "transition",
+    "NO_MOTION_NOISE", "N_STATES", "Block", "Collector", "average", "block_length", "changed_variance",
+    "measurement_row", "prior", "resolution", "transition",
 ]  # fmt: skip
 
 N_STATES = 6
 NO_MOTION_NOISE = MotionNoise()
 MAX_SPREAD_FRACTION = 0.35
 """Fraction of the spread that the noise of one measurement allows: errors of successive ones add up."""
+LAYER_VARIANCE = 0.25
+"""Variance of the change of wind per unit of the logarithm of the height, as a fraction of its own variance.
+A climb from the ground to 100 m, 2.4 units, changes most of the wind."""
 MIN_SIGMA_NT = 1e-3
 """Lower limit of a sample's sigma, nT."""
 
@@ -114,7 +117,7 @@ def transition(
         f[p, c], f[c, c] = seconds * (1.0 + kept) / 2.0, kept
         q[p, p] = o.drift**2 * seconds + gained * seconds * seconds / 3.0
         q[p, c] = q[c, p] = gained * seconds / 2.0
-        q[c, c] = gained + 0.5 * o.motion_error**2 * motion.turns
+        q[c, c] = gained + changed_variance(o, motion)
     # Position error of the motion between reports, then the two errors of the measurement.
     q[:2, :2] += [[motion.nn, motion.ne], [motion.ne, motion.ee]]
     slow = (4, o.bias_sigma, seconds / o.bias_time), (5, o.map_sigma, metres / o.map_length)
@@ -122,6 +125,12 @@ def transition(
         f[i, i] = exp(-decay)
         q[i, i] = sigma**2 * (1.0 - f[i, i] ** 2)
     return f, q
+
+
+def changed_variance(options: NavigationOptions, motion: MotionNoise) -> float:
+    """Return the variance of the current's change on each axis, (m/s)², by turns and changes of height."""
+    o = options
+    return 0.5 * o.motion_error**2 * motion.turns + LAYER_VARIANCE * o.current_sigma**2 * motion.layers
 
 
 def measurement_row(north: float, east: float, errors: float = 1.0) -> FloatArray:

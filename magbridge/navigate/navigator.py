@@ -118,7 +118,7 @@ class Navigator:
         recent = time_us - since_us < HEADING_AGE_US
         return Prediction(
             x[:2], P[:2, :2], alone, x[2:4], float(current_sigma), error if recent else 0.0, where.travelled,
-            where.speed, where.noise.turns, now.is_lost, now.informed,
+            where.speed, where.noise, now.is_lost, now.informed,
         )  # fmt: skip
 
     def _correct(

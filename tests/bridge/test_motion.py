@@ -250,6 +250,31 @@ def test_wind_on_the_ground_does_not_reject_gps_after_the_take_off(reports: bool
     assert bench.navigation.navigator.gnss.state is GnssState.GOOD
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_wind_that_grows_with_height_does_not_reject_gps_in_the_climb(seed: int) -> None:
+    """An aircraft climbs to 100 m in 10 s, through wind that grows from 0 to 8 m/s."""
+    bench, rng = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT), np.random.default_rng(seed)
+    position, wind = np.array([-1500.0, -1500.0]), np.array([4.8, -6.4])
+    for k in range(1, 241):
+        along = 0.5 * np.pi * np.clip((k - 160) / 8.0, 0.0, 1.0)  # a turn after the climb
+        flying, height = k > 130, 100.0 * np.clip((k - 140) / 20.0, 0.0, 1.0)
+        speed = 22.0 * np.clip((k - 120) / 20.0, 0.0, 1.0)
+        moved = speed * np.array([np.cos(along), np.sin(along)])
+        moved += wind * height / 100.0
+        position = position + 0.5 * moved
+        bench.to(0.5 * k)
+        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128)
+        bench.receive("EXTENDED_SYS_STATE", landed_state=2 if flying else 1)
+        bench.receive("GLOBAL_POSITION_INT", alt=round(1e3 * height))
+        bench.receive("ATTITUDE", yaw=along)
+        bench.receive("VFR_HUD", airspeed=speed, groundspeed=np.hypot(*moved) + 0.1)
+        latitude, longitude = offset(*PLACE, *(position + rng.normal(0.0, 0.5, 2)).tolist())
+        place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
+        bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
+        sample(bench, latitude, longitude)
+        assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
+
+
 def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:
     """At 40 m/s a position is about 6 m old when it arrives, and the error of that age is counted."""
     bench = made()
@@ -270,6 +295,11 @@ def test_a_position_of_the_receiver_is_moved_on_by_its_age() -> None:
     assert moved_on[2] == pytest.approx(np.hypot(1.0, 4.0))
     assert separation(*PLACE, *as_measured[:2]) == pytest.approx((0.0, 0.0), abs=0.05)
     assert as_measured[2] == 1.0
+    # a clock of the vehicle known to 1.2 s / sqrt(12): the age is as uncertain
+    clock = bench.navigation._component.vehicle.clock
+    clock.answer(5_600_000_000, clock.ask(bench.now_us), bench.now_us + 1_200_000)
+    bench.receive("GPS_RAW_INT", vel=4000, cog=9000, time_usec=5_000_000, **where)
+    assert seen[-1][2] == pytest.approx(np.hypot(1.0, 40.0 * np.hypot(0.1, 1.2 / np.sqrt(12.0))), rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -279,7 +279,7 @@ def test_positions_that_go_on_drifting_are_not_used_again() -> None:
             north = 60.0 * (late > 0.0) + drift * late
             P = np.eye(2) * (3.0 if late == 0.0 else 200.0) ** 2
             prediction = Prediction(
-                np.zeros(2), P, P, np.zeros(2), 0.3, 0.0, 22.0 * seconds, 22.0, 0.0, lost=False, informed=True
+                np.zeros(2), P, P, np.zeros(2), 0.3, 0.0, 22.0 * seconds, 22.0, lost=False, informed=True
             )
             place = offset(*PLACE, north + 22.0 * seconds, 0.0)
             states.append(monitor.check(round(5e5 * k) + 1, place, (north, 0.0), 1.0, prediction))

@@ -196,6 +196,16 @@ def test_a_clock_that_was_set_is_learned_again_at_once(now: int) -> None:
     assert clock.offset_us(START + 11_000_000) == pytest.approx(now, abs=20_000)
 
 
+def test_a_contradiction_within_the_stated_error_does_not_reset_the_clock() -> None:
+    """Slow exchanges leave 0.3 s of uncertainty; one that differs by little more than its half trip stays."""
+    clock = VehicleClock()
+    for i, late in enumerate([0, 0, 0, 0, 1_300_000]):
+        now = START + i * 1_000_000
+        asked = clock.ask(now)
+        clock.answer(1000 * (now + 7_000_000 + 250_000 + late), asked, now + 500_000 + late // 2)
+    assert len(clock._exchanges) == 5
+
+
 def test_frames_of_unknown_messages_are_not_lost(link: Line) -> None:
     """An autopilot sends messages that the dialect lacks; they count as received."""
     autopilot = Codec(1, 1)
