@@ -29,6 +29,8 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: 
     np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
     np.testing.assert_allclose(variance, 1.0, atol=0.2 if buried else 0.05)
     assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])
+    # the stated condition is a bound: the Laplacian of a grid has eigenvalues from 0 to below 8
+    assert np.linalg.cond(Q) <= field.condition <= 4.0 * np.linalg.cond(Q)
     factor = SparseFactor(field.precision)
     assert factor.log_determinant == pytest.approx(field.log_determinant)
     root = factor.draw(np.eye(field.nodes.size))

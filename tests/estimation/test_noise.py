@@ -7,7 +7,14 @@ import pytest
 from scipy.signal import lfilter
 
 from magbridge.arrays import FloatArray
-from magbridge.estimation.noise import NoiseModel, estimate_noise, fit_slow_and_white, samples_per_independent
+from magbridge.estimation.noise import (
+    NoiseModel,
+    effective_fraction,
+    estimate_noise,
+    fit_slow_and_white,
+    samples_per_independent,
+    whiten,
+)  # fmt: skip
 
 N = 4000
 STEPS = np.r_[np.inf, np.ones(N - 1)]
@@ -125,3 +132,27 @@ def test_correlation_of_many_runs_needs_memory_that_is_linear_in_the_samples() -
     tracemalloc.stop()
     assert found == pytest.approx(1.8 / 0.2, rel=0.15)  # (1 + rho) / (1 - rho)
     assert peak < 60 * values.nbytes
+
+
+@pytest.mark.parametrize(("rho", "white"), [(0.0, 0.0), (0.6, 0.0), (0.9, 0.3), (0.98, 0.9)])
+def test_the_effective_fraction_is_that_of_the_variance_of_a_mean(rho: float, white: float) -> None:
+    """The variance of a mean of n samples is the mean of their covariance matrix."""
+    n = 4000
+    lags = np.arange(n)
+    covariance = (1.0 - white) * rho**lags
+    covariance[0] += white
+    mean = (covariance[0] + 2.0 * ((1.0 - lags[1:] / n) * covariance[1:]).sum()) / n
+    assert 1.0 / (n * mean) == pytest.approx(effective_fraction(rho, white), rel=0.03)
+
+
+@pytest.mark.parametrize(("rho", "white"), [(0.7, 0.0), (0.95, 0.4)])
+def test_whitening_decorrelates_as_the_inverse_of_the_covariance_does(rho: float, white: float) -> None:
+    """The squared length of whitened values is that of the dense inverse, across gaps and runs."""
+    steps = np.array([np.inf, 1.0, 1.0, 3.0, 1.0, np.inf, 1.0, 2.0])
+    time = np.cumsum(np.where(np.isfinite(steps), steps, 0.0))
+    run = np.cumsum(~np.isfinite(steps))
+    together = run[:, None] == run
+    covariance = together * (1.0 - white) * rho ** np.abs(time[:, None] - time) + white * np.eye(len(steps))
+    values = np.random.default_rng(2).normal(size=(len(steps), 3))
+    found = whiten(values, steps, rho, white)
+    np.testing.assert_allclose(found.T @ found, values.T @ np.linalg.solve(covariance, values), rtol=1e-9)
