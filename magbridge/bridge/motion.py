@@ -19,7 +19,7 @@ from magbridge.field.geodesy import separation
 from magbridge.field.igrf import igrf
 from magbridge.link.component import Component
 from magbridge.link.estimates import Pose, quaternion
-from magbridge.link.telemetry import AIRCRAFT, is_contradicted
+from magbridge.link.telemetry import AIRCRAFT, is_contradicted, is_null_position
 from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_SEVERITY, MAV_TYPE
 from magbridge.navigate import Navigator
@@ -47,11 +47,11 @@ class Frame:
     def __init__(self) -> None:
         self.origin: tuple[float, float, float] | None = None
         self.attitude = 1.0, 0.0, 0.0, 0.0
-        self._altitude = self._down = nan
-        self._altitude_us = self._down_us = self._attitude_us = -MAX_STATE_AGE_US
+        self._altitude = self._down = self._gps_altitude = nan
+        self._altitude_us = self._down_us = self._attitude_us = self._gps_us = -MAX_STATE_AGE_US
         self._handlers = by_id(
             ATTITUDE=self._turn, GLOBAL_POSITION_INT=self._rise, GPS_GLOBAL_ORIGIN=self._set_origin,
-            LOCAL_POSITION_NED=self._sink, ODOMETRY=self._sink,
+            GPS_RAW_INT=self._gps, LOCAL_POSITION_NED=self._sink, ODOMETRY=self._sink,
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
@@ -70,9 +70,12 @@ class Frame:
     def depth(self, time_us: int) -> float:
         """Return the depth (m below the sea) at `time_us` (µs); NaN if unknown.
 
-        Without an altitude, the depth is relative to the origin of the local frame.
+        Without the autopilot's altitude, it is the GPS receiver's, else relative to the origin of the local
+        frame.
         """
         altitude = self.altitude(time_us)
+        if isnan(altitude) and time_us - self._gps_us < MAX_STATE_AGE_US:
+            return -self._gps_altitude
         return self._down if isnan(altitude) and time_us - self._down_us < MAX_STATE_AGE_US else -altitude
 
     def pose(self, time_us: int, latitude: float, longitude: float) -> Pose | str:
@@ -95,7 +98,15 @@ class Frame:
         self._attitude_us = time_us
 
     def _rise(self, message: Message, time_us: int) -> None:
-        self._altitude, self._altitude_us = 1e-3 * message["alt"], time_us
+        altitude = 1e-3 * message["alt"]
+        if is_null_position(message):  # the autopilot has no origin: its altitude is relative to the start
+            self._down, self._down_us = -altitude, time_us
+        else:
+            self._altitude, self._altitude_us = altitude, time_us
+
+    def _gps(self, message: Message, time_us: int) -> None:
+        if message["fix_type"] >= FIX_3D:
+            self._gps_altitude, self._gps_us = 1e-3 * message["alt"], time_us
 
     def _sink(self, message: Message, time_us: int) -> None:
         self._down, self._down_us = message["z"], time_us
@@ -329,20 +340,21 @@ class Motion:
             if is_contradicted(message):
                 self._contradicted_us = time_us
 
-    def _rise(self, time_us: int) -> None:
+    def rise(self, time_us: int) -> None:
+        """Pass the depth, and an aircraft's height, to the navigator."""
         depth = self._frame.depth(time_us)
         self._pass(time_us, depth=depth, height=-depth if self._is_aircraft else nan)
 
     def _global(self, message: Message, time_us: int) -> None:
-        self._rise(time_us)
+        self.rise(time_us)
         self._track(message, time_us, None, (message["vx"] * 1e-2, message["vy"] * 1e-2))
 
     def _local(self, message: Message, time_us: int) -> None:
-        self._rise(time_us)
+        self.rise(time_us)
         self._track(message, time_us, (message["x"], message["y"]), (message["vx"], message["vy"]))
 
     def _odometry(self, message: Message, time_us: int) -> None:
-        self._rise(time_us)
+        self.rise(time_us)
         velocity = message["vx"], message["vy"], message["vz"]
         if message["child_frame_id"] == MAV_FRAME.BODY_FRD:
             velocity = rotate(message["q"], velocity)

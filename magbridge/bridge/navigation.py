@@ -360,13 +360,14 @@ class NavigationService:
 
     def receive(self, message: Message, time_us: int) -> None:
         """Pass the motion or GPS position in a message, received at `time_us` (µs), to the navigator."""
+        if message.component == self._component.peer[1]:
+            self._frame.receive(message, time_us)
         if message.id == INTEGRITY:
             states = message["jamming_state"], message["spoofing_state"]
             self.navigator.gnss.receive_integrity(time_us, *states)
         elif message.id == GPS:
             self._gps(message, time_us)
         if message.component == self._component.peer[1]:
-            self._frame.receive(message, time_us)
             self.fixing.receive(message, time_us)
         self.motion.receive(message, time_us)
         if message.id == GPS and self._with_updates and not self.fixing.gps.good(time_us):
@@ -393,6 +394,7 @@ class NavigationService:
                 hypot(accuracy, GPS_AGE_SIGMA_S * speed, delay_sigma * speed) if accuracy > 0.0 else accuracy
             )
         sigma = accuracy if accuracy > 0.0 else None
+        self.motion.rise(time_us)
         self._notify(self.navigator.gnss_position(time_us, latitude, longitude, sigma))
         gnss = self.navigator.gnss
         if gnss.state is GnssState.GOOD and self.fixing.gps.held(time_us):

@@ -24,10 +24,17 @@ from magbridge.field.geodesy import separation
 from magbridge.link.component import Component
 from magbridge.link.estimates import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
 from magbridge.link.output import Rate
-from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, is_contradicted, own_time, sent_us
+from magbridge.link.telemetry import (
+    EKF_STATUS,
+    PX4_STATUS,
+    is_contradicted,
+    is_null_position,
+    own_time,
+    sent_us,
+)  # fmt: skip
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
-from magbridge.records import NULL_POSITION_DEG, Corrected, Vector
+from magbridge.records import Corrected, Vector
 
 if TYPE_CHECKING:
     from magbridge.field.igrf import NearbyField
@@ -108,11 +115,7 @@ class Position:
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
         # an autopilot that does not know its position sends one near 0, 0 or INT32_MAX
-        if (
-            max(abs(lat), abs(lon)) < 1e7 * NULL_POSITION_DEG
-            or abs(lat) > LATITUDE_E7
-            or abs(lon) > LONGITUDE_E7
-        ):
+        if is_null_position(message) or abs(lat) > LATITUDE_E7 or abs(lon) > LONGITUDE_E7:
             return
         if not ALTITUDE_M[0] < altitude < ALTITUDE_M[1]:
             altitude = 0.0

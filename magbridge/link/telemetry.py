@@ -15,11 +15,13 @@ from magbridge.link.vehicle import VehicleClock
 from magbridge.mavlink import Message, Source, Spec, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.mavlink.messages import MESSAGE_IDS, Field, split_index
+from magbridge.records import NULL_POSITION_DEG
 from magbridge.wording import suggestion
 
 __all__ = [
     "AIRCRAFT", "EKF_STATUS", "MIN_RATE_FRACTION", "PX4_STATUS", "Sources", "Stream", "StreamRequests",
-    "TelemetryMap", "is_contradicted", "is_possible", "needed_rates", "own_time", "sent_us",
+    "TelemetryMap", "is_contradicted", "is_null_position", "is_possible", "needed_rates", "own_time",
+    "sent_us",
 ]  # fmt: skip
 
 Value = tuple[str, float, int]
@@ -244,6 +246,11 @@ def is_contradicted(status: Message) -> bool:
     ArduPlane with a jammed receiver, heading and tilt were then wrong by 20 to 40 deg.
     """
     return bool(max(status[name] for name in INNOVATION_RATIOS[status.id]) > 1.0)
+
+
+def is_null_position(message: Message) -> bool:
+    """Return True if a GLOBAL_POSITION_INT lies near 0, 0: the autopilot does not know its position."""
+    return bool(max(abs(message["lat"]), abs(message["lon"])) < 1e7 * NULL_POSITION_DEG)
 
 
 def needed_rates(

@@ -234,16 +234,26 @@ class Estimate:
 
     def widen_current(self, sigma: float) -> None:
         """Widen the current of every filter to a 1-sigma of at least `sigma`, m/s, on each axis."""
-        if self._filter is None:
-            return
-        banks = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
-        for bank in (self._filter, *banks):
+        for bank in self._banks():
             Q = np.zeros_like(self.P)
             Q[2:4, 2:4] = missing_variance(bank.moments()[1][2:4, 2:4], sigma)
             bank.predict(np.eye(len(Q)), Q)
-        self.alone[2:, 2:] += missing_variance(self.alone[2:, 2:], sigma)
+        if self._filter is not None:
+            self.alone[2:, 2:] += missing_variance(self.alone[2:, 2:], sigma)
         self._restless = None
         self._refresh()
+
+    def widen_bias(self, sigma: float) -> None:
+        """Add the variance `sigma`², nT², to the bias of every filter."""
+        for bank in self._banks():
+            bank.predict(np.eye(len(self.P)), np.diag([0.0, 0.0, 0.0, 0.0, sigma * sigma, 0.0]))
+        self._restless = None
+        self._refresh()
+
+    def _banks(self) -> list[Bank]:
+        """Return the filter and the monitor's filters; none before the start."""
+        others = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
+        return [] if self._filter is None else [self._filter, *others]
 
     def _refresh(self) -> None:
         if self._filter is not None:

@@ -195,6 +195,10 @@ class GnssMonitor:
         self._history.clear()
         self._trusted = None
 
+    def new_height(self) -> None:
+        """Discard the evidence of the field, because the main field that it rests on has changed."""
+        self.evidence.restart()
+
     def fused_sigma(self, time_us: int, sigma: float) -> float:
         """Return the sigma (m) with which a position is fused, given the time since the previous one.
 
@@ -368,9 +372,10 @@ class _FieldTest:
         self._grid, self._options = grid, wider_level(options, grid.rms)
         self._claimed = options
         self._time_us = NEVER
-        self._restart()
+        self.restart()
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Discard all evidence and the filters without the receiver's positions."""
         self.log_odds_of_map = self.log_odds_of_position = 0.0
         self._unmapped = Unmapped(self._grid, self._options)
         self._filter: Bank | None = None
@@ -403,7 +408,7 @@ class _FieldTest:
         Discard the evidence if `restart` is True, or after a gap in the positions.
         """
         if restart or time_us - self._time_us > MAX_GNSS_AGE_US:
-            self._restart()
+            self.restart()
         self._positions.append((time_us, *offset_m))
         self._sigma, self._time_us = sigma, time_us
 

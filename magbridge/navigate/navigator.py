@@ -11,7 +11,7 @@ It uses only event time and no random numbers, so that a replay gives the same b
 
 from __future__ import annotations
 
-from math import isfinite, sqrt
+from math import isfinite, nan, sqrt
 
 import numpy as np
 
@@ -34,6 +34,11 @@ MAX_SAMPLE_AGE_S = 10.0
 MAX_UPDATE_AGE_INTERVALS = 3.0
 """Largest age of an update from which a position is still dead-reckoned, in intervals."""
 
+MIN_HEIGHT_STEP_M, MAX_CLIMB_M_S, MAX_CLIMB_TIME_S = 10.0, 20.0, 60.0
+"""Smallest step of the height that counts as a new origin: m, plus a vehicle's climb since the last height,
+m/s, over at most this time, s."""
+MAIN_FIELD_GRADIENT = 0.03
+"""Largest change of the main field with height, nT/m: three times the field over the radius of the Earth."""
 HEADING_AGE_US = 10_000_000
 """Time for which a poor heading makes the dead-reckoned velocity uncertain, µs."""
 POOR_HEADING_SIGMA_RAD, MAX_HEADING_SIGMA_RAD = 0.15, 1.0
@@ -64,6 +69,7 @@ class Navigator:
         self._reckoning = DeadReckoning()
         self._collector = Collector(options, block_length(grid))
         self._latest_us = NEVER
+        self._depth_us = NEVER
         self._heading_error = NEVER, 0.0  # time, µs; 1-sigma of the velocity, m/s
 
     def fix(
@@ -146,7 +152,20 @@ class Navigator:
         return record
 
     def telemetry(self, time_us: int, **values: float) -> None:
-        """Update dead reckoning with telemetry; names and units are as in :meth:`DeadReckoning.telemetry`."""
+        """Update dead reckoning with telemetry; names and units are as in :meth:`DeadReckoning.telemetry`.
+
+        A step of the depth that no vehicle makes changes the origin of the heights. The estimated bias then
+        contains the main field's error before it or after it.
+        """
+        depth = values.get("depth", nan)
+        if isfinite(depth):
+            step = abs(depth - self._reckoning.depth)
+            elapsed = 0.0 if self._depth_us == NEVER else (time_us - self._depth_us) * 1e-6
+            self._depth_us = time_us
+            if step > MIN_HEIGHT_STEP_M + MAX_CLIMB_M_S * min(elapsed, MAX_CLIMB_TIME_S):
+                self._collector.flush()
+                self.estimate.widen_bias(MAIN_FIELD_GRADIENT * step)
+                self.gnss.new_height()
         self._reckoning.telemetry(time_us * 1e-6, values)
 
     def new_motion(self, time_us: int) -> None:

@@ -152,7 +152,7 @@ def test_depth_counts_from_the_sea_on_high_ground() -> None:
     bench.receive("GPS_GLOBAL_ORIGIN", latitude=1, longitude=1, altitude=350_000)
     bench.receive("LOCAL_POSITION_NED", z=4.0)
     assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-346.0)
-    bench.receive("GLOBAL_POSITION_INT", alt=347_000)
+    bench.receive("GLOBAL_POSITION_INT", lat=495_000_000, lon=-579_000_000, alt=347_000)
     assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-347.0)
 
 
@@ -265,13 +265,33 @@ def test_wind_that_grows_with_height_does_not_reject_gps_in_the_climb(seed: int)
         bench.to(0.5 * k)
         bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=128)
         bench.receive("EXTENDED_SYS_STATE", landed_state=2 if flying else 1)
-        bench.receive("GLOBAL_POSITION_INT", alt=round(1e3 * height))
         bench.receive("ATTITUDE", yaw=along)
         bench.receive("VFR_HUD", airspeed=speed, groundspeed=np.hypot(*moved) + 0.1)
         latitude, longitude = offset(*PLACE, *(position + rng.normal(0.0, 0.5, 2)).tolist())
-        place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7)}
+        place = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(1e3 * height)}
+        bench.receive("GLOBAL_POSITION_INT", **place)
         bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, **place)
         sample(bench, latitude, longitude)
+        assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
+
+
+def test_the_first_height_of_an_airfield_does_not_reject_gps() -> None:
+    """On an airfield at 1,500 m, GPS is good 5 s before the autopilot's origin: 38 nT of the main field."""
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE", AIRCRAFT)
+    place = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7)}
+    rng, anomaly = np.random.default_rng(1), hills().look_up(PLACE[1], PLACE[0], 0.0).anomaly
+    for k in range(1, 301):
+        bench.to(0.2 * k)
+        bench.receive("HEARTBEAT", autopilot=ARDUPILOT, type=1, base_mode=0)
+        bench.receive("EXTENDED_SYS_STATE", landed_state=1)
+        bench.receive("ATTITUDE", yaw=0.0)
+        bench.receive("VFR_HUD", airspeed=0.3, groundspeed=0.05)
+        if k % 5 == 0:
+            bench.receive("GLOBAL_POSITION_INT", **(place | {"alt": 1_500_000} if k > 50 else {}))
+        if k > 25 and k % 5 == 0:
+            bench.receive("GPS_RAW_INT", fix_type=3, h_acc=1000, alt=1_500_000, **place)
+        field = total_field(PLACE[1], PLACE[0], -1500.0, bench.now_us * 1e-6).item() + anomaly + rng.normal()
+        bench.navigation.sample(bench.now_us, Corrected(field, 1.0, (field, 0.0, 0.0), (1.0, 1.0, 1.0), 0))
         assert bench.navigation.navigator.gnss.state in (GnssState.NONE, GnssState.GOOD), k
 
 
@@ -378,7 +398,7 @@ def test_odometry_waits_for_origin_attitude_and_height() -> None:
     bench.receive("ATTITUDE", yaw=0.5)
     bench.to(14)
     assert bench.fix() == []
-    bench.receive("GLOBAL_POSITION_INT", alt=-2000)
+    bench.receive("GLOBAL_POSITION_INT", lat=495_000_000, lon=-579_000_000, alt=-2000)
     bench.to(16)
     (sent,) = bench.fix()
     assert sent["z"] == pytest.approx(7.0), "2 m under the sea is 7 m under the origin"
@@ -388,7 +408,7 @@ def test_odometry_waits_for_origin_attitude_and_height() -> None:
         "no fixes to the autopilot: no height from the autopilot",
     ]
     bench.to(30)
-    bench.receive("GLOBAL_POSITION_INT", alt=-2000)
+    bench.receive("GLOBAL_POSITION_INT", lat=495_000_000, lon=-579_000_000, alt=-2000)
     assert bench.fix() == [], "that attitude is old"
     assert not any(one.name == "COMMAND_LONG" for one in bench.to(60)), "the origin is known"
 

@@ -32,6 +32,7 @@ from sitl.fluxgate import open_encoder
 TRACKING = 2
 START = 1_780_000_000_000_000
 SPEED, HEADING, OFF, DEPTH = 0.5, 60.0, 150.0, 1.0
+PLACE_E7 = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7)}
 ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
 """Origin of the autopilot's local frame (deg, deg, m), on a hill near the water."""
 QUATERNION = (0.8487626, 0.0993347, -0.1720527, 0.4900333)
@@ -70,7 +71,7 @@ def events(folder: Path) -> tuple[Event, ...]:
 def glide(grid: AnomalyGrid) -> Iterator[Event]:
     autopilot, fluxgate = Codec(1, 1), open_encoder("digitizer", SENSOR)
     origin = offset(*PLACE, OFF, -OFF)  # where it is; it believes to be at PLACE
-    fix = {"lat": round(PLACE[0] * 1e7), "lon": round(PLACE[1] * 1e7), "fix_type": 3, "h_acc": 200_000}
+    fix = {**PLACE_E7, "fix_type": 3, "h_acc": 200_000}
     origin_e7 = {"latitude": round(ORIGIN[0] * 1e7), "longitude": round(ORIGIN[1] * 1e7)}
     data = autopilot.pack("GPS_GLOBAL_ORIGIN", altitude=round(1e3 * ORIGIN_ALTITUDE), **origin_e7)
     yield Event(START + 4, Channel.LINK, data + autopilot.pack("GPS_RAW_INT", **fix))
@@ -83,7 +84,7 @@ def glide(grid: AnomalyGrid) -> Iterator[Event]:
         time_us = START + 4_000_000 * k
         data = autopilot.pack("ATTITUDE", yaw=radians(HEADING), pitch=-0.4)
         data += autopilot.pack("VFR_HUD", airspeed=SPEED)
-        data += autopilot.pack("GLOBAL_POSITION_INT", alt=round(-1e3 * DEPTH))
+        data += autopilot.pack("GLOBAL_POSITION_INT", **PLACE_E7, alt=round(-1e3 * DEPTH))
         yield Event(time_us, Channel.LINK, data)
         total = main[k - 1] + grid.look_up(longitude, latitude).anomaly
         field = (0.4 * total, 0.3 * total, float(np.sqrt(0.75)) * total)
@@ -196,7 +197,7 @@ def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
         pytest.skip("the others go out with each update")
     times = np.array([one["time_usec"] for one in sailed.fixes])
     assert np.median(np.diff(times)) == 200_000
-    beat = Codec(1, 1).pack("ATTITUDE") + Codec(1, 1).pack("GLOBAL_POSITION_INT", alt=-1000)
+    beat = Codec(1, 1).pack("ATTITUDE") + Codec(1, 1).pack("GLOBAL_POSITION_INT", **PLACE_E7, alt=-1000)
     last_us = events(folder)[-1].time_us
     silence = [Event(last_us + 200_000 * k, Channel.LINK, beat) for k in range(600)]
     after = named(fed(sailed.pipeline, *silence), "ODOMETRY")
