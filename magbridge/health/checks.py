@@ -1,9 +1,14 @@
 r"""Check single readings for stuck channels, and for a total field that cannot be the Earth's.
 
 A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. The check
-learns p for each channel, and for all three together. For all three, the noise gives a lower bound of p:
-normal noise of standard deviation :math:`\sigma`, in steps of q, repeats one channel's reading with the
-probability :math:`q / (2 \sqrt\pi \sigma)`.
+learns p for each channel, and for all three together. Noise and resolution give a lower bound of p: normal
+noise of standard deviation :math:`\sigma` stays within a step q, if the field is in the middle of the step,
+with the probability :math:`\mathrm{erf}(q / (2 \sqrt 2 \sigma))`, and within the steps of all three channels
+with the third power. A single channel that repeats is evidence only while another channel moves by more than
+one step: the channels of a coarse sensor on a vehicle at rest may repeat for hours. Rounding gives the
+readings of a moving vehicle a standard deviation of at least :math:`q / \sqrt{12}`.
+
+A value at which a channel was stuck is a limit of the channel's range, if no reading was ever beyond it.
 
 The Earth's total field is the sum of the main field and the crustal field. It differs from the main field by
 145 nT (1-sigma over the Earth, with disturbances: the error model of Chulliat et al. 2020, *The US/UK World
@@ -15,7 +20,7 @@ the Earth. Sigma includes the difference once it exceeds :data:`FAR_SIGMA`, unti
 
 from __future__ import annotations
 
-from math import inf, isnan, log, nan, pi, sqrt
+from math import erf, inf, isnan, log, nan, sqrt
 from typing import TYPE_CHECKING, Final
 
 from magbridge.records import NEVER, Vector
@@ -45,16 +50,17 @@ MAX_PROBABILITY: Final = 1e-9
 MIN_STUCK_FRACTION: Final = 1e-3
 MIN_RUN: Final = 4
 MIN_COMMON_RUN: Final = 3
+MIN_MOTION_STEPS: Final = 1.5
+"""Change of a reading, in steps, above which the vehicle is not at rest."""
 AXIS_LETTERS: Final = "xyz"
 
 
 class Repetition:
     """Statistics of a channel's repeated readings: length of the present run, and average fraction."""
 
-    __slots__ = ("fraction", "last", "limit", "run")
+    __slots__ = ("fraction", "run")
 
     def __init__(self) -> None:
-        self.last = self.limit = nan
         self.run = 0
         self.fraction = 0.1  # of repeated readings
 
@@ -76,14 +82,43 @@ class Repetition:
         return False
 
 
+class _Axis(Repetition):
+    """Readings of one channel: the last, the range so far, and the limits of the range, nT."""
+
+    __slots__ = ("high", "is_faulty", "last", "limits", "low")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = nan
+        self.low, self.high = inf, -inf
+        self.limits = set[float]()
+        self.is_faulty = False  # stuck, or at a limit at which it was stuck before
+
+    def move(self, value: float) -> None:
+        """Record a changed reading; a limit that it exceeds was not a limit."""
+        self.change()
+        if value > self.high:
+            self.limits.discard(self.high)
+            self.high = value
+        if value < self.low:
+            self.limits.discard(self.low)
+            self.low = value
+        self.last, self.is_faulty = value, value in self.limits
+
+    def stick(self) -> None:
+        """Record that the channel is stuck at the last reading."""
+        self.is_faulty = True
+        if self.last in (self.low, self.high):
+            self.limits.add(self.last)
+
+
 class RepetitionCheck:
     """Check of the three channels for stuck readings."""
 
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
-        self._axes = (Repetition(), Repetition(), Repetition())
+        self._axes = (_Axis(), _Axis(), _Axis())
         self._common = Repetition()
-        self._has_limit = False
         self._step = inf  # smallest change of a reading, nT
 
     @property
@@ -98,44 +133,42 @@ class RepetitionCheck:
         """
         x_axis, y_axis, z_axis = self._axes
         x, y, z = raw
-        if x == x_axis.last and y == y_axis.last and z == z_axis.last:
-            return self._repeat_all(scatter.white_sigma)
-        self._common.change()
-        stuck = False
-        for number, axis in enumerate(self._axes):
-            value = raw[number]
-            if value == axis.last:
-                stuck = self._repeat(number, axis, value) or stuck
-                continue
-            change = abs(value - axis.last)
-            self._step = min(self._step, change)
-            axis.last = value
-            axis.change()
-            if self._has_limit and abs(value) == axis.limit:
-                stuck = True
-        return stuck
+        changes = abs(x - x_axis.last), abs(y - y_axis.last), abs(z - z_axis.last)
+        largest = max(changes)
+        if largest == 0.0:
+            stuck = self._repeat_all(scatter.white_sigma)
+        else:
+            stuck = False
+            self._common.change()
+            for change in changes:
+                if 0.0 < change < self._step:
+                    self._step = change
+            is_moving = largest > MIN_MOTION_STEPS * self._step
+            for number, axis in enumerate(self._axes):
+                if raw[number] != axis.last:
+                    axis.move(raw[number])
+                elif is_moving and not axis.is_faulty:
+                    self._repeat(number, axis, scatter.white_sigma)
+        return stuck or x_axis.is_faulty or y_axis.is_faulty or z_axis.is_faulty
+
+    def _probability(self, sigma: float) -> float:
+        """Return the lower bound of the probability that one channel repeats, for noise of `sigma` nT."""
+        return erf(self._step / (2.0 * sqrt(2.0) * max(sigma, 1e-9)))
 
     def _repeat_all(self, white_sigma: float) -> bool:
         """Record a reading that repeats on all axes; return True if the run of repetitions is a fault."""
-        # probability that one channel repeats: step of the readings over sigma, as in the module
-        axis_probability = min(self._step / (2.0 * sqrt(pi) * max(white_sigma, 1e-9)), 1.0)
-        if not self._common.repeat(axis_probability**3, MIN_COMMON_RUN):
+        if not self._common.repeat(self._probability(white_sigma) ** 3, MIN_COMMON_RUN):
             return False
         self._messages.report("repeat", "all axes repeat one reading: sensor or driver at fault")
         return True
 
-    def _repeat(self, number: int, axis: Repetition, value: float) -> bool:
-        """Record a reading that repeats on one axis; return True if the run of repetitions is a fault."""
-        # a value at which the axis was stuck before is a limit: no probability is needed
-        if abs(value) == axis.limit:
-            axis.run += 1
-        elif not axis.repeat(0.0, MIN_RUN):
-            return False
-        axis.limit, self._has_limit = abs(value), True
-        self._messages.report(
-            "axis", f"axis {AXIS_LETTERS[number]} stuck at {value:.0f} nT, or clipped there"
-        )
-        return True
+    def _repeat(self, number: int, axis: _Axis, white_sigma: float) -> None:
+        """Record that an axis repeats its reading although the vehicle moves."""
+        sigma = max(white_sigma, self._step / sqrt(12.0))  # with the noise of rounding
+        if axis.repeat(self._probability(sigma), MIN_RUN):
+            axis.stick()
+            text = f"axis {AXIS_LETTERS[number]} stuck at {axis.last:.0f} nT, or clipped there"
+            self._messages.report("axis", text)
 
 
 MAX_LEVEL_SIGMA: Final = 5.0

@@ -6,7 +6,7 @@ from math import nan
 import numpy as np
 import pytest
 
-from magbridge.arrays import FloatArray, IntArray
+from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.calibration.model import Noise
 from magbridge.health import HealthMonitor
 from magbridge.health.consistency import Sensitivity
@@ -182,6 +182,65 @@ def test_clipping_is_remembered() -> None:
     assert missed.sum() <= 10
     assert missed[np.flatnonzero(clipped)[30] :].sum() == 0
     assert any("axis z stuck" in line for line in reported)
+
+
+def test_a_value_that_readings_exceed_is_not_a_limit() -> None:
+    """The axis sticks at its largest reading so far; later readings of this value are right."""
+    flight = Flight()
+    z = flight.raw[:, 2]
+    z[400:460] = np.abs(z[:400]).max()
+    z[600] = 1.01 * z[400]
+    z[500:1500:200] = z[400]
+    stuck = coarse_flags(flight.raw)[1]
+    assert stuck[420:460].all()
+    assert stuck[500], "until a reading exceeds it, the value may be a limit"
+    assert not stuck[600:].any()
+
+
+COARSE_NT = 20.0 / 3.0
+"""Step of an HMR2300, nT."""
+
+
+def coarse_flags(raw: FloatArray, rate: int = 20) -> tuple[IntArray, BoolArray]:
+    """Return the flags (n,) of a coarse sensor's readings, and where an axis is stuck (n,)."""
+    judge = HealthMonitor(Noise(2.0))
+    total = np.linalg.norm(raw, axis=1).tolist()
+    flags, stuck = [], []
+    for k, (x, y, z) in enumerate(raw.tolist()):
+        one, time_us = (x, y, z), k * 1_000_000 // rate
+        judge.check(time_us, one, one, (total[k], 2.0), 0, (total[0], 145.0), nan, 0.0, Sensitivity)
+        flags.append(judge.flags)
+        stuck.append(any(axis.is_faulty for axis in judge._axes._axes))
+    return np.array(flags), np.array(stuck)
+
+
+@pytest.mark.parametrize("rate", [1, 20])
+@pytest.mark.parametrize("noise", [0.5, 1.0, 2.0, 3.0, 4.0])
+def test_a_coarse_sensor_at_rest_is_not_stuck(noise: float, rate: int) -> None:
+    """One channel of several hundred readings may have one value, and another change by one step."""
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        raw = rng.normal(0.0, noise, (60 * rate, 3)) + np.array([18_000.0, -7000.0, 46_000.0])
+        raw += rng.uniform(0.0, COARSE_NT, 3)
+        assert not coarse_flags(np.rint(raw / COARSE_NT) * COARSE_NT, rate)[0].any()
+
+
+@pytest.mark.parametrize("noise", [0.5, 2.0])
+def test_a_stuck_axis_of_a_coarse_sensor_is_found_as_soon_as_the_vehicle_moves(noise: float) -> None:
+    time = np.arange(2000) / 20.0
+    yaw, pitch = 0.6 * np.sin(time / 4.0), 0.02 * np.sin(time / 1.7)
+    yaw[:600] = pitch[:600] = 0.0
+    north, down = 18_000.0, 46_000.0
+    raw = np.stack(
+        [north * np.cos(yaw) - down * pitch, -north * np.sin(yaw), down + north * np.cos(yaw) * pitch], 1
+    )
+    raw += np.random.default_rng(3).normal(0.0, noise, raw.shape)
+    raw = np.rint(raw / COARSE_NT) * COARSE_NT
+    assert not coarse_flags(raw)[1].any()
+    raw[300:, 2] = raw[300, 2]
+    stuck = coarse_flags(raw)[1]
+    assert not stuck[:600].any()
+    assert stuck[600 + 15 * 20 :].all()
 
 
 def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples() -> None:
