@@ -98,13 +98,15 @@ def small_bridge(
     battery: Parameter = BATTERY,
     more: str = "",
     boresight: Boresight | None = None,
+    options: str = ASCII_OPTIONS,
 ) -> Pipeline:
     """Return a bridge that is configured in a folder and to which the caller feeds events.
 
     The mass `battery` is the telemetry column ``battpos``; the bridge sends the messages `publish` with every
-    sample. `more` is an argument of :func:`bridge_text`. With a `boresight` in the calibration, the bridge
-    computes a heading.
+    sample. `more` and `options` are arguments of :func:`bridge_text`. With a `boresight` in the calibration,
+    the bridge computes a heading.
     """
     coefficients = np.random.default_rng(1).normal(size=4 * 9) * 300.0
     known = polynomial(coefficients, battery, boresight=boresight)
-    return set_up(load(write_bridge(folder, known, publish=dict.fromkeys(publish, 0), more=more)), start)
+    rates = dict.fromkeys(publish, 0)
+    return set_up(load(write_bridge(folder, known, publish=rates, more=more, options=options)), start)

@@ -279,7 +279,7 @@ class SensorStream:
     `start_us`: start of the bridge, µs since 1970 UTC.
     `publisher`: sender of the sensor's samples.
     `line`: monitor of the line, with the commands to send to the sensor.
-    `samples`, `lost`: number of readings received, and of readings missing in the instrument's numbering.
+    `samples`: number of readings received.
     `quality`: quality flags that were last sent as STATUSTEXT.
     `overload_rate`: limit of the samples with all optional work during an overload.
     """
@@ -301,7 +301,8 @@ class SensorStream:
             start_us, searching=has_magic(sensor.port), sensor_id=self.sensor_id,
         )  # fmt: skip
         self._component = component
-        self.samples = self.lost = self.quality = 0
+        self.samples = self.quality = self._missing = 0
+        self._rate = self.clock.rate
         self.overload_rate = Rate(OVERLOAD_HZ)
         self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
 
@@ -312,7 +313,18 @@ class SensorStream:
             self.line.on_unparsed(data, time_us)
             return []
         self.line.on_reading(time_us)
-        return self.clock.stamp(readings, time_us)
+        stamped = self.clock.stamp(readings, time_us)
+        if self.clock.rate != self._rate:
+            self._rate = self.clock.rate
+            configured = 1.0 / self.driver.period
+            text = f"{self.sensor.label} sends {self._rate:.3g} readings/s, but rate = {configured:.3g}"
+            self._component.announcer.state(f"rate {self.sensor_id}", text, MAV_SEVERITY.WARNING)
+        return stamped
+
+    @property
+    def lost(self) -> int:
+        """Number of readings missing in the instrument's numbering or at its rate."""
+        return self._missing - self.clock.invented
 
     def correct(
         self, reading: Reading, main_field: float, position: tuple[float, float] | None, depth: float
@@ -326,7 +338,7 @@ class SensorStream:
         """
         correction, time_us = self.correction, reading.time_us
         self.samples += 1
-        self.lost += reading.missing
+        self._missing += reading.missing
         self._times.append(time_us)
         self.line.read(reading.field, time_us)
         if isinstance(correction, Correction):

@@ -7,14 +7,17 @@ readings gives its lowest point, and a line is fitted to the lowest points of th
 delay, a constant, remains as an error of the times.
 
 For an instrument without a clock but with a steady rate, the device time of reading n is ``n * period``. The
-slope of the line is then the error of the nominal period.
+slope of the line is then the error of the nominal period. If the configured rate is wrong, the readings
+arrive on a straight line with another period, which replaces the nominal period.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from itertools import islice
 from math import inf, isnan, nan
-from typing import Final
+from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
@@ -38,6 +41,11 @@ STALL: Final = 100_000.0
 """Limit to which longer delays are reduced in the mean delay, µs, because they are not typical."""
 WANDER: Final = 0.05
 """Smallest sigma of the slope as a fraction of its prior sigma, because rates change with temperature."""
+MAX_PHASE: Final = 0.25
+"""Largest mean remainder of the heights, as a fraction of the period, that is the mean delay. Remainders of
+longer delays are about half a period."""
+MARGIN: Final = 0.1
+"""Largest error of the line, as a fraction of the period, where late readings differ from missing ones."""
 BOUND: Final = 5.0
 """Largest magnitude of the slope, in prior sigmas."""
 
@@ -46,7 +54,8 @@ class Floor:
     """Estimate of the straight line below the points (x, y), with x in s and y in µs.
 
     `slope`, `slope_sigma`: slope of the line and its standard deviation, µs/s.
-    `delay`: running mean of the points' height above the line, µs.
+    `period_us`: time between the points if they are readings at a steady rate, of which some may be lost, µs;
+        else 0.
     `lowest`: lowest point (x, y) of the last complete block, or of the present one.
 
     Notes
@@ -60,10 +69,10 @@ class Floor:
     delay divided by the number of readings in a block, as for exponentially distributed delays.
     """
 
-    def __init__(self, slope_sigma: float) -> None:
-        self._prior_sigma = slope_sigma
+    def __init__(self, slope_sigma: float, period_us: float = 0.0) -> None:
+        self._prior_sigma, self._period_us = slope_sigma, period_us
         self.slope = 0.0
-        self.delay = INITIAL_DELAY_US
+        self._delay = self._phase = INITIAL_DELAY_US
         self.restart(0.0, 0.0)
 
     def restart(self, x: float, y: float) -> None:
@@ -83,6 +92,15 @@ class Floor:
         return self._y + self.slope * (x - self._x) + self._drop
 
     @property
+    def delay(self) -> float:
+        """Mean height of the points above the line, µs.
+
+        Uncounted losses raise all points by whole periods. So the mean is of the remainders of the heights
+        after division by the period, as long as these are short.
+        """
+        return self._phase if self._phase < MAX_PHASE * self._period_us else self._delay
+
+    @property
     def scatter(self) -> float:
         """Standard deviation of the lowest points of blocks, µs."""
         return self.delay / self._size + 1.0
@@ -100,7 +118,11 @@ class Floor:
         if not self._count:
             self._began, self._least = x, inf
         delay = above if 0.0 < above < STALL else max(0.0, min(above, STALL))
-        self.delay += (delay - self.delay) * 0.02
+        self._delay += (delay - self._delay) * 0.02
+        if period := self._period_us:
+            margin = MARGIN * period
+            remainder = max((max(above, 0.0) + margin) % period - margin, 0.0)
+            self._phase += (remainder - self._phase) * 0.02
         if above < self._least:
             self._least, self.lowest = max(above, 0.0), (x, y)
             self._drop += min(above, 0.0)
@@ -144,6 +166,96 @@ class Floor:
         self._x, self._y, self._drop = x, y, 0.0
 
 
+PERIOD_ERROR: Final = 0.03
+"""Smallest relative error of a nominal period that replaces it."""
+MEASURED_READINGS: Final = (16, 64, 256)
+"""Numbers of the last readings from which the period is measured; more readings allow more jitter."""
+MIN_MEASURED_US: Final = 500_000
+"""Shortest time over which the period is measured, µs; readings that waited arrive within a shorter time."""
+OUTLIERS: Final = 10
+"""Reciprocal of the fraction of the highest residuals, and of the lowest, that do not count as scatter."""
+MAX_SCATTER: Final = 0.3
+"""Largest scatter of the times about a straight line, as a fraction of the period; a lost reading causes a
+step of a whole period. Delays up to `TOLERANCE` are allowed in any case."""
+MAX_RELATIVE_SCATTER: Final = 0.05
+"""Largest scatter as a fraction of the difference between the measured and the nominal time."""
+
+
+class MeasuredPeriod(NamedTuple):
+    """Period of an instrument's readings, from the straight line of their times."""
+
+    period_us: float
+    """Measured period, µs."""
+    time_us: float
+    """Time of the last reading on the line through the earliest times, µs."""
+    invented: int
+    """Number of readings that were counted as missing because of the wrong period."""
+
+
+class PeriodMeter:
+    """Measurement of the period of readings that contradict their nominal period.
+
+    Times (t) of the readings of a slower or faster instrument are a straight line over their number (n).
+    Lost readings cause steps of whole periods, which are no straight line. So losses do not look like a
+    slower instrument, unless each second reading is lost.
+    """
+
+    def __init__(self) -> None:
+        self._number = self._added = 0
+        self._late_us = 0.0
+        self._points: deque[tuple[int, float, float, int]] = deque(maxlen=MEASURED_READINGS[-1])
+
+    def skip(self, readings: int) -> None:
+        """Count `readings` without a known time."""
+        self._number += readings
+
+    def add(self, time_us: float, unseen: int, period_us: float) -> MeasuredPeriod | None:
+        """Add the time of the last counted reading; return its period if it contradicts `period_us`.
+
+        `unseen`: number of readings so far that count as missing by the nominal period.
+        """
+        if self._points:
+            number, last_us, _, _ = self._points[-1]
+            self._late_us = max(self._late_us + time_us - last_us - (self._number - number) * period_us, 0.0)
+        self._points.append((self._number, time_us, self._late_us, unseen))
+        self._added += 1
+        for size in MEASURED_READINGS:
+            if self._added % (size // 2) == 0 and len(self._points) >= size:
+                measured = self._measure(size, period_us)
+                if measured is not None:
+                    self._late_us = 0.0
+                    return measured
+        return None
+
+    def _measure(self, size: int, period_us: float) -> MeasuredPeriod | None:
+        points = list(islice(self._points, len(self._points) - size, None))
+        first, begin_us, late_us, unseen = points[0]
+        last, end_us, _, all_unseen = points[-1]
+        if end_us - begin_us < MIN_MEASURED_US or last == first:
+            return None
+        n = t = snn = snt = 0.0
+        for number, time_us, _, _ in points:
+            n += (number - first) / size
+            t += (time_us - begin_us) / size
+        for number, time_us, _, _ in points:
+            snn += (number - first - n) ** 2
+            snt += (number - first - n) * (time_us - begin_us - t)
+        slope_us = snt / snn
+        residuals = sorted(
+            time_us - begin_us - slope_us * (number - first) for number, time_us, _, _ in points
+        )
+        scatter = residuals[-1 - size // OUTLIERS] - residuals[size // OUTLIERS]
+        difference = (slope_us - period_us) * (last - first)
+        allowed = MAX_RELATIVE_SCATTER * abs(difference)
+        # after a pause of the line, readings that waited also arrive at short intervals
+        waited = difference < 0.0 and late_us > allowed
+        steady = scatter <= min(allowed, max(MAX_SCATTER * period_us, TOLERANCE))
+        if waited or not steady or abs(slope_us - period_us) <= PERIOD_ERROR * period_us:
+            return None
+        line_us = begin_us + slope_us * (last - first) + residuals[0]
+        return MeasuredPeriod(slope_us, line_us, all_unseen - unseen)
+
+
 SIGMA_CLOCK: Final = 1e3
 SIGMA_PERIOD: Final = 1e4
 """Prior standard deviations of a clock's rate and of a nominal period, µs/s (ppm)."""
@@ -152,8 +264,6 @@ RESTART: Final = 1e6
 the instrument was restarted."""
 HALF: Final = 0.6
 """Delay of a reading, as a fraction of the period, beyond which an earlier reading is missing."""
-MARGIN: Final = 0.1
-"""Largest error of the line, as a fraction of the period, where late readings differ from missing ones."""
 BASELINE: Final = 1 << 16
 """Number of readings after which the mean interval between readings is computed again."""
 MIN_INTERVAL_READINGS: Final = 16
@@ -168,7 +278,8 @@ class DeviceClock:
     `time_modulo`: time at which the instrument's clock wraps to 0, s; 0 if it never wraps.
     `sequence_modulo`: value at which the instrument's count of readings wraps to 0; 0 if it never wraps.
     `period`: time between the readings of an instrument without a clock, s; 0 if not steady, so that each
-        reading gets the time of its arrival.
+        reading gets the time of its arrival. A measured period replaces one that the readings contradict.
+    `invented`: number of readings that were reported as missing only because the period was wrong.
     `stepped`: True if one of the two clocks was set before the last reading, so that the relation between
         the clocks is estimated again.
     """
@@ -177,7 +288,9 @@ class DeviceClock:
         self._time_modulo = time_modulo
         self._sequence_modulo = sequence_modulo
         self._period = period
-        self._floor = Floor(SIGMA_PERIOD if period else SIGMA_CLOCK)
+        self._meter = PeriodMeter()
+        self._unseen = self.invented = 0
+        self._floor = Floor(SIGMA_PERIOD, 1e6 * period) if period else Floor(SIGMA_CLOCK)
         self._sequence: int | None = None
         self._since_us = self._readings = 0
         self._interval_us = 0.0
@@ -198,6 +311,11 @@ class DeviceClock:
     def drift_ppm(self) -> float:
         """Rate of the host's clock minus the instrument's, µs/s."""
         return self._floor.slope
+
+    @property
+    def rate(self) -> float:
+        """Rate of the readings by their period, which was configured or measured, Hz; 0 if not steady."""
+        return 1.0 / self._period if self._period else 0.0
 
     def stamp(self, readings: Sequence[Reading], arrival_us: int) -> list[Reading]:
         """Return the readings of one chunk, which arrived at `arrival_us` (µs), with their host times.
@@ -240,7 +358,7 @@ class DeviceClock:
             time_us = float(arrival_us)
         elif timed:
             if sequence is None and self._period:  # a nominal rate but no sequence number
-                missing = max(round((device_time - self._device_time) / self._period) - 1, 0)
+                missing = self._missing_by_time(device_time)
             time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, informative)
         elif self._period:
             time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, informative)
@@ -284,6 +402,18 @@ class DeviceClock:
         self._since_us, self._readings = arrival_us, 0
         return max(hole, 0)
 
+    def _missing_by_time(self, device_time: float) -> int:
+        """Return the number of readings missing before the one with a device time, by the period."""
+        self._meter.skip(1)
+        measured = self._meter.add(1e6 * device_time, self._unseen, 1e6 * self._period)
+        # a period that is longer by less than half causes no false losses
+        if measured is not None and measured.period_us > 1.5e6 * self._period:
+            self._period = measured.period_us * 1e-6
+            self.invented += measured.invented
+        missing = max(round((device_time - self._device_time) / self._period) - 1, 0)
+        self._unseen += missing
+        return missing
+
     def _begin(self, device_time: float, arrival_us: int) -> None:
         """Restart the estimate of the relation between the clocks from a reading."""
         self._origin_us = arrival_us
@@ -324,9 +454,15 @@ class DeviceClock:
         """
         floor, period_us = self._floor, 1e6 * self._period
         self._count += 1 + missing
+        self._meter.skip(1 + missing)
         x = self._count * self._period
         y = arrival_us - origin_us - 1e6 * x
         above = y - floor.value_at(x)
+        if informative and (measured := self._meter.add(arrival_us, self._unseen, period_us)):
+            self._period, self._floor = measured.period_us * 1e-6, Floor(SIGMA_PERIOD, measured.period_us)
+            self._begin(nan, int(measured.time_us))
+            self.invented += measured.invented
+            return measured.time_us, False, 0
         # no reading is sent after its arrival, so a reading late by less than a period proves no loss; the
         # margin covers the scatter of the line and its error since the last reading, because each reading
         # below the line lowers the line
@@ -343,4 +479,5 @@ class DeviceClock:
             y -= beats * period_us
             if not 0 < beats <= KEEP_PHASE:
                 floor.restart(x, y)
+        self._unseen += max(beats, 0)
         return origin_us + 1e6 * x + floor.value_at(x), beats < 0, max(beats, 0)

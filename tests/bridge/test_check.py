@@ -225,6 +225,12 @@ def test_live_reports_silent_ports(
     command("run", "--live", "--config", rig.config, code=2)
 
 
+def test_live_reports_a_wrong_rate(make_rig: Callable[..., Rig]) -> None:
+    rig = make_rig(sensor=("ascii", 'columns = ["x", "y", "z"]\nrate = 20.0'), hz=10.0)
+    check, _ = listened(rig)
+    assert any("ascii sends 10 readings/s, but rate = 20" in one.text for one in check.faults)
+
+
 def test_live_names_the_systems_that_send_and_telemetry_that_does_not_match(
     make_rig: Callable[..., Rig],
 ) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from fed import FedBridge, named
-from small import small_bridge
+from small import ASCII_OPTIONS, small_bridge
 
 from magbridge.bridge import events
 from magbridge.bridge.sensor import SensorLine
@@ -19,8 +19,8 @@ LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"
 class Bench(FedBridge):
     """Bridge whose sensor's port is open, and the x of each MAG_RAW that it sent."""
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(small_bridge(folder, ["MAG_RAW"]))
+    def __init__(self, folder: Path, options: str = ASCII_OPTIONS) -> None:
+        super().__init__(small_bridge(folder, ["MAG_RAW"], options=options))
         self.open(0.0)
 
     def open(self, seconds: float) -> None:
@@ -66,6 +66,15 @@ def test_an_instrument_that_hangs_is_reported(bench: Bench) -> None:
         hangs = [text for text in bench.texts if "reading" in text and text != "ascii sends readings"]
         assert len(hangs) == (k >= 100) + (k >= 110)
     assert hangs == ["ascii sends the same reading for 60 s", "ascii's readings change again"]
+
+
+def test_a_wrong_rate_is_reported_once(tmp_path: Path) -> None:
+    """The instrument sends 15 readings/s, which the bridge must not count as 20 with losses."""
+    bench = Bench(tmp_path, 'columns = ["x", "y", "z"], rate = 20.0')
+    for k in range(600):
+        bench.receive(k / 15.0, b"12340.5 43210.9 %d\r\n" % k)
+    assert [text for text in bench.texts if "rate" in text] == ["ascii sends 15 readings/s, but rate = 20"]
+    assert [message["samples_lost"] for message in named(bench.messages, "MAG_STATUS")][-1] == 0
 
 
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"

@@ -334,3 +334,56 @@ def test_a_late_line_is_not_a_missing_reading(delay: float) -> None:
     assert (error_us(made, arrived) <= 10.0).all()
     assert np.abs(error_us(made, true)).max() < 10_000
     assert all(b.time_us > a.time_us for a, b in pairwise(made))
+
+
+# -- with a wrong rate ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sent", [5.0, 10.0, 15.0, 19.0, 25.0, 40.0])
+def test_a_wrong_rate_is_replaced_by_the_measured_rate(sent: float) -> None:
+    """No loss is invented, and the times are right after some seconds."""
+    true = np.arange(0.0, 30.0, 1.0 / sent)
+    clock = DeviceClock(period=1.0 / 20.0)
+    made = stamps(clock, np.full(true.size, nan), arrivals(true, 2e-3))
+    assert clock.rate == pytest.approx(sent, rel=0.01)
+    assert sum(stamp.missing for stamp in made) == clock.invented
+    assert np.abs(error_us(made, true)[70:]).max() < 5_000
+    assert np.abs(error_us(made, true)).max() < 0.11e6
+    assert not any(stamp.missing for stamp in made[17:])
+
+
+@pytest.mark.parametrize("burst", [1, 3, 8])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_line_that_loses_many_readings_is_not_a_slower_instrument(burst: int, seed: int) -> None:
+    """Of 20 readings/s, 30 % are lost, alone or in bursts; the losses are counted and the times are right."""
+    random = np.random.default_rng(seed)
+    numbers: list[int] = []
+    while len(numbers) < 3_000:
+        lost = random.geometric(1.0 / burst) if random.random() < 0.43 / burst else 0
+        numbers.append((numbers[-1] if numbers else -1) + 1 + lost)
+    true: FloatArray = 0.05 * np.array(numbers)
+    clock = DeviceClock(period=0.05)
+    made = stamps(clock, np.full(true.size, nan), arrivals(true, 1e-3, seed))
+    assert clock.rate == pytest.approx(20.0)
+    assert sum(stamp.missing for stamp in made) == pytest.approx(numbers[-1] - len(numbers) + 1, abs=5)
+    assert error_us(made, true).std() < 10_000
+
+
+def test_a_backlog_is_not_a_faster_instrument() -> None:
+    """100 readings of 20 Hz arrive in 1 s after a pause of the link, one by one."""
+    true = np.arange(0.0, 60.0, 0.05)
+    arrived = arrivals(true, 2e-3)
+    late = (true > 30.0) & (true < 35.0)
+    arrived[late] = 35.0 + np.arange(late.sum()) * 0.01
+    clock = DeviceClock(period=0.05)
+    stamps(clock, np.full(true.size, nan), np.maximum.accumulate(arrived))
+    assert clock.rate == pytest.approx(20.0)
+
+
+def test_a_wrong_rate_of_an_instrument_with_a_clock_invents_no_losses() -> None:
+    true = np.arange(0.0, 60.0, 0.1)
+    clock = DeviceClock(period=0.05)
+    made = stamps(clock, true, arrivals(true, 2e-3))
+    assert clock.rate == pytest.approx(10.0)
+    assert sum(stamp.missing for stamp in made) == clock.invented
+    assert not any(stamp.missing for stamp in made[17:])
