@@ -93,7 +93,8 @@ class Peers:
         """Process bytes from the peer at `address`."""
         peer, now = self._peers.get(address), time.monotonic()
         if peer is None:
-            peer = self._add(address)
+            peer = Peer(address)
+            self._add(peer)
         known = now - peer.valid_s < PEER_SILENCE_S
         peer.unread += len(data)
         self._unknown_bytes += 0 if known else len(data)
@@ -125,6 +126,8 @@ class Peers:
         now = time.monotonic()
         for frame in frames:
             if peer := self._unconfirmed.get(frame):
+                if peer.address not in self._peers:  # replaced before the signature was checked
+                    self._add(peer)
                 self._record_valid(peer, frame, now)
         self._unconfirmed.clear()
 
@@ -178,12 +181,13 @@ class Peers:
         peer = self._routes.get(sender)
         return peer if peer in self.receivers() else None
 
-    def _add(self, address: Hashable) -> Peer:
+    def _add(self, peer: Peer) -> None:
+        """Add a peer; if there are too many, remove one to which the bridge does not send."""
         if len(self._peers) >= MAX_PARSED_PEERS:
-            least = min(self._peers.values(), key=lambda peer: (peer.autopilot_s, peer.valid_s))
-            del self._peers[least.address]
-        peer = self._peers[address] = Peer(address)
-        return peer
+            receivers = self.receivers()
+            others = [other for other in self._peers.values() if other not in receivers]
+            del self._peers[min(others, key=lambda other: (other.autopilot_s, other.valid_s)).address]
+        self._peers[peer.address] = peer
 
     def _record_valid(self, peer: Peer, frame: bytes, now_s: float) -> None:
         """Count a valid frame of a peer at `now_s`, and store the peer as the route to the frame's sender."""

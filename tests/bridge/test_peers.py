@@ -127,6 +127,25 @@ def test_strangers_never_take_the_autopilot_s_place(first: bool) -> None:
         assert port.notice() == ""
 
 
+@pytest.mark.parametrize("signed", [False, True])
+def test_many_strangers_at_once_silence_no_station(monkeypatch: pytest.MonkeyPatch, signed: bool) -> None:
+    """A station sends a heartbeat each second; 100 other sources send heartbeats between two of them."""
+    now = [1000.0]
+    monkeypatch.setattr("magbridge.bridge.port.time.monotonic", lambda: now[0])
+    both = Peers(PILOT, signed=signed)
+    for _ in range(3):
+        both.receive("station", beat(190, 255))
+        for k in range(100):
+            both.receive(k, beat(190, 2 + k))
+        both.drain()
+        both.credit([beat(190, 255)])
+        now[0] += 0.5
+        assert both.receivers()[0].address == "station"
+        assert both.route((255, 190)) is both.receivers()[0]
+        assert len(both.receivers()) == (1 if signed else MAX_RECEIVERS)
+        now[0] += 0.5
+
+
 def test_two_senders_as_the_autopilot_are_reported() -> None:
     both = Peers(PILOT)
     for who in "ab":
