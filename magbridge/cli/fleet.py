@@ -268,7 +268,7 @@ def export(
 
 
 def _lines(facts_of: dict[str, dict[str, Any]]) -> list[str]:
-    """Return a line for each vehicle, and a line for each change of its coefficients."""
+    """Return a line for each vehicle, each change of its coefficients, and each omitted deployment."""
     lines = []
     for name, one in facts_of.items():
         parts = one["deployments"]
@@ -278,5 +278,10 @@ def _lines(facts_of: dict[str, dict[str, Any]]) -> list[str]:
             f"  {part['date']} {part['deployment']} (refit {part['refit']}): {change['what']} moved by "
             f"{change['by_nT']:+.0f} nT, {change['sigmas']:.1f} sigma: {change['cause']}"
             for part, change in changes
+        ]
+        lines += [
+            f"  {part['date']} {part['deployment']} differs from earlier ones: the fleet's model omits it"
+            for part in parts
+            if part["omitted"]
         ]
     return lines

@@ -4,12 +4,16 @@ The coefficients of all deployments are converted to one scale of the mass posit
 F_0 (:func:`.rescaling`). z are these coefficients in units of their physical widths
 (:mod:`magbridge.estimation.priors`). Coefficients share their variances if they have the same monomial and
 kind: A or T, or for the constant monomial gain, soft iron or hard iron.
+
+A deployment that differs significantly from the earlier ones of its vehicle is not a sample of what
+overhauls and power-ups do. The model of the fleet omits it, so that one broken vehicle does not widen the
+predictions of all others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -147,6 +151,9 @@ class Fleet:
     """Deployments in the order of time."""
     observed: tuple[Observed, ...]
     """Information about z from each deployment, in the order of `lessons`."""
+    changed: frozenset[int] = frozenset()
+    """Indices of the deployments that differ significantly from the earlier ones of their vehicle.
+    `population` omits them. In predictions they count as a refit of their own."""
 
     def known(self, vehicle: str, refit: str, before_time: float = np.inf) -> Known:
         """Predict the coefficients of the next deployment of a vehicle, which may be new to the fleet.
@@ -154,14 +161,28 @@ class Fleet:
         `refit` may be an earlier refit of the vehicle, or a new one. The prediction uses only
         those deployments of the vehicle that began before `before_time` (s since 1970).
         """
-        past = [
-            seen
-            for lesson, seen in zip(self.lessons, self.observed, strict=True)
-            if lesson.vehicle == vehicle and lesson.time < before_time
-        ]
-        mean, P = self.population.expected(vehicle, past, refit)
+        past = []
+        for k, lesson in enumerate(self.lessons):
+            if lesson.vehicle == vehicle and lesson.time < before_time:
+                seen = self.observed[k]
+                past.append(
+                    replace(seen, refit=f"{CHANGED_PREFIX}{seen.refit}") if k in self.changed else seen
+                )
+        if past and past[-1].refit == f"{CHANGED_PREFIX}{refit}":  # the vehicle has not changed back
+            refit = past[-1].refit
+        return self.predicted(past, vehicle, refit)
+
+    def predicted(self, observed: Sequence[Observed], vehicle: str, refit: str) -> Known:
+        """Predict the coefficients of a vehicle's next deployment from its deployments `observed`."""
+        mean, P = self.population.expected(vehicle, observed, refit)
         E = self.basis
         return Known(self.parameters, self.exponents, REFERENCE_FIELD_NT, E @ mean, E @ P @ E.T)
+
+
+CHANGED_PREFIX = "changed: "
+"""Prefix of the refit of a changed deployment."""
+MAX_ROUNDS = 8
+"""Largest number of times that a fleet is learned without the deployments found to have changed."""
 
 
 def learn_fleet(
@@ -188,9 +209,32 @@ def learn_fleet(
     with threadpool_limits(1, "blas"):
         observed = tuple(Observed(one.vehicle, one.refit, one.brought(parameters, basis)) for one in lessons)
         groups = _groups(exponents)
-        shapes = _shapes(observed, groups, mounted, exponents, parameters, basis)
-        population = learn(observed, groups, shapes, variances)
-    return Fleet(parameters, exponents, basis, population, mounted, tuple(lessons), observed)
+        changed = frozenset[int]()
+        for _ in range(MAX_ROUNDS):
+            kept = [one for k, one in enumerate(observed) if k not in changed]
+            shapes = _shapes(kept, groups, mounted, exponents, parameters, basis)
+            population = learn(kept, groups, shapes, variances)
+            fleet = Fleet(
+                parameters, exponents, basis, population, mounted, tuple(lessons), observed, changed
+            )
+            if (found := _changed_deployments(fleet)) <= changed:
+                break
+            changed |= found
+    return fleet
+
+
+def _changed_deployments(fleet: Fleet) -> frozenset[int]:
+    """Return the indices of the deployments that differ from their vehicle's earlier unchanged ones."""
+    past: dict[str, list[Observed]] = {}
+    found = set[int]()
+    for k, (lesson, seen) in enumerate(zip(fleet.lessons, fleet.observed, strict=True)):
+        mine = past.setdefault(lesson.vehicle, [])
+        before = fleet.predicted(mine, lesson.vehicle, lesson.refit)
+        if mine and _compare(fleet, lesson, before, refitted=False).changes:
+            found.add(k)
+        else:
+            mine.append(seen)
+    return frozenset(found)
 
 
 def _shapes(
@@ -277,6 +321,8 @@ class History:
     """`found`, `found_sigma`: Estimate after its own data, and its 1-sigma, (n, k), nT."""
     changes: tuple[tuple[Change, ...], ...]
     """Significant changes in each deployment."""
+    omitted: tuple[bool, ...]
+    """True for each deployment that the model of the fleet omits, see :attr:`Fleet.changed`."""
 
 
 def history(fleet: Fleet, vehicle: str) -> History:
@@ -288,30 +334,42 @@ def history(fleet: Fleet, vehicle: str) -> History:
     the probability of a change as large is below :data:`FALSE_ALARM_PROBABILITY` over all monitored
     coefficients.
     """
-    mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
-    names, places = _looked_at(fleet)
-    rows: list[tuple[FloatArray, ...]] = []
-    changes: list[tuple[Change, ...]] = []
-    for lesson in mine:
+    indices = [k for k, one in enumerate(fleet.lessons) if one.vehicle == vehicle]
+    mine = tuple(fleet.lessons[k] for k in indices)
+    rows: list[_Comparison] = []
+    for k, lesson in enumerate(mine):
+        refitted = lesson.refit not in {one.refit for one in mine[:k]}
         before = fleet.known(vehicle, lesson.refit, lesson.time)
-        evidence = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
-        S = before.covariance
-        gain = np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, S)  # (S^-1 + J)^-1
-        P = 0.5 * (gain + gain.T)
-        after = P @ evidence.vector + np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, before.mean)
-        moved = np.maximum(np.diag(S) - np.diag(P), 0.0)[places]
-        rows.append(
-            (before.mean[places], np.sqrt(np.diag(S))[places], after[places], np.sqrt(np.diag(P))[places])
-        )
-        if len(rows) == 1:  # the first deployment has no predecessor
-            changes.append(())
-            continue
-        refitted = lesson.refit not in {one.refit for one in mine[: len(rows) - 1]}
-        changes.append(
-            tuple(_significant_changes(names, (after - before.mean)[places], np.sqrt(moved), refitted))
-        )
-    expected, sigma, found, left = np.array(rows).reshape(len(mine), 4, len(places)).swapaxes(0, 1)
-    return History(names, mine, expected, sigma, found, left, tuple(changes))
+        rows.append(_compare(fleet, lesson, before, refitted=refitted))
+    expected, sigma, found, left = (np.array([row[k] for row in rows]) for k in range(4))
+    # the first deployment has no predecessor
+    changes = tuple(row.changes if k else () for k, row in enumerate(rows))
+    omitted = tuple(k in fleet.changed for k in indices)
+    return History(_looked_at(fleet)[0], mine, expected, sigma, found, left, changes, omitted)
+
+
+class _Comparison(NamedTuple):
+    """A deployment's prediction with 1-sigma, its estimate with 1-sigma, each (k,), nT, and its changes."""
+
+    expected: FloatArray
+    expected_sigma: FloatArray
+    found: FloatArray
+    found_sigma: FloatArray
+    changes: tuple[Change, ...]
+
+
+def _compare(fleet: Fleet, lesson: Lesson, known: Known, *, refitted: bool) -> _Comparison:
+    """Compare a deployment with the prediction `known`; `refitted` if a new refit is on record."""
+    names, places = _looked_at(fleet)
+    evidence = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
+    S = known.covariance
+    gain = np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, np.column_stack([S, known.mean]))
+    P = 0.5 * (gain[:, :-1] + gain[:, :-1].T)  # (S^-1 + J)^-1
+    found = (P @ evidence.vector + gain[:, -1])[places]
+    expected, variance, left = known.mean[places], np.diag(S)[places], np.diag(P)[places]
+    moved = np.sqrt(np.maximum(variance - left, 0.0))
+    changes = tuple(_significant_changes(names, found - expected, moved, refitted))
+    return _Comparison(expected, np.sqrt(variance), found, np.sqrt(left), changes)
 
 
 def facts(history: History) -> dict[str, Any]:
@@ -326,6 +384,7 @@ def facts(history: History) -> dict[str, Any]:
                 "date": datetime.fromtimestamp(lesson.time, UTC).date().isoformat(),
                 **{key: column[k].tolist() for key, column in zip(keys, columns, strict=True)},
                 "changes": [change._asdict() for change in history.changes[k]],
+                "omitted": history.omitted[k],
             }
             for k, lesson in enumerate(history.lessons)
         ],

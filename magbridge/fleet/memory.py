@@ -160,12 +160,13 @@ def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
 
 
 def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting]]) -> str:
-    """Return a hash of the inputs from which variances are estimated: training records and mass positions."""
+    """Return a hash of the method and inputs of estimated variances: training records, mass positions."""
     each = sorted(
         (one.vehicle, one.refit, one.deployment, one.time, one.information.vector.tolist()) for one in lessons
     )
     where = [(name, mounted.get(name, {})) for name in sorted({one.vehicle for one in lessons})]
-    return sha256(msgspec.json.encode((each, where), order="sorted")).hexdigest()[:32]
+    inputs = (ESTIMATE, each, where)
+    return sha256(msgspec.json.encode(inputs, order="sorted")).hexdigest()[:32]
 
 
 def _lesson(row: Row) -> Lesson:
@@ -178,6 +179,8 @@ def _lesson(row: Row) -> Lesson:
     )  # fmt: skip
 
 
+ESTIMATE = "without changed deployments"
+"""Name of the method that estimates variances; variances stored by another method are not used."""
 MAX_VARIANCE_FRACTION = 0.25
 """Posterior over prior variance below which the data are taken to have determined a direction."""
 MAX_DEPARTURE_RATIO = 3.0
