@@ -276,6 +276,7 @@ class VehicleState:
         self._announcer, self._timers = announcer, timers
         self._losses = Losses(system, announcer, timers)
         self._boot_ms = self._boot_us = 0
+        self._other_clock = 0, 0  # the last boot time (ms) of another clock, and its time of reception (µs)
         self._stamps: dict[int, int] = {}  # the last boot time (ms) of each kind of message
         self._behind = 0
         self._changes: list[int] = []
@@ -334,7 +335,8 @@ class VehicleState:
     def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
         """Process the boot time of the message id `kind`, and detect a reboot or a second autopilot.
 
-        Late packets, and messages that are sent long after their time stamp, count as neither.
+        Late packets, and messages that are sent long after their time stamp, count as neither. A boot time
+        that goes back and continues another clock is not a reboot.
         """
         ahead_ms = _elapsed_ms(boot_ms, self._boot_ms)
         goes_on = _elapsed_ms(boot_ms, self._stamps.setdefault(kind, boot_ms)) >= -BACK_MS
@@ -347,18 +349,30 @@ class VehicleState:
             if self._behind < BELIEVED:
                 return
             self._behind = 0
-            self.reboots += 1
-            self.clock.reset()
-            self.on_reboot()
-            self._stamps.clear()
-            self._announcer.send_statustext(
-                f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING
-            )
-        elif self._behind or (self._boot_us and ahead_ms > (t_us - self._boot_us) // 1000 + LEAP_MS):
+            other_ms, other_us = self._other_clock
+            self._other_clock = self._boot_ms, self._boot_us
+            if other_us and abs(_elapsed_ms(boot_ms, other_ms) - (t_us - other_us) // 1000) <= LEAP_MS:
+                self._change(t_us)
+            else:
+                self._reboot()
+        elif self._behind:
             self._behind = 0
+            self._change(t_us)
+        elif self._boot_us and ahead_ms > (t_us - self._boot_us) // 1000 + LEAP_MS:
+            self._other_clock = self._boot_ms, self._boot_us
             self._change(t_us)
         if ahead_ms > 0 or ahead_ms < -BACK_MS or not self._boot_us:
             self._boot_ms, self._boot_us = boot_ms, t_us
+
+    def _reboot(self) -> None:
+        """Count and report a reboot, and reset what it ends."""
+        self.reboots += 1
+        self.clock.reset()
+        self.on_reboot()
+        self._stamps.clear()
+        self._announcer.send_statustext(
+            f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING
+        )
 
     def _change(self, t_us: int) -> None:
         """Count a change of the boot clock at `t_us`; report two autopilots after `TWICE` recent changes."""

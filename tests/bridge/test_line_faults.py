@@ -120,7 +120,7 @@ def with_another_bridge() -> Retell:
         (tripled, "", 0, 0, 0.5),
         (shuffled, "", 3, 0, 0.5),  # those that were kept back in the end
         (with_another_vehicle, "vehicle 2 is on the link too: ignored", 0, 0, 0.5),
-        (with_another_autopilot, "two autopilots send as 1:1", inf, 1, 6.0),  # two sequences and two clocks
+        (with_another_autopilot, "two autopilots send as 1:1", inf, 0, 6.0),  # two sequences and two clocks
         (with_another_bridge, "another program sends as 1:191", 0, 0, 0.5),
     ],
     ids=["three times", "out of order", "another vehicle", "another autopilot", "another bridge"],

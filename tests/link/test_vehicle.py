@@ -56,7 +56,32 @@ def test_a_reboot_is_distinguished_from_late_messages_and_from_two_autopilots(
 
 
 def test_two_autopilots_in_bursts(link: Line) -> None:
-    assert TWO[0] in boots(link, link.autopilot, [boot + 100 * i for i in range(12) for boot in BURST])
+    times = [boot + 100 * i for i in range(12) for boot in BURST]
+    assert boots(link, link.autopilot, times) == [*REBOOTED, *TWO]
+
+
+@pytest.mark.parametrize("interval", [5, 50])
+@pytest.mark.parametrize("other_ms", [-40_000, 20_000, 5_000_000, 1_764_000_000_000])
+@pytest.mark.parametrize("burst", [1, 4])
+def test_a_second_clock_causes_no_reboots(link: Line, interval: int, other_ms: int, burst: int) -> None:
+    """Attitudes at 10 Hz, and in each `interval` some named values with the time of another clock."""
+    texts = []
+    for i in range(600):
+        texts += link.texts(link.to(1 + i * 0.1))
+        now_ms = 1_000_000 + 100 * i
+        texts += link.texts(link.fly("ATTITUDE", time_boot_ms=now_ms))
+        if i % interval == 0:
+            stamp = {"time_boot_ms": (now_ms + other_ms) % (1 << 32)}
+            texts += link.texts(link.give(link.autopilot.pack("NAMED_VALUE_FLOAT", **stamp) * burst))
+    reboots = link.component.vehicle.reboots
+    is_behind = other_ms % (1 << 32) > 1 << 31
+    assert reboots <= (is_behind and burst > 1)  # the first time, it looks like a reboot
+    assert texts == REBOOTED * reboots + TWO * (interval == 5)
+    texts = []
+    for i in range(10):  # the autopilot reboots
+        texts += link.texts(link.to(62 + i * 0.1))
+        texts += link.texts(link.fly("ATTITUDE", time_boot_ms=1000 + 100 * i))
+    assert texts == REBOOTED
 
 
 def test_telemetry_that_is_sent_long_after_it_was_stamped_is_not_a_reboot(link: Line) -> None:
