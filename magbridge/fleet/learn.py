@@ -183,6 +183,9 @@ CHANGED_PREFIX = "changed: "
 """Prefix of the refit of a changed deployment."""
 MAX_ROUNDS = 8
 """Largest number of times that a fleet is learned without the deployments found to have changed."""
+SUSPICION_PROBABILITY = 0.05
+"""Probability with which the first round omits an unchanged deployment. The first variances are those with
+all changed deployments, which hide each other; the later rounds use :data:`FALSE_ALARM_PROBABILITY`."""
 
 
 def learn_fleet(
@@ -209,7 +212,7 @@ def learn_fleet(
     with threadpool_limits(1, "blas"):
         observed = tuple(Observed(one.vehicle, one.refit, one.brought(parameters, basis)) for one in lessons)
         groups = _groups(exponents)
-        changed = frozenset[int]()
+        changed, alarm = frozenset[int](), SUSPICION_PROBABILITY
         for _ in range(MAX_ROUNDS):
             kept = [one for k, one in enumerate(observed) if k not in changed]
             shapes = _shapes(kept, groups, mounted, exponents, parameters, basis)
@@ -217,20 +220,23 @@ def learn_fleet(
             fleet = Fleet(
                 parameters, exponents, basis, population, mounted, tuple(lessons), observed, changed
             )
-            if (found := _changed_deployments(fleet)) <= changed:
+            if (found := _changed_deployments(fleet, alarm)) == changed:
                 break
-            changed |= found
+            changed, alarm = found, FALSE_ALARM_PROBABILITY
     return fleet
 
 
-def _changed_deployments(fleet: Fleet) -> frozenset[int]:
-    """Return the indices of the deployments that differ from their vehicle's earlier unchanged ones."""
+def _changed_deployments(fleet: Fleet, alarm: float) -> frozenset[int]:
+    """Return the indices of the deployments that differ from their vehicle's earlier unchanged ones.
+
+    An unchanged deployment is among them with the probability `alarm`.
+    """
     past: dict[str, list[Observed]] = {}
     found = set[int]()
     for k, (lesson, seen) in enumerate(zip(fleet.lessons, fleet.observed, strict=True)):
         mine = past.setdefault(lesson.vehicle, [])
-        before = fleet.predicted(mine, lesson.vehicle, lesson.refit)
-        if mine and _compare(fleet, lesson, before, refitted=False).changes:
+        known = fleet.predicted(mine, lesson.vehicle, lesson.refit)
+        if mine and _compare(fleet, lesson, known, alarm=alarm).changes:
             found.add(k)
         else:
             mine.append(seen)
@@ -285,22 +291,28 @@ def _groups(exponents: Sequence[Exponents]) -> IndexArray:
     return np.array([order[name] for name in names], np.intp)
 
 
-FIXED = "hard iron"
+FIXED, SOFT = "hard iron", "soft iron"
+SOFT_AXES = "xx", "yy", "zz", "xy", "xz", "yz"
+"""Axes of the six elements of soft iron; the first three contain the gains of the axes."""
 FALSE_ALARM_PROBABILITY = 1e-3
-"""Probability of a false alarm in a deployment, over all monitored coefficients."""
+"""Probability of a false alarm in a deployment, over all monitored quantities."""
+NOISE = "noise"
+LOG_NOISE_SIGMA = 0.3
+"""Standard deviation of the logarithm of the noise between deployments of a vehicle. It is assumed, not
+estimated: a change of the noise is reported above a factor of about three."""
 
 
 class Change(NamedTuple):
-    """Significant change of a coefficient; the field names are the keys of the JSON output."""
+    """Significant change of a coefficient or the noise; the field names are the keys of the JSON output."""
 
     what: str
-    """Name of the coefficient: mass or hard iron, and axis."""
+    """Name of the coefficient: mass, hard iron or soft iron, and axis; or noise."""
     by_nT: float  # noqa: N815 - the JSON key
-    """Change of the coefficient from its prediction, nT."""
+    """Change from the prediction, nT; for soft iron in a field of :data:`REFERENCE_FIELD_NT`."""
     sigmas: float
     """Change divided by its standard deviation."""
     chance: float
-    """Probability that any coefficient of an unchanged vehicle changes by as many sigmas."""
+    """Probability that any quantity of an unchanged vehicle changes by as many sigmas."""
     cause: str
     """Likely cause, and if a refit is on record."""
 
@@ -310,7 +322,7 @@ class History:
     """A vehicle's coefficients from deployment to deployment."""
 
     names: tuple[str, ...]
-    """Names of the k coefficients: hard iron, and the effect of each mass over half its range."""
+    """Names of the k coefficients: hard iron, the effect of each mass over half its range, soft iron."""
     lessons: tuple[Lesson, ...]
     """Deployments of the vehicle in the order of time."""
     expected: FloatArray
@@ -332,18 +344,21 @@ def history(fleet: Fleet, vehicle: str) -> History:
     the posterior N(m', P). Under the model, ``Cov(m' - m) = S - P``. So the change of a coefficient, divided
     by its sigma, has a standard normal distribution, however much the runs determine. A change is reported if
     the probability of a change as large is below :data:`FALSE_ALARM_PROBABILITY` over all monitored
-    coefficients.
+    coefficients and the noise. The noise is compared with the median of the earlier deployments.
     """
     indices = [k for k, one in enumerate(fleet.lessons) if one.vehicle == vehicle]
     mine = tuple(fleet.lessons[k] for k in indices)
     rows: list[_Comparison] = []
     for k, lesson in enumerate(mine):
         refitted = lesson.refit not in {one.refit for one in mine[:k]}
-        before = fleet.known(vehicle, lesson.refit, lesson.time)
-        rows.append(_compare(fleet, lesson, before, refitted=refitted))
+        known = fleet.known(vehicle, lesson.refit, lesson.time)
+        rows.append(_compare(fleet, lesson, known, refitted=refitted))
     expected, sigma, found, left = (np.array([row[k] for row in rows]) for k in range(4))
     # the first deployment has no predecessor
-    changes = tuple(row.changes if k else () for k, row in enumerate(rows))
+    changes = tuple(
+        (*row.changes, *_noise_change(mine[:k], mine[k], len(row.found))) if k else ()
+        for k, row in enumerate(rows)
+    )
     omitted = tuple(k in fleet.changed for k in indices)
     return History(_looked_at(fleet)[0], mine, expected, sigma, found, left, changes, omitted)
 
@@ -358,8 +373,18 @@ class _Comparison(NamedTuple):
     changes: tuple[Change, ...]
 
 
-def _compare(fleet: Fleet, lesson: Lesson, known: Known, *, refitted: bool) -> _Comparison:
-    """Compare a deployment with the prediction `known`; `refitted` if a new refit is on record."""
+def _compare(
+    fleet: Fleet,
+    lesson: Lesson,
+    known: Known,
+    *,
+    refitted: bool = False,
+    alarm: float = FALSE_ALARM_PROBABILITY,
+) -> _Comparison:
+    """Compare a deployment with the prediction `known`; `refitted` if a new refit is on record.
+
+    `alarm` is the probability of a false alarm.
+    """
     names, places = _looked_at(fleet)
     evidence = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
     S = known.covariance
@@ -368,8 +393,8 @@ def _compare(fleet: Fleet, lesson: Lesson, known: Known, *, refitted: bool) -> _
     found = (P @ evidence.vector + gain[:, -1])[places]
     expected, variance, left = known.mean[places], np.diag(S)[places], np.diag(P)[places]
     moved = np.sqrt(np.maximum(variance - left, 0.0))
-    changes = tuple(_significant_changes(names, found - expected, moved, refitted))
-    return _Comparison(expected, np.sqrt(variance), found, np.sqrt(left), changes)
+    changes = _significant_changes(names, found - expected, moved, refitted, alarm)
+    return _Comparison(expected, np.sqrt(variance), found, np.sqrt(left), tuple(changes))
 
 
 def facts(history: History) -> dict[str, Any]:
@@ -392,37 +417,53 @@ def facts(history: History) -> dict[str, Any]:
 
 
 def _significant_changes(
-    names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool
+    names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool, alarm: float
 ) -> list[Change]:
     """Return the significant changes among `moves` (k,), nT, with 1-sigma `sigmas` (k,), largest first."""
     found = []
     for name, move, sigma in zip(names, moves, sigmas, strict=True):
         z = abs(move) / max(sigma, 1e-12)
-        chance = min(2.0 * float(norm.sf(z)) * len(names), 1.0)
-        if chance < FALSE_ALARM_PROBABILITY:
+        if (chance := _chance(z, len(names))) < alarm:
             found.append(Change(name, float(move), float(z), chance, _cause(name, refitted)))
     return sorted(found, key=lambda one: -one.sigmas)
+
+
+def _noise_change(earlier: Sequence[Lesson], lesson: Lesson, coefficients: int) -> list[Change]:
+    """Return the change of the noise from the median of the earlier deployments, if it is significant."""
+    known = float(np.median([one.noise for one in earlier]))
+    if not min(known, lesson.noise) > 0.0:  # a calibration made elsewhere may state no noise
+        return []
+    z = abs(float(np.log(lesson.noise / known))) / LOG_NOISE_SIGMA
+    if (chance := _chance(z, coefficients)) >= FALSE_ALARM_PROBABILITY:
+        return []
+    return [Change(NOISE, lesson.noise - known, z, chance, "sensor, wiring, currents, or disturbed runs")]
+
+
+def _chance(z: float, coefficients: int) -> float:
+    """Return the probability that one of several coefficients, or the noise, exceeds z sigmas."""
+    return min(2.0 * float(norm.sf(z)) * (coefficients + 1), 1.0)
 
 
 def _cause(name: str, refitted: bool) -> str:
     """Return the text of the likely cause of a coefficient's change."""
     mass, _, _ = name.rpartition(",")
-    what = (
-        "iron that was magnetised, fitted or removed"
-        if mass == FIXED
-        else f"another pack, moment or place of what {mass} moves"
-    )
+    what = {
+        FIXED: "iron that was magnetised, fitted or removed",
+        SOFT: "gain or axes of the sensor, or iron that was fitted or removed",
+    }.get(mass, f"another pack, moment or place of what {mass} moves")
     return f"{what}, {'more than refits do' if refitted else 'and no refit is on record'}"
 
 
 def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
-    """Return names and indices of the monitored coefficients: hard iron, and its change with each mass."""
-    names, places = [], []
+    """Return names and indices of the monitored coefficients.
+
+    They are the hard iron, its change with each mass, and the soft iron with the gains of the axes.
+    """
+    names = [f"{FIXED}, {axis}" for axis in "xyz"]
+    places = [6, 7, 8]
     for m, powers in enumerate(fleet.exponents):
-        if sum(powers) > 1:
+        if sum(powers) != 1:
             continue
-        mass = next((one.name for one, power in zip(fleet.parameters, powers, strict=True) if power), "")
-        for k, axis in enumerate("xyz"):
-            names.append(f"{mass or FIXED}, {axis}")
-            places.append(9 * m + 6 + k)
-    return tuple(names), places
+        names += [f"{fleet.parameters[powers.index(1)].name}, {axis}" for axis in "xyz"]
+        places += [9 * m + 6, 9 * m + 7, 9 * m + 8]
+    return (*names, *(f"{SOFT}, {axes}" for axes in SOFT_AXES)), [*places, *range(6)]

@@ -179,7 +179,7 @@ def _lesson(row: Row) -> Lesson:
     )  # fmt: skip
 
 
-ESTIMATE = "without changed deployments"
+ESTIMATE = "without changed deployments, from a clean start"
 """Name of the method that estimates variances; variances stored by another method are not used."""
 MAX_VARIANCE_FRACTION = 0.25
 """Posterior over prior variance below which the data are taken to have determined a direction."""

@@ -94,7 +94,7 @@ def _shown(
     """Return the values about a vehicle that the template of the page needs."""
     deployments = facts(history)["deployments"]
     for one in deployments:
-        one["masses"] = list(dict.fromkeys(change["what"].rpartition(",")[0] for change in one["changes"]))
+        one["masses"] = list(dict.fromkeys(change["what"].partition(",")[0] for change in one["changes"]))
     panels = [_panel(history, k) for k in range(len(history.names))] if history.lessons else []
     return {
         "name": name, "deployments": deployments, "panels": panels, "findings": found, "map": _survey(last),

@@ -1,6 +1,7 @@
 """Test that changed deployments are reported, and do not move the predictions of healthy vehicles."""
 
 import numpy as np
+import pytest
 
 from magbridge.calibration.model import Parameter
 from magbridge.estimation.information import GaussianInformation
@@ -25,14 +26,12 @@ def deployments(vehicle: str, count: int, seed: int) -> list[Lesson]:
     ]  # fmt: skip
 
 
-def moved(lesson: Lesson, by: float) -> Lesson:
-    """Return a deployment with the hard iron of x and y changed by `by`, nT."""
+def moved(lesson: Lesson, by: float, coefficients: slice = slice(6, 8)) -> Lesson:
+    """Return a deployment with coefficients changed by `by`, nT; by default the hard iron of x and y."""
     change = np.zeros(18)
-    change[6:8] = by
-    information = lesson.information
-    return lesson._replace(
-        information=GaussianInformation(information.precision, information.vector + change / NOISE_NT**2)
-    )
+    change[coefficients] = by
+    precision, vector = lesson.information.precision, lesson.information.vector
+    return lesson._replace(information=GaussianInformation(precision, vector + precision @ change))
 
 
 HEALTHY = [one for seed in range(6) for one in deployments(f"v{seed}", 4, seed)]
@@ -64,3 +63,13 @@ def test_a_change_that_lasts_and_its_repair_are_each_reported_once() -> None:
     reported = [{change.what for change in changes} for changes in found.changes]
     iron = {"hard iron, x", "hard iron, y"}
     assert reported == [set(), set(), iron, set(), set(), iron, set()]
+
+
+def test_a_changed_gain_and_more_noise_are_reported() -> None:
+    vehicle = deployments("changing", 4, 9)
+    vehicle[3] = moved(vehicle[3], 0.02 * REFERENCE_FIELD_NT, slice(1))._replace(noise=20.0)
+    found = history(learn_fleet([*HEALTHY, *vehicle]), "changing")
+    assert [change.what for change in found.changes[3]] == ["soft iron, xx", "noise"]
+    assert found.changes[3][0].by_nT == pytest.approx(1000.0, abs=100.0)
+    assert found.changes[3][1].by_nT == 18.0
+    assert not any(found.changes[:3])

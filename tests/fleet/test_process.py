@@ -176,7 +176,7 @@ def test_a_change_is_dated_and_reported(catalogue: Catalogue, tmp_path: Path, co
     assert {path.name for path in pages.iterdir()} == {"index.html", "comet.html", "fleet.json"}
     for text in (page.read_text(), (pages / "comet.html").read_text()):
         assert "<td class=changed>hard iron, y</td>" in text
-        assert text.count("<svg") == 6
+        assert text.count("<svg") == 12
         assert not any(colour in text for colour in PAGE_COLOURS)
         assert "src=" not in text
         assert 'href="http' not in text
