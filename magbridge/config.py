@@ -349,9 +349,21 @@ def parse(table: dict[str, Any], path: Path) -> Config:
                 f"expected one calibration of {main.label}, got this and its own; remove one",
             )
         calibration = CalibrationFile(file=main.calibration)
+    _check_sources(config.telemetry, path)
     return msgspec.structs.replace(
         config, sensor=main, more_sensors=tuple(others), calibration=calibration, path=path
     )
+
+
+def _check_sources(telemetry: dict[str, Telemetry], path: Path) -> None:
+    """Check that no two parameters have the same values; ConfigError: they have."""
+    names: dict[str, str] = {}
+    for name, one in telemetry.items():
+        values = (one.message, one.field, sorted(one.match.items()), one.component, one.scale, one.offset)
+        other = names.setdefault(repr(values), name)
+        if other != name:
+            text = f"expected other values than telemetry.{other}: message, match and field are equal"
+            raise ConfigError(path, f"telemetry.{name}", text)
 
 
 def _named_sensors(sensor: Any) -> dict[str, Any]:

@@ -24,13 +24,14 @@ from magbridge.bridge.port import cut
 from magbridge.bridge.run import Keeper, leave_wrong_devices, ports
 from magbridge.bridge.sensor import needed_units, open_correction, open_drivers, other_calibrations, unmet
 from magbridge.calibration.model import Calibration
-from magbridge.config import Config, Sensor, load, parse
+from magbridge.config import Config, Sensor, Telemetry, load, parse
 from magbridge.errors import ConfigError, MagbridgeError
 from magbridge.link.publish import check_publish
 from magbridge.link.telemetry import MIN_RATE_FRACTION, TelemetryMap
 from magbridge.link.vehicle import VehicleClock
 from magbridge.mavlink import Codec, Message, load_key, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.messages import MESSAGE_IDS
 from magbridge.records import Channel
 from magbridge.sensors import is_scalar, open_driver
 from magbridge.toml import load_toml
@@ -119,6 +120,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
         yield from _tried(lambda: load_key(key))
     for name, one in config.telemetry.items():
         yield from _tried(partial(TelemetryMap, {name: one}, config.link.autopilot, path))
+        yield from _unmatched(name, one, path)
     for name, rate in config.publish.items():
         yield from _tried(partial(check_publish, {name: rate}, path))
     if calibration is not None:
@@ -231,6 +233,14 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFaul
     key = "calibration.file" if config.calibration else "learning.prior"
     for doubt in calibration.warnings:
         yield ConfigFault(fatal=False, text=f"{config.path}: {key}: {doubt}")
+
+
+def _unmatched(name: str, source: Telemetry, path: Path) -> Iterator[ConfigFault]:
+    """Yield a fault if a parameter takes the values of all messages of a kind that states a name or index."""
+    fields = spec(source.message).fields if source.message in MESSAGE_IDS else {}
+    if not source.match and (key := next((key for key in ("name", "ind") if key in fields), "")):
+        text = f"none: every {source.message} is used, with any {key}; add {key} = ..."
+        yield ConfigFault(fatal=False, text=f"{path}: telemetry.{name}.match: {text}")
 
 
 def _map(config: Config, calibration: Calibration | None) -> Iterator[ConfigFault]:

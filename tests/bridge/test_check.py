@@ -225,10 +225,42 @@ def test_live_reports_silent_ports(
     command("run", "--live", "--config", rig.config, code=2)
 
 
+TWICE = (
+    GOOD
+    + """
+[telemetry.ballast]
+message = "NAMED_VALUE_FLOAT"
+match = {name = "battpos"}
+field = "value"
+"""
+)
+
+
+def test_a_source_that_two_parameters_share_is_an_error(config: Path) -> None:
+    config.write_text(TWICE)
+    (text,) = lines(config, fatal=True)
+    assert text.startswith("telemetry.ballast: expected other values than telemetry.battpos")
+    for other in ("scale = -1.0", "component = 7"):
+        config.write_text(TWICE + other)
+        assert not lines(config, fatal=True)
+
+
+@pytest.mark.parametrize(
+    ("message", "key", "match"), [("NAMED_VALUE_INT", "name", '"ballast"'), ("DEBUG", "ind", "7")]
+)
+def test_a_message_with_a_name_needs_a_match(config: Path, message: str, key: str, match: str) -> None:
+    table = f'[telemetry.ballast]\nmessage = "{message}"\nfield = "value"\n'
+    expected = f"telemetry.ballast.match: none: every {message} is used, with any {key}; add {key} = ..."
+    config.write_text(f"{GOOD}\n{table}")
+    assert expected in lines(config, fatal=False)
+    config.write_text(f"{GOOD}\n{table}match = {{{key} = {match}}}")
+    assert not any("match" in line for line in lines(config))
+
+
 def test_live_reports_a_wrong_rate(make_rig: Callable[..., Rig]) -> None:
-    rig = make_rig(sensor=("ascii", 'columns = ["x", "y", "z"]\nrate = 20.0'), hz=10.0)
+    rig = make_rig(sensor=("ascii", 'columns = ["x", "y", "z"]\nrate = 1.0'), hz=20.0)
     check, _ = listened(rig)
-    assert any("ascii sends 10 readings/s, but rate = 20" in one.text for one in check.faults)
+    assert any("ascii sends " in one.text and "readings/s, but rate = 1" in one.text for one in check.faults)
 
 
 def test_live_names_the_systems_that_send_and_telemetry_that_does_not_match(
