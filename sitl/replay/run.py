@@ -85,13 +85,15 @@ def _republished(files: Sequence[Path], config: Path, speed: float, log: Path | 
     begun = time.monotonic()
     stage.play(recorded.start, track(recorded.events(), "replaying"), speed)
     first = _first_difference(published, recorded.published)
+    beyond = max(len(published) - len(recorded.published), 0)
     return agreement(published, recorded) | {
         "files": [str(file) for file in files],
         "messages": recorded.messages,
         "bytes": len(recorded.published),
         "identical": first is None,
         "first_difference": first,
-        "beyond": max(len(published) - len(recorded.published), 0),
+        "beyond": beyond,
+        "is_cut": first == len(recorded.published) and beyond > 0,
         "same_config": load(config).digest == recorded.config_digest,
         "damages": recorded.damages,
         "seconds": time.monotonic() - begun,
@@ -257,10 +259,10 @@ def _counted(counts: dict[str, int]) -> str:
 def _own_log(result: Result) -> str:
     if result["identical"]:
         verdict = "republished bit for bit"
-    elif result["first_difference"] == result["bytes"] and result["beyond"]:
+    elif result["is_cut"]:
         verdict = (
-            f"republished bit for bit to the end of the log, and {result['beyond']} bytes beyond it: "
-            "the log is truncated, or the bridge sent less"
+            f"republished bit for bit to the end of the log; {result['beyond']} more bytes follow: "
+            "the log was cut, or the bridge was stopped before it sent them"
         )
     elif result["late_s"]:
         verdict = (

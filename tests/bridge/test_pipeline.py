@@ -93,7 +93,13 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
     assert agreement(published, Recorded(first)) == {"late_s": 0.0}
     more = {"files": second, "messages": recorded.messages, "bytes": 1, "seconds": 1.0, "same_config": True}
     words = summary(
-        {"runs": [result | more | {"identical": False, "first_difference": 0, "beyond": 0, "damages": 0}]}
+        {
+            "runs": [
+                result
+                | more
+                | {"identical": False, "is_cut": False, "first_difference": 0, "beyond": 0, "damages": 0}
+            ]
+        }
     )
     assert f"begins {recorded.late:.1f} s into the run" in words
 

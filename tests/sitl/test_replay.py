@@ -15,6 +15,8 @@ from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.calibration.model import Noise, identity
+from magbridge.cli import bridge as commands
+from magbridge.cli.common import FailedResult
 from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
 from magbridge.field.geodesy import offset
@@ -125,8 +127,11 @@ def test_a_log_that_breaks_off_is_the_same_as_far_as_it_goes_and_no_further(
         (run,) = replay([cut], path)["runs"]
         assert run["first_difference"] == (run["bytes"] if lacks else None)
         assert run["identical"] != lacks
+        assert run["is_cut"] == lacks
         assert 0 < run["beyond"] < 1000 or not lacks
         assert ("to the end of the log" in summary({"runs": [run]})) == lacks
+        if lacks:
+            commands.replay(cut, config=path)  # without FailedResult
 
 
 def test_another_configuration_is_distinguished(recorded: tuple[Path, Path], tmp_path: Path) -> None:
@@ -138,6 +143,8 @@ def test_another_configuration_is_distinguished(recorded: tuple[Path, Path], tmp
     assert not run["identical"]
     assert not run["same_config"]
     assert "not identical" in summary(result)
+    with pytest.raises(FailedResult, match="other values than the log holds"):
+        commands.replay(log, config=other)
 
 
 @pytest.mark.parametrize("motion", ["glide", "position"])
