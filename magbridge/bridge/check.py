@@ -170,6 +170,8 @@ def _other_sensors(config: Config, main: Calibration | None) -> Iterator[ConfigF
         except MagbridgeError as error:
             yield ConfigFault(fatal=True, text=str(error))
             continue
+        if own is not None:
+            yield from _unitless(own, config)
         if used is None and not (is_scalar(driver) and sensor.sigma is not None):
             why = f"the calibration is of {own.sensor.name!r}" if own is not None else "no calibration"
             text = f"{config.path}: {sensor.key}: {why}: every sample would be uncalibrated"
@@ -230,9 +232,21 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFaul
         return
     for error in unmet(needed_units(calibration), config):
         yield ConfigFault(fatal=True, text=str(error))
+    yield from _unitless(calibration, config)
     key = "calibration.file" if config.calibration else "learning.prior"
     for doubt in calibration.warnings:
         yield ConfigFault(fatal=False, text=f"{config.path}: {key}: {doubt}")
+
+
+def _unitless(calibration: Calibration, config: Config) -> Iterator[ConfigFault]:
+    """Yield a fault for each telemetry value without a unit that has one in the calibration."""
+    scalars = {channel.name: channel.unit for scalar in calibration.sensors for channel in scalar.channels}
+    for name, unit in (scalars | needed_units(calibration)).items():
+        if unit and name in config.telemetry and not config.telemetry[name].unit:
+            text = (
+                f"{config.path}: telemetry.{name}.unit: none: not compared with {unit!r}, the calibration's"
+            )
+            yield ConfigFault(fatal=False, text=text)
 
 
 def _unmatched(name: str, source: Telemetry, path: Path) -> Iterator[ConfigFault]:

@@ -154,6 +154,8 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         for key in ("scale", "range", "time_modulo", "rate"):
             if not isfinite(getattr(self, key) or 0.0):
                 raise ValueError(f"{key}: expected a finite number, got {getattr(self, key)}")
+        if self.scale == 0.0:
+            raise ValueError("scale: expected a number other than 0")
         named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns
         for name in named:
             if name not in ("x", "y", "z", "total_field", "-", *COLUMN_READERS):

@@ -225,6 +225,14 @@ def test_live_reports_silent_ports(
     command("run", "--live", "--config", rig.config, code=2)
 
 
+def test_a_unit_that_only_the_calibration_states_is_reported(config: Path) -> None:
+    expected = "telemetry.battpos.unit: none: not compared with 'in', the calibration's"
+    config.write_text(GOOD.replace('unit = "in"', ""))
+    assert expected in lines(config, fatal=False)
+    config.write_text(GOOD)
+    assert not any(".unit" in line for line in lines(config))
+
+
 TWICE = (
     GOOD
     + """

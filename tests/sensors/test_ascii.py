@@ -171,3 +171,8 @@ def test_lines_of_scalar_instruments(line: str, options: dict[str, Any], total: 
     assert reading.counts[0] * driver.nt_per_count == pytest.approx(total, abs=1e-4)
     assert is_scalar(driver)
     assert driver.frames_bad == 1
+
+
+def test_a_scale_of_zero_is_an_error() -> None:
+    with pytest.raises(ConfigError, match="options: scale: expected a number other than 0"):
+        open_driver("ascii", {"scale": 0.0})
