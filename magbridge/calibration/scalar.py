@@ -189,7 +189,9 @@ def scalar_design(
     columns = [*u.T]
     columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in INDUCED_PAIRS]
     columns += [u[:, i] * turn[:, j] for i in range(3) for j in range(3)]
-    smooth = np.where(np.isfinite(series.reference), series.reference, series.scalar)
+    known, smooth = np.isfinite(series.reference), series.scalar
+    if known.any():
+        smooth = np.interp(series.time, series.time[known], series.reference[known])
     columns.append(_rate(smooth, series.time))
     for channel, values in zip(channels, series.channels.T, strict=True):
         z = (values - channel.centre) / channel.scale
