@@ -33,6 +33,19 @@ def test_info_of_the_demo(deployment: Path, command: Command) -> None:
     assert battpos["lowest"] < battpos["highest"]
 
 
+def test_an_error_in_one_log_does_not_hide_the_others(deployment: Path, command: Command) -> None:
+    Path("bad.csv").write_text("not a log")
+    alone = command("info", "bad.csv", code=1).err
+    output = command("info", "bad.csv", "none.csv", deployment, "--json", code=1)
+    assert output.err.splitlines()[0] == alone.strip()
+    assert "none.csv: expected a file, there is none" in output.err
+    assert output.err.splitlines()[-1] == "magbridge: 2 of 3 logs cannot be read; see the lines above"
+    found = json.loads(output.out)
+    assert set(found) == {"bad.csv", "none.csv", str(deployment)}
+    assert found["bad.csv"]["error"] in alone
+    assert found[str(deployment)]["rows"]
+
+
 def test_info_says_what_is_missing() -> None:
     log = made("log", START + np.arange(9.0), {"mag_x": np.ones(9), "depth": np.full(9, np.nan)})
     facts = info(log)
