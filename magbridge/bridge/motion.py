@@ -149,6 +149,8 @@ ARMED = 128
 """Flag of HEARTBEAT.base_mode: the vehicle is armed."""
 STATE_UNKNOWN, ON_GROUND = 0, 1
 """Values of EXTENDED_SYS_STATE.landed_state (MAV_LANDED_STATE)."""
+DIFFERENTIAL_PRESSURE = 16
+"""Flag of SYS_STATUS.onboard_control_sensors_present: the vehicle has an airspeed sensor."""
 JUMP = 10.0
 """Step of a position, in excess of the motion by its velocity, that counts as a reset, m."""
 
@@ -198,6 +200,7 @@ class Motion:
         self._main_field = np.zeros(3)  # north, east, down, nT, at the time _main_us
         self._main_us = -MAX_MAIN_FIELD_AGE_US
         self._is_aircraft = self._armed = self._grounded = self._measures_wind = False
+        self._is_ardupilot = self._lacks_airspeed = False
         self._landed_state = STATE_UNKNOWN
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
@@ -207,7 +210,7 @@ class Motion:
             ATTITUDE=self._attitude, EKF_STATUS_REPORT=self._vouch, ESTIMATOR_STATUS=self._vouch,
             EXTENDED_SYS_STATE=self._extended, GLOBAL_POSITION_INT=self._global, GPS_RAW_INT=self._gps,
             HEARTBEAT=self._heartbeat, LOCAL_POSITION_NED=self._local, ODOMETRY=self._odometry,
-            RAW_IMU=self._gyro, VFR_HUD=self._speed,
+            RAW_IMU=self._gyro, SYS_STATUS=self._sensors, VFR_HUD=self._speed,
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
@@ -283,9 +286,18 @@ class Motion:
         if message.component == self._component.peer[1]:
             kind, stack = message["type"], message["autopilot"]
             self._is_aircraft, self._armed = kind in AIRCRAFT, bool(message["base_mode"] & ARMED)
-            is_ardupilot_boat = kind == MAV_TYPE.SURFACE_BOAT and stack == MAV_AUTOPILOT.ARDUPILOTMEGA
+            self._is_ardupilot = stack == MAV_AUTOPILOT.ARDUPILOTMEGA
+            is_ardupilot_boat = kind == MAV_TYPE.SURFACE_BOAT and self._is_ardupilot
             self._measures_wind = kind == MAV_TYPE.GROUND_ROVER or is_ardupilot_boat
             self._take_off_or_land(time_us)
+
+    def _sensors(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+        """Note if an ArduPilot has an airspeed sensor; without one, it sends a speed that depends on GPS."""
+        if message.component == self._component.peer[1] and self._is_ardupilot:
+            present = message["onboard_control_sensors_present"] & DIFFERENTIAL_PRESSURE
+            self._lacks_airspeed = not present
+            if self._lacks_airspeed and self.source is MotionSource.SPEED:
+                self.source = MotionSource.NONE  # the next best source is used at once
 
     def _extended(self, message: Message, time_us: int) -> None:
         if message.component == self._component.peer[1]:
@@ -306,7 +318,8 @@ class Motion:
         self._grounded = grounded
 
     def _speed(self, message: Message, time_us: int) -> None:
-        if self._measures_wind:  # the airspeed of a rover or an ArduPilot boat is not the speed of its medium
+        # the airspeed of a rover or an ArduPilot boat is not the speed of its medium
+        if self._measures_wind or self._lacks_airspeed:
             return
         speed = message["airspeed"]  # 0 of a vehicle that does not measure it
         is_ground = min(abs(speed - message["groundspeed"]), abs(speed - self._ground_speed)) < EQUAL_M_S

@@ -274,9 +274,13 @@ def needed_rates(
         names["ATTITUDE"] = (10.0, 4.0)
     if navigation:
         names |= {"VFR_HUD": (5.0, 2.0), "GPS_RAW_INT": (2.0, 1.0), "EKF_STATUS_REPORT": (1.0, 1.0)}
+        names["SYS_STATUS"] = (0.5, 0.5)  # states if the vehicle has an airspeed sensor
         names["EXTENDED_SYS_STATE"] = (1.0, 0.0)  # states if an aircraft is on the ground
         names["RAW_IMU"] = (1.0, 0.0)  # rates of the gyros without the autopilot's estimate of their bias
-    return rates | {(autopilot, spec(name).id): pair for name, pair in names.items()}
+    for name, pair in names.items():
+        stream = autopilot, spec(name).id
+        rates[stream] = max(pair, rates.get(stream, pair))
+    return rates
 
 
 class StreamRequests:

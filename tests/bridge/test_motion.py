@@ -187,6 +187,24 @@ def test_the_airspeed_of_a_rover_is_wind(kind: int, stack: int, used: bool) -> N
 
 
 @pytest.mark.parametrize(
+    ("stack", "sensors", "used"), [(ARDUPILOT, 15, False), (ARDUPILOT, 31, True), (PX4, 15, True)]
+)
+def test_an_ardupilot_without_an_airspeed_sensor_sends_no_airspeed(
+    stack: int, sensors: int, used: bool
+) -> None:
+    """A real ArduSub: VFR_HUD had an older GPS speed than GPS_RAW_INT; a right GPS was rejected for 380 s."""
+    bench = made("EXTERNAL_POSITION_ESTIMATE", stack)
+    bench.receive("HEARTBEAT", autopilot=stack, type=12)
+    bench.receive("ATTITUDE", yaw=0.0)
+    bench.receive("VFR_HUD", airspeed=1.2, groundspeed=1.1)
+    assert source(bench) is MotionSource.SPEED
+    bench.receive("SYS_STATUS", onboard_control_sensors_present=sensors)
+    bench.receive("LOCAL_POSITION_NED", vx=1.0, vy=0.5)
+    bench.receive("VFR_HUD", airspeed=1.2, groundspeed=1.1)
+    assert source(bench) is (MotionSource.SPEED if used else MotionSource.TRACK)
+
+
+@pytest.mark.parametrize(
     ("report", "flags"),
     [("EKF_STATUS_REPORT", 1 | 128), ("ESTIMATOR_STATUS", 2 | 128), ("ESTIMATOR_STATUS", 1)],
 )

@@ -247,8 +247,10 @@ def test_what_is_needed_depends_on_the_task() -> None:
     full = {spec(number).name for _, number in needed_rates(1, attitude=True, navigation=True)}
     assert full == {
         *("ATTITUDE", "EKF_STATUS_REPORT", "EXTENDED_SYS_STATE", "GLOBAL_POSITION_INT", "GPS_RAW_INT"),
-        *("RAW_IMU", "VFR_HUD"),
+        *("RAW_IMU", "SYS_STATUS", "VFR_HUD"),
     }
+    both = needed_rates(1, telemetry, attitude=False, navigation=True)
+    assert both[1, spec("SYS_STATUS").id] == plain[1, spec("SYS_STATUS").id] == (5.0, 2.0)
 
 
 # ---- Who may change what the bridge does, and whose telemetry counts -------------------------------------
