@@ -119,8 +119,9 @@ class Frame:
 
 MAX_SOURCE_AGE_US = 30_000_000
 """Time without data from a source of motion after which the next best source is used, µs."""
-GLIDING_US = 600_000_000
-"""Time after the last steep pitch for which the vehicle counts as a glider, µs."""
+GLIDING_US, MIN_DIVE_M = 600_000_000, 3.0
+"""Time after the last dive or climb for which the vehicle counts as a glider, µs; smallest change of depth
+of one, m, while the pitch is steep."""
 SPEED_WEIGHT = 0.1
 """Weight of each new speed in the running mean, which is used if no source of motion is left."""
 EQUAL_M_S = 0.011
@@ -139,6 +140,8 @@ MIN_HEADING_SIGMA_RAD, HEADING_INTERVAL_US = 0.07, 5_000_000
 current by it to the next, µs."""
 UNCHECKED_HEADING_SIGMA_RAD = 0.5
 """1-sigma of the autopilot's heading while it is wrong and no rates check it, rad: 20 to 40 deg were seen."""
+UNKNOWN_SPEED_RAD = 1.0
+"""1-sigma of the heading, rad, that stands for an unknown speed: the velocity is uncertain by its length."""
 MAX_RATE_RAD_S, MAX_FIELD_NT = 50.0, 1e6
 """Limits of a rate, rad/s, and of a field, nT, that no vehicle reaches."""
 NO_DIRECTION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.NO_BORESIGHT | Quality.LATE_JOIN)
@@ -191,11 +194,12 @@ class Motion:
         self._received_us = 0
         self._heading = self._pitch = self._last = nan
         self._steep_us = -GLIDING_US
+        self._dive_from = nan  # depth at which the pitch became steep, m
         self._ground_speed, self._equal = nan, 0  # m/s, by GPS; airspeeds in a row that were equal to it
         self._unvouched_us = (
             -MAX_SOURCE_AGE_US
         )  # when the autopilot last reported that its velocity does not hold
-        self._contradicted_us = self._gps_us = self._widened_us = -MAX_SOURCE_AGE_US
+        self._contradicted_us = self._gps_us = self._widened_us = self._guessed_us = -MAX_SOURCE_AGE_US
         self._filter = AttitudeFilter()
         self._main_field = np.zeros(3)  # north, east, down, nT, at the time _main_us
         self._main_us = -MAX_MAIN_FIELD_AGE_US
@@ -270,8 +274,7 @@ class Motion:
         own = message.component == self._component.peer[1]
         heading = self._turn(message, time_us) if own else message["yaw"]
         self._heading, self._pitch = degrees(heading) % 360.0, degrees(message["pitch"])
-        if abs(self._pitch) >= GLIDE:
-            self._steep_us = time_us
+        self._watch_for_glide(time_us)
         if self.source is MotionSource.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
             self._pass(time_us, heading=self._heading, pitch=self._pitch)
         elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
@@ -281,6 +284,22 @@ class Motion:
             MotionSource.LAST, time_us, "heading and the last known speed: no other is sent"
         ):
             self._pass(time_us, heading=self._heading, speed=self._last)
+            if time_us - self._guessed_us >= MAX_SOURCE_AGE_US:
+                self._guessed_us = time_us  # a speed that may have changed is as uncertain as its direction
+                self._navigator.widen_heading(time_us, UNKNOWN_SPEED_RAD)
+
+    def _watch_for_glide(self, time_us: int) -> None:
+        """Note when the vehicle last glided: while it is steep, its depth changes.
+
+        A vehicle with thrusters may also be steep when it accelerates.
+        """
+        depth = self._frame.depth(time_us)
+        if abs(self._pitch) < GLIDE or isnan(depth):
+            self._dive_from = nan
+        elif isnan(self._dive_from):
+            self._dive_from = depth
+        elif abs(depth - self._dive_from) >= MIN_DIVE_M:
+            self._steep_us = time_us
 
     def _heartbeat(self, message: Message, time_us: int) -> None:
         if message.component == self._component.peer[1]:

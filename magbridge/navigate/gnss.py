@@ -371,7 +371,6 @@ class _FieldTest:
         self.limit = log(options.alarm_odds)
         self._grid, self._options = grid, wider_level(options, grid.rms)
         self._claimed = options
-        self._time_us = NEVER
         self.restart()
 
     def restart(self) -> None:
@@ -382,7 +381,7 @@ class _FieldTest:
         self.separate_filters: list[Competitor] = []
         self._filtered = np.zeros(2)  # position at the last measurement
         self._positions: deque[tuple[int, float, float]] = deque(maxlen=RECENT_POSITIONS)
-        self._sigma = inf
+        self._sigma, self._time_us = inf, NEVER  # no comparison before the next position
         self._step = Step()  # since the last measurement that was used
 
     def unaided(self, *, by_field: bool) -> Bank | None:

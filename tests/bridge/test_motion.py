@@ -139,6 +139,32 @@ def test_speed_that_ends_is_not_followed_for_ever() -> None:
     assert moved(bench)[0] == pytest.approx(1.5 * 59, abs=3.0)
 
 
+@pytest.mark.parametrize(("sinks", "expected"), [(0.2, MotionSource.GLIDE), (0.0, MotionSource.LAST)])
+def test_a_vehicle_that_is_steep_at_one_depth_does_not_glide(sinks: float, expected: MotionSource) -> None:
+    """A real ArduSub pitches by 10 deg when it accelerates at the surface: no pitch then tells its speed."""
+    bench = made("EXTERNAL_POSITION_ESTIMATE", ARDUPILOT)
+    local(bench, 0, 0.0, vx=1.2)
+    bench.navigation.motion.gps_trusted = False  # the autopilot's velocity is not used
+    for k in range(1, 61):
+        bench.to(k)
+        bench.receive("LOCAL_POSITION_NED", z=10.0 + sinks * k)
+        bench.receive("ATTITUDE", yaw=0.0, pitch=-0.4)
+    assert source(bench) is expected
+
+
+def test_the_last_known_speed_is_uncertain_by_itself() -> None:
+    bench = made("EXTERNAL_POSITION_ESTIMATE", ARDUPILOT)
+    local(bench, 0, 0.0, vx=1.2)
+    bench.navigation.motion.gps_trusted = False
+    bench.navigation.navigator.fix(bench.now_us, *PLACE, 5.0)
+    for k in range(1, 41):
+        bench.to(k)
+        bench.receive("ATTITUDE", yaw=0.0)
+        sample(bench, *offset(*PLACE, 1.2 * k, 0.0))
+    assert source(bench) is MotionSource.LAST
+    assert np.sqrt(bench.navigation.navigator.estimate.P[2, 2]) > 0.8
+
+
 def test_without_any_motion_no_fix_is_sent() -> None:
     bench = made()
     bench.receive("GLOBAL_POSITION_INT", alt=-1000)
