@@ -5,7 +5,7 @@ learns p for each channel, and for all three together. Noise and resolution give
 noise of standard deviation :math:`\sigma` stays within a step q, if the field is in the middle of the step,
 with the probability :math:`\mathrm{erf}(q / (2 \sqrt 2 \sigma))`, and within the steps of all three channels
 with the third power. A single channel that repeats is evidence only while another channel moves by more than
-one step: the channels of a coarse sensor on a vehicle at rest may repeat for hours. Rounding gives the
+two steps: the channels of a coarse sensor on a vehicle at rest may repeat for hours. Rounding gives the
 readings of a moving vehicle a standard deviation of at least :math:`q / \sqrt{12}`.
 
 A value at which a channel was stuck is a limit of the channel's range, if no reading was ever beyond it.
@@ -50,8 +50,8 @@ MAX_PROBABILITY: Final = 1e-9
 MIN_STUCK_FRACTION: Final = 1e-3
 MIN_RUN: Final = 4
 MIN_COMMON_RUN: Final = 3
-MIN_MOTION_STEPS: Final = 1.5
-"""Change of a reading, in steps, above which the vehicle is not at rest."""
+MIN_MOTION_STEPS: Final = 2.5
+"""Change of a reading, in steps, above which the vehicle moves: two steps, with room for rounding."""
 AXIS_LETTERS: Final = "xyz"
 
 

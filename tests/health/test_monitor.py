@@ -215,8 +215,8 @@ def coarse_flags(raw: FloatArray, rate: int = 20) -> tuple[IntArray, BoolArray]:
 
 
 @pytest.mark.parametrize("rate", [1, 20])
-@pytest.mark.parametrize("noise", [0.5, 1.0, 2.0, 3.0, 4.0])
-def test_a_coarse_sensor_at_rest_is_not_stuck(noise: float, rate: int) -> None:
+@pytest.mark.parametrize("noise", [[0.5], [1.0], [2.0], [3.0], [4.0], [4.0, 4.0, 0.5]], ids=str)
+def test_a_coarse_sensor_at_rest_is_not_stuck(noise: list[float], rate: int) -> None:
     """One channel of several hundred readings may have one value, and another change by one step."""
     rng = np.random.default_rng(1)
     for _ in range(5):
