@@ -66,6 +66,7 @@ FIT_TEXTS = {
     "{left:.1f} are left (--heading-reference magnetic)",
     # Samples that were left out, and what the residuals show
     "outliers": "{count} of {samples} samples are outliers and were left out of the {product}",
+    "flagged_samples": "{count} of {samples} samples are flagged and left out: {flags}",
     "ends_left_out": "{samples} at the ends of the log left out: unlike the others (a crash?)",
     "without_position": "{samples} without a position: left out",
     "far_position": "{samples} far from all others (a jump in position): left out",

@@ -21,6 +21,7 @@ from magbridge.calibration.fitting.uncertainty import apart_from_level
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, require
 from magbridge.correction import Correction
+from magbridge.diagnostics import Diagnostic
 from magbridge.errors import DataError, FormatError
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
@@ -125,7 +126,7 @@ def corrected_by_others(ds: xr.Dataset) -> Samples:
     else:
         source = ds.attrs.get("source", "the log")
         raise FormatError(source, "expected mag_x mag_y mag_z, total_field or anomaly")
-    samples, known = located(ds, np.where(_doubtful(ds), np.nan, value - _daily(ds)))
+    samples, known = _unflagged(ds, ds, value)
     level_sigma = float(ds["level_sigma"].median()) if "level_sigma" in ds else 0.0
     return replace(samples.part(known), level_sigma=level_sigma)
 
@@ -138,11 +139,10 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
     require(ds, ("latitude", "longitude"))
     ds = at_one_time(ds)
     corrected = correct_rows(Correction(calibration), ds)
-    value = np.where(_doubtful(corrected), np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
-    samples, known = located(ds, value, by_line=False)
+    samples, known = _unflagged(ds, corrected, corrected["anomaly"].to_numpy(), by_line=False)
     field = np.stack([ds[name].to_numpy() for name in CHANNELS], axis=1)[known]
     channels = [
-        ds[name].to_numpy() if name in ds else np.full(len(value), np.nan) for name in calibration.channels
+        ds[name].to_numpy() if name in ds else np.full(len(known), np.nan) for name in calibration.channels
     ]
     read = np.stack(channels, axis=1)[known] if channels else np.empty((len(field), 0))
     return replace(
@@ -212,13 +212,31 @@ def joined(parts: Sequence[Samples]) -> Samples:
     return Samples(
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
         max(rho) if len(rho) == len(parts) else None, modes, max(one.level_sigma for one in parts),
+        tuple(reason for one in parts for reason in one.left_out),
     )  # fmt: skip
 
 
-def _doubtful(corrected: xr.Dataset) -> BoolArray:
-    """Return True for samples with a flag that may affect the field (n,); all False without flags."""
-    quality = np.asarray(corrected.get("quality", np.zeros(corrected.sizes["time"])), float)
-    return np.asarray(np.nan_to_num(quality).astype(int) & int(~Quality.NO_BORESIGHT), bool)
+def _unflagged(
+    ds: xr.Dataset, corrected: xr.Dataset, value: FloatArray, *, by_line: bool = True
+) -> tuple[Samples, BoolArray]:
+    """Return the rows of a log and a mask as :func:`located` does, without flags that may affect the field.
+
+    `value` (n,) is the anomaly, nT, with the daily variation; `corrected` has the flags, if there are any.
+    """
+    quality = np.nan_to_num(np.asarray(corrected.get("quality", np.zeros(len(value))), float)).astype(int)
+    flags = [flag for flag in Quality if flag != Quality.NO_BORESIGHT]
+    counts = {flag.names(): int((quality & flag != 0).sum()) for flag in flags}
+    doubtful = quality & int(~Quality.NO_BORESIGHT) != 0
+    reasons: tuple[Diagnostic, ...] = ()
+    if doubtful.any():
+        named = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+        values = {"count": int(doubtful.sum()), "samples": len(value), "flags": named}
+        reasons = (Diagnostic("flagged_samples", values),)
+    try:
+        samples, known = located(ds, np.where(doubtful, np.nan, value - _daily(ds)), by_line=by_line)
+    except FormatError as error:
+        raise FormatError(error.file, "; ".join([error.expected, *(one.text for one in reasons)])) from error
+    return replace(samples, left_out=reasons), known
 
 
 def _daily(ds: xr.Dataset) -> FloatArray | float:

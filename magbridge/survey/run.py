@@ -84,7 +84,7 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
 
     CalibrationError: the samples do not determine a map.
     """
-    warnings: list[Diagnostic] = []
+    warnings = [*samples.left_out]
     # 1. Leave out samples far from all others. 2. Grid. 3. Compare lines at their crossings before and after.
     far = far_off(samples.place)
     if count := int(far.sum()):
@@ -94,9 +94,10 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
         try:
             found = _gridded(samples, start)
         except np.linalg.LinAlgError as problem:
+            left_out = "".join(f"; {reason.text}" for reason in samples.left_out)
             raise CalibrationError(
                 f"the survey determines no map ({problem}): fly lines that cross, or give a calibration "
-                "(--calibration)"
+                f"(--calibration){left_out}"
             ) from problem
     ties = crossovers(samples.place, samples.line)
     B = found.at_samples(samples)

@@ -17,6 +17,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.spatial import cKDTree
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.diagnostics import Diagnostic
 from magbridge.estimation.blocks import BLOCK_ROWS, BlockColumns, ParameterBlock, in_chunks
 from magbridge.estimation.elimination import LinearisedRows, SampleSums, sum_rows
 from magbridge.estimation.gaussian_field import GaussianField
@@ -50,6 +51,8 @@ class Samples:
     """Change (n, r), nT, of every sample with 1-sigma of each uncertain combination of coefficients."""
     level_sigma: float = 0.0
     """1-sigma of the constant error of all samples (the reference bias), nT."""
+    left_out: tuple[Diagnostic, ...] = ()
+    """Why samples of the logs are not among these."""
 
     def __post_init__(self) -> None:
         n = len(self.value)

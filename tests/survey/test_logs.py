@@ -153,6 +153,23 @@ def test_what_correct_has_flagged_and_what_has_no_place_stay_out_of_the_map(
     assert np.std(error) < 1.5
 
 
+def test_flagged_samples_that_stay_out_of_the_map_are_counted(command: Command, tmp_path: Path) -> None:
+    """Half of a log cannot be the Earth's field: its crossings went with it, and nothing told why."""
+    log = flown("comet", with_ways([lanes(0), lanes(1)]))
+    n = log.sizes["time"]
+    log["mag_x"][n // 2 :] += 40_000.0
+    write(log, tmp_path / "log.nc")
+    words = tmp_path / "log.nc", "--calibration", calibrated("comet", tmp_path / "cal.json")
+    facts = json.loads(command("survey", *words, "-o", tmp_path / "map.nc", "--json").out)
+    (told,) = (warning for warning in facts["warnings"] if "flagged" in warning)
+    assert told.startswith(f"{n - facts['samples']} of {n} samples are flagged and left out: ")
+    assert "implausible" in told
+    log["mag_x"][: n // 2] += 40_000.0
+    write(log, tmp_path / "log.nc")
+    said = command("survey", *words, "-o", tmp_path / "map.nc", code=1).err
+    assert f"only 0 samples with a field and a position; {n} of {n} samples are flagged" in said
+
+
 def test_one_straight_line_has_a_crustal_field(command: Command, tmp_path: Path) -> None:
     """Distinguished or not, changes along it are neither noise nor only the vehicle's."""
     place = np.stack([np.linspace(-3000.0, 3000.0, 300), np.zeros(300)], axis=1)
