@@ -15,7 +15,8 @@ from magbridge.field.igrf import magnitude
 from magbridge.logs.checks import states_validity
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
-from magbridge.logs.naming import READING_RANGE_NT
+from magbridge.logs.mapping import bare
+from magbridge.logs.naming import HEIGHT_NAME, READING_RANGE_NT
 
 HORIZONTAL_POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
@@ -187,7 +188,11 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
     depth = log["depth"].dropna("time").to_numpy() if "depth" in log else np.empty(0)
-    if len(depth) and (middle := float(np.median(depth))) < -ABOVE:
+    heights = [one["name"] for one in columns if HEIGHT_NAME.fullmatch(bare(one["name"]))]
+    if "depth" not in log and heights:
+        hints.append(f'{heights[0]} is not used: as height above the sea, --column depth="{heights[0]}"')
+    is_height = "depth is minus" in str(log.attrs.get("guessed", ""))
+    if len(depth) and (middle := float(np.median(depth))) < -ABOVE and not is_height:
         hints.append(f"depth is {middle:.4g} m (median): if it counts upwards, scale = -1 in columns.toml")
     if moving := movers(log):
         hints.append(f"may move the field, for --parameter: {' '.join(moving)} (auto: those that do)")

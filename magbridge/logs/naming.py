@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 
@@ -15,7 +16,7 @@ from magbridge.columns import CHANNELS, COLUMNS, FURTHER_AXIS, NT_PER_UNIT, usua
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import BY_HOUR, DAY, SECONDS_OF_DAY
 from magbridge.logs.layout import PROJECTED_UNIT, Layout, Rows
-from magbridge.logs.mapping import CELL_NUMBER, NAMES, bare, is_unit, split
+from magbridge.logs.mapping import CELL_NUMBER, NAMES, ColumnSource, bare, is_unit, split
 
 AXES = "xyz"
 PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
@@ -51,6 +52,13 @@ UTM_HEADING = re.compile(r"([xy])_\w*?utm_?(\d{1,2})([ns])_m", re.IGNORECASE)
 """Heading of an easting or northing that names a zone of UTM, as MagComPy's ``X_NAD83UTM10N_m``."""
 LINE_NAMES = "line", "linename", "lineno", "linenumber"
 """Names of the column with the survey line, in lower case without punctuation."""
+HEIGHT_NAME = re.compile(
+    "(gps|gnss|msl|ellipsoid(al)?|baro|barometric)?(alt|altitude|height|hohe)"
+    "(msl|amsl|asl|gps|ellipsoid(al)?|wgs84)?(m|ft|feet)?"
+)
+"""Name of a column with the height above the sea, in lower case without punctuation."""
+HEIGHT_UNITS = {"m": 1.0, "ft": 0.3048, "feet": 0.3048, "km": 1e3}
+"""Unit of a height -> its size, m."""
 REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
 """Words in brackets after a heading that are not units."""
 DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
@@ -87,7 +95,7 @@ def name_columns(path: Path, layout: Layout, units: Sequence[str], rows: Rows) -
     lines = [k for k, name in enumerate(layout.names) if bare(name) in LINE_NAMES]
     if layout.foreign and len(lines) == 1:
         layout = layout.renamed({lines[0]: "line"})
-    layout = _with_utm(layout)
+    layout = _with_height(_with_utm(layout))
     layout = _with_time(layout, rows)
     return _without_texts(_with_total(_with_units_of_axes(layout, rows), rows), rows)
 
@@ -177,6 +185,31 @@ def _with_utm(layout: Layout) -> Layout:
         return layout
     layout = layout.renamed(names).with_units(dict.fromkeys(HEMISPHERES, *zones))
     return layout.guessing(f"position in the projection {layout.projection}")
+
+
+def _with_height(layout: Layout) -> Layout:
+    """Return the layout with the opposite of a height as ``depth``, if a log with positions has no depth."""
+    declared = layout.declared.columns.get("depth", ColumnSource())
+    if "depth" not in layout.names:
+        heights = [k for k, name in enumerate(layout.names) if HEIGHT_NAME.fullmatch(bare(name))]
+        if not (layout.foreign and heights and "latitude" in layout.names):
+            return layout
+        k = heights[0]
+    elif HEIGHT_NAME.fullmatch(bare(split(declared.heading or "")[0])) and declared.scale == 1.0:
+        k = layout.names.index("depth")
+    else:
+        return layout
+    name, unit = split(layout.headings[k])
+    unit = layout.units.get(layout.names[k], unit) or ("ft" if bare(name).endswith(("ft", "feet")) else "m")
+    if unit not in HEIGHT_UNITS:
+        return layout
+    source = msgspec.structs.replace(
+        declared, heading=layout.headings[k], unit="m", scale=-HEIGHT_UNITS[unit]
+    )
+    columns = {**layout.declared.columns, "depth": source}
+    layout = layout.renamed({k: "depth"}).with_units({"depth": "m"})
+    layout = replace(layout, declared=msgspec.structs.replace(layout.declared, columns=columns))
+    return layout.guessing(f"depth is minus {layout.headings[k]!r}, as height above the sea")
 
 
 def _with_time(layout: Layout, rows: Rows) -> Layout:

@@ -16,6 +16,7 @@ from magbridge import logs
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.logs import Options
 from magbridge.logs.deployment import passed_over
+from magbridge.logs.info import info
 
 HEADER = "time,mag_x [nT],mag_y [nT],mag_z [nT]"
 
@@ -371,6 +372,31 @@ def test_a_declared_unit_goes_before_the_heading(tmp_path: Path) -> None:
     declared = read(tmp_path, text, column=("heading=Hdg(mag) [rad]", "mag_x=Bx(raw) [mG]"))
     assert float(declared["heading"][0]) == pytest.approx(np.degrees(0.1))
     assert float(declared["mag_x"][0]) == 2_000_000.0
+
+
+HEIGHTS = ["altitude [m]", "altitude [ft]", "alt_ft", "GPS height", "Altitude_m", "alt_msl"]
+
+
+@pytest.mark.parametrize("heading", HEIGHTS)
+def test_a_height_is_the_opposite_of_the_depth(heading: str, tmp_path: Path) -> None:
+    """Ignored, it was 22 nT of total field at 1,000 m; declared as the depth, 50 nT."""
+    unit = 0.3048 if "ft" in heading else 1.0
+    text = lines(f"time,latitude,longitude,{heading}", lambda k: f"{NOON + k},45.0,-75.0,{1000.0 / unit}")
+    for column in ((), (f"depth={heading}",)):
+        log = read(tmp_path, text, column=column)
+        assert log["depth"].values == pytest.approx([-1000.0] * 40)
+        assert f"depth is minus {heading!r}, as height above the sea" in log.attrs["guessed"]
+        assert not [hint for hint in info(log)["hints"] if "depth" in hint]
+
+
+def test_a_height_beside_a_depth_or_without_positions_is_telemetry(tmp_path: Path) -> None:
+    """An underwater vehicle's altitude is its distance from the seabed."""
+    text = lines("time,latitude,longitude,depth,altitude [m]", lambda k: f"{NOON + k},45.0,-75.0,20,8")
+    log = read(tmp_path, text)
+    assert (log["depth"].values[0], log["altitude"].values[0]) == (20.0, 8.0)
+    log = read(tmp_path, lines("time,altitude [m]", lambda k: f"{NOON + k},8"))
+    assert "depth" not in log
+    assert any("altitude is not used" in hint for hint in info(log)["hints"])
 
 
 def test_columns_without_headings_are_called_by_their_numbers(tmp_path: Path) -> None:
