@@ -90,6 +90,8 @@ FIT_TEXTS = {
     # A survey's map
     "no_crossing_lines": "no line crosses another: only the smoothness of the crustal field separates it "
     "from line levels",
+    "misties_remain": "crossings differ by {misties_nT:.1f} nT after levelling, at a noise of "
+    "{noise_nT:.2f} nT: the map's sigma does not hold{divided}",
     "no_crossing_track": "the track never crosses itself: slow changes with time cannot be distinguished "
     "from the crustal field, and are in the map",
 }

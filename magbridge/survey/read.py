@@ -139,7 +139,7 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
     require(ds, ("latitude", "longitude"))
     ds = at_one_time(ds)
     corrected = correct_rows(Correction(calibration), ds)
-    samples, known = _unflagged(ds, corrected, corrected["anomaly"].to_numpy(), by_line=False)
+    samples, known = _unflagged(ds, corrected, corrected["anomaly"].to_numpy())
     field = np.stack([ds[name].to_numpy() for name in CHANNELS], axis=1)[known]
     channels = [
         ds[name].to_numpy() if name in ds else np.full(len(known), np.nan) for name in calibration.channels
@@ -153,13 +153,11 @@ def from_vector(ds: xr.Dataset, calibration: Calibration) -> Samples:
     )
 
 
-def located(
-    ds: xr.Dataset, value: FloatArray, name: str = "a field", *, by_line: bool = True
-) -> tuple[Samples, BoolArray]:
+def located(ds: xr.Dataset, value: FloatArray, name: str = "a field") -> tuple[Samples, BoolArray]:
     """Return all rows of a log as samples, and a mask (n,) of the rows with a value and a position.
 
-    `value` (n,) is the anomaly, nT, NaN where unknown; `name` is its name in the error. With `by_line` the
-    log's ``line`` and ``line_type`` divide it into lines. FormatError: fewer than ten usable rows.
+    `value` (n,) is the anomaly, nT, NaN where unknown; `name` is its name in the error. The log's ``line``
+    and ``line_type`` divide it into lines. FormatError: fewer than ten usable rows.
     """
     longitude, latitude, depth = positions(ds)
     known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
@@ -169,7 +167,7 @@ def located(
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     place = np.stack(separation(*origin, latitude, longitude), axis=1)
     line, tie = np.zeros(len(value), int), np.zeros(len(value), bool)
-    if by_line and "line" in ds:
+    if "line" in ds:
         names = ds["line"].to_numpy()
         names = names.astype(str) if names.dtype.kind == "O" else names
         line = np.unique(names, return_inverse=True)[1].ravel()
@@ -216,9 +214,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     )  # fmt: skip
 
 
-def _unflagged(
-    ds: xr.Dataset, corrected: xr.Dataset, value: FloatArray, *, by_line: bool = True
-) -> tuple[Samples, BoolArray]:
+def _unflagged(ds: xr.Dataset, corrected: xr.Dataset, value: FloatArray) -> tuple[Samples, BoolArray]:
     """Return the rows of a log and a mask as :func:`located` does, without flags that may affect the field.
 
     `value` (n,) is the anomaly, nT, with the daily variation; `corrected` has the flags, if there are any.
@@ -233,7 +229,7 @@ def _unflagged(
         values = {"count": int(doubtful.sum()), "samples": len(value), "flags": named}
         reasons = (Diagnostic("flagged_samples", values),)
     try:
-        samples, known = located(ds, np.where(doubtful, np.nan, value - _daily(ds)), by_line=by_line)
+        samples, known = located(ds, np.where(doubtful, np.nan, value - _daily(ds)))
     except FormatError as error:
         raise FormatError(error.file, "; ".join([error.expected, *(one.text for one in reasons)])) from error
     return replace(samples, left_out=reasons), known

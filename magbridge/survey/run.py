@@ -24,6 +24,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, DataError
+from magbridge.estimation.residual import robust_scale
 from magbridge.survey.alignment import ScalarTerms, align
 from magbridge.survey.gridding import Gridded, gridded
 from magbridge.survey.read import corrected_by_others, from_vector, joined, scalar_rows
@@ -37,6 +38,8 @@ __all__ = ["Result", "facts", "samples_of", "scalar_survey", "summary", "survey"
 
 DRAWN_TRACKS = 16
 """Number of random fields and position errors that estimate the effect of a track's jumps."""
+CONTRADICTION, MIN_MISTIE_NT = 2.5, 0.5
+"""Mis-ties after levelling above which a warning is given, as a multiple of the noise and in nT."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +113,11 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
         crossed(*courses(samples.place), PLACE_LENGTH_FRACTION * found.field.length)
     ):
         warnings.append(Diagnostic("no_crossing_track"))
+    left = robust_scale(after) if len(after) else 0.0
+    if left > max(CONTRADICTION * found.sigma, MIN_MISTIE_NT):
+        divided = "" if samples.line.any() else "; a column line gives each line a level of its own"
+        values = {"misties_nT": left, "noise_nT": found.sigma, "divided": divided}
+        warnings.append(Diagnostic("misties_remain", values))
     if found.size > found.sigma:
         warnings += too_rough(samples.place, found.field.length)
     if (out := int((~found.kept).sum())) > 0.02 * len(residual):

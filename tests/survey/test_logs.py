@@ -170,6 +170,27 @@ def test_flagged_samples_that_stay_out_of_the_map_are_counted(command: Command, 
     assert f"only 0 samples with a field and a position; {n} of {n} samples are flagged" in said
 
 
+def test_lines_of_a_raw_log_get_a_level_each_and_without_them_the_misties_are_told(
+    command: Command, tmp_path: Path
+) -> None:
+    """Twelve lines whose levels differ by 12 nT: the mis-ties are ten times the noise."""
+    place = np.concatenate([lanes(0), lanes(1)])
+    half = np.arange(len(place) // 2) // 52  # 44 places of a line, 8 of the way to the next
+    line = np.concatenate([half, half + 6])
+    levels = np.random.default_rng(3).normal(0.0, 12.0, line.max() + 1)[line]
+    log = flown("comet", place, varied=levels)
+    words = tmp_path / "log.nc", "--calibration", calibrated("comet", tmp_path / "cal.json")
+    write(log, tmp_path / "log.nc")
+    *_, facts = judged(command, tmp_path, *words)
+    assert any("a column line gives each line a level of its own" in text for text in facts["warnings"])
+    write(log.assign(line=("time", line.astype(float))), tmp_path / "log.nc")
+    error, _, facts = judged(command, tmp_path, *words)
+    assert facts["lines"] == line.max() + 1
+    assert facts["misties_after_nT"] < 0.3 * facts["misties_before_nT"]
+    assert np.std(error) < 3.0 * NOISE
+    assert not any("crossings differ" in text for text in facts["warnings"])
+
+
 def test_one_straight_line_has_a_crustal_field(command: Command, tmp_path: Path) -> None:
     """Distinguished or not, changes along it are neither noise nor only the vehicle's."""
     place = np.stack([np.linspace(-3000.0, 3000.0, 300), np.zeros(300)], axis=1)
