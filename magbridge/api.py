@@ -85,7 +85,8 @@ def calibrate(
     names = telemetry_columns(log, scalar) if channels is None else channels
     map_known = grid is not None or "reference_field" in log
     known = calibrate_scalar(log, found, scalar, names, grid=grid, map_known=map_known, lag=lag, lever=lever)
-    return replace(found, sensors=(known.sensor,))
+    doubts = (known.doubt,) if known.doubt else ()
+    return replace(found, sensors=(known.sensor,), warnings=(*found.warnings, *doubts))
 
 
 @overload

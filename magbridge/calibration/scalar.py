@@ -28,9 +28,9 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "RANGE_MARGIN", "CorrectedScalar",
-    "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "SensorDisagreement",
-    "compare_sensors", "correct_scalar", "scalar_design", "term_columns",
+    "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "RANGE_MARGIN", "REFERENCE_SIGMA_NT",
+    "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries",
+    "SensorDisagreement", "compare_sensors", "correct_scalar", "scalar_design", "term_columns",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19
@@ -68,7 +68,7 @@ class ScalarQuality(IntFlag):
     JUMP = 4
     """The reading jumped while the vector sensor's did not."""
     MISSING = 8
-    """A channel, the direction or the reading is unknown."""
+    """A channel, the direction or the reading is unknown: without a value, 0, or repeated."""
 
 
 class ScalarChannel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -189,9 +189,9 @@ def scalar_design(
     columns = [*u.T]
     columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in INDUCED_PAIRS]
     columns += [u[:, i] * turn[:, j] for i in range(3) for j in range(3)]
-    known, smooth = np.isfinite(series.reference), series.scalar
-    if known.any():
-        smooth = np.interp(series.time, series.time[known], series.reference[known])
+    smooth = series.reference if np.isfinite(series.reference).any() else series.scalar
+    if (known := np.isfinite(smooth)).any():
+        smooth = np.interp(series.time, series.time[known], smooth[known])
     columns.append(_rate(smooth, series.time))
     for channel, values in zip(channels, series.channels.T, strict=True):
         z = (values - channel.centre) / channel.scale

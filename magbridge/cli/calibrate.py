@@ -257,9 +257,8 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
         from magbridge.calibration.fitting.draw import draw_fit
 
         draw_fit(found.calibration, data, request.plot)
-    if not (found.supported or request.force):
-        why = found.warnings[0].text
-        raise DataError(f"{request.output}: not written, because {why}; --force writes it all the same")
+    if not found.supported:
+        _refuse(request, found.warnings[0].text)
     calibration, facts, text = found.calibration, _facts(found, data), ""
     if scalar and truth.reference != "scalar":
         with waiting("fitting the scalar"):
@@ -269,6 +268,12 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
     rows = f"; {counted(left_out, 'row')} without every value left out" if left_out else ""
     facts = {"file": str(request.output), "method": model.method, **facts, "left_out": left_out, **worth}
     return facts, f"{request.output}: {model.method}, {_summary(facts)}{rows}{text}"
+
+
+def _refuse(request: _Request, why: str) -> None:
+    """Do nothing with --force; otherwise DataError, and no file is written."""
+    if not request.force:
+        raise DataError(f"{request.output}: not written, because {why}; --force writes it all the same")
 
 
 def _fit(
@@ -378,6 +383,9 @@ def _with_scalar(
         lag=scalar.lag_s,
         lever=scalar.lever_m or (0.0, 0.0, 0.0),
     )
+    if fit.doubt:
+        _refuse(request, fit.doubt)
+        cli.complain(fit.doubt)
     facts["scalar"] = {
         "column": scalar.scalar,
         "channels": list(names),
@@ -397,7 +405,8 @@ def _with_scalar(
     if fit.merit:
         text += f"; {merit_text(fit.merit)} (fitted)"
     text += "".join(f"; {finding.text}" for finding in fit.findings[:MAX_LISTED_CONTRIBUTIONS])
-    return replace(calibration, sensors=(fit.sensor,)), text
+    doubts = (*calibration.warnings, fit.doubt) if fit.doubt else calibration.warnings
+    return replace(calibration, sensors=(fit.sensor,), warnings=doubts), text
 
 
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:

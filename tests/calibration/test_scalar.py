@@ -22,6 +22,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.file import decode_calibration, encode_calibration, load, save
 from magbridge.calibration.fitting import scalar_fit
 from magbridge.calibration.fitting.scalar_fit import ScalarFit, adapt_to_log, fit_scalar
+from magbridge.calibration.fitting.scalar_log import _without_repeated
 from magbridge.calibration.model import identity
 from magbridge.calibration.scalar import (
     ScalarQuality,
@@ -349,12 +350,49 @@ def test_commands_calibrate_and_correct_a_scalar(tmp_path: Path, capsys: pytest.
     back = logs.read(out)
     error = back["scalar_field"].to_numpy() - half(series, True).reference
     assert np.sqrt(np.mean(error**2)) < 2.0
-    assert np.mean(back["scalar_quality"].to_numpy().astype(int) & ScalarQuality.DISAGREES != 0) < 0.01
+    assert np.mean((back["scalar_quality"].to_numpy().astype(int) & ScalarQuality.DISAGREES) > 0) < 0.01
     assert main(["calibrate", str(tmp_path / "a.nc"), "--lag", "1", "-o", str(cal)]) == 2
     assert "--scalar COLUMN" in capsys.readouterr().err
     wrong = ["calibrate", str(tmp_path / "a.nc"), "--scalar", SCALAR, "--lever", "1,2", "-o", str(cal)]
     assert main(wrong) == 2
     assert "F,R,D" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("dead", [0.0, 54_000.0])
+def test_a_dead_zone_is_flagged_and_not_fitted(tmp_path: Path, dead: float) -> None:
+    series = half(flown(7), False)
+    frozen = np.zeros(len(series.time), bool)
+    frozen[600:700] = frozen[1500:1900] = True
+    write(series._replace(scalar=np.where(frozen, dead, series.scalar)), tmp_path / "a.nc")
+    log = mb.read(tmp_path / "a.nc")
+    corrected = mb.correct(mb.calibrate(log, scalar=SCALAR), log)
+    error = corrected["scalar_field"].to_numpy() - series.reference
+    assert np.sqrt(np.mean(error[~frozen] ** 2)) < 1.0
+    missing = (corrected["scalar_quality"].to_numpy().astype(int) & ScalarQuality.MISSING) > 0
+    np.testing.assert_array_equal(missing, frozen)
+
+
+def test_a_coarse_sensor_at_rest_may_repeat_its_reading() -> None:
+    reference = np.full(300, 50_000.0)
+    reading = np.round(reference + np.random.default_rng(1).normal(0.0, 0.2, 300))
+    reading[100:200] = 50_000.0
+    np.testing.assert_array_equal(_without_repeated(reading, reference), reading)
+    assert np.isnan(_without_repeated(reading, reference + 0.1 * np.arange(300.0))[100:200]).all()
+
+
+def test_a_compensation_that_improves_nothing_is_not_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    series = _part(half(flown(7), False), slice(1500))
+    random = np.random.default_rng(2)
+    write(series._replace(scalar=series.scalar + random.normal(0.0, 3_000.0, 1500)), tmp_path / "a.nc")
+    cal = tmp_path / "cal.json"
+    command = ["calibrate", str(tmp_path / "a.nc"), "--scalar", SCALAR, "-o", str(cal)]
+    assert main([*command, "--parameter", "relay"]) == 1
+    assert "improves nothing" in capsys.readouterr().err
+    assert not cal.exists()
+    assert main([*command, "--parameter", "relay", "--force"]) == 0
+    assert "improves nothing" in load(cal).warnings[-1]
 
 
 def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:

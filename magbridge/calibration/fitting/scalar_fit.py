@@ -38,6 +38,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.scalar import (
     CYCLE_LEVEL_SIGMA_NT,
     PLATFORM_TERMS,
+    REFERENCE_SIGMA_NT,
     ScalarChannel,
     ScalarNoise,
     ScalarSensor,
@@ -93,6 +94,8 @@ OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 """Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
 
 
+LEAST_GAIN = 0.99
+"""RMS after compensation in units of that before it, from which on nothing is improved."""
 FALSE_NAME_LEVEL = 1e-3
 """Probability of a finding by chance, over all terms that are tested."""
 
@@ -115,6 +118,16 @@ class ScalarFit:
     """Statistically significant lag, and channels that disturb the scalar (:data:`FALSE_NAME_LEVEL`)."""
     merit: dict[str, Any] | None = None
     """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
+
+    @property
+    def doubt(self) -> str:
+        """Return why the data do not support this compensation; empty if they do."""
+        if self.rms_after > max(LEAST_GAIN * self.rms_before, REFERENCE_SIGMA_NT):
+            return (
+                f"the compensation of {self.sensor.column} improves nothing: {self.rms_before:.0f} -> "
+                f"{self.rms_after:.0f} nT about the mean; its reading or the reference is wrong"
+            )
+        return ""
 
 
 def fit_scalar(

@@ -47,6 +47,12 @@ MAX_CHANNEL_GAP_S = 30.0
 """s between two values of a channel, across which it is not interpolated."""
 MAX_MODES, MIN_MODE_NT = 24, 0.02
 """Uncertain combinations of a compensation at most, and the RMS effect, nT, below which one is left out."""
+MIN_REPEATED_READINGS = 5
+"""Equal readings in a row, from which on a scalar magnetometer may be in its dead zone."""
+SMALL_STEP_QUANTILE = 0.05
+"""Quantile of the steps between different readings that stands for the sensor's resolution."""
+EXPECTED_STEPS = 10.0
+"""Steps of the expected field from sample to sample that are a change."""
 TELEMETRY_OF_SENSOR = ("sensor_temperature", "depth")
 """Columns with a meaning of their own that may also be telemetry channels."""
 SAMPLE_LABELS = {"run", "dive", "line", "line_type", "power_cycle"}
@@ -92,7 +98,6 @@ def calibrate_scalar(
     is not nT. CalibrationError: too few samples.
     """
     require(ds, (*CHANNELS, column, *names))
-    reading = scalar_reading(ds, column)
     reference = reference_field(moved_to_sensor(ds, lever), grid)
     if "daily_variation" in ds:
         reference = reference + ds["daily_variation"].to_numpy()
@@ -107,12 +112,13 @@ def calibrate_scalar(
         series, tuple(names), column=column, units=units, lag=lag, map_known=map_known, lever=lever
     )
     after = correct_scalar(fit.sensor, series).field - reference
-    return replace(fit, merit=merit_of(ds, reading - reference, after))
+    return replace(fit, merit=merit_of(ds, series.scalar - reference, after))
 
 
 def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
-    """Return a scalar magnetometer's reading (n,), nT; DataError: the column is not a total field in nT."""
+    """Return a scalar magnetometer's reading (n,), nT, NaN for 0; DataError: no total field in nT."""
     reading = ds[column].to_numpy().astype(float)
+    reading = np.where(reading == 0.0, np.nan, reading)
     median = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
     if not 1e4 < median < 1e5:
         source = ds.attrs.get("source", "the log")
@@ -120,6 +126,26 @@ def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
             f"{source}: column {column!r}: expected the total field in nT, got a median of {median:g}"
         )
     return reading
+
+
+def _without_repeated(reading: FloatArray, expected: FloatArray) -> FloatArray:
+    """Return a reading (n,), nT, with NaN where it is repeated while the `expected` (n,), nT, changes.
+
+    In its dead zone a sensor may repeat its last reading. A coarse sensor on a vehicle at rest repeats its
+    reading, too, so `expected` must change by more than the resolution and its own noise during the run.
+    """
+    if len(reading) < MIN_REPEATED_READINGS:
+        return reading
+    step = np.diff(reading)
+    small = np.abs(step[np.isfinite(step) & (step != 0.0)])
+    least = float(np.quantile(small, SMALL_STEP_QUANTILE)) if len(small) else 0.0
+    noise = np.abs(np.diff(expected))
+    least += EXPECTED_STEPS * float(np.median(noise[np.isfinite(noise)])) if np.isfinite(noise).any() else 0.0
+    first = np.flatnonzero(np.append(True, step != 0.0))
+    change = np.fmax.reduceat(expected, first) - np.fmin.reduceat(expected, first)
+    length = np.diff(np.append(first, len(reading)))
+    stuck = (length >= MIN_REPEATED_READINGS) & (change > least)
+    return np.where(np.repeat(stuck, length), np.nan, reading)
 
 
 def merit_of(ds: xr.Dataset, measured: FloatArray, compensated: FloatArray) -> dict[str, Any] | None:
@@ -223,10 +249,11 @@ def _series(
     """Return the rows of a log as arrays, telemetry interpolated to them."""
     time = np.asarray(ds["time"].to_numpy(), float)
     channels = [_at_rows(time, ds, name) for name in names]
+    expected = reference if np.isfinite(reference).any() else np.linalg.norm(vector, axis=1)
     cycle = ds["power_cycle"].to_numpy().astype(float) if "power_cycle" in ds else np.full(len(time), np.nan)
     return ScalarSeries(
         time,
-        ds[column].to_numpy().astype(float),
+        _without_repeated(scalar_reading(ds, column), expected),
         vector,
         reference,
         np.stack(channels, axis=1) if channels else np.empty((len(time), 0)),
