@@ -28,9 +28,10 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "RANGE_MARGIN", "REFERENCE_SIGMA_NT",
-    "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries",
-    "SensorDisagreement", "compare_sensors", "correct_scalar", "scalar_design", "term_columns",
+    "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "IMPOSSIBLE_FRACTION", "PLATFORM_TERMS", "RANGE_MARGIN",
+    "REFERENCE_SIGMA_NT", "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality",
+    "ScalarSensor", "ScalarSeries", "SensorDisagreement", "compare_sensors", "correct_scalar",
+    "scalar_design", "term_columns",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19
@@ -52,6 +53,8 @@ DISAGREEMENT_SIGMA = 4.0
 """Difference of two sensors, in its standard deviations, from which on it is flagged."""
 REFERENCE_SIGMA_NT = 145.0
 """1-sigma of the main-field model where no map is known (error model of the WMM 2020), nT."""
+IMPOSSIBLE_FRACTION = 0.2
+"""Distance from the reference, as a fraction of it, that neither crust nor vehicle explains."""
 MIN_AGREEING_SAMPLES = 10
 """Samples at which two sensors agree, from which on these show the crustal field."""
 BLAME_RATIO = 2.0
@@ -64,7 +67,7 @@ class ScalarQuality(IntFlag):
     EXTRAPOLATED = 1
     """A telemetry channel is outside the range of the fit."""
     DISAGREES = 2
-    """Scalar and vector sensor differ by more than their standard deviations allow."""
+    """The scalar differs from vector sensor or main field by more than the sigmas allow."""
     JUMP = 4
     """The reading jumped while the vector sensor's did not."""
     MISSING = 8
@@ -292,7 +295,8 @@ def compare_sensors(
     is added to the sensor that is the farther from the expected field, in standard deviations that include
     the expectation's own; to both where that does not distinguish them. The expected field is the reference
     plus what both sensors read of the crust before and after, where they agree: a disturbance that cancels a
-    crustal anomaly is thus not taken for the truth.
+    crustal anomaly is thus not taken for the truth. A scalar that is farther from the reference than
+    :data:`IMPOSSIBLE_FRACTION` of it disagrees, and the distance is an error.
     """
     with np.errstate(invalid="ignore"):
         difference = scalar - total
@@ -305,10 +309,11 @@ def compare_sensors(
         # Neither sensor is blamed alone where the expected field is unknown: both comparisons are False.
         blame_vector = off_total > BLAME_RATIO * off_scalar
         blame_scalar = off_scalar > BLAME_RATIO * off_total
-    scalar_excess = np.where(blame_vector, 0.0, excess)
+        far = np.abs(scalar - reference) > IMPOSSIBLE_FRACTION * reference
+    scalar_excess = np.where(far, (scalar - reference) ** 2, np.where(blame_vector, 0.0, excess))
     vector_excess = np.where(blame_scalar, 0.0, excess)
     jump = _jumps(scalar) & ~_jumps(total)
-    return SensorDisagreement(scalar_excess, vector_excess, np.asarray(disagrees), jump)
+    return SensorDisagreement(scalar_excess, vector_excess, np.asarray(disagrees | far), jump)
 
 
 def _expected_field(

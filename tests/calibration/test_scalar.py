@@ -395,6 +395,17 @@ def test_a_compensation_that_improves_nothing_is_not_written(
     assert "improves nothing" in load(cal).warnings[-1]
 
 
+def test_a_wrong_reference_is_refused_and_a_scalar_far_from_it_is_flagged(halves: Halves) -> None:
+    series, _, truth = halves
+    wrong = _part(series._replace(reference=0.5 * series.reference), slice(800))
+    found = fit_scalar(wrong, NAMES, map_known=True, lag=0.0)
+    assert "sign of the latitude" in found.doubt
+    n, one = 50, np.ones(50)
+    seen = compare_sensors(truth[:n] * 0.5, one, truth[:n] * 0.5, one, truth[:n])
+    assert seen.disagrees.all()
+    assert (np.sqrt(seen.scalar_variance) > 0.4 * truth[:n]).all()
+
+
 def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:
     series = flown(7)
     write(half(series, False), tmp_path / "a.nc")

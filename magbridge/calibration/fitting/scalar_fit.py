@@ -37,6 +37,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.scalar import (
     CYCLE_LEVEL_SIGMA_NT,
+    IMPOSSIBLE_FRACTION,
     PLATFORM_TERMS,
     REFERENCE_SIGMA_NT,
     ScalarChannel,
@@ -113,6 +114,8 @@ class ScalarFit:
     """Standard deviation of what each block adds to the fitted samples, nT."""
     left_out: int
     """Samples that were left out as outliers."""
+    removed: float
+    """Median of reading minus reference, nT."""
     log_evidence: float
     findings: tuple[Diagnostic, ...] = ()
     """Statistically significant lag, and channels that disturb the scalar (:data:`FALSE_NAME_LEVEL`)."""
@@ -122,6 +125,11 @@ class ScalarFit:
     @property
     def doubt(self) -> str:
         """Return why the data do not support this compensation; empty if they do."""
+        if abs(self.removed) > IMPOSSIBLE_FRACTION * self.sensor.reference_field:
+            return (
+                f"{self.sensor.column} reads {self.sensor.reference_field + self.removed:.0f} nT and the "
+                f"reference is {self.sensor.reference_field:.0f} nT: is the sign of the latitude right?"
+            )
         if self.rms_after > max(LEAST_GAIN * self.rms_before, REFERENCE_SIGMA_NT):
             return (
                 f"the compensation of {self.sensor.column} improves nothing: {self.rms_before:.0f} -> "
@@ -686,6 +694,7 @@ def _result(
     sensor = _marginal(sensor, GaussianInformation(X.T @ X, X.T @ y))
     return ScalarFit(
         sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
-        int((~kept).sum()) * problem.averaged, -state.cost,
+        int((~kept).sum()) * problem.averaged, float(np.nanmedian(series.scalar - series.reference)),
+        -state.cost,
         _findings(column, state, contribution, channels),
     )  # fmt: skip
