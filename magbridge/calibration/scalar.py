@@ -31,7 +31,7 @@ __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "IMPOSSIBLE_FRACTION", "PLATFORM_TERMS", "RANGE_MARGIN",
     "REFERENCE_SIGMA_NT", "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality",
     "ScalarSensor", "ScalarSeries", "SensorDisagreement", "compare_sensors", "correct_scalar",
-    "scalar_design", "term_columns",
+    "scalar_design", "term_columns", "unknown_direction_variance",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19
@@ -67,7 +67,7 @@ class ScalarQuality(IntFlag):
     EXTRAPOLATED = 1
     """A telemetry channel is outside the range of the fit."""
     DISAGREES = 2
-    """The scalar differs from vector sensor or main field by more than the sigmas allow."""
+    """The vector's direction is doubtful, or the scalar differs from vector or main field."""
     JUMP = 4
     """The reading jumped while the vector sensor's did not."""
     MISSING = 8
@@ -245,6 +245,27 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
     missing = ~np.isfinite(field)
     sigma = np.where(missing, np.inf, np.sqrt(variance))
     return CorrectedScalar(field, sigma, level_sigma, np.asarray(outside & ~missing), missing)
+
+
+def unknown_direction_variance(sensor: ScalarSensor, channels: FloatArray) -> FloatArray:
+    """Return the variance (n,), nT^2, of a compensation whose direction may be any; `channels` (n, k).
+
+    Notes
+    -----
+    The terms are u.p, u^T I u and z_k (u.c_k). The squares of p, of I without the part that is the same in
+    all directions, and of z_k c_k are added: an upper bound of each term's square.
+    """
+    mean = np.array(sensor.coefficients)
+    induced = np.zeros((3, 3))
+    for (i, j), value in zip(INDUCED_PAIRS, mean[PLATFORM_COLUMNS["induced"]], strict=True):
+        induced[i, j] = induced[j, i] = value
+    induced -= np.trace(induced) / 3.0 * np.eye(3)
+    constant = float((mean[PLATFORM_COLUMNS["permanent"]] ** 2).sum() + (induced**2).sum())
+    z = np.array([(channels[:, k] - one.centre) / one.scale for k, one in enumerate(sensor.channels)])
+    fields = mean[PLATFORM_TERMS : PLATFORM_TERMS + 3 * len(sensor.channels)].reshape(-1, 3)
+    return np.asarray(
+        constant + (np.nan_to_num(z) ** 2).T @ (fields**2).sum(axis=1) + np.zeros(len(channels))
+    )
 
 
 def _level(

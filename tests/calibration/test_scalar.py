@@ -22,7 +22,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.file import decode_calibration, encode_calibration, load, save
 from magbridge.calibration.fitting import scalar_fit
 from magbridge.calibration.fitting.scalar_fit import ScalarFit, adapt_to_log, fit_scalar
-from magbridge.calibration.fitting.scalar_log import _without_repeated
+from magbridge.calibration.fitting.scalar_log import _without_repeated, with_scalar
 from magbridge.calibration.model import identity
 from magbridge.calibration.scalar import (
     ScalarQuality,
@@ -34,6 +34,7 @@ from magbridge.calibration.scalar import (
 )
 from magbridge.cli import main
 from magbridge.errors import CalibrationError, FormatError
+from magbridge.records import Quality
 
 Halves = tuple[ScalarSeries, ScalarSeries, FloatArray]
 
@@ -404,6 +405,26 @@ def test_a_wrong_reference_is_refused_and_a_scalar_far_from_it_is_flagged(halves
     seen = compare_sensors(truth[:n] * 0.5, one, truth[:n] * 0.5, one, truth[:n])
     assert seen.disagrees.all()
     assert (np.sqrt(seen.scalar_variance) > 0.4 * truth[:n]).all()
+
+
+def test_a_doubtful_vector_makes_the_scalar_doubtful(tmp_path: Path) -> None:
+    series = half(flown(7), False)
+    write(series, tmp_path / "a.nc")
+    log = mb.read(tmp_path / "a.nc")
+    calibration = mb.calibrate(log, scalar=SCALAR)
+    vector = xr.Dataset(dict(mb.correct(replace(calibration, sensors=()), log)))
+    flags = np.zeros(len(series.time))
+    flags[300:700] = int(Quality.IMPLAUSIBLE)
+    corrected = with_scalar(vector.assign(quality=("time", flags)), log, calibration.sensors)
+    doubtful = (corrected["scalar_quality"].to_numpy().astype(int) & ScalarQuality.DISAGREES) > 0
+    assert doubtful[300:700].all()
+    assert doubtful[800:].mean() < 0.01
+    sigma = corrected["scalar_field_sigma"].to_numpy()
+    assert sigma[300:700].min() > 700.0  # the permanent field of [400, -250, 600] nT, and induced field
+    assert np.median(sigma[800:]) < 10.0
+    flags[:1500] = int(Quality.IMPLAUSIBLE)  # more than half: the axes are wrong everywhere
+    corrected = with_scalar(vector.assign(quality=("time", flags)), log, calibration.sensors)
+    assert corrected["scalar_field_sigma"].to_numpy().min() > 700.0
 
 
 def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:

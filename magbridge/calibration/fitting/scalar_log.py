@@ -25,11 +25,13 @@ from magbridge.calibration.scalar import (
     correct_scalar,
     scalar_design,
     term_columns,
+    unknown_direction_variance,
 )
 from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT, require, usual
 from magbridge.errors import DataError, FormatError
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.reference import reference_field
+from magbridge.records import Quality
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -170,16 +172,19 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
     sensor = next((one for one in sensors if one.column in log), None)
     if sensor is None:
         return corrected
-    found, seen, _, _ = _compensated(corrected, log, sensor)
+    found, seen, adapted, series = _compensated(corrected, log, sensor)
+    doubtful = _doubtful_direction(corrected)
+    variance = seen.scalar_variance
+    variance[doubtful] += unknown_direction_variance(adapted, series.channels)[doubtful]
     quality = np.zeros(len(found.field), int)
     for flag, rows in (
         (ScalarQuality.EXTRAPOLATED, found.extrapolated),
-        (ScalarQuality.DISAGREES, seen.disagrees),
+        (ScalarQuality.DISAGREES, seen.disagrees | doubtful),
         (ScalarQuality.JUMP, seen.jump),
         (ScalarQuality.MISSING, found.missing),
     ):
         quality[rows] |= int(flag)
-    widened = np.sqrt(found.sigma**2 + seen.scalar_variance)
+    widened = np.sqrt(found.sigma**2 + variance)
     columns = found.field, widened, found.level_sigma, quality.astype(float)
     added = {
         name: ("time", values, COLUMNS[name]._asdict())
@@ -188,6 +193,16 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
     wider = np.sqrt(corrected["total_field_sigma"].to_numpy() ** 2 + seen.vector_variance)
     own = {"total_field_sigma": ("time", wider, corrected["total_field_sigma"].attrs)}
     return corrected.assign(own | added)
+
+
+def _doubtful_direction(corrected: xr.Dataset) -> BoolArray:
+    """Return the samples (n,) whose vector is implausible; all, if it is at more than half of them.
+
+    The checks of the vector need some samples after a turn, so that a wrong axis is not flagged everywhere.
+    """
+    flags = np.asarray(corrected.get("quality", np.zeros(corrected.sizes["time"])), float)
+    implausible = (np.nan_to_num(flags).astype(int) & int(Quality.IMPLAUSIBLE)) > 0
+    return np.asarray(implausible | (implausible.mean() > 0.5))
 
 
 class Compensation(NamedTuple):
