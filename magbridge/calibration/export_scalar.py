@@ -99,6 +99,8 @@ void magbridge_correct_scalar(real reading, const real vector[3], const real tur
     }
     out->field = field;
     out->sigma = ROOT(variance > (real)0 ? variance : (real)0);
+    if (out->level_sigma > out->sigma)
+        out->level_sigma = out->sigma;
 }
 """)
 

@@ -237,6 +237,8 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
         platform = np.einsum("ni,ij,nj->n", design, covariance[:size, :size], design)
         joint = 2.0 * np.einsum("ni,ni->n", design, cross)
         variance = np.maximum(platform + joint + level_sigma**2, 0.0)
+        common = _common_variance(design, covariance[:size, :size], cross, level_sigma)
+        common = np.fmin(common, variance)
         variance += sensor.noise.white**2 + sensor.slow_variance
         low = np.array([channel.low for channel in known])
         high = np.array([channel.high for channel in known])
@@ -244,7 +246,30 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
         outside = ((series.channels < low - margin) | (series.channels > high + margin)).any(axis=1)
     missing = ~np.isfinite(field)
     sigma = np.where(missing, np.inf, np.sqrt(variance))
-    return CorrectedScalar(field, sigma, level_sigma, np.asarray(outside & ~missing), missing)
+    return CorrectedScalar(field, sigma, np.sqrt(common), np.asarray(outside & ~missing), missing)
+
+
+def _common_variance(
+    design: FloatArray, covariance: FloatArray, cross: FloatArray, level_sigma: FloatArray
+) -> FloatArray:
+    """Return the variance (n,), nT^2, that all samples of a power cycle share.
+
+    Notes
+    -----
+    The errors of two samples with the rows a, b (terms and level) have the covariance ``a^T C b``. Its mean
+    over all pairs of a power cycle is ``m^T C m``, with m the mean row. The level alone is not it: its error
+    is correlated with that of the terms. `cross` (n, m) and `level_sigma` (n,) are those of :func:`_level`.
+    """
+    variance = np.full(len(design), np.nan)
+    _, cycle = np.unique(np.column_stack([level_sigma, cross]), axis=0, return_inverse=True)
+    for index in range(cycle.max(initial=-1) + 1):
+        rows = cycle.ravel() == index
+        known = design[rows & np.isfinite(design).all(axis=1)]
+        if len(known):
+            mean, first = known.mean(axis=0), int(rows.argmax())
+            common = mean @ covariance @ mean + 2.0 * mean @ cross[first] + level_sigma[first] ** 2
+            variance[rows] = max(float(common), 0.0)
+    return variance
 
 
 def unknown_direction_variance(sensor: ScalarSensor, channels: FloatArray) -> FloatArray:

@@ -270,10 +270,10 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
     return facts, f"{request.output}: {model.method}, {_summary(facts)}{rows}{text}"
 
 
-def _refuse(request: _Request, why: str) -> None:
+def _refuse(request: _Request, reason: str) -> None:
     """Do nothing with --force; otherwise DataError, and no file is written."""
     if not request.force:
-        raise DataError(f"{request.output}: not written, because {why}; --force writes it all the same")
+        raise DataError(f"{request.output}: not written, because {reason}; --force writes it all the same")
 
 
 def _fit(

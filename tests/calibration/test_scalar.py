@@ -427,6 +427,23 @@ def test_a_doubtful_vector_makes_the_scalar_doubtful(tmp_path: Path) -> None:
     assert corrected["scalar_field_sigma"].to_numpy().min() > 700.0
 
 
+def test_the_common_sigma_is_the_part_that_all_samples_share() -> None:
+    series = _part(half(flown(8), False), slice(1200))
+    sensor = fit_scalar(series, CHANNELS, map_known=True, lag=0.0).sensor
+    size = len(sensor.coefficients) - 1
+    random = np.random.default_rng(1)
+    design = np.column_stack([scalar_design(series, sensor.channels, sensor.reference_field), np.ones(1200)])
+    draws = random.multivariate_normal(np.zeros(size + 1), sensor.total_covariance, 1000, method="eigh")
+    errors = draws @ design.T
+    found = correct_scalar(sensor, series)
+    assert (found.level_sigma <= found.sigma).all()
+    assert np.median(found.level_sigma) == pytest.approx(errors.mean(axis=1).std(), rel=0.1)
+    # What remains is the scatter about the common part, with the sensor's noise.
+    noise = sensor.noise.white**2 + sensor.slow_variance
+    scatter = np.mean((errors - errors.mean(axis=1)[:, None]) ** 2)
+    assert np.mean(found.sigma**2 - found.level_sigma**2) - noise == pytest.approx(scatter, rel=0.15)
+
+
 def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:
     series = flown(7)
     write(half(series, False), tmp_path / "a.nc")

@@ -49,7 +49,7 @@ MAX_CHANNEL_GAP_S = 30.0
 """s between two values of a channel, across which it is not interpolated."""
 MAX_MODES, MIN_MODE_NT = 24, 0.02
 """Uncertain combinations of a compensation at most, and the RMS effect, nT, below which one is left out."""
-MIN_REPEATED_READINGS = 5
+MIN_DEAD_READINGS = 5
 """Equal readings in a row, from which on a scalar magnetometer may be in its dead zone."""
 SMALL_STEP_QUANTILE = 0.05
 """Quantile of the steps between different readings that stands for the sensor's resolution."""
@@ -136,7 +136,7 @@ def _without_repeated(reading: FloatArray, expected: FloatArray) -> FloatArray:
     In its dead zone a sensor may repeat its last reading. A coarse sensor on a vehicle at rest repeats its
     reading, too, so `expected` must change by more than the resolution and its own noise during the run.
     """
-    if len(reading) < MIN_REPEATED_READINGS:
+    if len(reading) < MIN_DEAD_READINGS:
         return reading
     step = np.diff(reading)
     small = np.abs(step[np.isfinite(step) & (step != 0.0)])
@@ -146,7 +146,7 @@ def _without_repeated(reading: FloatArray, expected: FloatArray) -> FloatArray:
     first = np.flatnonzero(np.append(True, step != 0.0))
     change = np.fmax.reduceat(expected, first) - np.fmin.reduceat(expected, first)
     length = np.diff(np.append(first, len(reading)))
-    stuck = (length >= MIN_REPEATED_READINGS) & (change > least)
+    stuck = (length >= MIN_DEAD_READINGS) & (change > least)
     return np.where(np.repeat(stuck, length), np.nan, reading)
 
 
