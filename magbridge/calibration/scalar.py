@@ -193,9 +193,9 @@ def scalar_design(
     columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in INDUCED_PAIRS]
     columns += [u[:, i] * turn[:, j] for i in range(3) for j in range(3)]
     smooth = series.reference if np.isfinite(series.reference).any() else series.scalar
-    if (known := np.isfinite(smooth)).any():
-        smooth = np.interp(series.time, series.time[known], smooth[known])
-    columns.append(_rate(smooth, series.time))
+    known = np.isfinite(smooth)
+    rate = _rate(smooth, series.time)
+    columns.append(np.interp(series.time, series.time[known], rate[known]) if known.any() else rate)
     for channel, values in zip(channels, series.channels.T, strict=True):
         z = (values - channel.centre) / channel.scale
         columns += [z * u[:, i] for i in range(3)]
@@ -203,11 +203,16 @@ def scalar_design(
 
 
 def _rate(values: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative by time, (n,) or (n, 3); samples of one time have one derivative."""
-    moments, first, same = np.unique(time, return_index=True, return_inverse=True)
-    if len(moments) < 2:
-        return np.zeros_like(values)
-    return np.asarray(np.gradient(values[first], moments, axis=0)[same])
+    """Return the derivative by time, (n,) or (n, 3), over the known rows; NaN in the others.
+
+    Samples of one time have one derivative.
+    """
+    known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    moments, first, same = np.unique(time[known], return_index=True, return_inverse=True)
+    rate = np.where(np.isfinite(values), 0.0, np.nan)
+    if len(moments) > 1:
+        rate[known] = np.gradient(values[known][first], moments, axis=0)[same]
+    return rate
 
 
 def term_columns(channels: tuple[ScalarChannel, ...]) -> dict[str, slice]:

@@ -300,7 +300,7 @@ def test_samples_of_one_time_are_fitted_and_corrected() -> None:
 
 
 @pytest.mark.parametrize("rows", [[0], [800], [-1], [100, 101, 900]])
-def test_a_missing_value_costs_its_row_and_the_neighbours(rows: list[int]) -> None:
+def test_a_missing_value_costs_its_own_row(rows: list[int]) -> None:
     series = _part(half(flown(8), False), slice(1200))
     vector, reference = series.vector.copy(), series.reference.copy()
     vector[rows, 1], reference[[300, 600]] = np.nan, np.nan
@@ -308,7 +308,7 @@ def test_a_missing_value_costs_its_row_and_the_neighbours(rows: list[int]) -> No
     found = fit_scalar(missing, CHANNELS, map_known=True, lag=0.0)
     assert found.rms_after < 1.0
     error = correct_scalar(found.sensor, missing).field - series.reference
-    assert np.isnan(error).sum() <= 3 * len(rows)
+    assert np.flatnonzero(np.isnan(error)).tolist() == sorted(row % 1200 for row in rows)
     assert np.nanmax(np.abs(error)) < 5.0
     design = scalar_design(missing, found.sensor.channels, found.sensor.reference_field)
     # A missing position does not make the field's rate of change a jump between reference and reading.

@@ -169,8 +169,6 @@ def fit_scalar(
         _channel(name, series.channels[valid, k], units[k] if units else "") for k, name in enumerate(names)
     )
     reference_field = float(np.median(series.reference[valid]))
-    # The rates of change are unknown beside a missing value as well.
-    valid &= np.isfinite(scalar_design(series, channels, reference_field)).all(axis=1)
     valid &= _agreeing(series, valid, channels, reference_field)
     problem = _ScalarProblem.build(series, valid, channels, reference_field, lag)
     kept = np.ones(len(problem.target), bool)
