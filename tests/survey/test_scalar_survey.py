@@ -116,6 +116,8 @@ def test_shift_and_heading_error_are_found(flown: Grid) -> None:
     assert np.std(found.after) < 0.15 < 2.0 < found.scalar.misties_raw
     assert "lever - v * lag = -3.0" in found.scalar.summary()
     assert "cannot be separated at one speed" in found.scalar.summary()
+    assert found.scalar.shift_sigma[0] > 0.4  # any lag with the lever arm that cancels it
+    assert found.scalar.shift_sigma[1] > 0.4 * SPEED_M_S
     assert set(found.scalar.contribution) == {"heading error", "lag and lever arm"}
     # Levels of 3 nT on 14 lines hide a heading error of 2 nT.
     assert {finding.code for finding in found.scalar.findings} == {"scalar.shift"}
