@@ -59,9 +59,9 @@ class Counts(Driver):
     def feed(self, data: bytes) -> list[Reading]:
         """Parse bytes in pieces of any length; return the readings of the lines that they complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > LONGEST:  # noise without an end of a line
-            self._skipped += len(self._rest)
-            self._rest = b""
+        # Of noise without an end of a line, keep as much as shows that it is too long.
+        self._skipped += len(self._rest[LONGEST + 1 :])
+        self._rest = self._rest[: LONGEST + 1]
         return [reading for line in lines if (reading := self._reading(line))]
 
     def _reading(self, line: bytes) -> Reading | None:
@@ -71,7 +71,7 @@ class Counts(Driver):
             counts = (int(x), int(y), int(z))
         except ValueError:
             mark = b""
-        if mark != b"M":
+        if mark != b"M" or len(line) > LONGEST:
             self._bad += 1
             self._skipped += len(line)
             return None

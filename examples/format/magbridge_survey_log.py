@@ -12,7 +12,7 @@ magbridge drops and reports them. A line that cannot be parsed raises a ``Format
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
@@ -48,7 +48,9 @@ def _record(path: Path, row: int, line: str) -> tuple[float, ...]:
     """Return the time (s since 1970 UTC) and the six values of a line, in the units of `UNITS`."""
     when, *cells = line.split(";")
     try:
-        numbers = [datetime.fromisoformat(when.strip()).timestamp(), *map(float, cells)]
+        time = datetime.fromisoformat(when.strip())
+        time = time if time.tzinfo else time.replace(tzinfo=UTC)  # not the computer's time zone
+        numbers = [time.timestamp(), *map(float, cells)]
     except ValueError:
         numbers = []
     if len(numbers) != 1 + len(COLUMNS):

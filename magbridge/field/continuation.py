@@ -52,8 +52,8 @@ class Continued(NamedTuple):
 def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     """Return a grid continued to the mean depth, with its vertical gradient there; holes stay holes.
 
-    `depth` (n,) are all depths at which the grid will be used, m below the surface; negative is above. A grid
-    of unknown altitude is returned unchanged.
+    `depth` (n,) are all depths at which the grid will be used, m below the surface; negative is above, NaN is
+    ignored. A grid of unknown altitude is returned unchanged, and also one without a known depth.
 
     Notes
     -----
@@ -63,7 +63,8 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 
     used = np.asarray(depth, float)
-    level = float(used.mean())
+    used = used[np.isfinite(used)]
+    level = float(used.mean()) if used.size else nan
     # Continue to the mean depth, and keep the vertical slope for depths about it.
     height = grid.altitude + level  # downward
     if not isfinite(height):
@@ -127,7 +128,7 @@ def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:
         return np.asarray(np.exp(k * height))
     # exp(k h) = 1 / (1 - p) = 1 + p + p^2 + ...: the first terms amplify noise least.
     p = -np.expm1(-k * height)
-    return np.asarray((1 - p**terms) / (1 - p))
+    return np.asarray(sum((p**n for n in range(1, terms)), np.ones_like(p)))
 
 
 def _wavenumber(grid: AnomalyGrid) -> FloatArray:

@@ -25,6 +25,8 @@ __all__ = ["HOLE", "AnomalyGrid", "Local", "T", "curvature"]
 
 EVEN = 1e-3
 """Largest deviation of rounded coordinates from an even spacing, as a fraction of a step."""
+EDGE_CELLS = 1e-6
+"""Distance beyond the outermost nodes that still is on the map, in cells: the rounding of coordinates."""
 HOLE = 9.9e4
 """Smallest value that is a hole, nT: formats without NaN write holes as 99999 or 1.7e38."""
 PLANE_TOLERANCE_NT = 1e-6
@@ -140,7 +142,7 @@ class AnomalyGrid:
 
     @cached_property
     def _vertical(self) -> FloatArray | None:
-        return None if self.vertical is None else coefficients(self.vertical)
+        return None if self.vertical is None else coefficients(filled(self.vertical))
 
     def look_up(self, longitude: float, latitude: float, depth: float = nan) -> Local[float]:
         """Return value and derivatives of the map at one place; arguments as :meth:`evaluate`."""
@@ -161,9 +163,10 @@ class AnomalyGrid:
         rows, columns = self._whole.shape
         with np.errstate(invalid="ignore"):
             u = wrap(lon - self._x0) / self._dx
-            u = np.where(u < 0.0, u + 360.0 / self._dx, u)
+            u = np.where(u < -EDGE_CELLS, u + 360.0 / self._dx, u)
             v = (lat - self._y0) / self._dy
-            inside = (u >= 0.0) & (u <= columns) & (v >= 0.0) & (v <= rows)
+            right, top = columns + EDGE_CELLS, rows + EDGE_CELLS
+            inside = (u >= -EDGE_CELLS) & (u <= right) & (v >= -EDGE_CELLS) & (v <= top)
         u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
         j = np.minimum(u.astype(np.intp), columns - 1)
         i = np.minimum(v.astype(np.intp), rows - 1)

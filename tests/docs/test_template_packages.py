@@ -67,19 +67,25 @@ def test_the_driver_is_listed_and_reads_in_any_pieces(
     monkeypatch.syspath_prepend(str(installed))
     output = magbridge(installed, "drivers", "counts")
     assert "nt_per_count" in output.stdout
-    data = b"204 -5 7\nM 16204 -5013 49187\r\nM 1 2\nM 60000 2 3\n"
+    long = b"M 1 2" + b" " * 80 + b"3\n"
+    data = b"204 -5 7\nM 16204 -5013 49187\r\nM 1 2\nM 60000 2 3\n" + long
     whole, pieces = (open_driver("counts", {"nt_per_count": 2.0, "full_scale": 60_000}) for _ in range(2))
     readings = whole.feed(data)
     assert readings == [reading for byte in data for reading in pieces.feed(bytes([byte]))]
     assert [one.field for one in readings] == [(32408.0, -10026.0, 98374.0), (120000.0, 4.0, 6.0)]
     assert [one.saturated for one in readings] == [False, True]
-    assert (whole.frames_bad, whole.bytes_skipped) == (2, 13) == (pieces.frames_bad, pieces.bytes_skipped)
-    whole.feed(b"x" * 100_000)
-    assert whole.bytes_skipped == 100_013
+    assert (whole.frames_bad, whole.bytes_skipped) == (3, 99) == (pieces.frames_bad, pieces.bytes_skipped)
+    whole.feed(b"x" * 100_000 + b"\n")
+    assert whole.bytes_skipped == 100_099
 
 
-def test_the_format_is_read_by_every_command(installed: Path) -> None:
+def test_the_format_is_read_by_every_command(installed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sample = ROOT / "examples" / "format" / "sample.survey"
+    naive = installed / "naive.survey"
+    naive.write_text("2026-05-01T10:00:00; 48.31; -57.93; 16204.1; -5013.0; 49187.5; 12.4\n")
+    monkeypatch.setenv("TZ", "America/St_Johns")
+    magbridge(installed, "convert", naive, "-o", installed / "naive.csv")
+    assert "\n1777629600.0," in (installed / "naive.csv").read_text()
     magbridge(installed, "convert", sample, "-o", installed / "sample.csv")
     header, *rows = [
         line for line in (installed / "sample.csv").read_text().splitlines() if not line.startswith("#")

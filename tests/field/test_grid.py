@@ -116,6 +116,26 @@ def test_off_the_map_is_nan_or_refused(grid: AnomalyGrid) -> None:
         grid.anomaly_at([10.1, 10.1], [54.1, 54.41])
 
 
+def test_a_map_covers_its_own_edges() -> None:
+    """Coordinates of even spacing, rounded: the last node may exceed the first plus n steps by 1 ulp."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        (x0, y0), step = rng.uniform((-170.0, -70.0), (160.0, 70.0)).round(4), rng.choice([0.001, 0.01, 0.05])
+        lon, lat = x0 + step * np.arange(rng.integers(5, 60)), y0 + step * np.arange(rng.integers(5, 60))
+        own = AnomalyGrid(lon, lat, rng.normal(size=(lat.size, lon.size)))
+        x, y = (one.ravel() for one in np.meshgrid(lon, lat))
+        np.testing.assert_allclose(own.anomaly_at(x, y), own.anomaly.ravel(), atol=1e-6)
+
+
+def test_a_missing_vertical_slope_is_missing_there_only() -> None:
+    values, slope = hills(*np.meshgrid(LON, LAT)), np.full((41, 51), 0.01)
+    values[20, 20] = slope[20, 20] = np.nan
+    holed = AnomalyGrid(LON, LAT, values, altitude=0.0, vertical=slope)
+    flat = AnomalyGrid(LON, LAT, values, altitude=0.0)
+    risen = holed.look_up(10.1, 54.05, 30.0).anomaly - flat.look_up(10.1, 54.05).anomaly
+    assert risen == pytest.approx(0.3, abs=1e-6)
+
+
 def test_sigma_lies_between_its_nodes() -> None:
     grid = AnomalyGrid(LON, LAT, np.zeros((41, 51)), sigma=np.meshgrid(np.arange(51.0), LAT)[0])
     assert grid.look_up(10.105, 54.1).variance == pytest.approx((10**2 + 11**2) / 2)

@@ -63,6 +63,16 @@ def test_below_a_map_the_error_is_reported(depth: float) -> None:
     assert 200.0 < there.length < 2_000.0, "as wide as the pole is deep"
 
 
+@pytest.mark.parametrize("spacings", [5.0, 9.0, 40.0])
+def test_far_below_a_map_the_sum_of_the_series_stays_finite(spacings: float) -> None:
+    """exp(-k h) of the shortest wave is below the rounding from 8 spacings on; NaN depths are ignored."""
+    low = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0)
+    there = continued(low, np.array([spacings * low.spacing - 90.0, np.nan]))
+    assert np.isfinite(there.grid.anomaly).all()
+    assert 0.0 < there.sigma < 1e4
+    assert there.grid.altitude == pytest.approx(90.0 - spacings * low.spacing)
+
+
 def test_a_dive_is_followed_through_the_map() -> None:
     """About the middle of a dive the vertical gradient takes most of what the depth changes."""
     there = continued(AnomalyGrid(LON, LAT, monopole(0.0), altitude=0.0), np.linspace(0.0, 120.0))
