@@ -68,6 +68,8 @@ SEPARABLE_FRACTION = 0.5
 """Largest posterior over prior 1-sigma of lag and of lever arm with which the two count as separable."""
 SPEED_QUANTILES = 0.05, 0.95
 """Quantiles of the speeds between which their spread is measured."""
+IMPLAUSIBLE_SIGMAS = 3.0
+"""Lag or lever arm, in multiples of its prior 1-sigma, beyond which it is implausible."""
 MIN_SPREAD_FRACTION = 0.05
 """Smallest spread of the speeds, as a fraction of the median, that separates lag and lever arm. Their average
 over seconds is too small by 0.7 % in a turn of 300 m at 60 m/s."""
@@ -207,6 +209,15 @@ class _JointFit:
         # The noise is smaller at the right shift: choose field and noise again, on finer nodes.
         self.choice = self._refine_field(self.choice)
         self.solution = self._gauss_newton()
+        # The field of the vehicle's iron, which turns with the heading, passes for a large shift.
+        size = np.abs(self.shift[self.free])
+        self.implausible = bool((size > IMPLAUSIBLE_SIGMAS * self.prior_sigma).any())
+        if self.implausible:
+            covariance = self.solution.covariance
+            scale = np.ones(len(covariance))
+            last = slice(len(scale) - len(size), None)
+            scale[last] = np.maximum(size / np.sqrt(np.diag(covariance)[last]), 1.0)
+            self.solution = self.solution._replace(covariance=covariance * np.outer(scale, scale))
 
     def place(self, shift: FloatArray) -> FloatArray:
         """Return the sensor's places (n, 2), m, for a `shift` (3,): lag (s) and lever arm (m)."""
@@ -409,6 +420,9 @@ class _JointFit:
         names = ["heading error", *(term.name for term in self.rows.terms)]
         covariance, column = self.solution.covariance, self.rows.column
         tests, found = len(names) + 2, []
+        if self.implausible:
+            values = dict(zip(("lag_s", "forward_m", "starboard_m"), self.shift.tolist(), strict=True))
+            found.append(Diagnostic("scalar.implausible_shift", {"column": column, **values}))
         if len(self.free):
             # At one speed only the shift along the track is known: forward lever arm minus speed times lag.
             along = np.array([-self.speed, 1.0, 0.0])[self.free]

@@ -146,7 +146,9 @@ def scalar_survey(
     """
     rows = scalar_rows(logs, column, names, calibrations, lever)
     samples, terms = align(rows, lag=lag, lever_known=lever is not None)
-    return replace(survey(samples, terms.field), scalar=terms)
+    made = survey(samples, terms.field)
+    doubts = [finding for finding in terms.findings if finding.code == "scalar.implausible_shift"]
+    return replace(made, scalar=terms, warnings=(*made.warnings, *doubts))
 
 
 def _gridded(samples: Samples, start: Choice | None) -> Gridded:

@@ -123,6 +123,18 @@ def test_shift_and_heading_error_are_found(flown: Grid) -> None:
     assert {finding.code for finding in found.scalar.findings} == {"scalar.shift"}
 
 
+def test_a_shift_that_no_sensor_has_is_a_warning_with_a_wide_sigma(flown: Grid) -> None:
+    """With 13 nT of the vehicle's field and no calibration, a lag of 0.35 s was 4.85 s."""
+    reading = flown.log[SENSOR].to_numpy().copy()
+    for number in np.unique(flown.line):
+        rows = flown.line == number
+        reading[rows] = np.roll(reading[rows], 6)
+    found = mb.survey([flown.log.assign({SENSOR: ("time", reading, {"units": "nT"})})], scalar=SENSOR)
+    assert found.scalar is not None
+    assert "scalar.implausible_shift" in [warning.code for warning in found.warnings]
+    assert found.scalar.shift_sigma[0] >= abs(found.scalar.shift[0])
+
+
 @pytest.mark.parametrize("error", [2.0, 0.0])
 def test_a_heading_error_is_named_where_the_levels_of_lines_do_not_hide_it(error: float) -> None:
     found = mb.survey([grid(level=1.0, error=error).log], scalar=SENSOR)
