@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import hypot, log, sqrt
+from math import hypot, isfinite, log, sqrt
 
 import msgspec
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.calibration.model import Calibration
 from magbridge.config import NotNegative, Positive
+from magbridge.errors import OutOfRange
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 
@@ -161,9 +162,14 @@ def lasting_errors(grid: AnomalyGrid, options: NavigationOptions) -> tuple[Anoma
 
 
 def _added(options: NavigationOptions, errors: list[tuple[float, float]]) -> NavigationOptions:
-    """Return options whose map error includes `errors`, pairs of a sigma, nT, and a correlation length, m."""
+    """Return options whose map error includes `errors`, pairs of a sigma, nT, and a correlation length, m.
+
+    OutOfRange: a sigma that is not finite.
+    """
     whole = [*errors, (options.map_sigma, options.map_length)]
     sigma = hypot(*(sigma for sigma, _ in whole))
+    if not isfinite(sigma):
+        raise OutOfRange("map's sigma", f"{sigma} nT", "only a map with a finite sigma can be used")
     # sigma^2 = sum s_i^2 and (sigma / L)^2 = sum (s_i / L_i)^2.
     steepness = hypot(*(sigma / length for sigma, length in whole))
     return replace(options, map_sigma=sigma, map_length=sigma / steepness)

@@ -150,6 +150,14 @@ def test_what_lies_between_nodes_counts_as_map_error() -> None:
     assert known.map_length == pytest.approx(0.5 * coarse.spacing)
 
 
+def test_an_infinite_sigma_of_the_map_is_refused() -> None:
+    unknown = AnomalyGrid(
+        [-58.0, -57.9, -57.8, -57.7], [49.4, 49.5, 49.6, 49.7], np.eye(4), np.inf, sigma_length=500.0
+    )
+    with pytest.raises(OutOfRange, match="map's sigma = inf nT"):
+        lasting_errors(unknown, NavigationOptions())
+
+
 def test_a_map_whose_level_is_uncertain_leaves_the_bias_open() -> None:
     surveyed = synthetic(Map(40, 1000), 0).replaced(level_sigma=100.0)
     there, known = lasting_errors(surveyed, NavigationOptions(bias_sigma=5.0))
