@@ -5,10 +5,7 @@ Data :math:`y = J z + v`, with white noise v of unit variance, have the log like
 .. math:: \log L(z) = -\tfrac12 z^T \Lambda z + \eta^T z - \tfrac12 c - \tfrac{n}{2}\log 2\pi,
           \quad \Lambda = J^T J,\ \eta = J^T y,\ c = y^T y.
 
-Information of independent data adds (:meth:`GaussianInformation.__add__`). Unknowns are eliminated by
-Schur's complement, and the integral of the likelihood over a Gaussian prior is known in closed form
-(Rasmussen & Williams 2006, Gaussian processes for machine learning, sections 2.1 and A.3; Bar-Shalom, Li &
-Kirubarajan 2001, section 7.2).
+Information of independent data adds (:meth:`GaussianInformation.__add__`).
 """
 
 from __future__ import annotations
@@ -33,7 +30,7 @@ class GaussianInformation:
     vector: FloatArray
     """(q,): eta."""
     constant: float = 0.0
-    """c: the sum of squares at z = 0."""
+    """c: the sum of squares at z = 0, in units of the noise; the noise's determinant is not part of it."""
     n: float = 0.0
     """Number of samples."""
 
@@ -87,36 +84,6 @@ class GaussianInformation:
             self.precision[np.ix_(rows, rows)], self.vector[rows], self.constant, self.n
         )
 
-    def condition(self, rows: IndexArray, values: FloatArray) -> GaussianInformation:
-        """Return the information about the other unknowns if the unknowns `rows` (p,) are `values` (p,)."""
-        keep = np.setdiff1d(np.arange(len(self.vector)), rows)
-        # -1/2 z^T L z + eta^T z with z_rows fixed: a constant, and a change of the vector
-        precision, given = self.precision, np.asarray(values, float)
-        fixed = given @ precision[np.ix_(rows, rows)] @ given - 2.0 * self.vector[rows] @ given
-        vector = self.vector[keep] - precision[np.ix_(keep, rows)] @ given
-        return GaussianInformation(
-            precision[np.ix_(keep, keep)], vector, self.constant + float(fixed), self.n
-        )
-
-    def marginalise(self, rows: IndexArray, prior_precision: FloatArray) -> GaussianInformation:
-        """Return the information about the other unknowns, with the unknowns `rows` integrated out.
-
-        `rows` (p,): unknowns to integrate out; their prior has mean 0. `prior_precision` (p, p): precision
-        of that prior, positive definite.
-        """
-        keep = np.setdiff1d(np.arange(len(self.vector)), rows)
-        inner = self.precision[np.ix_(rows, rows)] + prior_precision
-        cross = self.precision[np.ix_(rows, keep)]
-        # Schur's complement: L_kk - L_kr (L_rr + P)^-1 L_rk
-        factor = cho_factor(inner, lower=True)
-        solved = cho_solve(factor, np.column_stack([self.vector[rows], cross]))
-        precision = self.precision[np.ix_(keep, keep)] - cross.T @ solved[:, 1:]
-        vector = self.vector[keep] - cross.T @ solved[:, 0]
-        # the determinants |P|^1/2 |L_rr + P|^-1/2 enter the constant
-        log_dets = 2.0 * np.log(np.diag(factor[0])).sum() - np.linalg.slogdet(prior_precision)[1]
-        constant = self.constant - self.vector[rows] @ solved[:, 0] + log_dets
-        return GaussianInformation(0.5 * (precision + precision.T), vector, float(constant), self.n)
-
     def blurred(self, direction: FloatArray, sigma: float) -> GaussianInformation:
         """Return the information after adding `direction` (q,) times a ~ N(0, `sigma`²) to the unknowns.
 
@@ -128,30 +95,13 @@ class GaussianInformation:
         # Rank-one downdate: d is the direction, L d the change of the gradient along it.
         moved = self.precision @ direction
         share = moved / (sigma**-2 + direction @ moved)
+        along = direction @ self.vector
         return GaussianInformation(
             self.precision - np.outer(share, moved),
-            self.vector - share * (direction @ self.vector),
-            self.constant,
+            self.vector - share * along,
+            float(self.constant - along**2 / (sigma**-2 + direction @ moved)),
             self.n,
         )
-
-    def posterior(self, prior_precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean (q,) and covariance (q, q) of z with a prior N(0, `prior_precision`^-1)."""
-        covariance = covariance_of(self.precision + prior_precision)
-        return np.asarray(covariance @ self.vector), covariance
-
-    def log_evidence(self, prior_precision: FloatArray) -> float:
-        """Return the logarithm of the likelihood integrated over a prior N(0, `prior_precision`^-1), (q, q).
-
-        Notes
-        -----
-        ``-(c - eta^T (L + P)^-1 eta) / 2 - log|L + P| / 2 + log|P| / 2 - n log(2 pi) / 2``.
-        """
-        factor = cho_factor(self.precision + prior_precision, lower=True)
-        # eta^T (L + P)^-1 eta, by one Cholesky factor that also gives the determinant.
-        explained = self.vector @ cho_solve(factor, self.vector)
-        log_dets = np.linalg.slogdet(prior_precision)[1] - 2.0 * np.log(np.diag(factor[0])).sum()
-        return float(0.5 * (explained - self.constant) + 0.5 * log_dets - 0.5 * self.n * np.log(2.0 * np.pi))
 
 
 def covariance_of(precision: FloatArray) -> FloatArray:
@@ -161,6 +111,7 @@ def covariance_of(precision: FloatArray) -> FloatArray:
     """
     # A precision with unit diagonal: unknowns in different units do not spoil the factorisation.
     scale = np.sqrt(np.diag(precision))
+    scale = np.where(scale > 0.0, scale, 1.0)
     try:
         factor, lower = cho_factor(precision / np.outer(scale, scale), lower=True)
     except np.linalg.LinAlgError as problem:
