@@ -118,7 +118,7 @@ TRACK_TEXTS = {
 """Texts of a localisation in a map that is made from the same log."""
 
 SCALAR_TEXTS = {
-    "scalar.lag": "{column} is {lag_s:.2f} s late (1-sigma {sigma_s:.1f} s): correct its clock",
+    "scalar.lag": "{column} is {lag_s:.2f} s late (1-sigma {sigma_s:.2g} s): correct its clock",
     "scalar.implausible_shift": "{column}: a lag of {lag_s:.1f} s and a lever arm of {forward_m:.0f} m "
     "forward, {starboard_m:.0f} m starboard are implausible, and so is the map: the vehicle's own field "
     "passes for them; calibrate --scalar first, or give --lag and --lever",

@@ -54,7 +54,7 @@ class ScalarCorrection:
     """
 
     def __init__(self, sensor: ScalarSensor | None, settings: Align, sigma: float | None = None) -> None:
-        self._sensor = sensor
+        self._sensor = sensor.without_shift() if sensor is not None else None
         channels = sensor.channels if sensor is not None else ()
         inputs = tuple(
             Input(one.name, one.low, one.high, MAX_TELEMETRY_AGE_S, is_mass=False) for one in channels

@@ -118,6 +118,7 @@ def scalar_header(sensor: ScalarSensor) -> str:
 
 def scalar_source(sensor: ScalarSensor) -> str:
     """Return ``magbridge_scalar.c``, with the level of the last power cycle that was fitted."""
+    sensor = sensor.without_shift()
     size = len(sensor.coefficients) - len(sensor.power_cycles)
     # The terms and one level: those of the other power cycles are left out.
     kept = [*range(size), len(sensor.coefficients) - 1]

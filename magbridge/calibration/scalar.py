@@ -9,8 +9,10 @@ Lawson 1950; Leliak 1961, doi:10.1109/TANE3.1961.4201799)::
 
 u is the unit vector of the field in the vector sensor's axes, p the permanent field (nT), I the induced
 (nT, symmetric), E that of the eddy currents (nT s), z_k a telemetry channel about its centre in units of
-its swing, c_k its field (nT a swing), a the lag (s, negative if the scalar is late), and the level is one
-constant for each power cycle. All coefficients are Gaussian with the prior widths that the fit chose.
+its swing, c_k its field (nT a swing), and the level is one constant for each power cycle. If the scalar is
+late, s is the reading of that much later, and a (s, negative if the scalar is late) is what remains of the
+lag; with known coefficients its column is the rate of the whole right side. All coefficients are Gaussian
+with the prior widths that the fit chose.
 
 The width of a channel's prior is for one swing *over everything known, the log to be corrected included*:
 :func:`magbridge.calibration.fitting.scalar_fit.adapt_to_log`.
@@ -43,6 +45,8 @@ CYCLE_LEVEL_SIGMA_NT = 30.0
 """1-sigma of the level of a power cycle, nT."""
 SAME_POWER_CYCLE_S = 12 * 3600.0
 """Time within which a log without a power cycle's number is taken to be of the fitted cycle, s."""
+MAX_MOVE_INTERVALS = 3.0
+"""Intervals between two readings, across which a moved reading is not interpolated."""
 RANGE_MARGIN = 0.02
 """Fraction of a channel's range by which telemetry may exceed it without a flag."""
 INDUCED_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -139,6 +143,8 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """Forward, starboard and down from the positions' origin to the scalar sensor, m."""
     slow_variance: float = 0.0
     """nT^2, variance of the slow noise: the sigma of the corrected field counts it."""
+    lag: float = 0.0
+    """s, by which the reading is behind the vector: it is moved before the terms are taken off."""
     width_covariance: tuple[tuple[float, ...], ...] = ()
     """Covariance of the coefficients that the uncertainty of the prior's widths adds to `covariance`."""
 
@@ -147,6 +153,12 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         """Covariance (m, m) of the coefficients, with that of uncertain widths."""
         covariance = np.array(self.covariance)
         return covariance + np.array(self.width_covariance) if self.width_covariance else covariance
+
+    def without_shift(self) -> ScalarSensor:
+        """Return the sensor with its lag as the coefficient of the reading's rate, for live use."""
+        k = PLATFORM_TERMS - 1
+        coefficients = *self.coefficients[:k], self.coefficients[k] - self.lag, *self.coefficients[k + 1 :]
+        return msgspec.structs.replace(self, lag=0.0, coefficients=coefficients)
 
 
 class ScalarSeries(NamedTuple):
@@ -181,10 +193,43 @@ class CorrectedScalar(NamedTuple):
     """(n,), a channel or the direction is unknown."""
 
 
+def moved_earlier(reading: FloatArray, time: FloatArray, lag: float) -> FloatArray:
+    """Return the reading (n,), nT, of `lag` (s) later; NaN where that is in a gap or outside the log.
+
+    A cubic through the readings on both sides, whose slopes are central differences.
+    """
+    known = np.isfinite(reading)
+    moments, first = np.unique(time[known], return_index=True)
+    if lag == 0.0 or len(moments) < 2:
+        return reading
+    values, widths = reading[known][first], np.diff(moments)
+    slopes = np.gradient(values, moments)
+    step = float(np.median(widths))
+    k = np.clip(np.searchsorted(moments, time + lag, "right") - 1, 0, len(widths) - 1)
+    h = widths[k]
+    x = (time + lag - moments[k]) / h
+    moved = values[k] * (1.0 + 2.0 * x) * (1.0 - x) ** 2 + values[k + 1] * (3.0 - 2.0 * x) * x**2
+    moved += h * x * (1.0 - x) * (slopes[k] * (1.0 - x) - slopes[k + 1] * x)
+    # In a gap and outside the log a straight line from the near side, for at most one interval.
+    open_end = (x < 0.0) | (x > 1.0) | (h > MAX_MOVE_INTERVALS * step)
+    after, before = x * h, (1.0 - x) * h
+    is_first = np.abs(after) < np.abs(before)
+    line = np.where(is_first, values[k] + slopes[k] * after, values[k + 1] - slopes[k + 1] * before)
+    moved = np.where(open_end, line, moved)
+    far = open_end & (np.minimum(np.abs(after), np.abs(before)) > step)
+    return np.where(far | ~known, np.nan, moved)
+
+
 def scalar_design(
-    series: ScalarSeries, channels: tuple[ScalarChannel, ...], reference_field: float
+    series: ScalarSeries,
+    channels: tuple[ScalarChannel, ...],
+    reference_field: float,
+    coefficients: FloatArray | None = None,
 ) -> FloatArray:
-    """Return the columns (n, 19 + 3k) of the model, without levels; `reference_field` is F_0, nT."""
+    """Return the columns (n, 19 + 3k) of the model, without levels; `reference_field` is F_0, nT.
+
+    With `coefficients` of the terms the lag's column is the rate of the reference and of the vehicle's field.
+    """
     length = np.sqrt(np.einsum("ni,ni->n", series.vector, series.vector))
     u = series.vector / length[:, None]
     turn = _rate(u, series.time)  # du/dt, 1/s
@@ -199,7 +244,12 @@ def scalar_design(
     for channel, values in zip(channels, series.channels.T, strict=True):
         z = (values - channel.centre) / channel.scale
         columns += [z * u[:, i] for i in range(3)]
-    return np.stack(columns, axis=1)
+    design = np.stack(columns, axis=1)
+    if coefficients is not None and np.isfinite(series.reference).any():  # the reading's rate has both
+        k = PLATFORM_TERMS - 1
+        others = np.delete(design, k, axis=1) @ np.delete(coefficients[: design.shape[1]], k)
+        design[:, k] += np.nan_to_num(_rate(others, series.time))
+    return design
 
 
 def _rate(values: FloatArray, time: FloatArray) -> FloatArray:
@@ -234,7 +284,8 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
         names = ", ".join(channel.name for channel in known)
         raise CalibrationError(f"expected {len(known)} channels ({names}), got {series.channels.shape[1]}")
     mean, covariance = np.array(sensor.coefficients), sensor.total_covariance
-    design = scalar_design(series, known, sensor.reference_field)
+    series = series._replace(scalar=moved_earlier(series.scalar, series.time, sensor.lag))
+    design = scalar_design(series, known, sensor.reference_field, mean)
     size = design.shape[1]
     level, level_sigma, cross = _level(sensor, series, mean, covariance)
     with np.errstate(invalid="ignore"):

@@ -393,6 +393,8 @@ def _with_scalar(
         "rms_nT": fit.rms_after,
         "contribution_nT": fit.contribution,
         "left_out": fit.left_out,
+        "lag_s": fit.sensor.lag,
+        "lag_sigma_s": fit.lag_sigma,
         "findings": [finding.text for finding in fit.findings],
         "figure_of_merit": fit.merit and {**fit.merit, "fitted": True},
     }

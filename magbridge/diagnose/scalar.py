@@ -22,6 +22,7 @@ from magbridge.calibration.scalar import (
     PLATFORM_TERMS,
     ScalarSensor,
     ScalarSeries,
+    moved_earlier,
     scalar_design,
     term_columns,
 )
@@ -71,7 +72,7 @@ class _Remainder(NamedTuple):
 
     def is_zero(self, term: slice) -> bool:
         """Return True if the coefficients at `term` may be zero."""
-        mean = np.array(self.fit.sensor.coefficients)
+        mean = np.array(self.fit.sensor.without_shift().coefficients)
         return not is_significant(mean[term], self.covariance[term, term], len(self.names) + 2)
 
 
@@ -80,18 +81,16 @@ def _of_sensor(
 ) -> list[Diagnostic]:
     """Return the lag, the heading error and the disturbing channels that the compensation leaves."""
     column, found = sensor.column, []
-    rest = _remainder(ds, calibration, sensor, grid)
     least = 0.0
-    if not rest.is_zero(LAG_TERM):
-        # The coefficient of the rate of change is negative if the scalar is late
-        late = -float(rest.fit.sensor.coefficients[LAG_TERM.start])
-        sigma = float(np.sqrt(rest.covariance[LAG_TERM, LAG_TERM][0, 0]))
-        found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": late, "sigma_s": sigma}))
-        # The platform's field is late as well, which the other terms imitate: move the reading, fit again,
-        # and do not name the lag's remnant
+    late, variance = _lag(ds, calibration, sensor, grid)
+    if is_significant(np.array([late]), np.array([[variance]]), len(sensor.channels) + 2):
+        found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": late, "sigma_s": variance**0.5}))
+        # The other terms imitate the platform's field that is late: move the reading, and do not name the
+        # lag's remnant
         moved = _moved(ds, column, late)
         least = REMNANT * float(np.nanstd((moved[column] - ds[column]).to_numpy()))
-        rest = _remainder(moved, calibration, sensor, grid)
+        ds = moved
+    rest = _remainder(ds, calibration, sensor, grid)
     fit = rest.fit
     effect = _heading_effect(
         rest.corrected, np.array(fit.sensor.coefficients)[HEADING_TERMS], fit.sensor.reference_field
@@ -107,10 +106,23 @@ def _of_sensor(
     return found
 
 
+def _lag(
+    ds: xr.Dataset, calibration: Calibration, sensor: ScalarSensor, grid: AnomalyGrid | None
+) -> tuple[float, float]:
+    """Return the lag that the calibration leaves, s, and its variance, s^2: a fit of the reading."""
+    fit = calibrate_scalar(
+        ds, calibration, sensor.column, telemetry_columns(ds, sensor.column), grid=grid,
+        map_known=grid is not None or "reference_field" in ds, lever=sensor.lever,
+    )  # fmt: skip
+    k = LAG_TERM.start
+    variance = fit.sensor.total_covariance[k, k] + sensor.total_covariance[k, k]
+    return fit.sensor.lag - sensor.lag, float(variance)
+
+
 def _moved(ds: xr.Dataset, column: str, lag: float) -> xr.Dataset:
     """Return the log with a column read `lag` (s) earlier."""
     time, reading = (ds[name].to_numpy().astype(float) for name in ("time", column))
-    return ds.assign({column: ("time", np.interp(time + lag, time, reading), ds[column].attrs)})
+    return ds.assign({column: ("time", moved_earlier(reading, time, lag), ds[column].attrs)})
 
 
 def _compensated(ds: xr.Dataset, calibration: Calibration, sensor: ScalarSensor) -> xr.Dataset:

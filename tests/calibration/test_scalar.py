@@ -444,6 +444,28 @@ def test_the_common_sigma_is_the_part_that_all_samples_share() -> None:
     assert np.mean(found.sigma**2 - found.level_sigma**2) - noise == pytest.approx(scatter, rel=0.15)
 
 
+@pytest.mark.parametrize(("late", "given"), [(0.1, None), (0.6, 0.6), (-0.4, None)])
+def test_a_lag_moves_direction_and_channels_too(late: float, given: float | None) -> None:
+    """The main field is constant: only the vehicle's own field shows the lag."""
+    t = np.arange(4000) / 10.0
+    angles = np.column_stack([90.0 * (t // 100.0), 8.0 * np.sin(2.0 * t), 9.0 * np.sin(1.5 * t)])
+    u = Rotation.from_euler("ZYX", angles, degrees=True).inv().apply([0.3, -0.06, 0.95])
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    current = np.sin(0.4 * t)
+    vehicle = u @ [30.0, -20.0, 10.0] + 5.0 * current * u[:, 0]
+    noise = np.random.default_rng(1).normal(0.0, 0.01, len(t))
+    reading = 50_000.0 + np.interp(t - late, t, vehicle) + noise
+    series = ScalarSeries(
+        t, reading, 50_000.0 * u, np.full(4000, 50_000.0), current[:, None], np.full(4000, np.nan)
+    )
+    found = fit_scalar(series, ("current",), map_known=True, lag=given)
+    assert found.sensor.lag == pytest.approx(late, abs=0.005)
+    assert found.lag_sigma == 0.0 if given else 0.0 < found.lag_sigma < 0.01
+    error = correct_scalar(found.sensor, series).field - 50_000.0
+    inner = np.abs(t % 100.0 - 50.0) < 45.0  # no turn from one heading to the next
+    assert np.sqrt(np.nanmean(error[inner] ** 2)) < 0.03
+
+
 def test_python_calibrates_and_corrects_a_scalar(tmp_path: Path) -> None:
     series = flown(7)
     write(half(series, False), tmp_path / "a.nc")
@@ -479,7 +501,7 @@ def test_compiled_c_gives_the_field_of_python(tmp_path: Path) -> None:
     correct_in_c = ctypes.CDLL(str(library)).magbridge_correct_scalar
     three = ctypes.c_double * 3
     series = series._replace(reference=np.full(len(series.time), np.nan))
-    expected = correct_scalar(sensor, series)
+    expected = correct_scalar(sensor.without_shift(), series)
     u = series.vector / np.linalg.norm(series.vector, axis=1)[:, None]
     turn, rate = np.gradient(u, series.time, axis=0), np.gradient(series.scalar, series.time)
     out = Corrected()

@@ -44,6 +44,7 @@ from magbridge.calibration.scalar import (
     ScalarNoise,
     ScalarSensor,
     ScalarSeries,
+    moved_earlier,
     scalar_design,
     term_columns,
 )
@@ -62,6 +63,10 @@ LOG_WIDTH_SIGMA = 0.5
 """1-sigma of the log of a width. If wider, permanent and induced field cancel over few attitudes."""
 CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA = 10.0, 1.5
 """nT a swing and its log's 1-sigma: centre of a channel's width."""
+LAG = PLATFORM_TERMS - 1
+"""Column of the lag."""
+LAG_GRID_S, LEAST_LAG_GAIN = np.linspace(-1.5, 1.5, 61), 20.0
+"""Lags that are tried first, s, and twice the log likelihood by which one must be better than no lag."""
 LAG_SIGMA_S = 0.5
 """1-sigma of the lag between scalar and vector, s."""
 TIME_CONSTANTS_S = (1.5, 5.0, 15.0, 50.0, 150.0, 500.0, 1500.0, 5000.0)
@@ -123,6 +128,12 @@ class ScalarFit:
     """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
 
     @property
+    def lag_sigma(self) -> float:
+        """1-sigma of the lag, s; 0 for a given lag."""
+        variance = self.sensor.total_covariance[LAG, LAG]
+        return float(np.sqrt(variance)) if self.sensor.prior_sigma[LAG] > 1e-6 else 0.0
+
+    @property
     def doubt(self) -> str:
         """Return why the data do not support this compensation; empty if they do."""
         if abs(self.removed) > IMPOSSIBLE_FRACTION * self.sensor.reference_field:
@@ -170,7 +181,16 @@ def fit_scalar(
     )
     reference_field = float(np.median(series.reference[valid]))
     valid &= _agreeing(series, valid, channels, reference_field)
-    problem = _ScalarProblem.build(series, valid, channels, reference_field, lag)
+    shift, terms = _first_lag(series, valid, channels, reference_field, lag)
+    series = series._replace(scalar=moved_earlier(series.scalar, series.time, shift))
+    problem = _ScalarProblem.build(
+        series,
+        valid & np.isfinite(series.scalar),
+        channels,
+        reference_field,
+        terms,
+        fixed_lag=lag is not None,
+    )
     kept = np.ones(len(problem.target), bool)
     start: FloatArray | None = None
     with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
@@ -181,7 +201,7 @@ def fit_scalar(
                 break
             kept &= ~outliers
             start = state.log_noise
-    return _result(problem, kept, state, series, column, channels, lever)
+    return _result(problem, kept, state, series, column, channels, lever, shift)
 
 
 def _agreeing(
@@ -209,6 +229,57 @@ def _agreeing(
     return np.asarray(valid & (residual <= WITNESS_SIGMA * usual))
 
 
+def _interval(time: FloatArray) -> tuple[float, int]:
+    """Return the interval of the samples, s, and their number in the fit's interval."""
+    gaps = np.diff(time)
+    step = float(np.median(gaps[gaps > 0.0])) if (gaps > 0.0).any() else FIT_INTERVAL_S
+    return step, max(1, int(FIT_INTERVAL_S / step + 1e-6))
+
+
+def _first_lag(
+    series: ScalarSeries,
+    valid: BoolArray,
+    channels: tuple[ScalarChannel, ...],
+    reference_field: float,
+    lag: float | None,
+) -> tuple[float, FloatArray]:
+    """Return a first estimate of the lag, s (`lag` if given), and of the terms (m,) that belong to it.
+
+    Notes
+    -----
+    Changes over the fit's interval have little slow noise and crustal field, so that least squares suffices.
+    With an orthonormal basis Q of the changes of the columns, the sum of squares that a lag leaves of the
+    changes y of the moved reading minus reference is ``y^T y - |Q^T y|^2``. A lag of which the samples show
+    nothing is 0.
+    """
+    design = scalar_design(series, channels, reference_field)
+    design[:, LAG] = 0.0
+    _, many = _interval(series.time)
+    change = series.time[many:] - series.time[:-many]
+
+    def changes(lag: float) -> FloatArray:
+        target = moved_earlier(series.scalar, series.time, lag) - series.reference
+        return np.asarray(target[many:] - target[:-many])
+
+    lags = LAG_GRID_S if lag is None else np.array([lag])
+    tried = np.array([changes(one) for one in lags])
+    rows = valid[many:] & valid[:-many] & np.isfinite(tried).all(axis=0) & (change < 2.0 * FIT_INTERVAL_S)
+    if rows.sum() <= design.shape[1]:
+        return (0.0 if lag is None else lag), np.zeros(design.shape[1])
+    columns = (design[many:] - design[:-many])[rows]
+    Q = np.linalg.svd(columns[:, np.ptp(columns, axis=0) > 0.0], full_matrices=False)[0]
+    left = ((tried[:, rows] - (tried[:, rows] @ Q) @ Q.T) ** 2).sum(axis=1)
+    if lag is None:
+        best, zero = int(left.argmin()), int(np.abs(lags).argmin())
+        gain = rows.sum() / many * np.log(left[zero] / left[best])
+        lag = 0.0
+        if gain > LEAST_LAG_GAIN and 0 < best < len(lags) - 1:
+            below, at, above = left[best - 1 : best + 2]
+            lag = float(lags[best] + 0.5 * (lags[1] - lags[0]) * (below - above) / (below - 2.0 * at + above))
+    found = np.linalg.lstsq(columns, changes(lag)[rows], rcond=1e-6)[0]
+    return lag, np.asarray(found)
+
+
 def is_significant(values: FloatArray, covariance: FloatArray, tests: int) -> bool:
     """Return True if coefficients (k,), one of several `tests`, are significant at :data:`FALSE_NAME_LEVEL`.
 
@@ -222,21 +293,21 @@ def is_significant(values: FloatArray, covariance: FloatArray, tests: int) -> bo
 
 
 def _findings(
-    column: str, state: _Posterior, contribution: dict[str, float], channels: tuple[ScalarChannel, ...]
+    sensor: ScalarSensor, contribution: dict[str, float], channels: tuple[ScalarChannel, ...]
 ) -> tuple[Diagnostic, ...]:
     """Return the lag if it is not zero, then the channels that disturb the scalar, the strongest first."""
-    names = [channel.name for channel in channels]
+    names, column = [channel.name for channel in channels], sensor.column
+    mean, covariance = np.array(sensor.coefficients), np.array(sensor.covariance)
+    mean[LAG] -= sensor.lag
     significant = {
-        name: is_significant(state.mean[term], state.covariance[term, term], len(names) + 1)
+        name: is_significant(mean[term], covariance[term, term], len(names) + 1)
         for name, term in term_columns(channels).items()
         if name == "lag" or name in names
     }
     found = []
-    if significant["lag"]:
-        # The coefficient of the rate of change is negative if the scalar is late.
-        late, k = -float(state.mean[PLATFORM_TERMS - 1]), PLATFORM_TERMS - 1
-        sigma = float(np.sqrt(state.covariance[k, k]))
-        found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": late, "sigma_s": sigma}))
+    if significant["lag"] and sensor.prior_sigma[LAG] > 1e-6:  # not a given one
+        sigma = float(np.sqrt(covariance[LAG, LAG]))
+        found.append(Diagnostic("scalar.lag", {"column": column, "lag_s": sensor.lag, "sigma_s": sigma}))
     for name in sorted(names, key=lambda name: -contribution[name]):
         if significant[name]:
             values = {"column": column, "channel": name, "effect_nT": contribution[name]}
@@ -286,18 +357,16 @@ class _ScalarProblem:
         valid: BoolArray,
         channels: tuple[ScalarChannel, ...],
         reference_field: float,
-        lag: float | None,
+        terms: FloatArray,
+        *,
+        fixed_lag: bool,
     ) -> _ScalarProblem:
-        """Average to the fit's interval and form the columns."""
-        gaps = np.diff(series.time)
-        step = float(np.median(gaps[gaps > 0.0])) if (gaps > 0.0).any() else FIT_INTERVAL_S
-        many = max(1, int(FIT_INTERVAL_S / step + 1e-6))
-        design = scalar_design(series, channels, reference_field)
+        """Average to the fit's interval and form the columns, that of the lag by the coefficients `terms`."""
+        step, many = _interval(series.time)
+        design = scalar_design(series, channels, reference_field, terms)
         target = series.scalar - series.reference
-        lag_column = PLATFORM_TERMS - 1
-        if lag is not None:
-            target = target + lag * design[:, lag_column]
-            design[:, lag_column] = 0.0
+        if fixed_lag:
+            design[:, LAG] = 0.0
         numbers, cycles = _power_cycles(series.power_cycle[valid])
         levels = np.zeros((len(target), len(cycles)))
         levels[np.flatnonzero(valid), numbers] = 1.0
@@ -308,7 +377,7 @@ class _ScalarProblem:
         group = piece * len(table) + (np.arange(len(table)) - first[piece]) // many
         _, starts, counts = np.unique(group, return_index=True, return_counts=True)
         table = np.add.reduceat(table, starts, axis=0) / counts[:, None]
-        family = _prior_family(channels, len(cycles), fixed_lag=lag is not None)
+        family = _prior_family(channels, len(cycles), fixed_lag=fixed_lag)
         return _ScalarProblem(
             table[:, 0], table[:, 1], table[:, 2:], family, _segments(table[:, 0], many * step), many * step,
             cycles, many,
@@ -659,6 +728,7 @@ def _result(
     column: str,
     channels: tuple[ScalarChannel, ...],
     lever: tuple[float, float, float],
+    shift: float,
 ) -> ScalarFit:
     """Return the fit with its sensor, RMS before and after, and contributions."""
     part = problem.part(kept)
@@ -667,6 +737,10 @@ def _result(
     contribution = {
         name: float(np.std(part.design[:, term] @ state.mean[term])) for name, term in columns.items()
     }
+    # The lag that remains is small, so that moving the reading by both is the same as its linear term.
+    mean, total_lag = state.mean.copy(), shift - float(state.mean[LAG])
+    mean[LAG] = 0.0
+    contribution["lag"] = abs(total_lag) * float(np.std(part.design[:, LAG]))
     averaged_white = float(np.exp(state.log_noise[0]))
     variances = _slow_variances(state.log_noise)[: len(TIME_CONSTANTS_S)]
     sensor = ScalarSensor(
@@ -675,7 +749,8 @@ def _result(
         directions_from="vector",
         reference_field=float(np.median(series.reference[np.isfinite(series.reference)])),
         channels=channels,
-        coefficients=tuple(state.mean.tolist()),
+        coefficients=tuple(mean.tolist()),
+        lag=total_lag,
         covariance=tuple(tuple(row) for row in state.covariance.tolist()),
         prior_sigma=tuple(state.prior_sigma.tolist()),
         noise=ScalarNoise(
@@ -694,5 +769,5 @@ def _result(
         sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
         int((~kept).sum()) * problem.averaged, float(np.nanmedian(series.scalar - series.reference)),
         -state.cost,
-        _findings(column, state, contribution, channels),
+        _findings(sensor, contribution, channels),
     )  # fmt: skip

@@ -222,8 +222,9 @@ def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> 
     FormatError: the log lacks a telemetry channel of the compensation.
     """
     found, seen, adapted, series = _compensated(corrected, log, sensor)
-    design = scalar_design(series, adapted.channels, adapted.reference_field)
-    mean, size = np.array(adapted.coefficients), design.shape[1]
+    mean = np.array(adapted.coefficients)
+    design = scalar_design(series, adapted.channels, adapted.reference_field, mean)
+    size = design.shape[1]
     contribution = {
         name: float(np.nanstd(design[:, columns] @ mean[columns]))
         for name, columns in term_columns(adapted.channels).items()
