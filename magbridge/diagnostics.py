@@ -18,8 +18,8 @@ FIT_TEXTS = {
     # Reasons against a fit: without --force they keep it from being written
     "unsupported_fit": "the data do not support this fit: {reasons}",
     "lasting_residual": "residuals of {noise_nT:.0f} nT last for many samples (autocorrelation "
-    "{autocorrelation:.3f}) without the crustal field: two vehicles in one log, an offset that jumped, or "
-    "wrong positions",
+    "{autocorrelation:.3f}) without the crustal field: two vehicles in one log, an offset that jumped, "
+    "wrong positions, a current that no --parameter names, or eddy currents near the sensor",
     "expected_error": "at these pitches and positions, on any heading and with 10 degrees more roll, "
     "expect {error_nT:.0f} nT of error",
     "narrow_headings": "all headings lie within {width_deg:.0f} degrees, and on other headings the "
