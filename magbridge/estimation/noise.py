@@ -8,7 +8,7 @@ these numbers, :class:`Whitening` removes the correlation, and :func:`estimate_n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
@@ -235,7 +235,7 @@ def estimate_noise(
     return NoiseModel(sigma or 1e-9, *shape, None if weight.all() else weight)
 
 
-def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> NoiseModel:
+def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel, free: float) -> NoiseModel:
     """Return the noise as a slow and a white part, if that is likelier than the given AR(1) process.
 
     The correlation time of noise is a property of the sensor. At a high sampling rate, the slow part of
@@ -243,15 +243,15 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> N
     slow part in white noise of many samples hardly shows in neighbours, but it limits the mean.
 
     `e` (n,): Residuals, nT. `steps` (n,): sampling intervals since the previous sample. `noise`: the result
-    of :func:`estimate_noise`.
+    of :func:`estimate_noise`. `free`: number of parameters that the data determined.
     """
-    e, rho = _clipped(e), noise.autocorrelation
+    clipped, rho = _clipped(e), noise.autocorrelation
     longest = float(np.isfinite(steps).sum()) + 2.0
 
     def negative_log_likelihood(rho: float, white: float) -> float:
         # sigma is profiled out: n/2 log(v^T v) + 1/2 sum log S
         whitening = Whitening(steps, rho, white)
-        v = whitening.apply(e)
+        v = whitening.apply(clipped)
         return float(0.5 * len(e) * np.log(v @ v) + 0.5 * np.log(whitening.variance).sum())
 
     def shape(x: FloatArray) -> tuple[float, float]:
@@ -269,8 +269,8 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> N
     best = min(answers, key=lambda answer: answer.fun)
     if best.fun > negative_log_likelihood(rho, 0.0) - MIN_LOG_LIKELIHOOD_GAIN:
         return noise
-    rho, white = shape(best.x)
-    return replace(noise, autocorrelation=rho, white=white)
+    # The standard deviation and the outliers belong to the same model.
+    return estimate_noise(e, steps, free, shape=shape(best.x))
 
 
 def _clipped(e: FloatArray) -> FloatArray:

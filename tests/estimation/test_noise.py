@@ -97,16 +97,24 @@ def test_every_number_that_was_fitted_counts() -> None:
 
 def test_a_slow_part_is_believed_only_where_it_is_likelier() -> None:
     alone = estimate_noise(drawn(0.5), STEPS, 0.0)
-    assert fit_slow_and_white(drawn(0.5), STEPS, alone) is alone
+    assert fit_slow_and_white(drawn(0.5), STEPS, alone, 0.0) is alone
     short = NoiseModel(4.0, 0.19)
-    assert fit_slow_and_white(drawn(0.19), STEPS, short) is short
+    assert fit_slow_and_white(drawn(0.19), STEPS, short, 0.0) is short
     both = drawn(0.98, 8.0) + drawn(0.0, 4.0, seed=2)
-    found = fit_slow_and_white(both, STEPS, estimate_noise(both, STEPS, 0.0))
+    found = fit_slow_and_white(both, STEPS, estimate_noise(both, STEPS, 0.0), 0.0)
     assert found.autocorrelation == pytest.approx(0.98, abs=0.01)
     assert found.white == pytest.approx(0.2, abs=0.05)
-    again = estimate_noise(both, STEPS, 0.0, shape=found.shape)
-    assert again.shape == found.shape
-    assert again.sigma == pytest.approx(80.0**0.5, rel=0.15)
+    assert found.sigma == pytest.approx(80.0**0.5, rel=0.15)
+
+
+def test_the_sigma_of_slow_noise_is_that_of_its_own_autocorrelation() -> None:
+    """The AR(1) process of the start has an autocorrelation of 0.99 at most, and a third of the sigma."""
+    rng, n, rho = np.random.default_rng(1), 20_000, 0.999
+    steps = np.r_[np.inf, np.ones(n - 1)]
+    e = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(size=n))
+    found = fit_slow_and_white(e, steps, estimate_noise(e, steps, 0.0), 0.0)
+    driving = found.sigma * np.sqrt(1.0 - found.autocorrelation**2)
+    assert driving == pytest.approx(np.sqrt(1.0 - rho**2), rel=0.05)
 
 
 def test_a_small_slow_part_is_found_where_neighbours_hardly_show_it() -> None:
@@ -117,7 +125,7 @@ def test_a_small_slow_part_is_found_where_neighbours_hardly_show_it() -> None:
     e = slow + rng.normal(0.0, 1.0, n)
     neighbours = estimate_noise(e, steps, 0.0)
     assert neighbours.autocorrelation < 0.2
-    found = fit_slow_and_white(e, steps, neighbours)
+    found = fit_slow_and_white(e, steps, neighbours, 0.0)
     assert -0.1 / np.log(found.autocorrelation) == pytest.approx(100.0, rel=0.6)
     assert found.white == pytest.approx(1.0 / 1.16, abs=0.05)
 

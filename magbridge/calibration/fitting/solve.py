@@ -266,7 +266,9 @@ def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
 def with_slow_noise(answer: Climbed) -> Climbed:
     """Return the posterior, fitted again with slow and white noise if the residuals have both."""
     for _ in range(2):
-        noise = fit_slow_and_white(answer.residual, answer.samples.steps, answer.noise)
+        noise = fit_slow_and_white(
+            answer.residual, answer.samples.steps, answer.noise, answer.widths.determined
+        )
         if noise is answer.noise:
             break
         answer = climb(answer.samples, answer.family, answer.z, answer.widths.eta, noise, shaped=True)
