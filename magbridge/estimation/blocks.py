@@ -87,10 +87,13 @@ class SlowFunctions:
 
     @property
     def shape(self) -> FloatArray:
-        """Prior widths (r,) of the functions' weights, relative to the first."""
-        # weights of a random walk fall as 1/k
+        """Prior widths (r,) of the functions' weights, relative to the first of the longest stretch."""
+        # Weights of a random walk over a time T are proportional to sqrt(T) / k.
         level = [1.0] * self.levels
-        return np.concatenate([[*(1.0 / np.arange(1, count + 1)), *level] for count in self.count])
+        growth = np.sqrt(self.span / self.span.max())
+        return np.concatenate(
+            [[*(g / np.arange(1, n + 1)), *level] for g, n in zip(growth, self.count, strict=True)]
+        )
 
     def __getitem__(self, rows: IndexArray | slice) -> FloatArray:
         t, of = self.time[rows], self.stretch[rows]
