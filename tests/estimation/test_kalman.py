@@ -94,6 +94,9 @@ def test_log_ratio_of_unknown_noise_is_the_ratio_of_student_densities() -> None:
     ratio = 0.5 * (dof + m) * np.log((dof + squares[0]) / (dof + squares[1]))
     ratio -= 0.5 * np.linalg.slogdet(both / S)[1]
     np.testing.assert_allclose(test.log_ratio[5], ratio, atol=1e-8)
+    factor = (dof + squares[1]) / (dof + m)
+    posterior = np.linalg.inv(np.eye(3) + F.T @ F / S)
+    np.testing.assert_allclose(test.covariance(5), factor * posterior, rtol=1e-6)
 
 
 def test_track_process_is_matern() -> None:
