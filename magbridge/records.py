@@ -95,7 +95,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     counts: tuple[int, int, int] | None = None
     """The converter's own numbers, where the instrument sends counts."""
     sequence: int | None = None
-    """Frame number, wrapping at the driver's ``SEQUENCE_MODULO``."""
+    """Frame number, wrapping at the driver's ``sequence_modulo``."""
     device_time: float = nan
     """Time on the instrument's clock, s; NaN if it has none."""
     channel_delay: Vector = (0.0, 0.0, 0.0)

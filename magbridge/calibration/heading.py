@@ -43,7 +43,8 @@ DEFAULT_TILT_SIGMA_DEG = 0.3
 """1-sigma of roll and of pitch where the log does not state one, deg."""
 MODEL_DECLINATION_SIGMA_DEG = 0.26
 """1-sigma of a main-field model's declination in a strong horizontal field, deg: the constant term of the
-error model ``sqrt(0.26^2 + (5417 nT / H)^2)`` (Chulliat et al. 2020, section 3.4)."""
+error model ``sqrt(0.26^2 + (5417 nT / H)^2)`` of the World Magnetic Model 2025 (technical report, NOAA NCEI,
+2025)."""
 MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
 """Term of the same error model that is inversely proportional to the horizontal field H, deg nT."""
 UNIFORM_SIGMA_DEG = 180.0 / sqrt(3.0)
@@ -251,7 +252,8 @@ def model_declination_sigma(horizontal: FloatArray, crustal_sigma: float = 0.0) 
 
     Notes
     -----
-    ``sigma_D^2 = 0.26^2 + (5417 / H)^2 + (180/pi crustal_sigma / (sqrt(2) H))^2`` (Chulliat et al. 2020).
+    ``sigma_D^2 = 0.26^2 + (5417 / H)^2 + (180/pi crustal_sigma / (sqrt(2) H))^2``; the first two terms are
+    those of WMM2025.
     """
     with np.errstate(divide="ignore"):
         model = np.hypot(MODEL_DECLINATION_SIGMA_DEG, MODEL_DECLINATION_SIGMA_NT_DEG / horizontal)

@@ -157,7 +157,7 @@ class GaussianField:
         flat = self.nodes.basis(place)
         if not self.harmonic:
             return flat
-        # Upward continuation as a polynomial in the Laplacian: exp(-k h) ~ (b0 + b1 L + b2 L^2) / (p + L).
+        # Downward continuation as a polynomial in the Laplacian: exp(k h) ~ (b0 + b1 L + b2 L^2) / (p + L).
         b = self._deeper(np.broadcast_to(np.asarray(deeper, float), len(place)))
         rows, terms = csr_array(diags_array(b[0]) @ flat), flat
         for one in b[1:]:
@@ -177,11 +177,11 @@ class GaussianField:
         """Return b (3, n) at `deeper` (n,), m below the nodes: exact at 0, interpolated elsewhere."""
         some = np.linspace(min(deeper.min(), 0.0), max(deeper.max(), 0.0), DEPTHS) if deeper.any() else [0.0]
         some = np.unique(np.append(some, 0.0))
-        # Least squares of exp(-k h) by the three terms, weighted by the field's power at each wave number.
+        # Least squares of exp(k h) by the three terms, weighted by the field's power at each wave number.
         waves, power = (one.ravel() for one in self._spectrum)
         root = np.sqrt(power / power.sum())
         design = np.stack([root * waves**i / (POLE + waves) for i in range(3)], axis=1)
-        falling = np.exp(self._wave_numbers[:, None] * some) * root[:, None]
+        growth = np.exp(self._wave_numbers[:, None] * some) * root[:, None]
         Q, R = np.linalg.qr(design)
-        found = solve_triangular(R, Q.T @ falling)
+        found = solve_triangular(R, Q.T @ growth)
         return np.stack([np.interp(deeper, some, one) for one in found])
