@@ -9,7 +9,7 @@ from typing import Final
 from magbridge.calibration.model import Noise
 from magbridge.estimation.track_process import Course, ReferenceSteps
 from magbridge.field.geodesy import separation
-from magbridge.health.checks import LevelCheck, Messages, RepetitionCheck
+from magbridge.health.checks import MIN_FIELD_NT, LevelCheck, Messages, RepetitionCheck
 from magbridge.health.consistency import ConsistencyCheck, Sensitivity, TestedSample
 from magbridge.health.scatter import ACCELERATION, MIN_FASTER_M_S, Scatter
 from magbridge.health.trend import TrendCheck
@@ -136,8 +136,10 @@ class HealthMonitor:
         if self.is_fault or trend.is_away:
             self.flags = IMPLAUSIBLE
         consistency = self._consistency
-        # the consistency check uses samples at rest that no other check has flagged
-        if steady and not self.flags and trend.is_established and consistency.is_due(time_us, trend):
+        # the consistency check uses samples at rest that no other check flagged; one with a sigma as large
+        # as the Earth's field, as of telemetry in a wrong unit, tells nothing and overflows
+        usable = steady and not self.flags and sigma < MIN_FIELD_NT
+        if usable and trend.is_established and consistency.is_due(time_us, trend):
             # while the position is unknown, the last known main field
             anomaly = total - steps.reference + steps.total if isfinite(steps.reference) else total
             course, speed = self._course.angle, trend.crossing_speed

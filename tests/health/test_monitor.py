@@ -1,6 +1,7 @@
 """Test that the monitor detects and reports each fault once, and does not flag a healthy sensor."""
 
 from collections.abc import Callable
+from functools import partial
 from math import nan
 
 import numpy as np
@@ -334,6 +335,19 @@ def test_without_a_position_only_what_is_nowhere_on_earth_is_wrong() -> None:
     flags, _, reported = flight.judge(reference=nan)
     assert (flags == IMPLAUSIBLE).all()
     assert "expected 17000 to 72000" in reported[0]
+
+
+def test_a_sigma_as_large_as_the_earth_s_field_tells_nothing() -> None:
+    """Telemetry in a wrong unit takes the calibration's polynomials to any size, and the sigma with them."""
+    flight, judge, rng = Flight(n=400), HealthMonitor(Noise(1.0)), np.random.default_rng(1)
+    for k, raw in enumerate((4e3 * flight.raw).tolist()):
+        total = float(np.linalg.norm(raw))
+        effects = 1e10 * rng.normal(size=9)
+        variance = judge.check(
+            k * PERIOD_US, tuple(flight.raw[k].tolist()), tuple(raw), (total, 80.0 * total), 0,
+            (FIELD, 145.0), nan, 0.0, partial(Sensitivity, (), effects),
+        )  # fmt: skip
+        assert variance >= 0.0
 
 
 def test_memory_and_state_do_not_grow() -> None:
