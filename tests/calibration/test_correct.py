@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import Corrector, correct, forward, vector_covariance
 from magbridge.calibration.effects import ChannelEffect
@@ -210,6 +211,13 @@ def test_a_boresight_turns_the_vector_and_leaves_the_magnitude() -> None:
     assert (raw.quality & Quality.NO_BORESIGHT).all()
     assert not (got.quality & Quality.NO_BORESIGHT).any()
     assert (np.linalg.norm(got.vector_sigma, axis=1) > np.linalg.norm(raw.vector_sigma, axis=1)).all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 2.0, 3.1])
+def test_the_boresight_s_matrix_is_that_of_its_rotation_vector(angle: float) -> None:
+    rotation = angle * np.array([2.0, -1.0, 2.0]) / 3.0
+    matrix = turned(tuple(rotation.tolist()), 1e-6 * np.eye(3)).matrix()
+    np.testing.assert_allclose(matrix, Rotation.from_rotvec(rotation).as_matrix(), atol=1e-12)
 
 
 def test_the_boresight_s_covariance_turns_the_vector() -> None:
