@@ -199,7 +199,7 @@ class Motion:
         self._unvouched_us = (
             -MAX_SOURCE_AGE_US
         )  # when the autopilot last reported that its velocity does not hold
-        self._contradicted_us = self._gps_us = self._widened_us = self._guessed_us = -MAX_SOURCE_AGE_US
+        self._contradicted_us = self._gps_us = self._widened_us = -MAX_SOURCE_AGE_US
         self._filter = AttitudeFilter()
         self._main_field = np.zeros(3)  # north, east, down, nT, at the time _main_us
         self._main_us = -MAX_MAIN_FIELD_AGE_US
@@ -280,13 +280,12 @@ class Motion:
         elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
             if self._use(MotionSource.GLIDE, time_us, "heading, pitch and depth"):
                 self._pass(time_us, heading=self._heading, pitch=self._pitch)
-        elif isfinite(self._last) and self._use(
-            MotionSource.LAST, time_us, "heading and the last known speed: no other is sent"
-        ):
-            self._pass(time_us, heading=self._heading, speed=self._last)
-            if time_us - self._guessed_us >= MAX_SOURCE_AGE_US:
-                self._guessed_us = time_us  # a speed that may have changed is as uncertain as its direction
-                self._navigator.widen_heading(time_us, UNKNOWN_SPEED_RAD)
+        elif isfinite(self._last):
+            was_known = self.source is not MotionSource.LAST
+            if self._use(MotionSource.LAST, time_us, "heading and the last known speed: no other is sent"):
+                self._pass(time_us, heading=self._heading, speed=self._last)
+                if was_known:
+                    self._navigator.widen_heading(time_us, UNKNOWN_SPEED_RAD)
 
     def _watch_for_glide(self, time_us: int) -> None:
         """Note when the vehicle last glided: while it is steep, its depth changes.

@@ -33,7 +33,7 @@ __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "IMPOSSIBLE_FRACTION", "PLATFORM_TERMS", "RANGE_MARGIN",
     "REFERENCE_SIGMA_NT", "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality",
     "ScalarSensor", "ScalarSeries", "SensorDisagreement", "compare_sensors", "correct_scalar",
-    "scalar_design", "term_columns", "unknown_direction_variance",
+    "moved_earlier", "scalar_design", "term_columns", "unknown_direction_variance",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19

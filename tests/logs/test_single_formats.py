@@ -204,10 +204,10 @@ def test_geosoft_xyz_keeps_its_lines(tmp_path: Path) -> None:
     )
     log = logs.read(path)
     assert log["line"].to_numpy().tolist() == [100.0] * 3 + [9000.0] * 3 + [1_000_002.0]
-    assert np.isnan(log["ALT"].to_numpy()).tolist() == [False] * 3 + [True] * 3 + [False]
+    assert np.isnan(log["depth"].to_numpy()).tolist() == [False] * 3 + [True] * 3 + [False]
     logs.write(log.assign(quality=("time", [1.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0])), again)
     assert again.read_text().splitlines()[:2] == [
-        "/ time,longitude,latitude,total_field,ALT,quality", "LINE 100"
+        "/ time,longitude,latitude,total_field,depth,quality", "LINE 100"
     ]  # fmt: skip
     back = logs.read(again)
     for name in log.variables:

@@ -10,7 +10,10 @@ from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
 from referee.autopilot import Autopilot, Truth, finite
 
 PLANE_RATES_HZ = dict.fromkeys(
-    ("ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT"),
+    (
+        *("ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
+        *("EKF_STATUS_REPORT", "SYS_STATUS"),
+    ),
     1.0,
 )
 """Rates of messages after a start, Hz: ArduPlane/GCS_MAVLink_Plane.cpp, var_info (SRn_*); also Rover, Sub."""

@@ -99,6 +99,8 @@ EARLY_US = 1_000
 """Time by which a message may be early, µs, so that rounded time steps skip none."""
 ARMED, IN_AIR = 128, 2
 """Flag of HEARTBEAT.base_mode, and value of EXTENDED_SYS_STATE.landed_state."""
+DIFFERENTIAL_PRESSURE = 16
+"""Bit of SYS_STATUS: there is an airspeed sensor."""
 OPTIONAL = frozenset(("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY", "RAW_IMU"))
 """Messages that the autopilot sends only if `streams` names them."""
 Place = tuple[float, float]
@@ -170,7 +172,7 @@ class Autopilot:
             "GPS_RAW_INT": self._gps_raw, "GLOBAL_POSITION_INT": self._global_position,
             "VFR_HUD": self._vfr_hud, "LOCAL_POSITION_NED": self._local_position,
             "ODOMETRY": self._own_odometry, "EXTENDED_SYS_STATE": self._extended_state,
-            "RAW_IMU": self._raw_imu,
+            "RAW_IMU": self._raw_imu, "SYS_STATUS": self._sys_status,
         }  # fmt: skip
 
     @property
@@ -335,6 +337,11 @@ class Autopilot:
         ground = hypot(*self.filter.velocity)
         speed = truth.speed if self._airspeed else ground
         return self._codec.pack("VFR_HUD", airspeed=speed, groundspeed=ground)
+
+    def _sys_status(self, truth: Truth) -> bytes:  # noqa: ARG002 - a message like the others
+        # GCS.cpp, update_sensor_status_flags
+        present = DIFFERENTIAL_PRESSURE if self._airspeed else 0
+        return self._codec.pack("SYS_STATUS", onboard_control_sensors_present=present)
 
     def _local_position(self, truth: Truth) -> bytes:
         (north, east), (vn, ve) = self.filter.position, self.filter.velocity

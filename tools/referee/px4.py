@@ -11,7 +11,7 @@ from referee.autopilot import Autopilot, Truth, finite
 
 PX4_RATES_HZ = {
     "ATTITUDE": 15.0, "VFR_HUD": 4.0, "GPS_RAW_INT": 5.0, "GLOBAL_POSITION_INT": 5.0,
-    "LOCAL_POSITION_NED": 1.0, "ESTIMATOR_STATUS": 0.5,
+    "LOCAL_POSITION_NED": 1.0, "ESTIMATOR_STATUS": 0.5, "SYS_STATUS": 1.0,
 }  # fmt: skip
 """Rates after a start, Hz: mavlink_main.cpp, configure_streams_to_default, MAVLINK_MODE_NORMAL."""
 
