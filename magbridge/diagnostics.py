@@ -120,8 +120,8 @@ TRACK_TEXTS = {
 SCALAR_TEXTS = {
     "scalar.lag": "{column} is {lag_s:.2f} s late (1-sigma {sigma_s:.2g} s): correct its clock",
     "scalar.implausible_shift": "{column}: a lag of {lag_s:.1f} s and a lever arm of {forward_m:.0f} m "
-    "forward, {starboard_m:.0f} m starboard are implausible, and so is the map: the vehicle's own field "
-    "passes for them; calibrate --scalar first, or give --lag and --lever",
+    "forward, {starboard_m:.0f} m starboard are implausible, and the map is wrong: probably they stand for "
+    "the vehicle's own field; calibrate --scalar first, or give --lag and --lever",
     "scalar.shift": "{column} reads the field {shift_m:.2f} m ahead of the position (1-sigma "
     "{sigma_m:.1f} m): a lag or a lever arm",
     "scalar.heading_error": "{column} has a heading error of {effect_nT:.1f} nT (standard deviation)",

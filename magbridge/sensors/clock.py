@@ -196,7 +196,7 @@ class PeriodMeter:
     """Measurement of the period of readings that contradict their nominal period.
 
     Times (t) of the readings of a slower or faster instrument are a straight line over their number (n).
-    Lost readings cause steps of whole periods, which are no straight line. So losses do not look like a
+    Lost readings cause steps of whole periods, so that the times leave the line. So losses differ from a
     slower instrument, unless each second reading is lost.
     """
 
