@@ -118,6 +118,25 @@ def test_a_moving_mass_is_flagged_until_it_rests() -> None:
     assert seen == [False] * 6 + [True] * 5 + [True] * 3 + [False] * 6
 
 
+@pytest.mark.parametrize(("change", "moving"), [(0.9, False), (1.1, True)])
+@pytest.mark.parametrize("seconds", [0.2, 1.0])
+@pytest.mark.parametrize("rests", [0.0, 1.1])
+def test_a_change_within_a_second_is_motion_above_the_moving_rate(
+    change: float, seconds: float, rests: float, *, moving: bool
+) -> None:
+    """Changes sooner than a second count as changes within a second, so that noise is no motion.
+
+    A rest before the change does not lower its rate.
+    """
+    settings = Align(moving_rate=0.1)
+    aligner = Aligner((BATTERY,), settings)
+    aligner.telemetry("battpos", START - round(rests * SECOND), 0.0)
+    aligner.telemetry("battpos", START, 0.0)
+    at_us = START + round(seconds * SECOND)
+    aligner.telemetry("battpos", at_us, change * settings.moving_rate * (BATTERY.high - BATTERY.low))
+    assert ("moving" in flags(aligner.reading(reading(), at_us))) == moving
+
+
 def test_noisy_telemetry_of_a_resting_mass_is_not_motion() -> None:
     aligner = Aligner((BATTERY,), Align())
     rng = np.random.default_rng(1)

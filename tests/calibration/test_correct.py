@@ -209,6 +209,9 @@ def test_a_boresight_turns_the_vector_and_leaves_the_magnitude() -> None:
     np.testing.assert_allclose(got.total, raw.total, rtol=1e-11)
     np.testing.assert_allclose(got.vector, raw.vector @ sighted.boresight.matrix().T, rtol=1e-9, atol=1e-6)
     assert (raw.quality & Quality.NO_BORESIGHT).all()
+    inside = [raw.quality == Quality.NO_BORESIGHT]
+    assert np.any(inside)
+    assert not got.quality[tuple(inside)].any()
     assert not (got.quality & Quality.NO_BORESIGHT).any()
     assert (np.linalg.norm(got.vector_sigma, axis=1) > np.linalg.norm(raw.vector_sigma, axis=1)).all()
 

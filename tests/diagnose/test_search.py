@@ -1,6 +1,7 @@
 """Test the search on artificial residuals, and the evidence that it compares."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +19,10 @@ from magbridge.diagnose.evidence import (
     Information,
     bayes_factor_threshold,
     evidence_of,
+    likeness,
     log_bayes,
     log_odds,
+    look_elsewhere_factors,
     score,
 )
 from magbridge.diagnose.joint import RIDGE, fit_joint
@@ -283,6 +286,54 @@ def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
         200.0, [chart], look_elsewhere, 0.0
     )
     assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
+
+
+def test_each_spectrum_that_was_tried_has_its_price() -> None:
+    """A choice among three spectra costs log 3, as a choice among three hypotheses does."""
+    one, three = (sized("map_error", 6, spectra=np.ones((k, 6))) for k in (1, 3))
+    odds = [log_odds(200.0, [chart], {"map_error": 1.0}, 0.0) for chart in (one, three)]
+    assert odds[0] - odds[1] == pytest.approx(np.log(3.0))
+
+
+@pytest.mark.parametrize(("correlation", "expected"), [(0.0, 2.0), (1.0, 1.0)])
+def test_number_of_hypotheses_counts_those_that_differ(correlation: float, expected: float) -> None:
+    """Two orthogonal candidates are two hypotheses, two equal ones are one; each of one size adds one."""
+    S = 100.0 * np.array([[1.0, correlation, 0.0], [correlation, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    info = Information(S, np.zeros(3), np.zeros((0, 3)))
+    steps = [sized("offset_step"), sized("offset_step")]
+    chart = sized("offset_step", spectra=np.ones((1, 1)))
+    places = [slice(k, k + 1) for k in range(3)]
+    assert look_elsewhere_factors(info, steps, places)["offset_step"] == pytest.approx(expected, abs=0.02)
+    more = look_elsewhere_factors(info, [*steps, chart], places)["offset_step"]
+    assert more == pytest.approx(expected + 1.0, abs=0.02)
+
+
+def test_likeness_is_the_correlation_of_two_columns_less_what_a_prior_prevents() -> None:
+    """Free coefficients imitate a signature in full; one of a common size only up to its prior."""
+    info = Information(np.array([[4.0, 1.2], [1.2, 1.0]]), np.zeros(2), np.zeros((0, 2)))
+    free, process = sized("late"), sized("map_error", spectra=np.ones((1, 1)))
+    a, b = slice(0, 1), slice(1, 2)
+    assert likeness(info, free, a, free, b) == pytest.approx(0.6, abs=1e-3)
+    # shares of power: 1.2²/(1 + 1)/4 and 1.2²/(4 + 1)/1
+    assert likeness(info, process, a, process, b) == pytest.approx(np.sqrt(1.2**2 / 5.0))
+
+
+def test_projection_of_a_model_is_the_joint_least_squares_solution() -> None:
+    """Compare with the normal equations of calibration, model and candidate, solved at once."""
+    rng = np.random.default_rng(8)
+    Z, C, B = (rng.normal(size=(40, size)) for size in (3, 2, 2))
+    y, prior = rng.normal(size=40), np.array([0.5, 0.5, 0.5, 2.0, 3.0])
+    base = SimpleNamespace(z=np.zeros(3), coefficients=np.zeros(2), prior=prior)
+    # candidate and model, with the calibration projected out
+    X = np.hstack([B, C])
+    K = np.linalg.solve(Z.T @ Z + np.diag(prior[:3]), Z.T @ X)
+    info = Information(X.T @ (X - Z @ K), X.T @ y - K.T @ (Z.T @ y), np.asarray(K, float))
+    found = info.fitted(base)  # type: ignore[arg-type]
+    both = np.hstack([Z, C])
+    K = np.linalg.solve(both.T @ both + np.diag(prior), both.T @ B)
+    np.testing.assert_allclose(found.matrix, B.T @ (B - both @ K))
+    np.testing.assert_allclose(found.score, B.T @ y - K.T @ (both.T @ y))
+    np.testing.assert_allclose(found.shift, K)
 
 
 def test_a_score_is_the_ratio_its_evidence_and_the_shrunk_estimate() -> None:

@@ -13,7 +13,14 @@ from magbridge.estimation.sparse import SparseFactor, inverse_blocks
 
 @pytest.mark.parametrize(
     ("alpha", "harmonic", "buried"),
-    [(2, False, False), (3, False, False), (4, False, False), (4, True, False), (4, False, True)],
+    [
+        (2, False, False),
+        (3, False, False),
+        (4, False, False),
+        (4, True, False),
+        (10, True, False),
+        (4, False, True),
+    ],
 )
 def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: bool, buried: bool) -> None:
     """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one.

@@ -49,14 +49,17 @@ def monitor(
     step: float,
     own: FloatArray | None = None,
     error_effects: FloatArray | None = None,
+    mass_changes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, list[str]]:
     """Return sigma (n,), flags (n,) and messages; each sample's own sigma (n,) is 1.5 nT by default.
 
-    `error_effects` (n, r) are the effects of the calibration's independent errors, nT.
+    `error_effects` (n, r) are the effects of the calibration's independent errors, nT, `mass_changes`
+    (n, m) those of moving each mass by 3 % of its range.
     """
     error_effects = np.zeros((len(total), 0)) if error_effects is None else error_effects
     own = np.full(len(total), 1.5) if own is None else own
-    health, rng = HealthMonitor(Noise(1.0)), np.random.default_rng(9)
+    masses = np.zeros((len(total), 0)) if mass_changes is None else mass_changes
+    health, rng = HealthMonitor(Noise(1.0), masses=masses.shape[1]), np.random.default_rng(9)
     sigma, flags = np.empty((2, len(total)))
     for k, F in enumerate(total.tolist()):
         time_us = round(1e6 * step * (k + 1))
@@ -64,19 +67,20 @@ def monitor(
         field = tuple((F * u[k]).tolist())
         raw = tuple((F * u[k] + rng.normal(0.0, 0.1, 3)).tolist())
         fields = F, float(own[k])
-        effects = partial(Sensitivity, error_effects=error_effects[k])
+        effects = partial(Sensitivity, masses[k].tolist(), error_effects[k])
         more = health.check(time_us, raw, field, fields, 0, (FIELD, 145.0), float(warmth[k]), 0.0, effects)
         sigma[k], flags[k] = (own[k] ** 2 + more) ** 0.5, health.flags
     return sigma, flags, health.messages
 
 
-@pytest.mark.parametrize("fault", ["none", "offset", "gain", "temperature", "drift"])
+@pytest.mark.parametrize("fault", ["none", "small", "offset", "gain", "temperature", "drift"])
 def test_error_that_follows_the_attitude_widens_sigma(fault: str) -> None:
     u, crust = glide(3)
     time = 4.0 * np.arange(len(u))
     warmth = 10.0 + 4.0 * np.sin(time / 700.0)
     amount = {
         "none": np.zeros(len(u)),
+        "small": 1.5 * np.ones(len(u)),  # less than the sigma that the samples have
         "offset": 15.0 * np.ones(len(u)),
         "temperature": 3.0 * (warmth - 10.0),
         "drift": 20.0 * time / 3600.0,
@@ -85,7 +89,7 @@ def test_error_that_follows_the_attitude_widens_sigma(fault: str) -> None:
     error = 60.0 * u[:, 0] ** 2 * late if fault == "gain" else amount.get(fault, crust) * u[:, 0] * late
     noise = np.random.default_rng(7).normal(0.0, 1.0, len(u))
     sigma, flags, messages = monitor(FIELD + crust + error + noise, u, warmth, speed=0.35, step=4.0)
-    if fault == "none":
+    if fault in {"none", "small"}:
         assert not flags.any()
         assert (sigma == 1.5).all()
         assert messages == []
@@ -93,6 +97,28 @@ def test_error_that_follows_the_attitude_widens_sigma(fault: str) -> None:
     plain = (flags == 0) & (time > 5000.0)
     assert np.count_nonzero((np.abs(error + noise) > 3.0 * sigma) & plain) < 0.02 * len(u)
     assert messages
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.06])
+def test_wrong_telemetry_of_a_mass_is_named_and_widens_sigma(wrong: float) -> None:
+    """The telemetry of one of two masses is wrong by 6 % of its range, twice the prior's 1-sigma."""
+    u, crust = glide(5)
+    k = np.arange(len(u))
+    # of effects of second order, because one of first order looks like an offset
+    changes = np.stack([40.0 * u[:, 0] * np.cos(k / 37.0), 15.0 * u[:, 2] * np.sin(k / 40.0)], axis=1)
+    error = wrong / 0.03 * changes[:, 0] * (k > 300)
+    noise = np.random.default_rng(7).normal(0.0, 1.0, len(u))
+    warmth = np.full(len(u), nan)
+    total = FIELD + crust + error + noise
+    sigma, flags, messages = monitor(total, u, warmth, speed=0.35, step=4.0, mass_changes=changes)
+    if not wrong:
+        assert not flags.any()
+        assert (sigma == 1.5).all()
+        assert messages == []
+        return
+    assert any("telemetry of a mass wrong" in line for line in messages)
+    late = (flags == 0) & (k > 1000)
+    assert np.count_nonzero(np.abs(error + noise)[late] > 3.0 * sigma[late]) < 0.02 * len(u)
 
 
 @pytest.mark.parametrize("seed", range(4))

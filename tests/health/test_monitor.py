@@ -123,9 +123,11 @@ def test_spikes_are_flagged_one_by_one() -> None:
 def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() -> None:
     flight = Flight()
     flight.raw[500:515] += along(flight.raw[500:515], 200.0)  # a ship passes: one minute
-    flags, _, reported = flight.judge()
+    flags, sigma, reported = flight.judge()
     assert (flags[500:515] == IMPLAUSIBLE).all()
     assert not flags[540:].any()
+    assert (sigma[520:550] > 100.0).all()
+    assert (sigma[580:] == SIGMA).all(), "four minutes after the second jump"
     assert len(reported) == 1
     flight.raw[515:1000] += along(flight.raw[515:1000], 200.0)
     flags, sigma, _ = flight.judge()
