@@ -294,7 +294,7 @@ def feed(bridge: Pipeline, files: FileServer, event: Event) -> None:
         files.ask(bridge.component.file_requests.popleft())
     if replies := files.drain()[1]:
         bridge.interleaved(replies)
-    bridge.streams[0].line.to_send.clear()
+    bridge.streams[0].to_send.clear()
     bridge.recorder.drain()
 
 

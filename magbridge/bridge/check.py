@@ -432,7 +432,7 @@ class LiveCheck:
         for key in sorted(needed.keys() | self._counts.keys(), key=lambda key: (key not in needed, key)):
             sender = f"{key[0]}:{key[1]}"
             self.arrived.append(Arrived(spec(key[2]).name, sender, self._rate(key), needed.get(key, 0.0)))
-        said = pipeline.component.announcer.texts
+        said = pipeline.component.output.texts
         # a later text replaces an earlier one of its subject, such as "field: stale telemetry" at the start
         latest = {text.partition(": ")[0]: text for _, text in said}
         texts = [text for severity, text in said if severity <= MAV_SEVERITY.WARNING]
@@ -465,7 +465,7 @@ class LiveCheck:
         for stream in pipeline.streams:
             self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
             if not stream.samples:
-                name, remedy = stream.sensor.driver, NO_READING[MAG_PORT_STATE(stream.line.state)]
+                name, remedy = stream.sensor.driver, NO_READING[MAG_PORT_STATE(stream.state)]
                 text = f"{name}: no reading in {self._duration_us * 1e-6:.0f} s: {remedy}"
                 self._warn(stream.sensor.key, text)
 

@@ -19,10 +19,10 @@ import msgspec
 
 from magbridge.bridge.port import Port
 from magbridge.bridge.position import CLOCK_SET_US
-from magbridge.bridge.sensor import SensorLine
+from magbridge.bridge.sensor import SensorStream
 from magbridge.config import Config, Sensor, Telemetry
 from magbridge.errors import PortError
-from magbridge.link.output import Announcer
+from magbridge.link.output import Output
 from magbridge.mavlink import Codec, Stream, spec
 from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
 from magbridge.records import Channel
@@ -162,8 +162,9 @@ stall, µs. While the inputs wait, each pass of the event loop has more to proce
 class StateChanges:
     """Handler of state frames, which applies the changes and sends STATUSTEXTs about them.
 
-    `codec`: codec of the link; its ``utc_offset_us`` follows the steps of the host's clock.
-    `sensors`: lines of the sensors, by sensor id.
+    `output`: sender of the STATUSTEXTs. The ``utc_offset_us`` of its codec follows the steps of the host's
+        clock.
+    `sensors`: the sensors, by sensor id.
     `log_state`: state of the log (MAG_LOG_STATE).
     `log_lost`: number of records that the log has lost.
     `since_us`, `until_us`: event times, µs; inputs up to `until_us` may have waited since `since_us`.
@@ -171,8 +172,8 @@ class StateChanges:
         only on event times, so that a replay omits the same work.
     """
 
-    def __init__(self, codec: Codec, announcer: Announcer, sensors: Mapping[int, SensorLine]) -> None:
-        self._codec, self._announcer, self._sensors = codec, announcer, sensors
+    def __init__(self, output: Output, sensors: Mapping[int, SensorStream]) -> None:
+        self._output, self._codec, self._sensors = output, output.codec, sensors
         self.log_state, self.log_lost = MAG_LOG_STATE.OFF, 0
         self.since_us = self.until_us = 0
         self.is_overloaded = False
@@ -183,7 +184,7 @@ class StateChanges:
         """End an overload if no stall was reported for `PAUSE_US` before `time_us` (µs)."""
         if time_us - self._last_stall_us > PAUSE_US:
             self.is_overloaded = False
-            self._announcer.state("overload", "overload is over")
+            self._output.announce("overload", "overload is over")
 
     def _find_overload(self, time_us: int, duration_us: int) -> None:
         """Detect that successive stalls, the last of `duration_us` until `time_us`, fill most of the time."""
@@ -195,7 +196,7 @@ class StateChanges:
         if elapsed_us >= OVERLOAD_US and 2 * self._stalled_us >= elapsed_us and not is_single:
             self.is_overloaded = True
             text = "overload: learning pauses, fewer messages"
-            self._announcer.state("overload", text, MAV_SEVERITY.WARNING)
+            self._output.announce("overload", text, MAV_SEVERITY.WARNING)
 
     @staticmethod
     def held_up(data: bytes) -> int:
@@ -208,12 +209,12 @@ class StateChanges:
             if message.id == CLOCK_STEP:
                 self._codec.utc_offset_us += message["step"]
                 step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
-                self._announcer.send_statustext(step, MAV_SEVERITY.NOTICE)
+                self._output.send_statustext(step, MAV_SEVERITY.NOTICE)
                 self.check_clock()
             elif message.id == INTERLEAVED:  # in a replay
                 self._codec.skip(message["count"])
             elif message.id == NOTICE:
-                self._announcer.send_statustext(message["text"], MAV_SEVERITY(message["severity"]))
+                self._output.send_statustext(message["text"], MAV_SEVERITY(message["severity"]))
             elif message.id == STANDSTILL:
                 self._stood_still(time_us, message["duration"])
             elif message.id == PORT:
@@ -226,7 +227,7 @@ class StateChanges:
         if unset or self._clock_unset:
             text = "host clock was never set: no date, no main field" if unset else "host clock is set"
             severity = MAV_SEVERITY.WARNING if unset else MAV_SEVERITY.INFO
-            self._announcer.state("clock", text, severity)
+            self._output.announce("clock", text, severity)
         self._clock_unset = unset
 
     def _stood_still(self, time_us: int, duration_us: int) -> None:
@@ -236,20 +237,20 @@ class StateChanges:
         self._find_overload(time_us, duration_us)
         if duration_us >= NOTICE_US and not self.is_overloaded:
             text = f"stood still for {duration_us * 1e-6:.1f} s: late samples are flagged"
-            self._announcer.send_statustext(text, MAV_SEVERITY.WARNING)
+            self._output.send_statustext(text, MAV_SEVERITY.WARNING)
 
     def _port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
         severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR
         if port == MAG_PORT_NAME.LOG:
             self.log_state = MAG_LOG_STATE.OK if well else MAG_LOG_STATE.FAILED
             self.log_lost = dropped
-            self._announcer.state("log", f"log: {reason or 'being written'}", severity)
+            self._output.announce("log", f"log: {reason or 'being written'}", severity)
         elif port != MAG_PORT_NAME.LINK:
             if (sensor := self._sensors.get(source_of(port)[1])) is not None:
-                sensor.opened(time_us) if well else sensor.lost(reason)
+                sensor.opened(time_us) if well else sensor.closed(reason)
         else:
             severity = MAV_SEVERITY.WARNING if well and reason else severity
-            self._announcer.state("link", f"link: {reason or 'open'}", severity)
+            self._output.announce("link", f"link: {reason or 'open'}", severity)
 
 
 BYTES: Final = spec("MAG_SENSOR_BYTES")

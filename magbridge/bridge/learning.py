@@ -135,12 +135,12 @@ class LearningService:
         learner, component = self.learner, self._component
         for notice in learner.notices:
             severity = MAV_SEVERITY.WARNING if notice.grave else MAV_SEVERITY.NOTICE
-            component.announcer.send_statustext(notice.text, severity)
+            component.output.send_statustext(notice.text, severity)
         learner.notices.clear()
         if learner.calibration is not self._published:
             self._published = learner.calibration
             self._id = calibration_id(learner.calibration)
-            component.use_calibration(self._id)
+            component.publisher.calibration_id = self._id
             if not learner.renewed or time_us - self._kept_us > FILE_INTERVAL_US:
                 self._kept_us = time_us
                 self.to_keep.append(learner.calibration)
@@ -153,7 +153,7 @@ class LearningService:
         learner, offset_us = self.learner, self._component.codec.utc_offset_us
         state, first = learner.state, learner.calibration is learner.first
         going = MAG_LEARNING_STATE.LEARNING if first else MAG_LEARNING_STATE.LEARNED
-        self._component.outbox.send(
+        self._component.output.send(
             "MAG_LEARNING",
             time_usec=time_us + offset_us,
             alarm_since=state.since_us + offset_us if state.causes else 0,

@@ -345,7 +345,7 @@ class Motion:
             text = "VFR_HUD.airspeed is the speed over ground: not used"
             self._equal += 1
             if self._equal >= MIN_EQUAL:
-                self._component.announcer.state("airspeed", text, MAV_SEVERITY.WARNING)
+                self._component.output.announce("airspeed", text, MAV_SEVERITY.WARNING)
         elif speed > 0.0 and isfinite(self._heading):
             self._equal = 0
             self._last = speed
@@ -456,7 +456,7 @@ class Motion:
             self.source, self._stream, self._step = source, stream, None
         self._received_us = time_us
         severity = MAV_SEVERITY.WARNING if source is MotionSource.LAST else MAV_SEVERITY.INFO
-        self._component.announcer.state("motion", f"dead reckoning by {words}", severity)
+        self._component.output.announce("motion", f"dead reckoning by {words}", severity)
         return True
 
     def _pass(self, time_us: int, **values: Any) -> None:

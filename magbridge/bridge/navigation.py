@@ -121,7 +121,7 @@ class Fixing:
             GLOBAL_POSITION_INT=self._compare, GPS_RAW_INT=self._gps, HEARTBEAT=self._heartbeat,
         )  # fmt: skip
         if kind.local:
-            component.timers.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
+            component.output.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
 
     @property
     def velocity_stays(self) -> bool:
@@ -166,7 +166,7 @@ class Fixing:
             since_us = inf if self._before_us is None else now_us - self._before_us
             fix = widened(fix, since_us * 1e-6)
         self._before_us = now_us
-        self._kind.send(self._component.outbox, fix, *self._component.peer)
+        self._kind.send(self._component.output, fix, *self._component.peer)
         self.sent += 1
         rejected = self._gnss.state is GnssState.REJECTED and self._has_gps(now_us)
         self._state(f"fixes go to the autopilot: GPS is {'rejected' if rejected else 'lost'}")
@@ -212,7 +212,7 @@ class Fixing:
         self._waiting += 1
         if self._waiting > UNANSWERED:
             text = "the autopilot does not answer fixes"
-            self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
+            self._component.output.announce("answer", text, MAV_SEVERITY.WARNING)
 
     def _answer(self, message: Message, time_us: int) -> None:
         if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:
@@ -226,12 +226,12 @@ class Fixing:
         if result != self._result:
             self._result, self._report_us = result, time_us + ANSWER_PAUSE_US
         if accepted:
-            self._component.announcer.state("answer", "the autopilot takes fixes")
+            self._component.output.announce("answer", "the autopilot takes fixes")
             return
         known = result in set(MAV_RESULT)
         name = MAV_RESULT(result).name if known else f"result {result}"
         text = f"the autopilot refuses fixes: {name}{HINTS.get(result, '')}"
-        self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
+        self._component.output.announce("answer", text, MAV_SEVERITY.WARNING)
 
     def _compare(self, message: Message, time_us: int) -> None:
         """Compare the autopilot's position with the last fix; report a difference that lasts `UNUSED_US`."""
@@ -241,12 +241,12 @@ class Fixing:
         distance = hypot(*separation(self._last.latitude, self._last.longitude, *own))
         if distance < MIN_DIFFERENCE_M + DIFFERENCE_SIGMA * self._last.sigma:
             self._agreed_us = time_us
-            self._component.announcer.forget("use")
+            self._component.output.forget("use")
         elif time_us - self._agreed_us > UNUSED_US:
             text = f"the autopilot does not use the fixes: its position is {distance:.0f} m off"
             # report only once, although the distance in the text changes
             if not self._reported_unused:
-                self._component.announcer.state("use", text, MAV_SEVERITY.WARNING)
+                self._component.output.announce("use", text, MAV_SEVERITY.WARNING)
         self._reported_unused = distance >= MIN_DIFFERENCE_M and time_us - self._agreed_us > UNUSED_US
 
     def _read_version(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
@@ -281,7 +281,7 @@ class Fixing:
     def _request(self, name: str) -> None:
         """Request one message `name` from the autopilot."""
         system, autopilot = self._component.peer
-        self._component.outbox.send(
+        self._component.output.send(
             "COMMAND_LONG",
             command=MAV_CMD.REQUEST_MESSAGE,
             param1=float(spec(name).id),
@@ -296,7 +296,7 @@ class Fixing:
         )
 
     def _state(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        self._component.announcer.state("fixes", text, severity)
+        self._component.output.announce("fixes", text, severity)
 
 
 GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
@@ -354,7 +354,7 @@ class NavigationService:
         self._with_updates = fix.rate == 0.0
         if not self._with_updates:
             now_us = component.codec.now_us
-            component.timers.every("fix", round(1e6 / fix.rate), lambda _: self._send(), now_us)
+            component.output.every("fix", round(1e6 / fix.rate), lambda _: self._send(), now_us)
         self._rate: Rate = component.rates["MAG_NAVIGATION"]
         self._state = NavigationState.OFF
 
@@ -406,7 +406,7 @@ class NavigationService:
             if gnss.state is not GnssState.GOOD:
                 word = gnss.state.name.lower()
                 text, severity = f"GPS {word}: {GPS_REASONS[gnss.reason]}", MAV_SEVERITY.WARNING
-            self._component.announcer.state("gps", text, severity)
+            self._component.output.announce("gps", text, severity)
 
     def _delay(self, message: Message, time_us: int) -> tuple[float, float]:
         """Return how long a GPS_RAW_INT, received at `time_us` (µs), has waited, and its 1-sigma, s.
@@ -425,10 +425,10 @@ class NavigationService:
         if record.state is not self._state:
             self._state = record.state
             severity = MAV_SEVERITY.WARNING if record.state is NavigationState.LOST else MAV_SEVERITY.INFO
-            component.announcer.state("navigation", f"navigation: {STATE_TEXTS[record.state]}", severity)
+            component.output.announce("navigation", f"navigation: {STATE_TEXTS[record.state]}", severity)
         offset_us = component.codec.utc_offset_us
         if self._rate.due(record.time_us):
-            component.outbox.send(
+            component.output.send(
                 "MAG_NAVIGATION",
                 time_usec=record.time_us + offset_us,
                 lat=round(record.latitude * 1e7),

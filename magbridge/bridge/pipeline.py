@@ -31,10 +31,10 @@ from magbridge.link.component import Component
 from magbridge.link.estimates import NO_ATTITUDE, Attitude
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.publish import MASK, check_publish
-from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, Sources, TelemetryMap, is_possible, needed_rates
+from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, TelemetryMap, is_possible, needed_rates
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Message, Signing, Spec, load_key, spec
-from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver
@@ -100,15 +100,13 @@ class Pipeline:
         stamps = start.signing_timestamp, start.signing_streams
         self.signing = Signing(key, *stamps, (own.system, own.autopilot)) if key else None
         self.component = self._open_component()
-        self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
         publisher = self.component.publisher
         stream = SensorStream(config.sensor, drivers[0], main, self.component, start.time_us, publisher)
         self.streams = [stream, *self._other_streams(drivers[1:], more or {}, used)]
         self._by_id = {one.sensor_id: one for one in self.streams}
-        lines = {one.sensor_id: one.line for one in self.streams}
         if len(self.streams) > 1:
-            self.component.reports.more += [one.report for one in self.streams]
-        self._changes = StateChanges(self.component.codec, self.component.announcer, lines)
+            self.component.more_reports += [one.report for one in self.streams]
+        self._changes = StateChanges(self.component.output, self._by_id)
         self._comparisons = [
             SensorComparison((config.sensor.label, one.label)) for one in config.more_sensors
         ]
@@ -147,7 +145,6 @@ class Pipeline:
             version=__version__,
             kept=start.parameters,
             status=self._status,
-            speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
             streams=streams,
         )
 
@@ -164,7 +161,7 @@ class Pipeline:
             own = calibrations.get(number)
             correction, used = open_correction(sensor, driver, config, own, main)
             if own is not None and used is None:
-                component.announcer.send_statustext(NOT_USED.format(sensor.driver), MAV_SEVERITY.ERROR)
+                component.output.send_statustext(NOT_USED.format(sensor.driver), MAV_SEVERITY.ERROR)
             publisher = component.another_publisher(number, calibration_id(used) if used else 0)
             yield SensorStream(sensor, driver, correction, component, self._start.time_us, publisher)
 
@@ -181,19 +178,19 @@ class Pipeline:
     @property
     def deadline(self) -> int:
         """Time by which :meth:`feed` must be called, if only with an empty event, µs since 1970 UTC."""
-        return self.component.next_deadline
+        return self.component.output.next_deadline
 
     def feed(self, event: Event) -> list[tuple[int, bytes]]:
         """Process an event; return the frames to send over the link, each with its event time (µs)."""
         component, recorder = self.component, self.recorder
-        outbox, time_us, channel, data = component.outbox, event.time_us, event.channel, event.data
+        output, time_us, channel, data = component.output, event.time_us, event.channel, event.data
         if channel is Channel.STATE and data and (held_us := self._changes.held_up(data)):
-            for name in ("autopilot", *(stream.line.timer for stream in self.streams)):
-                component.timers.delay(name, held_us)  # during a stall, silence cannot be observed
-        component.advance(time_us)
+            for name in ("autopilot", *(stream.timer for stream in self.streams)):
+                output.delay(name, held_us)  # during a stall, silence cannot be observed
+        output.advance(time_us)
         due: list[tuple[int, bytes]] = []
-        if outbox.frames:
-            due = outbox.drain()
+        if output.frames:
+            due = output.drain()
             recorder.sent(due)
         if self._late and time_us > self._changes.until_us:
             self._late = False
@@ -213,7 +210,7 @@ class Pipeline:
             if self._changes.until_us >= time_us:
                 self._late = True
                 self._set_late(self._changes.since_us)
-        answers = outbox.drain()
+        answers = output.drain()
         recorder.sent(answers)
         return due + answers if due else answers
 
@@ -290,7 +287,7 @@ class Pipeline:
             variance, flags = max(variance, more), flags | flag
             if comparison.message:
                 severity = MAV_SEVERITY.ERROR if comparison.is_wrong else MAV_SEVERITY.INFO
-                self.component.announcer.send_statustext(comparison.message, severity)
+                self.component.output.send_statustext(comparison.message, severity)
                 comparison.message = ""
         if isinstance(stream.correction, Correction):
             stream.correction.is_contradicted = bool(flags or variance)
@@ -318,13 +315,13 @@ class Pipeline:
         component = self.component
         for message in component.receive(data, time_us):
             for name, value, when_us in self._telemetry.values(message, time_us, component.vehicle.clock):
-                if self._sources.admit(name, message.component, time_us):
+                if self._telemetry.admit(name, message, time_us, component.output):
                     guessed = self._late and when_us == time_us
                     true_us = when_us - self._telemetry.delays_us[name]
                     for stream in self.streams:
                         stream.correction.telemetry(name, value, true_us, guessed=guessed)
             if not is_possible(message):
-                self.component.announcer.state(
+                self.component.output.announce(
                     f"impossible {message.name}", f"{message.name} with impossible values ignored",
                     MAV_SEVERITY.WARNING,
                 )  # fmt: skip
@@ -350,7 +347,7 @@ class Pipeline:
             self._parts.call("position", None, self._position.update, message, time_us)
         elif message.component not in self._ignored_positions:
             self._ignored_positions.add(message.component)
-            self.component.announcer.send_statustext(
+            self.component.output.send_statustext(
                 f"position of component {message.component} ignored", MAV_SEVERITY.WARNING
             )
 
@@ -374,13 +371,13 @@ class Pipeline:
         names = Quality(doubtful).names().replace("_", " ")
         severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
         key = f"quality {stream.sensor_id}" if stream.sensor_id else "quality"
-        self.component.announcer.state(key, f"{self._field_of(stream)}: {names or 'good'}", severity)
+        self.component.output.announce(key, f"{self._field_of(stream)}: {names or 'good'}", severity)
         stream.quality = doubtful
 
     def _report_implausible(self, stream: SensorStream) -> None:
         prefix = f"{stream.sensor.label}: " if len(self.streams) > 1 else ""
         for text in stream.correction.notices:
-            self.component.announcer.send_statustext(prefix + text, MAV_SEVERITY.ERROR)
+            self.component.output.send_statustext(prefix + text, MAV_SEVERITY.ERROR)
         stream.correction.notices.clear()
 
     def _field_of(self, stream: SensorStream) -> str:
@@ -388,7 +385,7 @@ class Pipeline:
         return f"field of {stream.sensor.label}" if len(self.streams) > 1 else "field"
 
     def _report_no_anomaly(self, reason: str) -> None:
-        self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
+        self.component.output.announce("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
 
     def _begin(self, start: StartEvent, calibration: Calibration | None, *, foreign: bool) -> None:
         """Record the frames that a replay needs, and send a STATUSTEXT about the calibration in use.
@@ -398,7 +395,7 @@ class Pipeline:
         for frame in self.beginning(start.parameters):
             self.recorder.state(start.time_us, frame)
         self._changes.check_clock()
-        send_statustext = self.component.announcer.send_statustext
+        send_statustext = self.component.output.send_statustext
         if foreign:
             send_statustext(NOT_USED.format(self._config.sensor.driver), MAV_SEVERITY.ERROR)
         elif isinstance(self._correction, ScalarCorrection):
@@ -425,14 +422,14 @@ class Pipeline:
         for bit, name in enumerate(self._config.telemetry):
             if bit < 32 and name in tracks and tracks[name].stale(now_us):
                 stale |= 1 << bit
-        # count unsent frames, too: in a replay, several timers may fire before the outbox is drained
-        records = self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0
+        # count unsent frames, too: in a replay, several timers may fire before the output is drained
+        records = self.recorder.count + len(self.component.output.frames) if self.recorder.active else 0
         return {
             "samples": main.samples & MASK,
-            "samples_lost": main.lost & MASK,
+            "samples_lost": main.readings_lost & MASK,
             "sensor_bytes_skipped": main.driver.bytes_skipped & MASK,
             "sensor_frames_bad": main.driver.frames_bad & MASK,
-            "sensor_state": main.line.state,
+            "sensor_state": main.state,
             "sensor_clock_drift": -main.clock.drift_ppm,
             "sample_rate": main.sample_rate,
             "telemetry_stale": stale,
@@ -486,7 +483,7 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after_event: C
         if sent:
             edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
         for stream in pipeline.streams:
-            if commands := stream.line.to_send:
+            if commands := stream.to_send:
                 edge.send(port_number(stream.sensor_id), b"".join(commands))
                 commands.clear()
         records = pipeline.recorder.drain()

@@ -338,6 +338,6 @@ class LiveHeading:
         utc_us = time_us + self._component.codec.utc_offset_us
         is_true = isfinite(attitude.heading)
         if self._send is not None and is_true and self._rate.due(time_us):
-            self._send(self._component.outbox, attitude, max(utc_us, 0), self.stack)
+            self._send(self._component.output, attitude, max(utc_us, 0), self.stack)
         if self._nmea_rate.due(time_us):
             self.nmea.append(nmea_sentences(attitude, max(utc_us, 0)))

@@ -189,7 +189,7 @@ def run(path: Path) -> None:
     log = _open_log(config, edge, pipeline)
     _stop_on_signals(edge)
     # after the signal handlers are set, because a program may send a signal when it reads the first text
-    texts = pipeline.component.announcer.texts
+    texts = pipeline.component.output.texts
     Thread(target=_print_statustexts, args=(texts,), name="voice", daemon=True).start()
     sys.setswitchinterval(SWITCH)
     # These objects live as long as the process, so the collector need not scan them. A collection before
@@ -218,8 +218,8 @@ def run(path: Path) -> None:
 def leave_wrong_devices(pipeline: Pipeline, sensors: Mapping[int, SerialPort | BusPort]) -> None:
     """For each sensor on whose port another instrument seems to send, switch to the next matching device."""
     for stream in pipeline.streams:
-        if stream.line.wrong_device:
-            stream.line.wrong_device = False
+        if stream.wrong_device:
+            stream.wrong_device = False
             sensors[port_number(stream.sensor_id)].move_on()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING, Final
@@ -20,7 +20,7 @@ from magbridge.config import Align, Config, Sensor
 from magbridge.correction import Correction
 from magbridge.errors import ConfigError
 from magbridge.link.component import Component
-from magbridge.link.output import Announcer, Rate, Timers
+from magbridge.link.output import Rate
 from magbridge.link.publish import Publisher
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Corrected, Reading, Vector
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from magbridge.learning import Learner
 
 __all__ = [
-    "NMEA_SENTENCE", "SensorLine", "SensorStream", "needed_units", "open_correction", "open_drivers",
+    "NMEA_SENTENCE", "SensorStream", "needed_units", "open_correction", "open_drivers",
     "other_calibrations", "unmet",
 ]  # fmt: skip
 
@@ -53,131 +53,6 @@ MIN_REPEATED_READINGS: Final = 10
 get no flag, because a sensor with steps of 100 nT may send equal readings at rest."""
 LINE_CHECK_INTERVAL_US = 1_000_000
 """Time between two checks that readings arrive, µs."""
-
-
-class SensorLine:
-    """Monitor of a sensor's line, which sends the start-up commands whenever the sensor may have lost them.
-
-    `name`: name of the sensor in STATUSTEXTs.
-    `start`: function that is called when the line is opened; returns the commands that start the sensor.
-    `timeout_us`: time without a reading after which the sensor counts as silent, µs.
-    `searching`: True if the line may be another instrument's. The sensor then gets commands after a pause,
-    and
-        none if the line carries NMEA 0183 and no readings.
-    `announcer`, `timers`: services of the link.
-    `start_us`: start of the run, µs since 1970 UTC.
-    `sensor_id`: number of the sensor.
-    `timer`: name of the timer that checks if the sensor is silent.
-    `state`: state of the line (MAG_PORT_STATE).
-    `to_send`: commands to send; the caller of the pipeline sends them and empties the list.
-    `wrong_device`: True if a timeout or NMEA 0183 suggests another instrument, and no reading has arrived
-        since the line was opened. The owner of the line then tries another device and resets this attribute.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        start: Callable[[], tuple[bytes, ...]],
-        timeout_us: int,
-        announcer: Announcer,
-        timers: Timers,
-        start_us: int,
-        *,
-        searching: bool = False,
-        sensor_id: int = 0,
-    ) -> None:
-        suffix = f" {sensor_id}" if sensor_id else ""
-        self.timer, self._command_timer = f"sensor{suffix}", f"command{suffix}"
-        self._reading_key = f"reading{suffix}"
-        self._name, self._start, self._timeout_us = name, start, timeout_us
-        self._announcer, self._timers = announcer, timers
-        self.state = MAG_PORT_STATE.ABSENT
-        self.to_send: list[bytes] = []
-        self.wrong_device = self._known = False
-        self._received_us = start_us
-        # shorter than the timeout, so that the pause does not change the message about a silent line
-        self._listen_us = min(LISTEN_US, timeout_us // 2) if searching else 0
-        self._commands: tuple[bytes, ...] = ()
-        self._tail = b""
-        self._unparsed_us = 0
-        self._field: Vector | None = None
-        self._repeats = self._since_us = 0
-        self._hangs = False
-        timers.every(self.timer, LINE_CHECK_INTERVAL_US, self._look, start_us + LINE_CHECK_INTERVAL_US)
-
-    def on_reading(self, time_us: int) -> None:
-        """Record the arrival of a reading at `time_us` (µs)."""
-        self._received_us, self._known = time_us, True
-        if self.state != OK:
-            self.state = OK
-            self._announcer.state(self.timer, f"{self._name} sends readings")
-
-    def read(self, field: Vector, time_us: int) -> None:
-        """Compare a reading (nT) with earlier ones; report one that does not change for `SAME_US`."""
-        if field != self._field:
-            self._field, self._repeats, self._since_us = field, 0, time_us
-            if self._hangs:
-                self._hangs = False
-                self._announcer.state(self._reading_key, f"{self._name}'s readings change again")
-            return
-        self._repeats += 1
-        if not self._hangs and self._repeats >= MIN_REPEATED_READINGS and time_us - self._since_us >= SAME_US:
-            self._hangs = True
-            text = f"{self._name} sends the same reading for {SAME_US // 1_000_000} s"
-            self._announcer.state(self._reading_key, text, MAV_SEVERITY.WARNING)
-
-    def on_unparsed(self, data: bytes, time_us: int) -> None:
-        """Record the arrival of bytes that complete no reading, and detect NMEA 0183 in them."""
-        self._unparsed_us = time_us
-        received = self._tail + data
-        self._tail = received[-MAX_SENTENCE_BYTES:]
-        if self._listen_us and not self._known and NMEA_SENTENCE.search(received):
-            self._commands, self.wrong_device = (), True
-            self._timers.cancel(self._command_timer)
-
-    def opened(self, time_us: int) -> None:
-        """Handle an opened port: send the start-up commands, and set the state to SILENT until a reading."""
-        self._commands, self._known, self._tail = self._start(), False, b""
-        self._wake(time_us, self._listen_us)
-
-    def lost(self, reason: str) -> None:
-        """Record and report that the port was lost because of `reason`."""
-        self.state = MAG_PORT_STATE.LOST
-        self._timers.cancel(self._command_timer)
-        self._announcer.state(self.timer, f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
-
-    def _look(self, time_us: int) -> None:
-        if time_us - self._received_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
-            return
-        sends = time_us - self._unparsed_us < self._timeout_us // 2
-        what = self._unparsed() if sends else "is silent"
-        self._announcer.state(self.timer, f"{self._name} {what}", MAV_SEVERITY.ERROR)
-        self.wrong_device = not self._known
-        self._wake(time_us)
-
-    def _unparsed(self) -> str:
-        """Return a description of received bytes that are not readings, with the likely cause."""
-        if not TEXT_BYTES.fullmatch(self._tail):
-            return "sends, but no readings: baud rate?"
-        if NOT_A_NUMBER.search(self._tail):
-            return "sends NaN, but no readings"
-        return "sends text, but no readings: sensor.options?"
-
-    def _wake(self, time_us: int, listen_us: int = 0) -> None:
-        self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
-        if listen_us:
-            self._timers.run_once(
-                self._command_timer, time_us + listen_us, lambda t: self._command(t, self._commands)
-            )
-        else:
-            self._command(time_us, self._commands)
-
-    def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
-        if commands:
-            self.to_send.append(commands[0])
-            self._timers.run_once(
-                self._command_timer, time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:])
-            )
 
 
 def needed_units(calibration: Calibration) -> dict[str, str]:
@@ -272,13 +147,21 @@ def scalar_entry(
 
 
 class SensorStream:
-    """Processing of one sensor, from received bytes to corrected samples.
+    """Processing of one sensor, from its serial line to corrected samples.
+
+    It sends the start-up commands whenever the sensor may have lost them. If the line may be another
+    instrument's, because a pattern found it, the sensor gets commands after a pause, and none if the line
+    carries NMEA 0183 and no readings.
 
     `correction`: correction of the sensor's readings.
     `component`: the MAVLink component.
     `start_us`: start of the bridge, µs since 1970 UTC.
     `publisher`: sender of the sensor's samples.
-    `line`: monitor of the line, with the commands to send to the sensor.
+    `timer`: name of the timer that checks if the sensor is silent.
+    `state`: state of the line (MAG_PORT_STATE).
+    `to_send`: commands to send; the caller of the pipeline sends them and empties the list.
+    `wrong_device`: True if a timeout or NMEA 0183 suggests another instrument, and no reading has arrived
+        since the line was opened. The owner of the line then tries another device and resets this attribute.
     `samples`: number of readings received.
     `quality`: quality flags that were last sent as STATUSTEXT.
     `overload_rate`: limit of the samples with all optional work during an overload.
@@ -296,33 +179,50 @@ class SensorStream:
         self.sensor, self.driver, self.correction, self.publisher = sensor, driver, correction, publisher
         self.sensor_id = sensor.id or 0
         self.clock = DeviceClock.for_driver(driver)
-        self.line = SensorLine(
-            sensor.label, driver.start, round(sensor.timeout * 1e6), component.announcer, component.timers,
-            start_us, searching=has_magic(sensor.port), sensor_id=self.sensor_id,
-        )  # fmt: skip
-        self._component = component
+        self._component, self._output = component, component.output
+        suffix = f" {sensor.id}" if sensor.id else ""
+        self.timer, self._command_timer = f"sensor{suffix}", f"command{suffix}"
+        self._reading_key = f"reading{suffix}"
+        self._timeout_us = round(sensor.timeout * 1e6)
+        self.state = MAG_PORT_STATE.ABSENT
+        self.to_send: list[bytes] = []
+        self.wrong_device = self._known = False
+        self._received_us = start_us
+        # shorter than the timeout, so that the pause does not change the message about a silent line
+        self._listen_us = min(LISTEN_US, self._timeout_us // 2) if has_magic(sensor.port) else 0
+        self._commands: tuple[bytes, ...] = ()
+        self._tail = b""
+        self._unparsed_us = 0
+        self._field: Vector | None = None
+        self._repeats = self._since_us = 0
+        self._hangs = False
         self.samples = self.quality = self._missing = 0
         self._rate = self.clock.rate
         self.overload_rate = Rate(OVERLOAD_HZ)
         self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
+        interval_us = LINE_CHECK_INTERVAL_US
+        self._output.every(self.timer, interval_us, self._check_line, start_us + interval_us)
 
     def receive(self, data: bytes, time_us: int) -> list[Reading]:
         """Parse bytes received at `time_us` (µs); return the completed readings with their times."""
         readings = self.driver.feed(data)
         if not readings:
-            self.line.on_unparsed(data, time_us)
+            self._receive_unparsed(data, time_us)
             return []
-        self.line.on_reading(time_us)
+        self._received_us, self._known = time_us, True
+        if self.state != OK:
+            self.state = OK
+            self._output.announce(self.timer, f"{self.sensor.label} sends readings")
         stamped = self.clock.stamp(readings, time_us)
         if self.clock.rate != self._rate:
             self._rate = self.clock.rate
             configured = 1.0 / self.driver.period
             text = f"{self.sensor.label} sends {self._rate:.3g} readings/s, but rate = {configured:.3g}"
-            self._component.announcer.state(f"rate {self.sensor_id}", text, MAV_SEVERITY.WARNING)
+            self._output.announce(f"rate {self.sensor_id}", text, MAV_SEVERITY.WARNING)
         return stamped
 
     @property
-    def lost(self) -> int:
+    def readings_lost(self) -> int:
         """Number of readings missing in the instrument's numbering or at its rate."""
         return self._missing - self.clock.invented
 
@@ -340,7 +240,7 @@ class SensorStream:
         self.samples += 1
         self._missing += reading.missing
         self._times.append(time_us)
-        self.line.read(reading.field, time_us)
+        self._watch_for_repeats(reading.field, time_us)
         if isinstance(correction, Correction):
             return [
                 correction.reading(reading, time_us, main_field=main_field, position=position, depth=depth)
@@ -363,28 +263,94 @@ class SensorStream:
         """Apply the settings of the alignment, and the age (s) beyond which each telemetry value is stale."""
         self.correction.aligner.tune(own_settings(self.sensor, self.driver, settings), ages)
 
+    def _watch_for_repeats(self, field: Vector, time_us: int) -> None:
+        """Compare a reading (nT) with earlier ones; report one that does not change for `SAME_US`."""
+        if field != self._field:
+            self._field, self._repeats, self._since_us = field, 0, time_us
+            if self._hangs:
+                self._hangs = False
+                self._output.announce(self._reading_key, f"{self.sensor.label}'s readings change again")
+            return
+        self._repeats += 1
+        if not self._hangs and self._repeats >= MIN_REPEATED_READINGS and time_us - self._since_us >= SAME_US:
+            self._hangs = True
+            text = f"{self.sensor.label} sends the same reading for {SAME_US // 1_000_000} s"
+            self._output.announce(self._reading_key, text, MAV_SEVERITY.WARNING)
+
+    def _receive_unparsed(self, data: bytes, time_us: int) -> None:
+        """Record the arrival of bytes that complete no reading, and detect NMEA 0183 in them."""
+        self._unparsed_us = time_us
+        received = self._tail + data
+        self._tail = received[-MAX_SENTENCE_BYTES:]
+        if self._listen_us and not self._known and NMEA_SENTENCE.search(received):
+            self._commands, self.wrong_device = (), True
+            self._output.cancel(self._command_timer)
+
+    def opened(self, time_us: int) -> None:
+        """Handle an opened port: send the start-up commands, and set the state to SILENT until a reading."""
+        self._commands, self._known, self._tail = self.driver.start(), False, b""
+        self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
+        if self._listen_us:
+            listened_us = time_us + self._listen_us
+            self._output.run_once(
+                self._command_timer, listened_us, lambda t: self._command(t, self._commands)
+            )
+        else:
+            self._command(time_us, self._commands)
+
+    def closed(self, reason: str) -> None:
+        """Record and report that the port was lost because of `reason`."""
+        self.state = MAG_PORT_STATE.LOST
+        self._output.cancel(self._command_timer)
+        self._output.announce(self.timer, f"{self.sensor.label} lost: {reason}", MAV_SEVERITY.ERROR)
+
+    def _check_line(self, time_us: int) -> None:
+        if time_us - self._received_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
+            return
+        sends = time_us - self._unparsed_us < self._timeout_us // 2
+        what = self._unparsed() if sends else "is silent"
+        self._output.announce(self.timer, f"{self.sensor.label} {what}", MAV_SEVERITY.ERROR)
+        self.wrong_device = not self._known
+        self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
+        self._command(time_us, self._commands)
+
+    def _unparsed(self) -> str:
+        """Return a description of received bytes that are not readings, with the likely cause."""
+        if not TEXT_BYTES.fullmatch(self._tail):
+            return "sends, but no readings: baud rate?"
+        if NOT_A_NUMBER.search(self._tail):
+            return "sends NaN, but no readings"
+        return "sends text, but no readings: sensor.options?"
+
+    def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
+        if commands:
+            self.to_send.append(commands[0])
+            self._output.run_once(
+                self._command_timer, time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:])
+            )
+
     @property
     def sample_rate(self) -> float:
         """Rate of the latest readings, Hz; NaN while the sensor is silent."""
         times = self._times
-        span_us = times[-1] - times[0] if times and self.line.state == MAG_PORT_STATE.OK else 0
+        span_us = times[-1] - times[0] if times and self.state == OK else 0
         return (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan
 
     def report(self) -> None:
         """Send MAG_SENSOR with the state and the counts of the sensor."""
         component = self._component
-        component.outbox.send(
+        self._output.send(
             "MAG_SENSOR",
             time_usec=component.codec.utc_us,
             calibration_id=self.publisher.calibration_id,
             samples=self.samples & 0xFFFFFFFF,
-            samples_lost=self.lost & 0xFFFFFFFF,
+            samples_lost=self.readings_lost & 0xFFFFFFFF,
             bytes_skipped=self.driver.bytes_skipped & 0xFFFFFFFF,
             frames_bad=self.driver.frames_bad & 0xFFFFFFFF,
             sample_rate=self.sample_rate,
             clock_drift=-self.clock.drift_ppm,
             sensor_id=self.sensor_id,
-            state=self.line.state,
+            state=self.state,
             name=self.sensor.label,
         )
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from magbridge.config import Link
 from magbridge.link.files import GENERAL, crc32, metadata_files, uri
-from magbridge.link.output import Announcer, Outbox, Timers
-from magbridge.link.parameters import Authority, Parameters, ParameterService, Tunable, rates
+from magbridge.link.output import Output
+from magbridge.link.parameters import Parameters, ParameterService, Tunable, rates
 from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS, MASK, PUBLISHED, MessageRates, Publisher
 from magbridge.link.telemetry import Stream, StreamRequests
 from magbridge.link.vehicle import VehicleState
@@ -20,6 +20,7 @@ from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message,
 from magbridge.mavlink.codec import NOT_SIGNED
 from magbridge.mavlink.enums import (
     FIRMWARE_VERSION_TYPE,
+    MAG_PORT_STATE,
     MAV_AUTOPILOT,
     MAV_CMD,
     MAV_PROTOCOL_CAPABILITY,
@@ -54,14 +55,13 @@ class Commands:
     """
 
     def __init__(self, component: Component) -> None:
-        self._component, self._outbox, self._announcer = component, component.outbox, component.announcer
-        reports = component.reports
+        self._component, self._output = component, component.output
         by_name: dict[str, Callable[[], bool]] = {
-            "HEARTBEAT": reports.heartbeat,
-            "MAG_STATUS": reports.status,
-            "AUTOPILOT_VERSION": reports.version,
-            "COMPONENT_INFORMATION_BASIC": reports.information,
-            "COMPONENT_METADATA": reports.metadata,
+            "HEARTBEAT": component.send_heartbeat,
+            "MAG_STATUS": component.send_status,
+            "AUTOPILOT_VERSION": component.send_version,
+            "COMPONENT_INFORMATION_BASIC": component.send_information,
+            "COMPONENT_METADATA": component.send_metadata,
             **{name: partial(component.publisher.repeat, name) for name in PUBLISHED},
         }
         self._messages: dict[int, Callable[[], bool]] = by_id(**by_name)
@@ -84,15 +84,17 @@ class Commands:
         command = self._commands.get(number)
         if self._is_flood(message.system, message.component):
             text = f"more than {MAX_COMMAND_RATE} commands a second from {message.system}:{message.component}"
-            self._announcer.state("flood", text, MAV_SEVERITY.WARNING)
+            self._output.announce("flood", text, MAV_SEVERITY.WARNING)
             result = MAV_RESULT.TEMPORARILY_REJECTED
-        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._component.authority.may_change(message):
+        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._component.parameter_service.may_change(
+            message
+        ):
             text = f"{message.system}:{message.component} may not set a rate: no station, no autopilot"
-            self._announcer.state("rate", text, MAV_SEVERITY.WARNING, recurring=True)
+            self._output.announce("rate", text, MAV_SEVERITY.WARNING, recurring=True)
             result = MAV_RESULT.DENIED
         else:
             result = command(values) if command else self._unsupported(number)
-        self._outbox.send(
+        self._output.send(
             "COMMAND_ACK",
             command=number,
             result=result,
@@ -103,7 +105,7 @@ class Commands:
 
     def _is_flood(self, system: int, component: int) -> bool:
         """Count a command; return True if its sender has sent more than `MAX_COMMAND_RATE` in this second."""
-        now_us = self._outbox.codec.now_us
+        now_us = self._output.codec.now_us
         if now_us - self._second_us >= 1_000_000:
             self._second_us, self._asked = now_us, {}
         who = (system, component) if (system, component) in self._asked else (0, 0)
@@ -115,7 +117,7 @@ class Commands:
     def _unsupported(self, number: int) -> MAV_RESULT:
         if number in CALIBRATES:
             text = "this magnetometer is calibrated from its logs: magbridge calibrate"
-            self._announcer.state("calibrate", text, MAV_SEVERITY.NOTICE, recurring=True)
+            self._output.announce("calibrate", text, MAV_SEVERITY.NOTICE, recurring=True)
         return MAV_RESULT.UNSUPPORTED
 
     def _only_us(self, number: int, first: float) -> bool:
@@ -144,8 +146,8 @@ class Commands:
         number = to_integer(values[0])
         if not 0 <= number <= 0xFFFF:
             return MAV_RESULT.DENIED
-        interval = self._component.message_rates.interval_us(number, self._component.reports.sample_rate)
-        self._outbox.send("MESSAGE_INTERVAL", message_id=number, interval_us=interval)
+        interval = self._component.message_rates.interval_us(number, self._component.sample_rate)
+        self._output.send("MESSAGE_INTERVAL", message_id=number, interval_us=interval)
         return MAV_RESULT.ACCEPTED
 
     def _capabilities(self, values: list[float]) -> MAV_RESULT:
@@ -176,105 +178,6 @@ CAPABILITIES = (
     | MAV_PROTOCOL_CAPABILITY.FTP
     | MAV_PROTOCOL_CAPABILITY.PARAM_ENCODE_C_CAST
 )
-
-
-class Reports:
-    """Sender of HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the messages that describe the component.
-
-    `version`: version of the program, such as ``"0.1.0"``.
-    `condition`: returns the fields of MAG_STATUS that other parts of the bridge supply.
-    `speaking`: returns True if the sensor delivers readings.
-    `calibration_id`: CRC-32 of the calibration file; 0 without a calibration.
-    `more`: functions that are called after each MAG_STATUS, to send further messages at its rate.
-    """
-
-    def __init__(
-        self,
-        component: Component,
-        version: str,
-        calibration_id: int,
-        condition: Callable[[], dict[str, Any]],
-        speaking: Callable[[], bool],
-    ) -> None:
-        self._component, self._outbox, self._speaking = component, component.outbox, speaking
-        self._version, self.calibration_id, self._condition = version, calibration_id, condition
-        self._start_us = component.codec.now_us
-        self.more: list[Callable[[], object]] = []
-
-    def heartbeat(self) -> bool:
-        """Send HEARTBEAT, with state ACTIVE if the sensor delivers readings, else CRITICAL; return True."""
-        self._outbox.put(HEARTBEAT_SPEC, ALIVE if self._speaking() else CRITICAL)
-        return True
-
-    def status(self) -> bool:
-        """Send MAG_STATUS, then the messages of `more`; return True."""
-        codec, vehicle = self._component.codec, self._component.vehicle
-        clock = vehicle.clock
-        payload = STATUS.payload(
-            time_usec=codec.utc_us,
-            vehicle_clock_offset=(
-                round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0
-            ),
-            uptime=(codec.now_us - self._start_us) // 1_000_000 & MASK,
-            calibration_id=self.calibration_id,
-            link_frames=codec.frames & MASK,
-            link_frames_lost=vehicle.frames_lost & MASK,
-            link_bytes_skipped=codec.bytes_skipped & MASK,
-            link_refused=codec.signing.refused & MASK if codec.signing else 0,
-            vehicle_clock_sigma=clock.sigma,
-            vehicle_clock_drift=clock.drift_ppm,
-            vehicle_reboots=vehicle.reboots & 0xFFFF,
-            autopilot_state=vehicle.state,
-            **{"sample_rate": nan, "sensor_clock_drift": nan} | self._condition(),
-        )
-        self._outbox.put(STATUS, payload)
-        for send in self.more:
-            send()
-        return True
-
-    def version(self) -> bool:
-        """Send AUTOPILOT_VERSION; return True."""
-        numbers = [int(number) & 0xFF for number in re.findall(r"\d+", self._version)[:3]]
-        version = bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,))
-        self._outbox.send(
-            "AUTOPILOT_VERSION", capabilities=CAPABILITIES, flight_sw_version=int.from_bytes(version, "big")
-        )
-        return True
-
-    def information(self) -> bool:
-        """Send COMPONENT_INFORMATION_BASIC; return True."""
-        self._outbox.send(
-            "COMPONENT_INFORMATION_BASIC",
-            time_boot_ms=self._boot_ms,
-            capabilities=CAPABILITIES,
-            vendor_name="magbridge",
-            model_name="magnetometer bridge",
-            software_version=self._version,
-        )
-        return True
-
-    def metadata(self) -> bool:
-        """Send COMPONENT_METADATA with the URI of the files that describe the parameters; return True."""
-        general, component = self._component.metadata[GENERAL], self._component.codec.component
-        self._outbox.send(
-            "COMPONENT_METADATA",
-            time_boot_ms=self._boot_ms,
-            file_crc=crc32(general),
-            uri=uri(component, GENERAL),
-        )
-        return True
-
-    @property
-    def sample_rate(self) -> float:
-        """Recent rate of the sensor's samples, Hz; NaN while unknown."""
-        rate: float = self._condition().get("sample_rate", nan)
-        return rate
-
-    @property
-    def _boot_ms(self) -> int:
-        return (self._component.codec.now_us - self._start_us) // 1000 & MASK
-
-
 TIMESYNC = spec("TIMESYNC")
 SETUP_SIGNING = spec("SETUP_SIGNING").id.to_bytes(3, "little")
 TIMESYNC_US = 1_000_000
@@ -295,16 +198,16 @@ class Component:
     `calibration_id`: CRC-32 of the calibration file; 0 without a calibration.
     `version`: version of the program, such as ``"0.1.0"``.
     `kept`: values of the parameters that a station changed in an earlier run, by name.
-    `status`: returns the fields of MAG_STATUS on the samples, the log and the sensor.
-    `speaking`: returns True if the sensor delivers readings; else the heartbeat's state is CRITICAL.
+    `status`: returns the fields of MAG_STATUS on the samples, the log and the sensor. The state of the
+        heartbeat is CRITICAL unless ``sensor_state`` is OK.
     `streams`: needed rates of telemetry, see :func:`needed_rates`.
-    `outbox`: messages to send.
+    `output`: messages to send, with the timers and the STATUSTEXTs.
     `received`: all received bytes as frames for the log; the bridge empties the list.
     `signed_frames`: the signed frames of the last :meth:`receive` that were accepted.
     `file_requests`: requests for files; the bridge takes them out and replies.
     `metadata`: contents of the files that describe the parameters, by path.
-    `authority`, `parameters`, `parameter_service`, `message_rates`, `announcer`, `vehicle`, `publisher`,
-    `reports`: services of the component.
+    `more_reports`: functions that are called after each MAG_STATUS, to send further messages at its rate.
+    `parameters`, `parameter_service`, `message_rates`, `vehicle`, `publisher`: services of the component.
     """
 
     def __init__(
@@ -319,46 +222,37 @@ class Component:
         version: str = "0.0.0",
         kept: Mapping[str, float] | None = None,
         status: Callable[[], dict[str, Any]] = dict,
-        speaking: Callable[[], bool] = bool,
         streams: Mapping[Stream, tuple[float, float]] | None = None,
     ) -> None:
         self._link = link
         self.codec = Codec(link.system, link.component, signing)
         self.codec.now_us = start_us
         self._frame_log = FrameLogWriter(link.system, link.component)
-        self.outbox, self.timers = Outbox(self.codec), Timers()
+        self.output = Output(self.codec)
         self.received: list[bytes] = []
         self.signed_frames: list[bytes] = []
         self._whole = link.shared
         self._refusals_reported = 0
-        self.announcer = Announcer(self.outbox, self.timers)
-        self.vehicle = VehicleState(link.system, link.component, link.autopilot, self.announcer, self.timers)
-        self.streams = StreamRequests(
-            (link.system, link.autopilot), streams or {}, self.outbox, self.timers, self.announcer,
-            active=link.request_streams,
-        )  # fmt: skip
+        self.vehicle = VehicleState(link.system, link.component, link.autopilot, self.output)
+        self.streams = StreamRequests(self.peer, streams or {}, self.output, active=link.request_streams)
         self.vehicle.on_reboot = self.streams.rebooted
         self.parameters = Parameters([*rates({**DEFAULT_RATES_HZ, **publish}, LIMITS), *tunables])
         for name in self.parameters.restore(kept or {}):
-            self.announcer.send_statustext(
-                f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING
-            )
+            self.output.send_statustext(f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING)
         if changed := self.parameters.changed():
-            self.announcer.send_statustext(f"kept from the link, not as configured: {', '.join(changed)}")
-        self.message_rates = MessageRates(self.parameters, self.timers, self.codec)
+            self.output.send_statustext(f"kept from the link, not as configured: {', '.join(changed)}")
+        self.message_rates = MessageRates(self.parameters, self.output)
         self.rates = self.message_rates.by_name
-        self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
+        self.publisher = Publisher(self.output, self.rates, calibration_id, start_us)
         self.metadata = metadata_files(self.parameters.table.values(), link.component)
         self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
-        self.reports = Reports(self, version, calibration_id, status, speaking)
-        self.authority = Authority(link.system, link.autopilot)
-        self.parameter_service = ParameterService(
-            self.parameters, self.outbox, self.timers, self.announcer, self.authority
-        )
+        self._version, self._status, self._start_us = version, status, start_us
+        self.more_reports: list[Callable[[], object]] = []
+        self.parameter_service = ParameterService(self.parameters, self.output, self.peer)
         self._handlers = self._open_handlers()
-        self.message_rates.send_by_clock("HEARTBEAT", self.reports.heartbeat)
-        self.message_rates.send_by_clock("MAG_STATUS", self.reports.status)
-        self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
+        self.message_rates.send_by_clock("HEARTBEAT", self.send_heartbeat)
+        self.message_rates.send_by_clock("MAG_STATUS", self.send_status)
+        self.output.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
     def _open_handlers(self) -> dict[int, Callable[[Message], None]]:
         """Return the handlers of requests, replies and heartbeats, by message id."""
@@ -368,7 +262,7 @@ class Component:
             PARAM_REQUEST_READ=self._if_ours(service.read),
             PARAM_SET=self._if_ours(service.write),
             TIMESYNC=self._timesync,
-            HEARTBEAT=self._heartbeat,
+            HEARTBEAT=service.heartbeat,
             LOG_ERASE=self._if_to_us_alone(self._erase),
             **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), command),
             **dict.fromkeys(FILE_REQUESTS, self._if_to_us_alone(self.file_requests.append)),
@@ -379,30 +273,15 @@ class Component:
         """System id and component id of the autopilot."""
         return self._link.system, self._link.autopilot
 
-    def use_calibration(self, calibration_id: int) -> None:
-        """Set the calibration id of all later messages."""
-        self.publisher.calibration_id = self.reports.calibration_id = calibration_id
-
     def another_publisher(self, sensor_id: int, calibration_id: int) -> Publisher:
         """Return a publisher of a further sensor's samples, as MAG_RAW and MAG_FIELD with `sensor_id`."""
         rates = {name: self.message_rates.another(name) for name in ("MAG_RAW", "MAG_FIELD")}
-        return Publisher(self.outbox, rates, calibration_id, sensor_id=sensor_id)
-
-    @property
-    def next_deadline(self) -> int:
-        """Event time (µs) of the next timer."""
-        return self.timers.next_deadline
-
-    def advance(self, t_us: int) -> None:
-        """Advance the time to `t_us`; each message carries the time at which it was due."""
-        if self.timers.next_deadline <= t_us:
-            self.timers.advance(t_us, self._begin)
-        self.codec.now_us = t_us
+        return Publisher(self.output, rates, calibration_id, sensor_id=sensor_id)
 
     def receive(self, data: bytes, t_us: int) -> list[Message]:
         """Process bytes received at `t_us` (µs); return the messages that are telemetry of our vehicle.
 
-        Replies to requests go to the outbox. The caller has called :meth:`advance` for `t_us` before.
+        Replies to requests go to the output, which the caller has advanced to `t_us` before.
         """
         self.codec.now_us = t_us
         ours = []
@@ -430,7 +309,7 @@ class Component:
         """Send one STATUSTEXT for each reason why frames are rejected, since their sender seems absent."""
         if message.frame[7:10] == SETUP_SIGNING:
             text = f"key from {message.system}:{message.component} not taken: keys come from a file"
-            self.announcer.state("key", text, MAV_SEVERITY.WARNING)
+            self.output.announce("key", text, MAV_SEVERITY.WARNING)
         if self.codec.signing is None:
             return
         refusals = list(self.codec.signing.refusals.items())
@@ -438,7 +317,7 @@ class Component:
             text = f"frames of {system}:{component} refused: {why}"
             if why == NOT_SIGNED:
                 text += ", or a router has removed the signature"
-            self.announcer.state(f"refused: {why}", text, MAV_SEVERITY.WARNING)
+            self.output.announce(f"refused: {why}", text, MAV_SEVERITY.WARNING)
         self._refusals_reported = len(refusals)
 
     def _report_clock(self, signing: Signing) -> None:
@@ -448,10 +327,7 @@ class Component:
         """
         if (days := signing.followed_days) >= 1.0:
             text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
-            self.announcer.state("signing clock", text, MAV_SEVERITY.WARNING)
-
-    def _begin(self, t_us: int) -> None:
-        self.codec.now_us = t_us
+            self.output.announce("signing clock", text, MAV_SEVERITY.WARNING)
 
     def _for_us(self, message: Message) -> bool:
         return message["target_system"] in (0, self._link.system) and message["target_component"] in (
@@ -461,10 +337,6 @@ class Component:
 
     def _if_ours(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
         return lambda message: handler(message) if self._for_us(message) else None
-
-    def _heartbeat(self, message: Message) -> None:
-        if self.authority.heartbeat(message):
-            self.parameter_service.greet((message.system, message.component))
 
     def _if_to_us_alone(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
         """Return a handler that ignores messages whose target is not exactly this component.
@@ -478,7 +350,7 @@ class Component:
 
     def _erase(self, _: Message) -> None:
         text = "logs are not erased over the link"
-        self.announcer.state("erase", text, MAV_SEVERITY.WARNING, recurring=True)
+        self.output.announce("erase", text, MAV_SEVERITY.WARNING, recurring=True)
 
     def _timesync(self, message: Message) -> None:
         now_us = self.codec.now_us
@@ -486,10 +358,84 @@ class Component:
             return
         if message["tc1"] == 0:
             answer = TIMESYNC.struct.pack(now_us * 1000, message["ts1"], message.system, message.component)
-            self.outbox.put(TIMESYNC, answer)
+            self.output.put(TIMESYNC, answer)
         elif (message.system, message.component) == (self._link.system, self._link.autopilot):
             self.vehicle.clock.answer(message["tc1"], message["ts1"], now_us)
 
     def _ask_time(self, t_us: int) -> None:
         ts1 = self.vehicle.clock.ask(t_us)
-        self.outbox.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
+        self.output.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
+
+    def send_heartbeat(self) -> bool:
+        """Send HEARTBEAT, with state ACTIVE if the sensor delivers readings, else CRITICAL; return True."""
+        is_alive = self._status().get("sensor_state") == MAG_PORT_STATE.OK
+        self.output.put(HEARTBEAT_SPEC, ALIVE if is_alive else CRITICAL)
+        return True
+
+    def send_status(self) -> bool:
+        """Send MAG_STATUS, then those of `more_reports`; return True."""
+        codec, vehicle = self.codec, self.vehicle
+        clock = vehicle.clock
+        payload = STATUS.payload(
+            time_usec=codec.utc_us,
+            vehicle_clock_offset=(
+                round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0
+            ),
+            uptime=(codec.now_us - self._start_us) // 1_000_000 & MASK,
+            calibration_id=self.publisher.calibration_id,
+            link_frames=codec.frames & MASK,
+            link_frames_lost=vehicle.frames_lost & MASK,
+            link_bytes_skipped=codec.bytes_skipped & MASK,
+            link_refused=codec.signing.refused & MASK if codec.signing else 0,
+            vehicle_clock_sigma=clock.sigma,
+            vehicle_clock_drift=clock.drift_ppm,
+            vehicle_reboots=vehicle.reboots & 0xFFFF,
+            autopilot_state=vehicle.state,
+            **{"sample_rate": nan, "sensor_clock_drift": nan} | self._status(),
+        )
+        self.output.put(STATUS, payload)
+        for send in self.more_reports:
+            send()
+        return True
+
+    def send_version(self) -> bool:
+        """Send AUTOPILOT_VERSION; return True."""
+        numbers = [int(number) & 0xFF for number in re.findall(r"\d+", self._version)[:3]]
+        version = bytes([*numbers, 0, 0, 0][:3]) + bytes((FIRMWARE_VERSION_TYPE.OFFICIAL,))
+        self.output.send(
+            "AUTOPILOT_VERSION", capabilities=CAPABILITIES, flight_sw_version=int.from_bytes(version, "big")
+        )
+        return True
+
+    def send_information(self) -> bool:
+        """Send COMPONENT_INFORMATION_BASIC; return True."""
+        self.output.send(
+            "COMPONENT_INFORMATION_BASIC",
+            time_boot_ms=self._boot_ms,
+            capabilities=CAPABILITIES,
+            vendor_name="magbridge",
+            model_name="magnetometer bridge",
+            software_version=self._version,
+        )
+        return True
+
+    def send_metadata(self) -> bool:
+        """Send COMPONENT_METADATA with the URI of the files that describe the parameters; return True."""
+        general, component = self.metadata[GENERAL], self.codec.component
+        self.output.send(
+            "COMPONENT_METADATA",
+            time_boot_ms=self._boot_ms,
+            file_crc=crc32(general),
+            uri=uri(component, GENERAL),
+        )
+        return True
+
+    @property
+    def sample_rate(self) -> float:
+        """Recent rate of the sensor's samples, Hz; NaN while unknown."""
+        rate: float = self._status().get("sample_rate", nan)
+        return rate
+
+    @property
+    def _boot_ms(self) -> int:
+        return (self.codec.now_us - self._start_us) // 1000 & MASK

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from magbridge.link.output import Outbox
+from magbridge.link.output import Output
 from magbridge.mavlink.enums import GLOBAL_POSITION_SRC, MAV_AUTOPILOT, MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 from magbridge.mavlink.messages import east_e7
 
@@ -68,11 +68,11 @@ def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, flo
     )
 
 
-def send_attitude(outbox: Outbox, attitude: Attitude, time_us: int) -> None:
+def send_attitude(output: Output, attitude: Attitude, time_us: int) -> None:
     """Send ATTITUDE_QUATERNION_COV with `attitude` and the covariance of roll, pitch and heading (rad²)."""
     tilt, turn = attitude.tilt_sigma**2, radians(attitude.sigma) ** 2
     roll_rate, pitch_rate, yaw_rate = attitude.rates
-    outbox.send(
+    output.send(
         "ATTITUDE_QUATERNION_COV",
         time_usec=time_us,
         q=quaternion(attitude.roll, attitude.pitch, radians(attitude.heading)),
@@ -106,7 +106,7 @@ def _pose(attitude: Attitude, stack: int) -> tuple[tuple[float, float, float], l
     return (0.0, 0.0, 0.0), covariance
 
 
-def _odometry(outbox: Outbox, attitude: Attitude, time_us: int, stack: int) -> None:
+def _odometry(output: Output, attitude: Attitude, time_us: int, stack: int) -> None:
     """Send the heading as ODOMETRY.
 
     ArduPilot accepts only the frame LOCAL_FRD. PX4 interprets the yaw as relative to true north only in
@@ -115,11 +115,11 @@ def _odometry(outbox: Outbox, attitude: Attitude, time_us: int, stack: int) -> N
     position, covariance = _pose(attitude, stack)
     frame = MAV_FRAME.LOCAL_NED if stack == MAV_AUTOPILOT.PX4 else MAV_FRAME.LOCAL_FRD
     turn = quaternion(attitude.roll, attitude.pitch, radians(attitude.heading))
-    _send_odometry(outbox, time_us, frame, position, turn, covariance)
+    _send_odometry(output, time_us, frame, position, turn, covariance)
 
 
 def _send_odometry(
-    outbox: Outbox,
+    output: Output,
     time_us: int,
     frame: MAV_FRAME,
     position: tuple[float, float, float],
@@ -129,7 +129,7 @@ def _send_odometry(
 ) -> None:
     """Send ODOMETRY with position (m), quaternion `turn` and pose covariance, but without velocities."""
     x, y, z = position
-    outbox.send(
+    output.send(
         "ODOMETRY",
         time_usec=time_us,
         frame_id=frame,
@@ -147,17 +147,17 @@ def _send_odometry(
     )
 
 
-def _vision_position(outbox: Outbox, attitude: Attitude, time_us: int, stack: int) -> None:
+def _vision_position(output: Output, attitude: Attitude, time_us: int, stack: int) -> None:
     """Send the heading as VISION_POSITION_ESTIMATE."""
     (x, y, z), covariance = _pose(attitude, stack)
     yaw = radians((attitude.heading + 180.0) % 360.0 - 180.0)
-    outbox.send(
+    output.send(
         "VISION_POSITION_ESTIMATE", usec=time_us, x=x, y=y, z=z, roll=attitude.roll, pitch=attitude.pitch,
         yaw=yaw, covariance=covariance,
     )  # fmt: skip
 
 
-HEADING_SENDERS: Final[dict[str, Callable[[Outbox, Attitude, int, int], None]]] = {
+HEADING_SENDERS: Final[dict[str, Callable[[Output, Attitude, int, int], None]]] = {
     "odometry": _odometry,
     "vision_position_estimate": _vision_position,
 }
@@ -275,13 +275,13 @@ def widened(fix: Fix, seconds: float) -> Fix:
     )
 
 
-def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
+def external_position(output: Output, fix: Fix, system: int, autopilot: int) -> None:
     """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE, with which the autopilot resets its position to the fix.
 
     ArduPilot (``AP_NavEKF3_PosVelFusion.cpp``, setLatLng) extrapolates the position by its velocity over the
     age of the fix, which is 0 here. PX4 (``EKF2.cpp``) rejects an age of NaN.
     """
-    outbox.send(
+    output.send(
         "COMMAND_INT",
         command=MAV_CMD.EXTERNAL_POSITION_ESTIMATE,
         frame=MAV_FRAME.GLOBAL,
@@ -297,13 +297,13 @@ def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> 
     )
 
 
-def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
+def global_position(output: Output, fix: Fix, system: int, autopilot: int) -> None:
     """Send GLOBAL_POSITION_SENSOR, which PX4 fuses as an auxiliary position.
 
     PX4 (``mavlink_receiver.cpp``, ``aux_global_position_control.cpp``) uses the time of arrival as the time
     of the position, and replaces a sigma of NaN by 1 m.
     """
-    outbox.send(
+    output.send(
         "GLOBAL_POSITION_SENSOR",
         target_system=system,
         target_component=autopilot,
@@ -321,7 +321,7 @@ def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> No
     )
 
 
-def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # noqa: ARG001 - it has no target
+def odometry(output: Output, fix: Fix, system: int, autopilot: int) -> None:  # noqa: ARG001 - it has no target
     """Send ODOMETRY in the frame LOCAL_FRD, whose axes are north-east-down in ArduPilot in spite of the name.
 
     ArduPilot (``GCS_Common.cpp``, handle_odometry) accepts only LOCAL_FRD with BODY_FRD, and needs the whole
@@ -335,13 +335,13 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
     for diagonal in (11, 15, 18, 20):
         covariance[diagonal] = OTHERS_VARIANCE
     frame = MAV_FRAME.LOCAL_FRD
-    _send_odometry(outbox, fix.time_us, frame, (north, east, down), attitude, covariance, fix.resets)
+    _send_odometry(output, fix.time_us, frame, (north, east, down), attitude, covariance, fix.resets)
 
 
 class Kind(NamedTuple):
     """Properties of one message type that can carry a position fix."""
 
-    send: Callable[[Outbox, Fix, int, int], Any]
+    send: Callable[[Output, Fix, int, int], Any]
     """Function that sends a :class:`Fix` to a system id and component id."""
     rate: float
     """Default rate, Hz; 0 sends every update."""

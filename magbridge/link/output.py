@@ -1,4 +1,4 @@
-"""Queue of frames to send, timers, rate limits and STATUSTEXT messages.
+"""Queue of frames to send, with timers and STATUSTEXT messages, and rate limits.
 
 All times are event times in µs since 1970 UTC, so that a replay sends the same frames at the same times.
 """
@@ -12,7 +12,7 @@ from typing import Any
 from magbridge.mavlink import Codec, Spec
 from magbridge.mavlink.enums import MAV_SEVERITY
 
-__all__ = ["FOREVER", "Announcer", "Outbox", "Rate", "Timers", "period_us"]
+__all__ = ["FOREVER", "Output", "Rate", "period_us"]
 
 FOREVER = 1 << 62
 """Deadline if no timer is set, µs."""
@@ -26,16 +26,27 @@ ANNOUNCEMENT_INTERVAL_US = 1_000_000
 """Shortest time between two STATUSTEXTs on one state, µs; a change within it is sent when it ends."""
 
 
-class Outbox:
-    """Queue of packed frames that the bridge shall send.
+class Output:
+    """Queue of packed frames that the bridge shall send, with the timers and the STATUSTEXTs that fill it.
+
+    Timers fire at their deadlines in event time and in the order of the deadlines, however often
+    :meth:`advance` is called. A replay therefore fires the same timers at the same event times.
 
     `codec`: packs the messages; its ``now_us`` is the event time of the next frame.
     `frames`: event time (µs) and bytes of each frame, in the order of sending.
+    `next_deadline`: event time (µs) at which the next timer fires; `FOREVER` if no timer is set.
+    `texts`: severity and text of the latest STATUSTEXTs; another thread may take them out and print them.
     """
 
     def __init__(self, codec: Codec) -> None:
         self.codec = codec
         self.frames: list[tuple[int, bytes]] = []
+        self._deadlines: dict[str, int] = {}
+        self._actions: dict[str, tuple[int, Callable[[int], object]]] = {}  # period in µs, and action
+        self.next_deadline = FOREVER
+        self.texts: deque[tuple[MAV_SEVERITY, str]] = deque(maxlen=TEXTS_KEPT)
+        self._announced: dict[str, tuple[str, int]] = {}
+        self._chunked_texts = 0
 
     def send(self, _name: str, **fields: Any) -> None:
         """Pack a message by name and queue it; fields that are not given are zero."""
@@ -49,21 +60,6 @@ class Outbox:
         """Return the queued frames and empty the queue."""
         frames, self.frames = self.frames, []
         return frames
-
-
-class Timers:
-    """Named timers, which call their actions in the order of the deadlines.
-
-    Timers fire at their deadlines in event time, however often :meth:`advance` is called. A replay therefore
-    fires the same timers at the same event times.
-
-    `next_deadline`: event time (µs) at which the next timer fires; `FOREVER` if no timer is set.
-    """
-
-    def __init__(self) -> None:
-        self._deadlines: dict[str, int] = {}
-        self._actions: dict[str, tuple[int, Callable[[int], object]]] = {}  # period in µs, and action
-        self.next_deadline = FOREVER
 
     def every(self, name: str, period_us: int, action: Callable[[int], object], first_us: int) -> None:
         """Call ``action(deadline)`` at `first_us` and then every `period_us` (rounded down to 4 µs)."""
@@ -84,10 +80,11 @@ class Timers:
             self._deadlines[name] += delay_us & ~3
             self._find_next()
 
-    def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
-        """Fire all timers that are due up to `t_us` (µs); call ``begin(deadline)`` before each action.
+    def advance(self, t_us: int) -> None:
+        """Fire all timers that are due up to `t_us` (µs), and set the codec's time to `t_us`.
 
-        Of equal deadlines, the timer that was set first fires first.
+        Each frame has the time at which it was due. Of equal deadlines, the timer that was set first fires
+        first.
         """
         while (deadline := self.next_deadline) <= t_us:
             name = next(name for name, due_us in self._deadlines.items() if due_us == deadline)
@@ -97,8 +94,9 @@ class Timers:
             else:
                 del self._deadlines[name]
             self._find_next()
-            begin(deadline)
+            self.codec.now_us = deadline
             action(deadline)
+        self.codec.now_us = t_us
 
     def _set(self, name: str, deadline: int, period: int, action: Callable[[int], object]) -> None:
         before = self._deadlines.get(name)
@@ -108,6 +106,51 @@ class Timers:
 
     def _find_next(self) -> None:
         self.next_deadline = min(self._deadlines.values(), default=FOREVER)
+
+    def send_statustext(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+        """Send `text`, in chunks of 50 bytes if it is longer; non-ASCII characters become question marks."""
+        self.texts.append((severity, text))
+        data = text.encode("ascii", "replace")
+        chunks = [data[i : i + STATUSTEXT_LENGTH] for i in range(0, len(data), STATUSTEXT_LENGTH)]
+        if len(chunks) > 1:
+            self._chunked_texts = self._chunked_texts % 0xFFFF + 1
+            if len(chunks[-1]) == STATUSTEXT_LENGTH:
+                chunks.append(b"")  # the receiver waits for a chunk that is not full
+        for i, chunk in enumerate(chunks):
+            self.send(
+                "STATUSTEXT",
+                severity=severity,
+                text=chunk,
+                id=self._chunked_texts if len(chunks) > 1 else 0,
+                chunk_seq=i,
+            )
+
+    def forget(self, key: str) -> None:
+        """Delete the last announced state of `key`, so that :meth:`announce` announces the next state."""
+        self._announced.pop(key, None)
+
+    def announce(
+        self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, recurring: bool = False
+    ) -> None:
+        """Send `text` as the new state of `key`, unless the last text sent for `key` was equal.
+
+        If `recurring`, send an equal text again after `ANNOUNCEMENT_INTERVAL_US`. Send a text that changes
+        within this interval when the interval ends.
+        """
+        now_us = self.codec.now_us
+        last_text, last_us = self._announced.get(key, ("", now_us - ANNOUNCEMENT_INTERVAL_US))
+        elapsed_us = now_us - last_us
+        timer = f"announce {key}"
+        self.cancel(timer)
+        if text == last_text and not (recurring and elapsed_us >= ANNOUNCEMENT_INTERVAL_US):
+            return
+        if elapsed_us < ANNOUNCEMENT_INTERVAL_US:
+            self.run_once(
+                timer, last_us + ANNOUNCEMENT_INTERVAL_US, lambda _: self.announce(key, text, severity)
+            )
+            return
+        self._announced[key] = text, now_us
+        self.send_statustext(text, severity)
 
 
 def period_us(hertz: float) -> int:
@@ -150,61 +193,3 @@ class Rate:
             return True
         self._next_us = t_us + self._period_us
         return True
-
-
-class Announcer:
-    """Sender of STATUSTEXT messages, which sends the text of a state only if the state has changed.
-
-    `texts`: severity and text of the latest messages; another thread may take them out and print them.
-    """
-
-    def __init__(self, outbox: Outbox, timers: Timers) -> None:
-        self._outbox, self._timers = outbox, timers
-        self.texts: deque[tuple[MAV_SEVERITY, str]] = deque(maxlen=TEXTS_KEPT)
-        self._announced: dict[str, tuple[str, int]] = {}
-        self._chunked_texts = 0
-
-    def send_statustext(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        """Send `text`, in chunks of 50 bytes if it is longer; non-ASCII characters become question marks."""
-        self.texts.append((severity, text))
-        data = text.encode("ascii", "replace")
-        chunks = [data[i : i + STATUSTEXT_LENGTH] for i in range(0, len(data), STATUSTEXT_LENGTH)]
-        if len(chunks) > 1:
-            self._chunked_texts = self._chunked_texts % 0xFFFF + 1
-            if len(chunks[-1]) == STATUSTEXT_LENGTH:
-                chunks.append(b"")  # the receiver waits for a chunk that is not full
-        for i, chunk in enumerate(chunks):
-            self._outbox.send(
-                "STATUSTEXT",
-                severity=severity,
-                text=chunk,
-                id=self._chunked_texts if len(chunks) > 1 else 0,
-                chunk_seq=i,
-            )
-
-    def forget(self, key: str) -> None:
-        """Delete the last announced state of `key`, so that :meth:`state` announces the next state."""
-        self._announced.pop(key, None)
-
-    def state(
-        self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, recurring: bool = False
-    ) -> None:
-        """Send `text` as the new state of `key`, unless the last text sent for `key` was equal.
-
-        If `recurring`, send an equal text again after `ANNOUNCEMENT_INTERVAL_US`. Send a text that changes
-        within this interval when the interval ends.
-        """
-        now_us = self._outbox.codec.now_us
-        last_text, last_us = self._announced.get(key, ("", now_us - ANNOUNCEMENT_INTERVAL_US))
-        elapsed_us = now_us - last_us
-        timer = f"announce {key}"
-        self._timers.cancel(timer)
-        if text == last_text and not (recurring and elapsed_us >= ANNOUNCEMENT_INTERVAL_US):
-            return
-        if elapsed_us < ANNOUNCEMENT_INTERVAL_US:
-            self._timers.run_once(
-                timer, last_us + ANNOUNCEMENT_INTERVAL_US, lambda _: self.state(key, text, severity)
-            )
-            return
-        self._announced[key] = text, now_us
-        self.send_statustext(text, severity)

@@ -9,48 +9,14 @@ from struct import pack, unpack
 import msgspec
 
 from magbridge.config import Align, Telemetry
-from magbridge.link.output import Announcer, Outbox, Timers
+from magbridge.link.output import Output
 from magbridge.mavlink import Message
 from magbridge.mavlink.enums import MAV_PARAM_TYPE, MAV_SEVERITY, MAV_TYPE
 
 __all__ = [
-    "Authority", "ParameterService", "Parameters", "Tunable", "alignment", "file_rate", "learning",
-    "rate_name", "rates", "telemetry_ages",
+    "ParameterService", "Parameters", "Tunable", "alignment", "file_rate", "learning", "rate_name", "rates",
+    "telemetry_ages",
 ]  # fmt: skip
-
-MAX_COMPONENTS = 64
-"""Most components whose MAV_TYPE is stored; a further one displaces the oldest."""
-
-
-class Authority:
-    """Access rights: only the autopilot and ground stations may change parameters and rates.
-
-    A ground station is a component with a HEARTBEAT of type GCS. A component of another system without a
-    heartbeat also counts as a station, because small programs send none. A component of our own vehicle
-    without a heartbeat does not.
-
-    `system`, `autopilot`: system id and autopilot's component id of our own vehicle.
-    """
-
-    def __init__(self, system: int, autopilot: int) -> None:
-        self._system, self._autopilot = system, autopilot
-        self._kinds: dict[tuple[int, int], int] = {}
-
-    def heartbeat(self, message: Message) -> bool:
-        """Store the MAV_TYPE of the sender of a HEARTBEAT; return True for a ground station."""
-        kind: int = message["type"]
-        self._kinds.pop((message.system, message.component), None)
-        self._kinds[message.system, message.component] = kind
-        if len(self._kinds) > MAX_COMPONENTS:
-            del self._kinds[next(iter(self._kinds))]
-        return kind == MAV_TYPE.GCS
-
-    def may_change(self, message: Message) -> bool:
-        """Return True if the sender of `message` may change the bridge's settings."""
-        who = message.system, message.component
-        ours = message.system == self._system
-        kind = self._kinds.get(who, None if ours else MAV_TYPE.GCS)
-        return kind == MAV_TYPE.GCS or who == (self._system, self._autopilot)
 
 
 class Tunable(msgspec.Struct, frozen=True):
@@ -197,32 +163,35 @@ LIST_INTERVAL_US = 10_000_000
 """Time after which the parameters are sent to a new station a second time, µs."""
 FORGOTTEN_US = 60_000_000
 """Time without a heartbeat after which a station counts as new again, µs."""
-STATIONS = 16
-"""Most stations whose last heartbeat is stored."""
+MAX_SENDERS = 64
+"""Most components whose last heartbeat is stored; a further one displaces the one silent for longest."""
 
 
 class ParameterService:
     """Handler of PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; all values are REAL32.
 
-    `authority`: decides which senders may set a parameter.
+    Only the autopilot and ground stations may change parameters and rates. A ground station is a component
+    with a HEARTBEAT of type GCS. A component of another system without a heartbeat also counts as a station,
+    because small programs send none. A component of our own vehicle without a heartbeat does not.
+
+    `peer`: system id and component id of the autopilot.
     """
 
-    def __init__(
-        self,
-        parameters: Parameters,
-        outbox: Outbox,
-        timers: Timers,
-        announcer: Announcer,
-        authority: Authority,
-    ) -> None:
-        self._parameters, self._outbox, self._timers = parameters, outbox, timers
-        self._announcer, self._authority = announcer, authority
+    def __init__(self, parameters: Parameters, output: Output, peer: tuple[int, int]) -> None:
+        self._parameters, self._output, self._peer = parameters, output, peer
         self._listed = self._rounds = self._unasked = 0
-        self._stations: dict[tuple[int, int], int] = {}
+        # MAV_TYPE and time (µs) of the last heartbeat of each component
+        self._senders: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def may_change(self, message: Message) -> bool:
+        """Return True if the sender of `message` may change the bridge's settings."""
+        who = message.system, message.component
+        unknown = -1 if message.system == self._peer[0] else int(MAV_TYPE.GCS)
+        return who == self._peer or self._senders.get(who, (unknown, 0))[0] == MAV_TYPE.GCS
 
     def send(self, name: str) -> None:
         """Send PARAM_VALUE with the current value of a parameter."""
-        self._outbox.send(
+        self._output.send(
             "PARAM_VALUE",
             param_id=name,
             param_value=self._parameters[name],
@@ -231,18 +200,18 @@ class ParameterService:
             param_index=self._parameters.names.index(name),
         )
 
-    def greet(self, station: tuple[int, int]) -> None:
-        """Record a station's heartbeat; send a new station all parameters, now and `LIST_INTERVAL_US` later.
+    def heartbeat(self, message: Message) -> None:
+        """Record a heartbeat; send a new station all parameters, now and `LIST_INTERVAL_US` later.
 
         If an autopilot is present, QGroundControl does not request the parameters of another component. It
         also discards parameters that it receives before it has the autopilot's.
         """
-        now_us = self._outbox.codec.now_us
-        before_us = self._stations.pop(station, None)
-        self._stations[station] = now_us
-        if len(self._stations) > STATIONS:
-            del self._stations[next(iter(self._stations))]
-        if before_us is None or now_us - before_us > FORGOTTEN_US:
+        who, now_us, kind = (message.system, message.component), self._output.codec.now_us, message["type"]
+        _, before_us = self._senders.pop(who, (kind, now_us - FORGOTTEN_US - 1))
+        self._senders[who] = kind, now_us
+        if len(self._senders) > MAX_SENDERS:
+            del self._senders[next(iter(self._senders))]
+        if kind == MAV_TYPE.GCS and now_us - before_us > FORGOTTEN_US:
             under_way, self._unasked = self._unasked, 3
             if not under_way:
                 self._list_unasked(now_us)
@@ -251,7 +220,7 @@ class ParameterService:
         self._unasked -= 1
         if self._unasked:
             self._begin()
-            self._timers.run_once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
+            self._output.run_once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
         """Start to send all parameters, one every `PACE_US`; if a list is being sent, complete it first."""
@@ -260,7 +229,7 @@ class ParameterService:
     def _begin(self) -> None:
         if not self._rounds:
             self._listed = 0
-            self._timers.every("parameters", PACE_US, self._send_next, self._outbox.codec.now_us)
+            self._output.every("parameters", PACE_US, self._send_next, self._output.codec.now_us)
         self._rounds = 2 if self._listed else 1
 
     def _send_next(self, _: int) -> None:
@@ -270,7 +239,7 @@ class ParameterService:
             self._listed = 0
             self._rounds -= 1
         if not self._rounds:
-            self._timers.cancel("parameters")
+            self._output.cancel("parameters")
 
     def read(self, message: Message) -> None:
         """Send the parameter of a request, which has an index or a name; ignore unknown parameters."""
@@ -290,7 +259,7 @@ class ParameterService:
             return
         if message["param_type"] != MAV_PARAM_TYPE.REAL32:
             self._refuse(name, "only REAL32 is taken")
-        elif not self._authority.may_change(message):
+        elif not self.may_change(message):
             who = f"{message.system}:{message.component}"
             self._refuse(name, f"only a station or the autopilot sets it, not {who}")
         elif not self._parameters.set(name, value):
@@ -299,8 +268,8 @@ class ParameterService:
             )
         else:
             text = f"{name} = {value:.6g}, set by {message.system}:{message.component}"
-            self._announcer.state(f"set {name}", text, MAV_SEVERITY.NOTICE)
+            self._output.announce(f"set {name}", text, MAV_SEVERITY.NOTICE)
         self.send(name)
 
     def _refuse(self, name: str, reason: str) -> None:
-        self._announcer.state(f"refused {name}", f"{name}: {reason}", MAV_SEVERITY.WARNING, recurring=True)
+        self._output.announce(f"refused {name}", f"{name}: {reason}", MAV_SEVERITY.WARNING, recurring=True)

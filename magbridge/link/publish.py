@@ -11,12 +11,12 @@ from typing import Final
 from magbridge.align import Sample
 from magbridge.errors import ConfigError
 from magbridge.link.estimates import NO_ATTITUDE, Attitude, send_attitude
-from magbridge.link.output import Outbox, Rate, Timers, period_us
+from magbridge.link.output import Output, Rate, period_us
 from magbridge.link.parameters import (
     Parameters,
     rate_name,
 )
-from magbridge.mavlink import Codec, spec
+from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import MESSAGES
 from magbridge.records import Corrected
@@ -60,13 +60,13 @@ class Publisher:
 
     def __init__(
         self,
-        outbox: Outbox,
+        output: Output,
         rates: Mapping[str, Rate],
         calibration_id: int = 0,
         start_us: int = 0,
         sensor_id: int = 0,
     ) -> None:
-        self._outbox, self._codec = outbox, outbox.codec
+        self._output, self._codec = output, output.codec
         self.calibration_id, self._start_us, self._sensor_id = calibration_id, start_us, sensor_id
         self._messages = [
             (rates[name], getattr(self, method)) for name, method in PUBLISHED.items() if name in rates
@@ -84,7 +84,7 @@ class Publisher:
         *,
         is_brief: bool = False,
     ) -> None:
-        """Send the messages whose rates are due for a sample, at the time ``outbox.codec.now_us``.
+        """Send the messages whose rates are due for a sample, at the time ``output.codec.now_us``.
 
         `sample`: reading with the telemetry of its time.
         `corrected`: the corrected field of the sample.
@@ -109,7 +109,7 @@ class Publisher:
         return True
 
     def _raw(self, sample: Sample, *_: object) -> None:
-        self._outbox.put(RAW, self.raw_payload(sample))
+        self._output.put(RAW, self.raw_payload(sample))
 
     def raw_payload(self, sample: Sample) -> bytes:
         """Return the payload of MAG_RAW for a sample."""
@@ -142,7 +142,7 @@ class Publisher:
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, self._sensor_id,
             *(NO_HEADING if attitude is NO_ATTITUDE else attitude[:3]),
         )  # fmt: skip
-        self._outbox.put(FIELD_MESSAGE, payload)
+        self._output.put(FIELD_MESSAGE, payload)
 
     def _imu(self, sample: Sample, corrected: Corrected, *_: object) -> None:
         x, y, z = corrected.field
@@ -150,7 +150,7 @@ class Publisher:
         payload = IMU_FIELD.pack(
             time_us, x * GAUSS_PER_NT, y * GAUSS_PER_NT, z * GAUSS_PER_NT, MAGNETOMETER, 0
         )
-        self._outbox.put(IMU, payload)
+        self._output.put(IMU, payload)
 
     def _named(self, sample: Sample, corrected: Corrected, anomaly: float, _: Attitude) -> None:
         boot_ms = (sample.time_us - self._start_us) // 1000 & MASK
@@ -158,16 +158,16 @@ class Publisher:
         if isfinite(anomaly):
             values.append((b"mag_anom", anomaly))
         for name, value in values:
-            self._outbox.put(NAMED, NAMED.struct.pack(boot_ms, value, name))
+            self._output.put(NAMED, NAMED.struct.pack(boot_ms, value, name))
 
     def _vector(self, sample: Sample, corrected: Corrected, *_: object) -> None:
         time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
-        self._outbox.put(VECTOR, VECTOR.struct.pack(time_us, *corrected.field, b"mag_field"))
+        self._output.put(VECTOR, VECTOR.struct.pack(time_us, *corrected.field, b"mag_field"))
 
     def _quaternion(self, sample: Sample, _: Corrected, __: float, attitude: Attitude) -> None:
         if isfinite(attitude.heading):
             time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
-            send_attitude(self._outbox, attitude, time_us)
+            send_attitude(self._output, attitude, time_us)
 
 
 PUBLISHED: dict[str, str] = {
@@ -221,8 +221,8 @@ class MessageRates:
     `by_name`: rate of each message of the main sensor and of each report, by message name.
     """
 
-    def __init__(self, parameters: Parameters, timers: Timers, codec: Codec) -> None:
-        self._parameters, self._timers, self._codec = parameters, timers, codec
+    def __init__(self, parameters: Parameters, output: Output) -> None:
+        self._parameters, self._output = parameters, output
         self.by_name = {name: Rate(parameters[rate_name(name)]) for name in LIMITS}
         self._by_clock: dict[str, Callable[[], object]] = {}
         self._rates = [(rate_name(name), rate) for name, rate in self.by_name.items()]
@@ -271,6 +271,6 @@ class MessageRates:
             return
         hertz = self._parameters[parameter]
         if hertz > 0:
-            self._timers.every(parameter, period_us(hertz), lambda _: report(), self._codec.now_us)
+            self._output.every(parameter, period_us(hertz), lambda _: report(), self._output.codec.now_us)
         else:
-            self._timers.cancel(parameter)
+            self._output.cancel(parameter)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
-from magbridge.link.output import Announcer, Outbox, Timers
+from magbridge.link.output import Output
 from magbridge.link.vehicle import VehicleClock
 from magbridge.mavlink import Message, Source, Spec, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
@@ -19,7 +19,7 @@ from magbridge.records import NULL_POSITION_DEG
 from magbridge.wording import suggestion
 
 __all__ = [
-    "AIRCRAFT", "EKF_STATUS", "MIN_RATE_FRACTION", "PX4_STATUS", "Sources", "Stream", "StreamRequests",
+    "AIRCRAFT", "EKF_STATUS", "MIN_RATE_FRACTION", "PX4_STATUS", "Stream", "StreamRequests",
     "TelemetryMap", "is_contradicted", "is_null_position", "is_possible", "needed_rates", "own_time",
     "sent_us",
 ]  # fmt: skip
@@ -91,7 +91,7 @@ def find(layout: Spec, name: str, path: Path, key: str) -> Field:
 
 
 class TelemetryMap:
-    """Reader of all configured parameters from messages, with the time of each value.
+    """Reader of all configured parameters from messages, with the source and the time of each value.
 
     `telemetry`: sections ``[telemetry.NAME]`` of the configuration, by name.
     `autopilot`: id of the autopilot's component, whose clock the :class:`VehicleClock` estimates.
@@ -105,6 +105,10 @@ class TelemetryMap:
     ) -> None:
         self._autopilot = autopilot
         self.delays_us = {name: round(what.delay * 1e6) for name, what in telemetry.items()}
+        self._sources = {
+            name: Source(autopilot, round(what.max_age * 1e6), what.component)
+            for name, what in telemetry.items()
+        }
         self._by_id: dict[int, list[Extractor]] = {}
         self._times: dict[int, ReadTime | None] = {}
         for name, what in telemetry.items():
@@ -132,13 +136,27 @@ class TelemetryMap:
         for one in extractors:
             value = one.value(message.payload)
             if value is not None:
-                when_us = when_us or self._time(message, t_us, clock)
+                if not when_us:
+                    read = self._times[message.id] if message.component == self._autopilot else None
+                    when_us = sent_us(read, message.payload, t_us, clock)
                 found.append((one.name, value, when_us))
         return found
 
-    def _time(self, message: Message, t_us: int, clock: VehicleClock) -> int:
-        read = self._times[message.id]
-        return t_us if message.component != self._autopilot else sent_us(read, message.payload, t_us, clock)
+    def admit(self, name: str, message: Message, time_us: int, output: Output) -> bool:
+        """Return True if the sender of `message` is the source of the parameter `name` at `time_us` (µs).
+
+        STATUSTEXTs report a second sender, and a change of the source.
+        """
+        source, sender = self._sources[name], f"{message.system}:{message.component}"
+        before = source.component
+        if not source.admit(message.component, time_us):
+            text = f"{name} also from {sender}: not used"
+            output.announce(f"source {name} {message.component}", text, MAV_SEVERITY.WARNING)
+            return False
+        if message.component != before and before is not None:
+            text = f"{name} now from {sender}, not {before}"
+            output.announce(f"source {name}", text, MAV_SEVERITY.WARNING)
+        return True
 
 
 def sent_us(read: ReadTime | None, payload: bytes, t_us: int, clock: VehicleClock) -> int:
@@ -291,7 +309,6 @@ class StreamRequests:
 
     `peer`: system id and component id of the autopilot.
     `rates`: needed rates from :func:`needed_rates`.
-    `outbox`, `timers`, `announcer`: services of the link.
     `active`: False to measure rates without requests.
     """
 
@@ -299,14 +316,12 @@ class StreamRequests:
         self,
         peer: tuple[int, int],
         rates: Mapping[Stream, tuple[float, float]],
-        outbox: Outbox,
-        timers: Timers,
-        announcer: Announcer,
+        output: Output,
         *,
         active: bool = True,
     ) -> None:
         self._active = active
-        self._peer, self._outbox, self._timers, self._announcer = peer, outbox, timers, announcer
+        self._peer, self._output = peer, output
         self.needed = dict(rates)
         """Sender and message -> needed rates: on an aircraft, and on any other vehicle, Hz."""
         self._numbers = {number for _, number in self.needed}
@@ -334,7 +349,7 @@ class StreamRequests:
                 self._numbers.add(PX4_STATUS)
             if not self._present:
                 self._present = True
-                self._timers.every("streams", self.interval_us, self._look, time_us + self.interval_us)
+                self._output.every("streams", self.interval_us, self._look, time_us + self.interval_us)
         elif message.id == ACK:
             is_asked = self._asked is not None and message.component == self._asked[0]
             if is_asked and message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL:
@@ -381,7 +396,7 @@ class StreamRequests:
             return
         stream = self._asked = self._queue.popleft()
         self._attempts[stream] += 1
-        self._outbox.send(
+        self._output.send(
             "COMMAND_LONG",
             target_system=self._peer[0],
             target_component=stream[0],
@@ -389,8 +404,8 @@ class StreamRequests:
             param1=float(stream[1]),
             param2=1e6 / self.rate_of(stream),
         )
-        deadline = self._outbox.codec.now_us + ANSWER_US
-        self._timers.run_once("stream request", deadline, lambda _: self._ask_next())
+        deadline = self._output.codec.now_us + ANSWER_US
+        self._output.run_once("stream request", deadline, lambda _: self._ask_next())
 
     def _answered(self, result: int) -> None:
         """Process the reply to the pending request: report a rejection, then send the next request."""
@@ -402,8 +417,8 @@ class StreamRequests:
             sender = "the autopilot" if component == self._peer[1] else f"component {component}"
             text = f"{sender} does not send {name} at {self.rate_of(self._asked):g} Hz: {why}"
             self.denied[name] = text
-            self._announcer.state(f"stream {name}", text, MAV_SEVERITY.WARNING)
-        self._timers.cancel("stream request")
+            self._output.announce(f"stream {name}", text, MAV_SEVERITY.WARNING)
+        self._output.cancel("stream request")
         self._ask_next()
 
 
@@ -417,33 +432,3 @@ INNOVATION_RATIOS: Final = {
 }
 """Id of an estimator message -> its fields with ratios of innovations to their limits."""
 ACK: Final = spec("COMMAND_ACK").id
-
-
-class Sources:
-    """Selection of one component as the source of each telemetry parameter, with reports of conflicts.
-
-    `telemetry`: sections ``[telemetry.NAME]`` of the configuration, by name.
-    `system`, `autopilot`: system id and autopilot's component id of our own vehicle.
-    """
-
-    def __init__(
-        self, telemetry: Mapping[str, Telemetry], system: int, autopilot: int, announcer: Announcer
-    ) -> None:
-        self._system, self._announcer = system, announcer
-        self._of = {
-            name: Source(autopilot, round(one.max_age * 1e6), one.component)
-            for name, one in telemetry.items()
-        }
-
-    def admit(self, name: str, component: int, time_us: int) -> bool:
-        """Return True if `component` is the source of the parameter `name` at `time_us` (µs)."""
-        source = self._of[name]
-        before = source.component
-        if not source.admit(component, time_us):
-            text = f"{name} also from {self._system}:{component}: not used"
-            self._announcer.state(f"source {name} {component}", text, MAV_SEVERITY.WARNING)
-            return False
-        if component != before and before is not None:
-            text = f"{name} now from {self._system}:{component}, not {before}"
-            self._announcer.state(f"source {name}", text, MAV_SEVERITY.WARNING)
-        return True

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from math import nan, sqrt
 from typing import Final, NamedTuple
 
-from magbridge.link.output import Announcer, Timers
+from magbridge.link.output import Output
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE
 from magbridge.mavlink.messages import MESSAGES
@@ -197,47 +197,6 @@ class Numbers:
         self._last = number
 
 
-class Losses:
-    """Counts of lost frames of each component of one vehicle, with reports of components that lose many.
-
-    `announcer`, `timers`: services of the link.
-    """
-
-    def __init__(self, system: int, announcer: Announcer, timers: Timers) -> None:
-        self._system, self._announcer, self._timers = system, announcer, timers
-        self._numbers: dict[int, Numbers] = {}
-        self._before: dict[int, tuple[int, int]] = {}
-
-    def count(self, component: int, number: int, t_us: int) -> None:
-        """Count a frame of `component` with sequence number `number`, received at `t_us` (µs)."""
-        numbers = self._numbers.get(component)
-        if numbers is None:
-            if len(self._numbers) >= WATCHED:
-                return
-            if not self._numbers:
-                self._timers.every("losses", LOSS_INTERVAL_US, self._look, t_us + LOSS_INTERVAL_US)
-            numbers = self._numbers[component] = Numbers(number)
-        numbers.count(number)
-
-    def lost_frames(self, component: int) -> int:
-        """Return the number of lost frames of a component."""
-        numbers = self._numbers.get(component)
-        return 0 if numbers is None else numbers.lost
-
-    def _look(self, _: int) -> None:
-        for component, numbers in self._numbers.items():
-            received, lost = self._before.get(component, (0, 0))
-            self._before[component] = numbers.received, numbers.lost
-            received, lost = numbers.received - received, numbers.lost - lost
-            if lost >= LEAST and lost > MANY * (received + lost):
-                # a router may forward some frames only to other receivers
-                who = f"{self._system}:{component}"
-                text = f"{who}: over {MANY:.0%} of its frames missing, or for others"
-                self._announcer.state(f"losses {component}", text, MAV_SEVERITY.WARNING)
-            elif received and not lost:
-                self._announcer.forget(f"losses {component}")
-
-
 HEARTBEAT: Final = spec("HEARTBEAT").id
 ABSENT_US = 5_000_000
 """Time without a heartbeat after which the autopilot counts as lost, µs."""
@@ -265,16 +224,15 @@ class VehicleState:
     `state`: presence of the autopilot: ABSENT, OK or LOST.
     """
 
-    def __init__(
-        self, system: int, component: int, autopilot: int, announcer: Announcer, timers: Timers
-    ) -> None:
+    def __init__(self, system: int, component: int, autopilot: int, output: Output) -> None:
         self.system, self.component, self.autopilot = system, component, autopilot
         self.clock = VehicleClock()
         self.reboots = 0
         self.on_reboot: Callable[[], object] = int
         self.state = MAG_PORT_STATE.ABSENT
-        self._announcer, self._timers = announcer, timers
-        self._losses = Losses(system, announcer, timers)
+        self._output = output
+        self._numbers: dict[int, Numbers] = {}
+        self._before: dict[int, tuple[int, int]] = {}  # frames received and lost at the last comparison
         self._boot_ms = self._boot_us = 0
         self._other_clock = 0, 0  # the last boot time (ms) of another clock, and its time of reception (µs)
         self._stamps: dict[int, int] = {}  # the last boot time (ms) of each kind of message
@@ -284,7 +242,8 @@ class VehicleState:
     @property
     def frames_lost(self) -> int:
         """Number of lost frames of the autopilot, from its sequence numbers."""
-        return self._losses.lost_frames(self.autopilot)
+        numbers = self._numbers.get(self.autopilot)
+        return 0 if numbers is None else numbers.lost
 
     def receive(self, message: Message, t_us: int) -> bool:
         """Update the state with a message received at `t_us` (µs); return True if it is from our vehicle."""
@@ -292,11 +251,11 @@ class VehicleState:
             self._other_sender(message)
             return False
         if message.component == self.component:
-            self._announcer.state(
+            self._output.announce(
                 "twin", f"another program sends as {self.system}:{self.component}", MAV_SEVERITY.WARNING
             )
             return False
-        self._losses.count(message.component, message.sequence, t_us)
+        self.count(message, t_us)
         if message.component == self.autopilot:
             if message.id in HAS_BOOT_TIME:
                 boot_ms = spec(message.id).fields["time_boot_ms"].get(message.payload)
@@ -306,16 +265,38 @@ class VehicleState:
         return True
 
     def count(self, message: Message, t_us: int) -> None:
-        """Count a frame of the vehicle that has an unknown message id or was rejected."""
-        if message.system == self.system and message.component != self.component:
-            self._losses.count(message.component, message.sequence, t_us)
+        """Count a frame of the vehicle, which may have an unknown message id or be rejected."""
+        if message.system != self.system or message.component == self.component:
+            return
+        numbers = self._numbers.get(message.component)
+        if numbers is None:
+            if len(self._numbers) >= WATCHED:
+                return
+            if not self._numbers:
+                self._output.every("losses", LOSS_INTERVAL_US, self._find_losses, t_us + LOSS_INTERVAL_US)
+            numbers = self._numbers[message.component] = Numbers(message.sequence)
+        numbers.count(message.sequence)
+
+    def _find_losses(self, _: int) -> None:
+        """Report each component that has lost many frames since the last call."""
+        for component, numbers in self._numbers.items():
+            received, lost = self._before.get(component, (0, 0))
+            self._before[component] = numbers.received, numbers.lost
+            received, lost = numbers.received - received, numbers.lost - lost
+            if lost >= LEAST and lost > MANY * (received + lost):
+                # a router may forward some frames only to other receivers
+                who = f"{self.system}:{component}"
+                text = f"{who}: over {MANY:.0%} of its frames missing, or for others"
+                self._output.announce(f"losses {component}", text, MAV_SEVERITY.WARNING)
+            elif received and not lost:
+                self._output.forget(f"losses {component}")
 
     def _other_sender(self, message: Message) -> None:
         """Send a STATUSTEXT if the heartbeat of another vehicle, not of a ground station, is on the link."""
         if message.id != HEARTBEAT:
             return
         if message["type"] != MAV_TYPE.GCS and message["autopilot"] != MAV_AUTOPILOT.INVALID:
-            self._announcer.state(
+            self._output.announce(
                 f"system {message.system}",
                 f"vehicle {message.system} is on the link too: ignored",
                 MAV_SEVERITY.NOTICE,
@@ -324,13 +305,13 @@ class VehicleState:
     def _present(self, t_us: int) -> None:
         who = f"autopilot {self.system}:{self.autopilot}"
         if self.state != MAG_PORT_STATE.OK:
-            self._announcer.state("autopilot", f"{who} found", MAV_SEVERITY.INFO)
+            self._output.announce("autopilot", f"{who} found", MAV_SEVERITY.INFO)
         self.state = MAG_PORT_STATE.OK
-        self._timers.run_once("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
+        self._output.run_once("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
 
     def _vanish(self, sender: str) -> None:
         self.state = MAG_PORT_STATE.LOST
-        self._announcer.state("autopilot", f"{sender} is silent", MAV_SEVERITY.WARNING)
+        self._output.announce("autopilot", f"{sender} is silent", MAV_SEVERITY.WARNING)
 
     def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
         """Process the boot time of the message id `kind`, and detect a reboot or a second autopilot.
@@ -370,7 +351,7 @@ class VehicleState:
         self.clock.reset()
         self.on_reboot()
         self._stamps.clear()
-        self._announcer.send_statustext(
+        self._output.send_statustext(
             f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING
         )
 
@@ -378,7 +359,7 @@ class VehicleState:
         """Count a change of the boot clock at `t_us`; report two autopilots after `TWICE` recent changes."""
         self._changes = [*(when for when in self._changes if t_us - when < CHANGES_US), t_us][-TWICE:]
         if len(self._changes) == TWICE:
-            self._announcer.state(
+            self._output.announce(
                 "autopilots", f"two autopilots send as {self.system}:{self.autopilot}", MAV_SEVERITY.WARNING
             )
 

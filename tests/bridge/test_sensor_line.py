@@ -7,11 +7,13 @@ from fed import FedBridge, named
 from small import ASCII_OPTIONS, small_bridge
 
 from magbridge.bridge import events
-from magbridge.bridge.sensor import SensorLine
-from magbridge.link.output import Announcer, Outbox, Timers
-from magbridge.mavlink import Codec
+from magbridge.bridge.sensor import SensorStream
+from magbridge.config import Align, Link, Sensor
+from magbridge.correction import Correction
+from magbridge.link.component import Component
 from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel
+from magbridge.sensors.hmr2300 import Hmr2300, Hmr2300Options
 
 LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"
 
@@ -98,20 +100,30 @@ def test_an_instrument_with_another_protocol_is_not_silent(bench: Bench, line: b
     assert bench.texts[-1] == "ascii is silent"
 
 
-def opened_line(*commands: bytes, searching: bool = False) -> tuple[SensorLine, Timers]:
-    """Return a sensor's line that was opened at 0, and its timers."""
-    timers = Timers()
-    announcer = Announcer(Outbox(Codec(1, 191)), timers)
-    line = SensorLine("hmr2300", lambda: commands, 10_000_000, announcer, timers, 0, searching=searching)
-    line.opened(0)
-    return line, timers
+class Commanded(Hmr2300):
+    """Driver with given start-up commands."""
+
+    def __init__(self, commands: tuple[bytes, ...]) -> None:
+        super().__init__(Hmr2300Options())
+        self.start = lambda: commands  # type: ignore[method-assign]
 
 
-def sent_at(line: SensorLine, timers: Timers, now_us: int) -> list[bytes]:
-    timers.advance(now_us, lambda _: None)
-    sent = list(line.to_send)
-    line.to_send.clear()
-    return sent
+class OpenedLine:
+    """Sensor whose port was opened at 0, by the name of its port or by a pattern."""
+
+    def __init__(self, *commands: bytes, port: str = "/dev/ttyUSB0") -> None:
+        component, driver = Component(Link("udpout:h:1"), {}, start_us=0), Commanded(commands)
+        correction, self._output = Correction(None, Align()), component.output
+        self.sensor = SensorStream(
+            Sensor("hmr2300", port), driver, correction, component, 0, component.publisher
+        )
+        self.sensor.opened(0)
+
+    def sent_at(self, now_us: int) -> list[bytes]:
+        self._output.advance(now_us)
+        sent = list(self.sensor.to_send)
+        self.sensor.to_send.clear()
+        return sent
 
 
 @pytest.mark.parametrize(
@@ -127,31 +139,31 @@ def sent_at(line: SensorLine, timers: Timers, now_us: int) -> list[bytes]:
 def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
     searching: bool, received: bytes, sent: list[float]
 ) -> None:
-    line, timers = opened_line(b"go", searching=searching)
+    line = OpenedLine(b"go", port="/dev/ttyUSB*" if searching else "/dev/ttyUSB0")
     times = []
     for k in range(50):
-        times += [0.1 * k for _ in sent_at(line, timers, 100_000 * k)]
+        times += [0.1 * k for _ in line.sent_at(100_000 * k)]
         if received and k % 10 == 7:
-            line.on_unparsed(received[:11], 100_000 * k)
-            line.on_unparsed(received[11:], 100_000 * k)
+            line.sensor.receive(received[:11], 100_000 * k)
+            line.sensor.receive(received[11:], 100_000 * k)
     assert times == pytest.approx(sent, abs=0.11)
-    assert line.wrong_device == (sent == [])
+    assert line.sensor.wrong_device == (sent == [])
 
 
 def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
-    line, timers = opened_line(b"1", b"2", b"3", searching=True)
+    line = OpenedLine(b"1", b"2", b"3", port="/dev/ttyUSB*")
     sent = []
     for now_us in range(0, 2_000_000, 10_000):
-        sent += sent_at(line, timers, now_us)
-        if sent and not line.wrong_device:
-            line.on_unparsed(GGA, now_us)
+        sent += line.sent_at(now_us)
+        if sent and not line.sensor.wrong_device:
+            line.sensor.receive(GGA, now_us)
     assert sent == [b"1"]
-    assert line.wrong_device
+    assert line.sensor.wrong_device
 
 
 def test_commands_are_a_tenth_of_a_second_apart() -> None:
     """An instrument replies to one command before it reads the next."""
-    line, timers = opened_line(b"1", b"2", b"3")
+    line = OpenedLine(b"1", b"2", b"3")
     for now_us in range(0, 300_000, 10_000):
         expected = {0: [b"1"], 100_000: [b"2"], 200_000: [b"3"]}.get(now_us, [])
-        assert sent_at(line, timers, now_us) == expected
+        assert line.sent_at(now_us) == expected

@@ -39,11 +39,11 @@ class Line:
     def to(self, seconds: float) -> list[Any]:
         """Advance the time to `seconds` after the start; return the messages that the station receives."""
         self.now = START + round(seconds * SECOND)
-        self.component.advance(self.now)
+        self.component.output.advance(self.now)
         return self.receive()
 
     def receive(self) -> list[Any]:
-        frames = self.component.outbox.drain()
+        frames = self.component.output.drain()
         self.sent += frames
         received: list[Any] = []
         for _, frame in frames:

@@ -34,7 +34,7 @@ class Bench:
     def to(self, seconds: float) -> list[Message]:
         """Advance the time to `seconds` after the start; return the messages sent, and store the texts."""
         self.now_us = START_US + round(seconds * 1e6) // 4 * 4
-        self.component.advance(self.now_us)
+        self.component.output.advance(self.now_us)
         return self._drain()
 
     def receive(self, name: str, component: int = 1, **fields: Any) -> list[Message]:
@@ -58,8 +58,8 @@ class Bench:
         return found
 
     def _drain(self) -> list[Message]:
-        self.texts += [text for _, text in self.component.announcer.texts]
-        self.component.announcer.texts.clear()
-        frames = b"".join(frame for _, frame in self.component.outbox.drain())
+        self.texts += [text for _, text in self.component.output.texts]
+        self.component.output.texts.clear()
+        frames = b"".join(frame for _, frame in self.component.output.drain())
         wanted = ("COMMAND_INT", "COMMAND_LONG", "GLOBAL_POSITION_SENSOR", "ODOMETRY")
         return [message for message in Codec(255, 190).parse(frames) if message.name in wanted]

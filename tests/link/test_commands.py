@@ -11,8 +11,8 @@ from small import START, small_bridge
 
 from magbridge.bridge.events import Event
 from magbridge.config import Telemetry
-from magbridge.link.output import Announcer, Outbox, Timers
-from magbridge.link.telemetry import Sources, Stream, StreamRequests, needed_rates
+from magbridge.link.output import Output
+from magbridge.link.telemetry import Stream, StreamRequests, TelemetryMap, needed_rates
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
 from magbridge.records import Channel
@@ -116,7 +116,7 @@ def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Lin
     ask = {"target_system": 1, "target_component": 191, "command": REQUEST, "param1": METADATA}
     received = link.give(others.pack("COMMAND_LONG", **ask))
     assert [one.result for one in link.only(received, "COMMAND_ACK")] == [ACCEPTED]
-    reported = [text for _, text in link.component.announcer.texts if "commands a second" in text]
+    reported = [text for _, text in link.component.output.texts if "commands a second" in text]
     assert reported == ["more than 100 commands a second from 255:190"]
     link.to(2.0)
     assert result(link, link.command(REQUEST, METADATA)) == ACCEPTED
@@ -140,9 +140,8 @@ class Bench:
         needed: Mapping[Stream, tuple[float, float]] = NEEDED,
     ) -> None:
         self.codec = Codec(1, 191)
-        self.outbox, self.timers = Outbox(self.codec), Timers()
-        self.announcer = Announcer(self.outbox, self.timers)
-        self.requests = StreamRequests((1, 1), needed, self.outbox, self.timers, self.announcer)
+        self.output = Output(self.codec)
+        self.requests = StreamRequests((1, 1), needed, self.output)
         self._ear, self._kind, self._result = Codec(0, 0), kind, result
         self._codecs = {1: Codec(1, 1), 25: Codec(1, 25)}
         self.receivers: set[int] = set()
@@ -156,8 +155,7 @@ class Bench:
                 for _ in range(rate):
                     self._give(name, component)
             self.now_us += SECOND
-            self.codec.now_us = self.now_us
-            self.timers.advance(self.now_us, lambda _: None)
+            self.output.advance(self.now_us)
             self._answer()
 
     def _give(self, name: str, component: int = 1, **fields: object) -> None:
@@ -165,7 +163,7 @@ class Bench:
         self.requests.receive(message, self.now_us)
 
     def _answer(self) -> None:
-        while frames := self.outbox.drain():
+        while frames := self.output.drain():
             for _, frame in frames:
                 (message,) = Codec(0, 0).parse(frame)
                 if message.name == "COMMAND_LONG":
@@ -213,7 +211,7 @@ def test_a_denial_is_reported_and_not_repeated() -> None:
     bench = Bench(1, MAV_RESULT.DENIED)
     bench.run(60, ATTITUDE=1, VFR_HUD=5)
     assert bench.asked == [("ATTITUDE", 10.0)]
-    assert [text for _, text in bench.announcer.texts] == [
+    assert [text for _, text in bench.output.texts] == [
         "the autopilot does not send ATTITUDE at 10 Hz: DENIED"
     ]
 
@@ -302,12 +300,6 @@ def test_who_may_change_parameters_and_rates(
     assert (f"{system}:{component} may not set a rate" in text) is not may
 
 
-def sources(**what: Any) -> tuple[Sources, Announcer]:
-    announcer = Announcer(Outbox(Codec(1, 191)), Timers())
-    telemetry = {"battpos": Telemetry("NAMED_VALUE_FLOAT", "value", max_age=2.0, **what)}
-    return Sources(telemetry, 1, 1, announcer), announcer
-
-
 @pytest.mark.parametrize(
     ("wanted", "order", "admitted"),
     [
@@ -321,9 +313,12 @@ def sources(**what: Any) -> tuple[Sources, Announcer]:
 def test_two_sources_of_one_parameter(
     wanted: int | None, order: list[tuple[int, int]], admitted: list[bool]
 ) -> None:
-    both, announcer = sources(component=wanted)
-    assert [both.admit("battpos", who, s * 1_000_000) for s, who in order] == admitted
-    reported = [text for _, text in announcer.texts]
+    output = Output(Codec(1, 191))
+    what = Telemetry("NAMED_VALUE_FLOAT", "value", max_age=2.0, component=wanted)
+    both = TelemetryMap({"battpos": what})
+    messages = {who: Codec(0, 0).parse(Codec(1, who).pack("NAMED_VALUE_FLOAT"))[0] for _, who in order}
+    assert [both.admit("battpos", messages[who], s * 1_000_000, output) for s, who in order] == admitted
+    reported = [text for _, text in output.texts]
     refused = {who for (_, who), good in zip(order, admitted, strict=True) if not good}
     assert {who for who in refused if f"battpos also from 1:{who}: not used" in reported} == refused
 
@@ -334,7 +329,7 @@ def test_another_component_s_value_changes_no_sample(tmp_path: Path) -> None:
         frame = Codec(1, component).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
         pipeline.feed(Event(START + component * 1000, Channel.LINK, frame))
     assert pipeline._correction.aligner.by_name["battpos"].last == 0.25
-    assert "battpos also from 1:99: not used" in [text for _, text in pipeline.component.announcer.texts]
+    assert "battpos also from 1:99: not used" in [text for _, text in pipeline.component.output.texts]
 
 
 @pytest.mark.parametrize(

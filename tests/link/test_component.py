@@ -42,18 +42,17 @@ def test_when_it_is_woken_does_not_matter(make_link: MakeLine) -> None:
 
 def test_next_deadline_is_when_something_is_sent(link: Line) -> None:
     for _ in range(20):
-        deadline = link.component.next_deadline
-        link.component.advance(deadline - 4)
-        assert not link.component.outbox.drain()
-        link.component.advance(deadline)
-        assert {at for at, _ in link.component.outbox.drain()} == {deadline}
+        deadline = link.component.output.next_deadline
+        link.component.output.advance(deadline - 4)
+        assert not link.component.output.drain()
+        link.component.output.advance(deadline)
+        assert {at for at, _ in link.component.output.drain()} == {deadline}
 
 
 def test_status(make_link: MakeLine) -> None:
     link = make_link(
         calibration_id=7,
         status=lambda: {"samples": 5, "sensor_state": MAG_PORT_STATE.OK, "log_records": 3},
-        speaking=lambda: True,
     )
     link.to(0)
     link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
@@ -91,7 +90,7 @@ def test_replaying_what_was_received_gives_the_same_bytes(make_link: MakeLine) -
     log: list[tuple[int, bytes]] = []
     for i in range(400):
         first.now += 4 * rng.randrange(20_000)
-        first.component.advance(first.now)
+        first.component.output.advance(first.now)
         data = rng.choice(
             [
                 rng.randbytes(rng.randrange(60)),
@@ -110,7 +109,7 @@ def test_replaying_what_was_received_gives_the_same_bytes(make_link: MakeLine) -
     first.to(40)
     frame_log = FrameLogReader()
     for at, frame in log:
-        second.component.advance(at)
+        second.component.output.advance(at)
         second.component.receive(frame_log.data(frame), at)
     second.to(40)
     assert len(first.sent) > 200
@@ -189,13 +188,13 @@ def test_it_continues_after_any_message(chunks: list[bytes]) -> None:
     component = Component(Link("u"), {"HIGHRES_IMU": 1.0}, alignment(Align()), start_us=START)
     for i, chunk in enumerate(chunks):
         now = START + i * 300_000
-        component.advance(now)
+        component.output.advance(now)
         component.receive(chunk, now)
-        assert len(component.outbox.drain()) < 50  # no message makes it send without end
-    component.advance(START + 10_000_000)
+        assert len(component.output.drain()) < 50  # no message makes it send without end
+    component.output.advance(START + 10_000_000)
     rows = component.parameters.table.values()
     assert all(row.low <= component.parameters[row.name] <= row.high * 1.0001 for row in rows)
-    beats = [1 for _, frame in component.outbox.drain() if frame[7:10] == b"\0\0\0"]
+    beats = [1 for _, frame in component.output.drain() if frame[7:10] == b"\0\0\0"]
     assert len(beats) >= 1
 
 

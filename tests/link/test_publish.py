@@ -14,7 +14,7 @@ from scipy.linalg import solve_continuous_are
 
 from magbridge.align import Sample
 from magbridge.link.estimates import FIX_MESSAGES, WALK, Fix, Pose, widened
-from magbridge.link.output import FOREVER, Announcer, Outbox, Rate, Timers
+from magbridge.link.output import FOREVER, Output, Rate
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Corrected, Quality, Reading
 
@@ -132,36 +132,29 @@ def test_a_jittering_stream_at_just_the_rate_passes_whole() -> None:
 
 
 def test_timers_fire_in_order_at_their_own_times() -> None:
-    timers = Timers()
+    output = Output(Codec(1, 191))
     fired: list[tuple[str, int]] = []
-    begun: list[int] = []
-    timers.every("a", 300, lambda t: fired.append(("a", t)), 0)
-    timers.every("b", 500, lambda t: fired.append(("b", t)), 100)
-    timers.run_once("c", 600, lambda t: timers.run_once("d", t + 1, lambda t: fired.append(("d", t))))
-    timers.advance(1000, begun.append)
+    output.every("a", 300, lambda _: fired.append(("a", output.codec.now_us)), 0)
+    output.every("b", 500, lambda t: fired.append(("b", t)), 100)
+    output.run_once("c", 600, lambda t: output.run_once("d", t + 1, lambda t: fired.append(("d", t))))
+    output.advance(1000)
     assert fired == [("a", 0), ("b", 100), ("a", 300), ("a", 600), ("b", 600), ("d", 601), ("a", 900)]
-    assert begun == [0, 100, 300, 600, 600, 600, 601, 900]
-    assert timers.next_deadline == 1100
+    assert output.next_deadline == 1100
     for name in ("a", "b", "never"):
-        timers.cancel(name)
-    assert timers.next_deadline == FOREVER
+        output.cancel(name)
+    assert output.next_deadline == FOREVER
 
 
 class Talker:
     def __init__(self, peer: ModuleType) -> None:
         self.codec = Codec(1, 191)
-        self.outbox, self.timers = Outbox(self.codec), Timers()
-        self.announcer = Announcer(self.outbox, self.timers)
+        self.output = Output(self.codec)
         self.station = peer.MAVLink(None)
         self.codec.now_us = START
 
     def at(self, seconds: float) -> list[Any]:
-        def begin(t: int) -> None:
-            self.codec.now_us = t
-
-        self.timers.advance(START + round(seconds * 1e6), begin)
-        begin(START + round(seconds * 1e6))
-        return [m for _, frame in self.outbox.drain() for m in self.station.parse_buffer(frame)]
+        self.output.advance(START + round(seconds * 1e6))
+        return [m for _, frame in self.output.drain() for m in self.station.parse_buffer(frame)]
 
 
 @pytest.fixture
@@ -173,7 +166,7 @@ def talker(peer: ModuleType) -> Talker:
 def test_a_text_is_sent_whole_or_in_pieces(talker: Talker, length: int) -> None:
     text = "".join(chr(97 + i % 26) for i in range(length))
     for _ in range(2):
-        talker.announcer.send_statustext(text)
+        talker.output.send_statustext(text)
         messages = talker.at(0)
         assert "".join(message.text for message in messages) == text
         assert {message.severity for message in messages} == {6}
@@ -184,15 +177,15 @@ def test_a_text_is_sent_whole_or_in_pieces(talker: Talker, length: int) -> None:
             assert messages[0].id > 0
             assert [message.chunk_seq for message in messages] == list(range(len(messages)))
             assert len(messages[-1].text) < 50  # else the receiver waits for more
-    talker.announcer.send_statustext("5 µT")
+    talker.output.send_statustext("5 µT")
     assert talker.at(0)[0].text == "5 ?T"
 
 
 def test_only_changes_are_reported(talker: Talker) -> None:
     for second, state in enumerate(("ok", "ok", "lost", "lost", "ok")):
         talker.at(second * 2)
-        talker.announcer.state("sensor", state)
-        talker.announcer.state("log", "ok")
+        talker.output.announce("sensor", state)
+        talker.output.announce("log", "ok")
     assert [m.text for m in talker.at(20)] == ["ok"]
 
 
@@ -200,7 +193,7 @@ def test_a_flapping_text_is_sent_once_a_second_and_its_last_state_always(talker:
     texts = []
     for i in range(201):  # 100 Hz for 2 s, ends on "up"
         texts += talker.at(i / 100)
-        talker.announcer.state("link", "up" if i % 2 == 0 else "down")
+        talker.output.announce("link", "up" if i % 2 == 0 else "down")
     texts += talker.at(10)
     assert 2 <= len(texts) <= 4
     assert texts[-1].text == "up"
@@ -216,9 +209,9 @@ FIX = Fix(NOW, 49.5123456, -57.9876543, 400.0, 120.0, 100.0, -3.5, POSE, 300)
 
 
 def decoded(kind: str, fix: Fix = FIX) -> Message:
-    outbox = Outbox(Codec(1, 191))
-    FIX_MESSAGES[kind].send(outbox, fix, 3, 4)
-    ((_, frame),) = outbox.drain()
+    output = Output(Codec(1, 191))
+    FIX_MESSAGES[kind].send(output, fix, 3, 4)
+    ((_, frame),) = output.drain()
     return Codec(255, 190).parse(frame)[0]
 
 

@@ -242,4 +242,4 @@ def test_frames_of_unknown_messages_are_not_lost(link: Line) -> None:
         for frame in (*frames[:9], bytes(unknown), *frames[9:]):
             link.give(frame)
         link.to(second + 1.0)
-    assert not any("frames missing" in text for _, text in link.component.announcer.texts)
+    assert not any("frames missing" in text for _, text in link.component.output.texts)

@@ -332,8 +332,8 @@ class Exchange:
             for name, fields in self.air.fleet.due(self.now):
                 if answers:
                     self.bridge.receive(self.air.codec.pack(name, **fields), us)
-            self.bridge.advance(us)
-            for _, frame in self.bridge.outbox.drain():
+            self.bridge.output.advance(us)
+            for _, frame in self.bridge.output.drain():
                 message = next(iter(Codec(0, 0).parse(frame)))
                 if message.name == "PARAM_VALUE" and message["param_id"] in self.lose:
                     self.lose.remove(message["param_id"])

@@ -132,8 +132,8 @@ def test_the_bridge_requests_the_rates_that_a_started_autopilot_does_not_send(
     measured, answers = [], b""
     for k in range(500):
         now_us = START_US + 100_000 * k
-        bridge.advance(now_us)
-        for _, frame in bridge.outbox.drain():
+        bridge.output.advance(now_us)
+        for _, frame in bridge.output.drain():
             answers += autopilot.receive(frame, now_us)
         bridge.receive(answers + autopilot.step(now_us, Truth(PLACE, 22.0, 0.0, 0.0, 0.0, PLACE)), now_us)
         answers = b""

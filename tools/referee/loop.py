@@ -156,7 +156,7 @@ def sail(
         now_us = start_us + round(seconds * SECOND_US) // 4 * 4
         for when_us, corrected in due(samples, now_us - 1):
             navigation.sample(when_us, corrected)
-        component.advance(now_us)
+        component.output.advance(now_us)
         answers += exchange(component, autopilot)
         for message in component.receive(answers + autopilot.step(now_us, truth), now_us):
             navigation.receive(message, now_us)
@@ -164,8 +164,8 @@ def sail(
         for when_us, corrected in due(samples, now_us):
             navigation.sample(when_us, corrected)
         answers = exchange(component, autopilot)
-        texts += [(seconds, text) for _, text in component.announcer.texts]
-        component.announcer.texts.clear()
+        texts += [(seconds, text) for _, text in component.output.texts]
+        component.output.texts.clear()
         off = separation(*truth.place, *autopilot.place)
         own, claimed = own_error(navigation, now_us, truth), autopilot.filter.sigma
         navigator = navigation.navigator
@@ -187,7 +187,7 @@ def due(samples: deque[tuple[float, float, float]], until_us: int) -> Iterator[t
 
 def exchange(component: Component, autopilot: Autopilot) -> bytes:
     """Deliver the bridge's queued frames to the autopilot; return its replies."""
-    return b"".join([autopilot.receive(frame, time_us) for time_us, frame in component.outbox.drain()])
+    return b"".join([autopilot.receive(frame, time_us) for time_us, frame in component.output.drain()])
 
 
 def own_error(navigation: NavigationService, now_us: int, truth: Truth) -> float:
