@@ -16,10 +16,11 @@ from zipfile import ZIP_DEFLATED, ZipFile
 from nicegui import ui
 
 from magbridge.mavlink import spec
-from magbridge.monitor import panels, words
+from magbridge.monitor import words
 from magbridge.monitor.charts import Background, TelemetryChart, TotalField, TrackMap
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.link import StationLink, monotonic_s
+from magbridge.monitor.panels import AlarmPanel, LearningPanel, Panel, ParameterPanel
 from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, MONITOR_STYLE, RED, Changes, slanted
 from magbridge.version import __version__
@@ -38,7 +39,7 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
     def utc(moment: float) -> str:
         return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall + moment))
 
-    health = words.health(state, now_s) | words.losses(state, now_s)
+    health = words.health(state, now_s) | words.losses(state)
     about: dict[str, Any] = {
         "made": utc(now_s),
         "magbridge": __version__,
@@ -130,27 +131,29 @@ class Page:
         with self._body:
             with ui.element().classes(f"{GRID} md:grid-cols-[18rem_minmax(0,1fr)]"):
                 with ui.column().classes("w-full gap-4"):
-                    self._figures = panels.Figures(state)
-                    self._rose = panels.CompassRose()
+                    field = Panel("Field, nT ± 2σ", "figures"), Panel("Heading ± 2σ", "rose")
                 self._total = TotalField(self._tier, self._set_tier)
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 with ui.column().classes("w-full gap-4"):
-                    self._alarms = panels.AlarmPanel(self._station, state, sound=self._sound)
-                    self._flags = panels.Flags()
+                    self._alarms = AlarmPanel(self._station, state, sound=self._sound)
+                    flags = Panel("Flags", "flags")
                 with ui.element().classes(f"{GRID} sm:grid-cols-2 content-start"):
-                    self._health = panels.FactPanel("Bridge", words.health, "status")
-                    self._losses = panels.FactPanel("Losses", words.losses, "status")
-            self._sensors = panels.SensorPanel()
-            title = "Position by the field; innovation and bias in nT"
-            grid = f"{GRID} md:grid-cols-3 gap-y-1"
-            self._navigation = panels.FactPanel(title, words.whereabouts, "navigation", grid)
-            self._learning = panels.LearningPanel(self._station, state)
+                    status = Panel("Bridge", "health"), Panel("Losses", "losses")
+            more = (
+                Panel("Sensors, nT ± 2σ", "sensors"),
+                Panel("Position by the field; innovation and bias in nT", "navigation"),
+                LearningPanel(self._station, state),
+            )
             with ui.element().classes(f"{GRID} lg:grid-cols-[minmax(0,2fr)_minmax(0,3fr)] items-start"):
                 self._track = TrackMap(self._background)
                 self._telemetry = TelemetryChart()
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
-                self._texts = panels.Texts()
-                self._parameters = panels.ParameterPanel(self._station, state)
+                texts = Panel("Messages, UTC", "texts")
+                texts.html.classes("max-h-60 overflow-auto").props(
+                    'tabindex=0 role=log aria-label="Messages"'
+                )
+                parameters = ParameterPanel(self._station, state)
+        self._panels = *field, flags, *status, *more, texts, parameters
 
     def _set_tier(self, tier: str) -> None:
         self._tier = tier
@@ -167,8 +170,7 @@ class Page:
         self._offer(list(states))
         state, moment = self._state, monotonic_s()
         self._show_stream(state, moment)
-        shown = self._figures, self._rose, self._flags, self._health, self._losses, self._sensors
-        for panel in (*shown, self._navigation, self._learning, self._texts, self._parameters):
+        for panel in self._panels:
             panel.show(state, moment)
         self._sound = self._alarms.sound
         self._alarms.show(state, moment)

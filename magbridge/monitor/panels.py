@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from importlib.resources import files
 from math import cos, nan, radians, sin
 from typing import Any
 
-from jinja2 import Template
+from jinja2 import Environment, PackageLoader
 from nicegui import ui
 
 from magbridge.config import Align, Telemetry
 from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
 from magbridge.link.publish import DEFAULT_RATES_HZ, LIMITS
 from magbridge.mavlink.enums import MAV_SEVERITY
-from magbridge.monitor import words
+from magbridge.monitor import widgets, words
 from magbridge.monitor.history import Alarm
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import BridgeState
-from magbridge.monitor.widgets import (
-    AMBER,
-    GREEN,
-    GRID,
-    INK,
-    MUTED,
-    RED,
-    Changes,
-    button,
-    card,
-    clock,
-    fact,
-    nothing,
-    show_facts,
-    slanted,
-)
+from magbridge.monitor.widgets import AMBER, INK, MUTED, RED, Changes, button, card, clock, nothing
 
 TUNABLES = {
     one.name: one
@@ -45,133 +29,43 @@ TUNABLES = {
 """Parameter of the largest telemetry age; it describes every MB_AGE_ parameter of a bridge."""
 
 
-class Figures:
-    """Panel of the present field values, nT."""
-
-    def __init__(self, state: BridgeState) -> None:
-        with card("Field, nT ± 2σ") as self.box:
-            self._labels = [self._quantity(name) for name in words.measured(state)]
-
-    @staticmethod
-    def _quantity(name: str) -> tuple[ui.label, ui.label]:
-        with ui.column().classes("gap-0"):
-            ui.label(name).classes(f"text-xs {MUTED}")
-            with ui.row().classes("items-baseline gap-2"):
-                size = "text-3xl" if name == "Total field" else "text-xl"
-                return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(f"{MUTED} tabular-nums")
-
-    def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the values of the last MAG_FIELD, in italics if it is old."""
-        for labels, texts in zip(self._labels, words.measured(state).values(), strict=True):
-            for label, text in zip(labels, texts, strict=True):
-                label.set_text(text)
-        self.box.style(slanted("no field" in words.silence(state, now_s)))
+ROSE_RADIUS = 80.0
+"""Radius of the compass circle in ``rose.svg``, in units of the picture, whose width is 200."""
+ENGINE = Environment(loader=PackageLoader("magbridge.monitor", ""), autoescape=True)
 
 
-class Flags:
-    """Panel of the quality flags that are set, with the time since when."""
-
-    def __init__(self) -> None:
-        self._changes = Changes()
-        with card("Flags"):
-            self._box = ui.column().classes("gap-2")
-
-    def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the flags that are set at `now_s`."""
-        flags = {
-            name: f"since {clock(t)}, {words.duration(now_s - t)}" for name, (t, _) in state.flags.items()
-        }
-        if not self._changes.new("flags", flags or bool(state.field), self._box):
-            return
-        with self._box:
-            if state.field and not flags:
-                ui.label("None").style(f"color: {GREEN}")
-            for name, since in flags.items():
-                color = AMBER if name == "no_boresight" else RED
-                with ui.column().classes("gap-0 border-l-4 pl-3").style(f"border-color: {color}"):
-                    ui.label(words.FLAG_TEXTS[name]).classes("leading-tight")
-                    ui.label(f"{name}, {since}").classes(f"text-xs {MUTED}")
+def rose_picture(field: dict[str, Any]) -> str:
+    """Return the compass rose as an SVG with a needle and the 2-sigma band of the heading."""
+    heading, sigma, _ = words.current_heading(field) or (None, 0.0, "")
+    half = radians(2.0 * sigma)
+    # the right end of the band, in a picture that is rotated to the heading
+    x, y = round(ROSE_RADIUS * sin(half), 2), round(-ROSE_RADIUS * cos(half), 2)
+    label = words.heading_text(field)
+    picture = ENGINE.get_template("rose.svg")
+    return picture.render(heading=heading, half_width=2.0 * sigma, x=x, y=y, label=label)
 
 
-Facts = Callable[[BridgeState, float], Mapping[str, tuple[str, bool]]]
-"""Function of :mod:`.words` that returns name -> text, and True if it is normal."""
+ENGINE.globals |= {
+    "words": words, "widgets": widgets, "rose_picture": rose_picture, "MAV_SEVERITY": MAV_SEVERITY
+}  # fmt: skip
+CONTENTS: Any = ENGINE.get_template("panels.html").module
+"""Macros that return the contents of the panels as HTML."""
 
 
-class FactPanel:
-    """Panel of texts from the last message of one kind, in red where they are not normal.
+class Panel:
+    """Panel whose content is the macro `content` of ``panels.html``; hidden while the content is empty."""
 
-    `source` is the message, by the name of an attribute of :class:`.BridgeState`. Without one, the panel is
-    hidden, unless it is of the bridge's own status.
-    """
-
-    def __init__(
-        self, title: str, facts: Facts, source: str, grid: str = "w-full flex flex-col gap-2"
-    ) -> None:
-        self._facts, self._source = facts, source
-        with (
-            ui.element().classes("w-full") as self._box,
-            card(title) as self.card,
-            ui.element().classes(grid),
-        ):
-            self._labels = [fact(name) for name in facts(BridgeState(), 0.0)]
+    def __init__(self, title: str, content: str) -> None:
+        self._content = getattr(CONTENTS, content)
+        with ui.element().classes("w-full") as self.box, card(title) as self.card:
+            self.html = ui.html("", sanitize=False).classes("w-full")
 
     def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the texts; those of an old MAG_STATUS in italics."""
-        there, of_status = bool(getattr(state, self._source)), self._source == "status"
-        self._box.set_visibility(there or of_status)
-        facts = self._facts(state, now_s)
-        show_facts(self._labels, facts if there else dict.fromkeys(facts, ("–", True)))
-        is_old = of_status and "no status" in words.silence(state, now_s)
-        for label in self._labels:
-            label.style(slanted(is_old) if is_old else "font-style: normal")
-
-
-class SensorPanel:
-    """Panel that compares the sensors of a bridge; hidden if the bridge has only one."""
-
-    def __init__(self) -> None:
-        self._changes = Changes()
-        with ui.element().classes("w-full") as self._box, card("Sensors, nT ± 2σ"):
-            self._table = ui.element().classes(f"{GRID} sm:grid-cols-2 lg:grid-cols-4 gap-x-8")
-
-    def show(self, state: BridgeState, now_s: float) -> None:
-        """Show each sensor's total field, its difference from the first sensor, its line and its flags."""
-        rows = words.sensor_rows(state, now_s)
-        labels = [state.sensors[number].label for number in rows]
-        self._box.set_visibility(bool(rows))
-        if not self._changes.new("rows", (labels, rows), self._table):
-            return
-        with self._table:
-            for name, row in zip(labels, rows.values(), strict=True):
-                with ui.column().classes("w-full gap-0"):
-                    ui.label(name).classes("font-medium")
-                    show_facts([fact(quantity) for quantity in row], row)
-
-
-class Texts:
-    """Panel of the STATUSTEXTs that the bridge has sent."""
-
-    def __init__(self) -> None:
-        self._changes = Changes()
-        with card("Messages, UTC"):
-            self._box = ui.column().classes("w-full max-h-60 gap-1 overflow-auto flex-nowrap")
-            self._box.props('tabindex=0 role=log aria-label="Messages"')
-
-    def show(self, state: BridgeState, _now_s: float) -> None:
-        """Show the texts, the newest first."""
-        if not self._changes.new("texts", list(state.texts), self._box):
-            return
-        with self._box:
-            if not state.texts:
-                nothing()
-            for received in state.texts:
-                bad, warned = (
-                    received.severity <= MAV_SEVERITY.ERROR,
-                    received.severity == MAV_SEVERITY.WARNING,
-                )
-                with ui.row().classes("gap-3 flex-nowrap text-sm"):
-                    ui.label(clock(received.time)).classes(f"{MUTED} tabular-nums")
-                    ui.label(received.text).style(f"color: {RED if bad else AMBER if warned else INK}")
+        """Show the state at `now_s`."""
+        content = str(self._content(state, now_s))
+        if content != self.html.content:
+            self.html.set_content(content)
+        self.box.set_visibility(bool(content))
 
 
 class ParameterPanel:
@@ -226,12 +120,11 @@ class Row:
     """Row for the alarms of one cause; it is updated in place, so that a click finds its button."""
 
     def __init__(self, acknowledge: Callable[[], None]) -> None:
-        self._acknowledge = acknowledge
         with ui.row().classes("w-full items-center justify-between flex-nowrap border-l-4 pl-3") as self.box:
             with ui.column().classes("gap-0"):
                 self._text = ui.label().classes("leading-tight text-sm")
                 self._times = ui.label().classes(f"text-xs {MUTED}")
-            self._seen: ui.button | None = None
+            self._seen = button("Seen", acknowledge)
 
     def show(self, alarm: Alarm) -> None:
         """Show text and start of the alarms, and a button until a user acknowledges them."""
@@ -241,17 +134,9 @@ class Row:
         times = f", {alarm.count} times" if alarm.count > 1 else ""
         over = "since" if alarm.active else "over; at"
         self._times.set_text(f"{over} {clock(alarm.since)} UTC{times}")
-        if alarm.acknowledged and self._seen is not None:
-            self._seen.delete()
-            self._seen = None
-        elif not alarm.acknowledged:
-            if self._seen is None:
-                with self.box:
-                    self._seen = button("Seen", self._acknowledge)
-            label = f"Seen: {alarm.text}"
-            if self._seen.props.get("aria-label") != label:
-                self._seen.props["aria-label"] = label
-                self._seen.update()
+        self._seen.set_visibility(not alarm.acknowledged)
+        self._seen.props["aria-label"] = f"Seen: {alarm.text}"
+        self._seen.update()
 
 
 class AlarmPanel:
@@ -315,14 +200,13 @@ LEARNING_COMMANDS = {
 }
 
 
-class LearningPanel(FactPanel):
+class LearningPanel(Panel):
     """Panel of the online calibration (learning) of a bridge; hidden if the bridge does not learn."""
 
     def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
-        grid = f"{GRID} md:grid-cols-2 gap-x-12 gap-y-1"
-        super().__init__(TITLE, lambda state, _: words.learnt(state), "learning", grid)
-        self._box.props(f'role=region aria-label="{TITLE}"')
+        super().__init__(TITLE, "learning")
+        self.box.props(f'role=region aria-label="{TITLE}"')
         with self.card:
             with ui.row().classes("gap-x-4"):
                 self._buttons = [
@@ -361,36 +245,3 @@ class LearningPanel(FactPanel):
         with self._station.lock:
             if DO in self._state.parameters:
                 self._state.set(DO, value)
-
-
-ROSE_RADIUS = 80.0
-"""Radius of the compass circle in ``rose.svg``, in units of the picture, whose width is 200."""
-ROSE = Template(files("magbridge.monitor").joinpath("rose.svg").read_text(encoding="utf-8"), autoescape=True)
-
-
-def rose_picture(field: dict[str, Any]) -> str:
-    """Return the compass rose as an SVG with a needle and the 2-sigma band of the heading."""
-    heading, sigma, _ = words.current_heading(field) or (None, 0.0, "")
-    half = radians(2.0 * sigma)
-    # the right end of the band, in a picture that is rotated to the heading
-    x, y = round(ROSE_RADIUS * sin(half), 2), round(-ROSE_RADIUS * cos(half), 2)
-    label = words.heading_text(field)
-    return str(ROSE.render(heading=heading, half_width=2.0 * sigma, x=x, y=y, label=label))
-
-
-class CompassRose:
-    """Panel of the compass rose with the heading."""
-
-    def __init__(self) -> None:
-        self._changes = Changes()
-        with card("Heading ± 2σ") as self.box:
-            self._picture = ui.html("", sanitize=False).classes("w-full flex justify-center")
-            self._text = ui.label().classes(f"w-full text-center tabular-nums {MUTED}")
-
-    def show(self, state: BridgeState, now_s: float) -> None:
-        """Show the heading of the last sample."""
-        picture = rose_picture(state.field)
-        if self._changes.new("rose", picture):
-            self._picture.set_content(picture)
-            self._text.set_text(words.heading_text(state.field))
-        self.box.style(slanted("no field" in words.silence(state, now_s)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -51,20 +51,6 @@ def card(title: str) -> Iterator[ui.card]:
     with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg dark:bg-slate-800") as made:
         ui.label(title).classes(f"text-sm font-semibold {MUTED}").props("role=heading aria-level=2")
         yield made
-
-
-def fact(name: str) -> ui.label:
-    """Make a row with a name and an empty value, and return the label of the value."""
-    with ui.row().classes("w-full justify-between text-sm gap-x-2"):
-        ui.label(name).classes(MUTED)
-        return ui.label().classes("font-medium tabular-nums")
-
-
-def show_facts(labels: Iterable[ui.label], facts: Mapping[str, tuple[str, bool]]) -> None:
-    """Set each label to the text of its fact, in red if the fact's flag is False."""
-    for label, (text, is_well) in zip(labels, facts.values(), strict=True):
-        label.set_text(text)
-        label.style(f"color: {INK if is_well else RED}")
 
 
 def slanted(old: bool) -> str:

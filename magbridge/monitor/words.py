@@ -170,7 +170,7 @@ def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
     }
 
 
-def losses(state: BridgeState, _now_s: float) -> dict[str, tuple[str, bool]]:
+def losses(state: BridgeState) -> dict[str, tuple[str, bool]]:
     """Return the losses of bridge and link: name of an item -> its text, and True if it is normal."""
     counts = {name: state.status.get(counter, 0) for name, counter in LOSS_TEXTS.items()}
     return {

@@ -155,7 +155,7 @@ def test_figures(air: Air) -> None:
     assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
     air.feed(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
     assert health(BridgeState(), NOW)["Calibration"] == ("–", True)
-    items = health(air.state, NOW) | losses(air.state, NOW)
+    items = health(air.state, NOW) | losses(air.state)
     assert items["Sensor"] == ("lost", False)
     assert items["Autopilot"] == ("ok", True)
     assert items["Log"] == ("failed", False)
