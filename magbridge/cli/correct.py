@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -71,7 +70,13 @@ def correct(
     plot
         A PNG, PDF or SVG to write, with the corrected field, its 2-sigma band, and the flagged samples.
     """
-    source = _source(calibration, config, learn=learn)
+    if config is not None and not learn:
+        raise WrongUse(
+            "--config: expected --learn with it, because only learning uses a bridge.toml; add --learn"
+        )
+    source = calibration or config
+    if source is None:
+        raise WrongUse("expected --calibration cal.json, or --learn with --config bridge.toml")
     cli.logs_to_read(files, output, source, reading.columns)
     cli.without_dask()
 
@@ -83,10 +88,10 @@ def correct(
         raise WrongUse(
             "--save: expected --learn with it, because it writes the learned calibration; add --learn"
         )
-    tally = Tally()
     correction: mb.Correction | None = None
     pieces: list[dict[str, Any]] = []
-    drawn: list[xr.Dataset] = []
+    kept: list[xr.Dataset] = []
+    rows = 0
     with Writer(output) as writer:
         parts = track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting")
         given = files, known, source, settings if learn else None
@@ -94,19 +99,16 @@ def correct(
             writer.append(corrected)
             _notify(correction)
             pieces.append(part.attrs)
-            tally.add(corrected, part.sizes["time"])
-            if plot:
-                drawn.append(corrected[list(CORRECTED)])
+            rows += part.sizes["time"]
+            kept.append(corrected[list(CORRECTED) if plot else ["quality", "total_field"]])
     if plot:
         from magbridge.logs.deployment import join
         from magbridge.plot import draw_corrected
 
-        draw_corrected(join(drawn), plot)
+        draw_corrected(join(kept), plot)
     cli.note_losses(*pieces)
     cli.note_settings(*pieces)
-    if warning := tally.warning():
-        cli.complain(f"{source}: {warning}")
-    facts, summary = tally.facts(), tally.summary()
+    facts, summary = _counts(kept, rows, source)
     if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
     cli.print_result(facts, summary, json, output)
@@ -129,21 +131,6 @@ def _scalar_too(
     logs, corrected, correction = zip(*pieces, strict=True)
     log = join(logs)
     yield log, with_scalar(join(corrected), log, known.sensors), correction[-1]
-
-
-def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Path:
-    """Return the file that messages name: the calibration, or without it the configuration.
-
-    WrongUse: both are missing, or `config` is given without `learn`.
-    """
-    if config is not None and not learn:
-        raise WrongUse(
-            "--config: expected --learn with it, because only learning uses a bridge.toml; add --learn"
-        )
-    source = calibration or config
-    if source is None:
-        raise WrongUse("expected --calibration cal.json, or --learn with --config bridge.toml")
-    return source
 
 
 def _known(file: Path | None, config: Path | None) -> tuple[mb.Calibration, Config]:
@@ -255,58 +242,35 @@ def _with_log_columns(
     return corrected.assign(kept).assign_attrs(meaning | attrs)
 
 
-@dataclass
-class Tally:
-    """Counts of the corrected samples of a log and of their flags."""
+def _counts(corrected: list[xr.Dataset], rows: int, source: Path) -> tuple[dict[str, Any], str]:
+    """Return the counts of corrected samples and of their flags, for JSON and as a sentence.
 
-    samples: int = 0
-    left_out: int = 0
-    """`samples`, `left_out`: Number of corrected rows, and of rows without a reading."""
-    flagged: int = 0
-    """Number of samples with a flag that concerns the total field."""
-    flags: Counter[str] = field(default_factory=Counter)
-    """Name of a flag -> number of samples with the flag."""
-    unearthly: int = 0
-    """Number of samples whose total field is outside the range of the Earth's main field."""
+    `corrected` are the pieces of a log that had `rows` rows, some of them without a reading. If most total
+    fields are outside the Earth's range, a warning about the calibration `source` is printed to stderr.
+    """
+    import numpy as np
 
-    def add(self, corrected: xr.Dataset, rows: int) -> None:
-        """Add the samples of a corrected piece of the log, which had `rows` rows."""
-        from magbridge.field.reference import MAIN_FIELD_RANGE_NT
+    from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
-        self.samples += corrected.sizes["time"]
-        self.left_out += rows - corrected.sizes["time"]
-        of_total = ~Quality.NO_BORESIGHT  # NO_BORESIGHT concerns only the vector
-        quality = corrected["quality"].to_numpy().astype(int)
-        self.flagged += int((quality & of_total != 0).sum())
-        self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in of_total})
-        total = corrected["total_field"]
-        self.unearthly += int(((total < MAIN_FIELD_RANGE_NT[0]) | (total > MAIN_FIELD_RANGE_NT[1])).sum())
-
-    def warning(self) -> str:
-        """Return a warning if most total fields are outside the Earth's range; else an empty text."""
-        from magbridge.field.reference import MAIN_FIELD_RANGE_NT
-
-        if self.unearthly <= self.samples / 2:
-            return ""
-        low, high = (f"{limit:,.0f}" for limit in MAIN_FIELD_RANGE_NT)
-        return (
-            f"{self.unearthly} of {self.samples} corrected total fields are outside the Earth's range, {low} "
-            f"to {high} nT; use the calibration of this vehicle"
+    of_total = ~Quality.NO_BORESIGHT  # NO_BORESIGHT concerns only the vector
+    quality = np.concatenate([part["quality"].to_numpy() for part in corrected]).astype(int)
+    total = np.concatenate([part["total_field"].to_numpy() for part in corrected])
+    samples, flagged = len(quality), int((quality & of_total != 0).sum())
+    left_out = rows - samples
+    flags = +Counter({flag.names(): int((quality & flag != 0).sum()) for flag in of_total})
+    low, high = MAIN_FIELD_RANGE_NT
+    unearthly = int(((total < low) | (total > high)).sum())
+    if unearthly > samples / 2:
+        cli.complain(
+            f"{source}: {unearthly} of {samples} corrected total fields are outside the Earth's range, "
+            f"{low:,.0f} to {high:,.0f} nT; use the calibration of this vehicle"
         )
-
-    def facts(self) -> dict[str, Any]:
-        """Return the counts for JSON."""
-        left_out = {"left_out": self.left_out}
-        return {"rows": self.samples, "flagged": self.flagged, "flags": +self.flags, **left_out}
-
-    def summary(self) -> str:
-        """Return the counts as a sentence."""
-        named = ", ".join(f"{name} {count}" for name, count in (+self.flags).items())
-        text = f"{counted(self.samples, 'sample')}, {self.flagged} of them flagged"
-        text += f" ({named})" if named else ""
-        if self.left_out:
-            text += f"; {counted(self.left_out, 'row')} without any of {' '.join(CHANNELS)} left out"
-        return text
+    text = f"{counted(samples, 'sample')}, {flagged} of them flagged"
+    if flags:
+        text += f" ({', '.join(f'{name} {count}' for name, count in flags.items())})"
+    if left_out:
+        text += f"; {counted(left_out, 'row')} without any of {' '.join(CHANNELS)} left out"
+    return {"rows": samples, "flagged": flagged, "flags": flags, "left_out": left_out}, text
 
 
 SEAGLIDER_COUNT_NT = 100.0
