@@ -210,7 +210,7 @@ def show(
         and all numbers as fleet.json.
     """
     from magbridge.fleet.catalogue import open_catalogue
-    from magbridge.fleet.learn import facts, history
+    from magbridge.fleet.learn import history
     from magbridge.fleet.memory import findings, fleets, last_maps
     from magbridge.fleet.register import vehicles
 
@@ -229,7 +229,7 @@ def show(
         from magbridge.fleet.page import write_pages
 
         write_pages(found, html, findings(there), last_maps(there))
-    facts_of = {name: facts(one) for name, one in found.items()}
+    facts_of = {name: one.facts for name, one in found.items()}
     cli.print_result({"vehicles": facts_of}, "\n".join(_lines(facts_of)), json)
 
 

@@ -317,24 +317,45 @@ class Change(NamedTuple):
     """Likely cause, and if a refit is on record."""
 
 
-@dataclass(frozen=True, eq=False)
-class History:
+class Comparison(NamedTuple):
+    """Coefficients of one deployment: predicted from the earlier ones, and estimated with its own data."""
+
+    lesson: Lesson
+    expected: FloatArray
+    expected_sigma: FloatArray
+    """`expected`, `expected_sigma`: Prediction before the deployment, and its 1-sigma, (k,), nT."""
+    found: FloatArray
+    found_sigma: FloatArray
+    """`found`, `found_sigma`: Estimate after its own data, and its 1-sigma, (k,), nT."""
+    changes: tuple[Change, ...]
+    """Significant changes, the largest first."""
+    omitted: bool = False
+    """True if the model of the fleet omits the deployment, see :attr:`Fleet.changed`."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The comparison as a dictionary for JSON; coefficients in nT."""
+        names = "expected", "expected_sigma", "found", "found_sigma"
+        return {
+            "deployment": self.lesson.deployment, "refit": self.lesson.refit,
+            "date": datetime.fromtimestamp(self.lesson.time, UTC).date().isoformat(),
+            **{f"{name}_nT": getattr(self, name).tolist() for name in names},
+            "changes": [change._asdict() for change in self.changes], "omitted": self.omitted,
+        }  # fmt: skip
+
+
+class History(NamedTuple):
     """A vehicle's coefficients from deployment to deployment."""
 
     names: tuple[str, ...]
     """Names of the k coefficients: hard iron, the effect of each mass over half its range, soft iron."""
-    lessons: tuple[Lesson, ...]
+    deployments: tuple[Comparison, ...]
     """Deployments of the vehicle in the order of time."""
-    expected: FloatArray
-    expected_sigma: FloatArray
-    """`expected`, `expected_sigma`: Prediction before the deployment, and its 1-sigma, (n, k), nT."""
-    found: FloatArray
-    found_sigma: FloatArray
-    """`found`, `found_sigma`: Estimate after its own data, and its 1-sigma, (n, k), nT."""
-    changes: tuple[tuple[Change, ...], ...]
-    """Significant changes in each deployment."""
-    omitted: tuple[bool, ...]
-    """True for each deployment that the model of the fleet omits, see :attr:`Fleet.changed`."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The history as a dictionary for JSON; coefficients in nT."""
+        return {"coefficients": list(self.names), "deployments": [one.facts for one in self.deployments]}
 
 
 def history(fleet: Fleet, vehicle: str) -> History:
@@ -346,42 +367,25 @@ def history(fleet: Fleet, vehicle: str) -> History:
     the probability of a change as large is below :data:`FALSE_ALARM_PROBABILITY` over all monitored
     coefficients and the noise. The noise is compared with the median of the earlier deployments.
     """
-    indices = [k for k, one in enumerate(fleet.lessons) if one.vehicle == vehicle]
-    mine = tuple(fleet.lessons[k] for k in indices)
-    rows: list[_Comparison] = []
-    for k, lesson in enumerate(mine):
-        refitted = lesson.refit not in {one.refit for one in mine[:k]}
+    rows: list[Comparison] = []
+    for k, lesson in enumerate(fleet.lessons):
+        if lesson.vehicle != vehicle:
+            continue
         known = fleet.known(vehicle, lesson.refit, lesson.time)
-        rows.append(_compare(fleet, lesson, known, refitted=refitted))
-    expected, sigma, found, left = (np.array([row[k] for row in rows]) for k in range(4))
-    # the first deployment has no predecessor
-    changes = tuple(
-        (*row.changes, *_noise_change(mine[:k], mine[k], len(row.found))) if k else ()
-        for k, row in enumerate(rows)
-    )
-    omitted = tuple(k in fleet.changed for k in indices)
-    return History(_looked_at(fleet)[0], mine, expected, sigma, found, left, changes, omitted)
-
-
-class _Comparison(NamedTuple):
-    """A deployment's prediction with 1-sigma, its estimate with 1-sigma, each (k,), nT, and its changes."""
-
-    expected: FloatArray
-    expected_sigma: FloatArray
-    found: FloatArray
-    found_sigma: FloatArray
-    changes: tuple[Change, ...]
+        row = _compare(fleet, lesson, known, [one.lesson for one in rows])
+        # the first deployment has no predecessor
+        rows.append(row._replace(changes=row.changes if rows else (), omitted=k in fleet.changed))
+    return History(_looked_at(fleet)[0], tuple(rows))
 
 
 def _compare(
     fleet: Fleet,
     lesson: Lesson,
     known: Known,
-    *,
-    refitted: bool = False,
+    earlier: Sequence[Lesson] = (),
     alarm: float = FALSE_ALARM_PROBABILITY,
-) -> _Comparison:
-    """Compare a deployment with the prediction `known`; `refitted` if a new refit is on record.
+) -> Comparison:
+    """Compare a deployment with the prediction `known`, and its noise and refit with `earlier` deployments.
 
     `alarm` is the probability of a false alarm.
     """
@@ -392,60 +396,28 @@ def _compare(
     P = 0.5 * (gain[:, :-1] + gain[:, :-1].T)  # (S^-1 + J)^-1
     found = (P @ evidence.vector + gain[:, -1])[places]
     expected, variance, left = known.mean[places], np.diag(S)[places], np.diag(P)[places]
-    moved = np.sqrt(np.maximum(variance - left, 0.0))
-    changes = _significant_changes(names, found - expected, moved, refitted, alarm)
-    return _Comparison(expected, np.sqrt(variance), found, np.sqrt(left), tuple(changes))
-
-
-def facts(history: History) -> dict[str, Any]:
-    """Return a history as a dictionary for JSON; coefficients in nT."""
-    columns = history.expected, history.expected_sigma, history.found, history.found_sigma
-    keys = "expected_nT", "expected_sigma_nT", "found_nT", "found_sigma_nT"
-    return {
-        "coefficients": list(history.names),
-        "deployments": [
-            {
-                "deployment": lesson.deployment, "refit": lesson.refit,
-                "date": datetime.fromtimestamp(lesson.time, UTC).date().isoformat(),
-                **{key: column[k].tolist() for key, column in zip(keys, columns, strict=True)},
-                "changes": [change._asdict() for change in history.changes[k]],
-                "omitted": history.omitted[k],
-            }
-            for k, lesson in enumerate(history.lessons)
-        ],
-    }  # fmt: skip
-
-
-def _significant_changes(
-    names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool, alarm: float
-) -> list[Change]:
-    """Return the significant changes among `moves` (k,), nT, with 1-sigma `sigmas` (k,), largest first."""
-    found = []
-    for name, move, sigma in zip(names, moves, sigmas, strict=True):
-        z = abs(move) / max(sigma, 1e-12)
-        if (chance := _chance(z, len(names))) < alarm:
-            found.append(Change(name, float(move), float(z), chance, _cause(name, refitted)))
-    return sorted(found, key=lambda one: -one.sigmas)
-
-
-def _noise_change(earlier: Sequence[Lesson], lesson: Lesson, coefficients: int) -> list[Change]:
-    """Return the change of the noise from the median of the earlier deployments, if it is significant."""
-    known = float(np.median([one.noise for one in earlier]))
-    if not min(known, lesson.noise) > 0.0:  # a calibration made elsewhere may state no noise
-        return []
-    z = abs(float(np.log(lesson.noise / known))) / LOG_NOISE_SIGMA
-    if (chance := _chance(z, coefficients)) >= FALSE_ALARM_PROBABILITY:
-        return []
-    return [Change(NOISE, lesson.noise - known, z, chance, "sensor, wiring, currents, or disturbed runs")]
-
-
-def _chance(z: float, coefficients: int) -> float:
-    """Return the probability that one of several coefficients, or the noise, exceeds z sigmas."""
-    return min(2.0 * float(norm.sf(z)) * (coefficients + 1), 1.0)
+    moves = found - expected
+    z = np.abs(moves) / np.sqrt(np.maximum(variance - left, 1e-24))
+    changed = [(name, float(move), float(one)) for name, move, one in zip(names, moves, z, strict=True)]
+    if earlier:
+        usual = float(np.median([one.noise for one in earlier]))
+        if min(usual, lesson.noise) > 0.0:  # a calibration made elsewhere may state no noise
+            ratio = abs(float(np.log(lesson.noise / usual)))
+            changed.append((NOISE, lesson.noise - usual, ratio / LOG_NOISE_SIGMA))
+    refitted = lesson.refit not in {one.refit for one in earlier}
+    changes = [
+        Change(name, move, one, chance, _cause(name, refitted))
+        for name, move, one in changed
+        if (chance := min(2.0 * float(norm.sf(one)) * (len(names) + 1), 1.0)) < alarm
+    ]
+    changes.sort(key=lambda change: -change.sigmas)
+    return Comparison(lesson, expected, np.sqrt(variance), found, np.sqrt(left), tuple(changes))
 
 
 def _cause(name: str, refitted: bool) -> str:
-    """Return the text of the likely cause of a coefficient's change."""
+    """Return the text of the likely cause of a change of a coefficient or of the noise."""
+    if name == NOISE:
+        return "sensor, wiring, currents, or disturbed runs"
     mass, _, _ = name.rpartition(",")
     what = {
         FIXED: "iron that was magnetised, fitted or removed",

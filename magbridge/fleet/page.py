@@ -6,6 +6,7 @@ from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from io import BytesIO, StringIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,7 +22,7 @@ from matplotlib.figure import Figure
 from magbridge.errors import MagbridgeError, WriteError
 from magbridge.field.read import read_grid
 from magbridge.files import atomic_path, new_folder
-from magbridge.fleet.learn import FALSE_ALARM_PROBABILITY, History, facts
+from magbridge.fleet.learn import FALSE_ALARM_PROBABILITY, History
 from magbridge.fleet.register import is_file_name
 from magbridge.pictures import literal
 from magbridge.plot import grid
@@ -65,7 +66,7 @@ def write_pages(
         _write(path, "Fleet", vehicles, vehicles)
         return
     with new_folder(path):
-        numbers = {"vehicles": {name: facts(one) for name, one in histories.items()}}
+        numbers = {"vehicles": {name: one.facts for name, one in histories.items()}}
         with atomic_path(path / "fleet.json") as temporary:
             temporary.write_bytes(msgspec.json.encode(numbers))
         for vehicle in vehicles:
@@ -92,10 +93,10 @@ def _shown(
     name: str, history: History, found: Sequence[Mapping[str, Any]], last: tuple[str, Path] | None
 ) -> dict[str, Any]:
     """Return the values about a vehicle that the template of the page needs."""
-    deployments = facts(history)["deployments"]
+    deployments = history.facts["deployments"]
     for one in deployments:
         one["masses"] = list(dict.fromkeys(change["what"].partition(",")[0] for change in one["changes"]))
-    panels = [_panel(history, k) for k in range(len(history.names))] if history.lessons else []
+    panels = [_panel(history, k) for k in range(len(history.names))] if deployments else []
     return {
         "name": name, "deployments": deployments, "panels": panels, "findings": found, "map": _survey(last),
     }  # fmt: skip
@@ -123,24 +124,28 @@ def _panel(history: History, k: int) -> str:
         figure = Figure(figsize=(3.4, 2.0))
         figure.subplots_adjust(0.15, 0.2, 0.98, 0.88)
         ax = figure.subplots()
-        when = np.array([datetime.fromtimestamp(lesson.time, UTC) for lesson in history.lessons])
-        moved = np.array(
-            [any(change.what == history.names[k] for change in changes) for changes in history.changes]
-        )
+        each, name = history.deployments, history.names[k]
+        when = np.array([datetime.fromtimestamp(one.lesson.time, UTC) for one in each])
+        moved = np.array([any(change.what == name for change in one.changes) for one in each])
+        found = np.array([one.found[k] for one in each])
+        bars = 2.0 * np.array([one.found_sigma[k] for one in each])
         # the first prediction is so wide that its band would hide the others
         later = slice(1, None) if len(when) > 1 else slice(None)
-        band = history.expected[later, k], 2.0 * history.expected_sigma[later, k]
-        ax.errorbar(when[later], *band, fmt="none", color=BAND, lw=7)
-        ax.errorbar(
-            when, history.found[:, k], 2.0 * history.found_sigma[:, k], fmt="o", ms=4, lw=1.2, color=INK
-        )
-        ax.plot(when[moved], history.found[moved, k], "o", ms=7, color=CHANGED)
-        for before, after in zip(history.lessons, history.lessons[1:], strict=False):
-            if before.refit != after.refit:
-                middle = datetime.fromtimestamp((before.time + after.time) / 2.0, UTC)
+        expected = np.array([one.expected[k] for one in each[later]])
+        bands = 2.0 * np.array([one.expected_sigma[k] for one in each[later]])
+        ax.errorbar(when[later], expected, bands, fmt="none", color=BAND, lw=7)
+        ax.errorbar(when, found, bars, fmt="o", ms=4, lw=1.2, color=INK)
+        ax.plot(when[moved], found[moved], "o", ms=7, color=CHANGED)
+        for before, after in pairwise(each):
+            if before.lesson.refit != after.lesson.refit:
+                middle = datetime.fromtimestamp((before.lesson.time + after.lesson.time) / 2.0, UTC)
                 ax.axvline(middle, color=REFIT, lw=0.8, ls=":")  # type: ignore[arg-type]
-        _limit(ax, history, k, later)
-        ax.set_title(f"{history.names[k]}, nT", fontsize=9, loc="left")
+        low, high, half = float((found - bars).min()), float((found + bars).max()), float(bands.max())
+        if 2.0 * half > MAX_BAND_RATIO * (high - low):
+            # limit the axis to the estimates; the band stands above the axes, where no other hides it
+            ax.set_ylim(low - (high - low), high + (high - low))
+            ax.set_title(f"expected {expected[-1]:,.0f} ± {half:,.0f}", fontsize=7, loc="right")
+        ax.set_title(f"{name}, nT", fontsize=9, loc="left")
         _dates(ax, when.tolist())
         ax.spines[["top", "right"]].set_visible(False)
         literal(figure)
@@ -160,15 +165,3 @@ def _dates(ax: Axes, dates: Sequence[datetime]) -> None:
         ax.set_xticks(list(dates), [f"{one:%Y-%m-%d}" for one in dates])  # type: ignore[arg-type]
     else:
         ax.xaxis.set_major_formatter(ConciseDateFormatter(ax.xaxis.get_major_locator()))  # type: ignore[no-untyped-call]
-
-
-def _limit(ax: Axes, history: History, k: int, later: slice) -> None:
-    """Limit the vertical axis to the estimates if a band is much wider, and state the band as text."""
-    low = float((history.found[:, k] - 2.0 * history.found_sigma[:, k]).min())
-    high = float((history.found[:, k] + 2.0 * history.found_sigma[:, k]).max())
-    half = float(2.0 * history.expected_sigma[later, k].max())
-    if 2.0 * half <= MAX_BAND_RATIO * (high - low):
-        return
-    ax.set_ylim(low - (high - low), high + (high - low))
-    note = f"expected {history.expected[later, k][-1]:,.0f} ± {half:,.0f}"
-    ax.set_title(note, fontsize=7, loc="right")  # above the axes, where no band hides it

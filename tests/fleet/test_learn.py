@@ -52,15 +52,15 @@ def test_a_broken_vehicle_does_not_widen_the_predictions_of_the_others() -> None
     (mean, sigma), (other, wider) = prediction(whole), prediction(with_it)
     assert (np.abs(other - mean) < 0.1 * sigma).all()
     assert (np.abs(wider / sigma - 1.0) < 0.1).all()
-    assert history(with_it, "broken").omitted == (False, False, False, True)
+    assert [one.omitted for one in history(with_it, "broken").deployments] == [False, False, False, True]
 
 
 def test_a_change_that_lasts_and_its_repair_are_each_reported_once() -> None:
     vehicle = deployments("changing", 7, 8)
     vehicle[2:5] = [moved(one, 600.0) for one in vehicle[2:5]]
-    found = history(learn_fleet([*HEALTHY, *vehicle]), "changing")
-    assert found.omitted == (False, False, True, True, True, False, False)
-    reported = [{change.what for change in changes} for changes in found.changes]
+    found = history(learn_fleet([*HEALTHY, *vehicle]), "changing").deployments
+    assert [one.omitted for one in found] == [False, False, True, True, True, False, False]
+    reported = [{change.what for change in one.changes} for one in found]
     iron = {"hard iron, x", "hard iron, y"}
     assert reported == [set(), set(), iron, set(), set(), iron, set()]
 
@@ -68,8 +68,8 @@ def test_a_change_that_lasts_and_its_repair_are_each_reported_once() -> None:
 def test_a_changed_gain_and_more_noise_are_reported() -> None:
     vehicle = deployments("changing", 4, 9)
     vehicle[3] = moved(vehicle[3], 0.02 * REFERENCE_FIELD_NT, slice(1))._replace(noise=20.0)
-    found = history(learn_fleet([*HEALTHY, *vehicle]), "changing")
-    assert [change.what for change in found.changes[3]] == ["soft iron, xx", "noise"]
-    assert found.changes[3][0].by_nT == pytest.approx(1000.0, abs=100.0)
-    assert found.changes[3][1].by_nT == 18.0
-    assert not any(found.changes[:3])
+    found = [one.changes for one in history(learn_fleet([*HEALTHY, *vehicle]), "changing").deployments]
+    assert [change.what for change in found[3]] == ["soft iron, xx", "noise"]
+    assert found[3][0].by_nT == pytest.approx(1000.0, abs=100.0)
+    assert found[3][1].by_nT == 18.0
+    assert not any(found[:3])
