@@ -11,7 +11,6 @@ import pytest
 import xarray as xr
 from demos import demo_log
 
-from magbridge.errors import WriteError
 from magbridge.files import atomic_path, new_folder
 from magbridge.logs import write
 
@@ -60,14 +59,6 @@ def test_a_block_that_raises_leaves_everything_as_it_was(tmp_path: Path) -> None
     with pytest.raises(ZeroDivisionError), atomic_path(target) as temporary:
         temporary.write_text(str(1 // (temporary.write_text("half") - 4)))
     assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
-
-
-def test_no_folder_is_one_line(tmp_path: Path) -> None:
-    with (
-        pytest.raises(WriteError, match=os.strerror(2)),
-        atomic_path(tmp_path / "no" / "a.json") as temporary,
-    ):
-        temporary.write_text("")
 
 
 @pytest.mark.parametrize(("name", "left"), [("new/doubt", []), (".", ["half"])])

@@ -4,7 +4,6 @@ import select
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from math import nan
 from pathlib import Path
 
 import pytest
@@ -13,15 +12,13 @@ from checks import replays
 from fed import FedBridge, named
 from fuzz import events, feed, make_bridge
 from rig import Rig
-from small import START, small_bridge
+from small import small_bridge
 
 from magbridge.bridge.run import FileServer
 from magbridge.correction import Correction
 from magbridge.mavlink import Codec, Message
-from magbridge.one_time import OneTime
 from magbridge.parts import OptionalParts
-from magbridge.records import Channel, Reading
-from magbridge.sensors.clock import DeviceClock
+from magbridge.records import Channel
 
 KEY = bytes(range(1, 33))
 SECRET = bytes(range(101, 133))
@@ -148,20 +145,3 @@ def test_a_part_that_raises_is_switched_off_and_the_sample_is_published(
     expected = "plausibility check is off after an internal error: ZeroDivisionError: made for this test"
     assert "".join(bridge.texts).count(expected) == 1
     assert list(correction.parts.failures) == ["plausibility check"]
-
-
-def test_zero_counts_of_channels_sampled_in_turn() -> None:
-    align = OneTime()
-    for k in range(4):
-        out, _ = align.bring((0.0, 0.0, 0.0), (0.0, 0.16, 0.32), 1_000_000 + 4_000_000 * k)
-        assert out == (0.0, 0.0, 0.0)
-    assert align.variance == 0.0
-
-
-@pytest.mark.parametrize("device_time", [1e308, -1e308, float("inf"), 1e300])
-def test_an_absurd_device_time_dates_a_reading_by_its_arrival(device_time: float) -> None:
-    clock = DeviceClock()
-    for number, time in enumerate((10.0, device_time, nan)):
-        arrival_us = START + number * 1_000_000
-        reading = clock.update(Reading((0.0, 0.0, 0.0), device_time=time), arrival_us)
-        assert reading.time_us == pytest.approx(arrival_us, abs=4)

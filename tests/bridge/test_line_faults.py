@@ -153,18 +153,6 @@ def test_disturbed_telemetry_changes_no_sample_and_is_reported_once(
     assert back < soon(within_s)
 
 
-def test_parameter_out_of_range(rig: Rig) -> None:
-    rig.until_well()
-    mark = rig.mark
-    for value in (0.5, float("nan"), float("inf"), -1.0):
-        rig.set_parameter("MB_GAP_FACTOR", value)
-    rig.until_reported("MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000", mark)
-    rig.until(lambda: len(rig.of("PARAM_VALUE", mark)) == 4)
-    assert {message["param_value"] for message in rig.of("PARAM_VALUE", mark)} == {2.5}
-    assert rig.undue_flags(mark) == ""
-    assert not (rig.folder / "bridge.parameters.json").exists()
-
-
 def test_autopilot_reboots(rig: Rig, measured: Measured) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark

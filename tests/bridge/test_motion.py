@@ -165,12 +165,6 @@ def test_the_last_known_speed_is_uncertain_by_itself() -> None:
     assert np.sqrt(bench.navigation.navigator.estimate.P[2, 2]) > 0.8
 
 
-def test_without_any_motion_no_fix_is_sent() -> None:
-    bench = made()
-    bench.receive("GLOBAL_POSITION_INT", alt=-1000)
-    assert source(bench) is MotionSource.NONE
-
-
 def test_depth_counts_from_the_sea_on_high_ground() -> None:
     bench = made()
     bench.receive("LOCAL_POSITION_NED", z=4.0)
@@ -542,17 +536,6 @@ def test_what_ardupilot_would_believe_too_much_is_not_sent() -> None:
     assert bench.texts_with("claim") == [
         "no fixes to the autopilot: ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
     ]
-
-
-def test_a_fix_soon_after_another_is_widened_where_it_is_fused() -> None:
-    bench = Bench("GLOBAL_POSITION_SENSOR")
-    assert bench.fix(sigma=20.0)[0]["eph"] == pytest.approx(20.0), "the first is new"
-    bench.to(1)
-    soon = bench.fix(sigma=20.0)[0]["eph"]
-    bench.to(5)
-    later = bench.fix(sigma=20.0)[0]["eph"]
-    assert soon == pytest.approx(2.0 * later)
-    assert later > 20.0
 
 
 @pytest.mark.parametrize(

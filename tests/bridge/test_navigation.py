@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cache
-from itertools import islice
 from math import radians
 from pathlib import Path
 from typing import NamedTuple
@@ -182,13 +181,6 @@ def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
         "no fixes to the autopilot: no valid position",
         "fixes go to the autopilot: GPS is lost",
     ]
-
-
-def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> None:
-    if sailed.kind != "GLOBAL_POSITION_SENSOR":
-        pytest.skip("one kind is enough")
-    again = frames(bridge(folder, sailed.kind), islice(events(folder), 300))
-    assert again == sailed.sent[: len(again)]
 
 
 def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:

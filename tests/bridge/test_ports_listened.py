@@ -23,7 +23,6 @@ from magbridge.bridge.ports import listen, recognise
 from magbridge.config import load
 from magbridge.errors import PortError
 from magbridge.mavlink import Codec
-from magbridge.sensors.options import driver_names, options_of
 
 
 def nmea(text: str) -> bytes:
@@ -113,15 +112,6 @@ def test_a_busy_port_names_the_program_that_holds_it() -> None:
         other.communicate(b"\n")
     assert refused.value.reason.startswith("busy: ")
     assert f"(process {other.pid})" in refused.value.reason
-
-
-@pytest.mark.parametrize("driver", driver_names())
-def test_every_option_of_a_driver_is_reported(driver: str, command: Command) -> None:
-    output = command("drivers", driver).out
-    for one in options_of(driver):
-        assert one.name in output
-        assert one.kind
-        assert one.meaning, one.name
 
 
 @pytest.mark.parametrize(

@@ -78,17 +78,6 @@ def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
     assert not Path("cal.json").exists()
 
 
-def test_a_column_of_strings(good: tuple[Path, Path], command: Command) -> None:
-    header, *rows = good[0].read_text().splitlines()
-    place = [name.partition(" ")[0] for name in header.split(",")].index("ballast")
-    cells = [row.split(",") for row in rows]
-    spoilt = [",".join([*row[:place], "in", *row[place + 1 :]]) for row in cells]
-    Path("bad.csv").write_text("\n".join([header, *spoilt, ""]))
-    output = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
-    assert output.startswith("bad.csv: column 'ballast': expected this column; there are: mag_x ")
-    assert output.endswith("; guessed: left out, no numbers: ballast")
-
-
 def test_positions_outside_the_grid(good: tuple[Path, Path], command: Command) -> None:
     axis = np.arange(10.0, 11.0, 0.1)
     AnomalyGrid(axis, axis, np.zeros((len(axis), len(axis)))).save("far.nc")

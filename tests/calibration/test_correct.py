@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from magbridge.calibration.correct import Corrector, correct, forward, vector_covariance
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.kernel import TABLE_SUMS
-from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, identity
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Effect, Polynomial, full_order
 from magbridge.errors import CalibrationError
 from magbridge.records import Quality
@@ -234,13 +234,6 @@ def test_the_boresight_s_covariance_turns_the_vector() -> None:
     for b, one, other in zip(before.vector, before.vector_sigma, after.vector_sigma, strict=True):
         cross = np.cross(np.eye(3), b)
         np.testing.assert_allclose(other**2, one**2 + np.diag(cross @ root @ root.T @ cross.T), rtol=1e-9)
-
-
-def test_no_motion_no_actuator_correction_and_identity_changes_nothing() -> None:
-    field, _, time = random_samples(9, 20, 0)
-    got = correct(identity(), field, np.empty((20, 0)), time)
-    np.testing.assert_allclose(got.vector, field, rtol=1e-15)
-    assert (got.quality & Quality.UNCALIBRATED).all()
 
 
 @pytest.mark.parametrize("extra", [False, True])

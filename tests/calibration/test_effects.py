@@ -25,7 +25,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import read_vehicle
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import MAX_ORDER, TERMS, Effect, LogSeries, Polynomial, term_class
+from magbridge.calibration.terms import MAX_ORDER, Effect, LogSeries, Polynomial
 from magbridge.errors import CalibrationError, ConfigError
 from magbridge.estimation.residual import symmetric
 
@@ -74,11 +74,6 @@ def test_an_effect_has_one_physics_in_two_forms(effect: Effect) -> None:
     found = stepped(effect, time, values, field)
     assert found.shape == (n, effect.columns(5e4).shape[1])
     assert np.ptp(found[np.isfinite(found).all(axis=1)], axis=0).all()
-
-
-def test_every_effect_is_held_to_it() -> None:
-    every = {kind for kind in TERMS if issubclass(term_class(kind), Effect)}
-    assert {effect.kind for effect in EFFECTS} == every
 
 
 def test_a_lag_approaches_a_new_temperature_as_heat_stores_do() -> None:

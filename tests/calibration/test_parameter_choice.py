@@ -96,17 +96,6 @@ def test_auto_goes_with_nothing_else(more: tuple[str, ...], tmp_path: Path, comm
     assert "--parameter auto" in command.refuses(*given, code=2)
 
 
-def test_error_on_later_parts_is_known_with_and_without_a_parameter() -> None:
-    """The choice compares the two; a column that does not move the field does not lower it."""
-    log = flight()
-    without, useful, useless = (
-        fit(observations(log, names)).details["forward_nT"]
-        for names in ((), ("battery_current",), ("servo1",))
-    )
-    assert useful < 0.8 * without
-    assert useless > 0.95 * without
-
-
 # ---- a column that moves the field and was not declared is named; one that does not is not -----------------
 
 

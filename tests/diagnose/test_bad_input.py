@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from commands import Command
 from demos import demo
 from machine import full_disk
 
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.file import save
 from magbridge.calibration.model import CalibratedSensor, Calibration
 from magbridge.diagnose.assessment import DiagnosisResult
 from magbridge.diagnose.report import page
@@ -21,7 +19,6 @@ from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import load_survey
 from magbridge.errors import DataError, WriteError
 from magbridge.field.geodesy import offset, wrap
-from magbridge.logs import write
 
 Plain = tuple[xr.Dataset, Calibration]
 Found = tuple[DiagnosisResult, Path]
@@ -50,15 +47,6 @@ def test_the_demonstrations_survey_is_plain(found: Found) -> None:
     remarks = json.loads((found[1] / "findings.json").read_text())["remarks"]
     assert remarks == ["a<b>.csv: fitted to this log"]
     assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (found[1] / "report.html").read_text()
-
-
-def test_where_one_file_cannot_be_written_none_is(found: Found, tmp_path: Path) -> None:
-    (tmp_path / "report.html").mkdir()
-    (tmp_path / "findings.json").write_text("of an earlier diagnosis")
-    with pytest.raises(WriteError, match=r"report\.html: cannot be written: Is a directory"):
-        page.write(found[0], tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "findings.json"}
-    assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
 
 
 def test_a_full_disk_names_the_file_that_has_no_room(found: Found, tmp_path: Path) -> None:
@@ -196,14 +184,6 @@ def test_another_magnetometer_is_not_telemetry(plain: Plain) -> None:
     ds, calibration = plain
     both = ds.assign(second=ds["mag_x"].assign_attrs(units="nT"))
     assert "second" not in load_survey([both], calibration).channels
-
-
-def test_the_command_line_says_it_in_one_line(plain: Plain, command: Command) -> None:
-    save(plain[1], "cal.json")
-    write(plain[0].isel(time=slice(0, 3)), "three.nc")
-    output = command.refuses("diagnose", "three.nc", "--calibration", "cal.json", "-o", "out")
-    assert output == "three.nc (simulated: demo): 3 samples, at least 60 needed"
-    assert not Path("out").exists()
 
 
 def test_a_channel_that_repeats_its_reading_is_known_where_it_was_read(plain: Plain) -> None:

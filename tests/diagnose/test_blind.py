@@ -76,11 +76,6 @@ def test_a_hidden_effect_is_found_and_named(name: str) -> None:
     assert {cause for cause in row["sets"] if theory["left"].get(cause, 0.0) > FAR} == set(), row
 
 
-def test_outliers_are_found() -> None:
-    row = blind("named", ("outliers",), 12.0)
-    assert row["first"] == ["outliers"]
-
-
 @pytest.mark.parametrize(
     ("noise", "losses"),
     [*product(("white", "ar", "half"), [""]), *zip(("mixed", "heavy", "uneven", "map"), LOSSES, strict=True)],

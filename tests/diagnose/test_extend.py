@@ -58,11 +58,6 @@ def test_a_misfit_grows_with_the_effect_and_points_anywhere() -> None:
     )
 
 
-def test_what_is_hardly_seen_is_hardly_widened() -> None:
-    before = fitted(np.array([1e-3, 0.0]))
-    np.testing.assert_allclose(with_misfit([current(2)], before).covariance, before.covariance, rtol=1e-4)
-
-
 def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     """Runs turn in five minutes, the survey in an hour; the gain has absorbed the runs' attenuation."""
     rng, tau = np.random.default_rng(5), 1.5

@@ -5,7 +5,6 @@ from dataclasses import replace
 from inspect import getsource
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import xarray as xr
@@ -240,14 +239,6 @@ def test_columns_are_derivatives_of_the_nonlinear_model(name: str, problem: Prob
     """For every candidate whose effect the corrector computes as the search does."""
     for candidate in CAUSES[name].candidates(problem)[::7]:
         assert CAUSES[name].jacobian_error(problem, candidate) < 1e-3, candidate.names
-
-
-@pytest.mark.parametrize("name", CAUSES)
-def test_what_a_row_puts_forward_has_its_name_and_can_be_written(name: str, problem: Problem) -> None:
-    """A number of numpy's, as is read off a spectrum, is none to a file."""
-    made = CAUSES[name].candidates(problem)
-    assert {one.cause for one in made} <= {name}
-    msgspec.to_builtins([one.effects for one in made])
 
 
 # ---- one vocabulary of causes ------------------------------------------------------------------------------

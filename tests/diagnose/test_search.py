@@ -242,15 +242,6 @@ def sized(cause: str, size: int = 1, **more: object) -> Candidate:
     return candidate(cause, np.zeros((1, size)), **more)
 
 
-def test_evidence_asks_its_price() -> None:
-    """The evidence accepts many ratios or one; it is zero without free coefficients."""
-    np.testing.assert_allclose(
-        log_bayes(np.array([2.0, 3.0, 60.0]), 3), [0.0, 0.0, 28.5 - 1.5 * np.log(20.0)]
-    )
-    assert log_bayes(60.0, 3) < log_bayes(60.0, 1)
-    assert log_bayes(60.0, 0) == 0.0
-
-
 def test_what_cannot_be_negative_has_twice_the_prior_where_it_is() -> None:
     """Compare with the integral over half a Gaussian prior of the likeliest size."""
     estimate = 1.8
@@ -276,16 +267,6 @@ def test_a_size_that_cannot_be_negative_has_one_tail(one: Candidate, least: floa
     draws = np.random.default_rng(5).standard_normal((2000, one.size)) * np.sqrt(np.diag(S))
     ratios = [score(Information(S, b, np.zeros((0, 0))), slice(None), one).ratio for b in draws]
     assert least <= np.mean(one.tail * chi2.sf(ratios, 1) < 0.1) < 0.12
-
-
-def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
-    """The evidence of a cause does not depend on a free shape, which has its own prior."""
-    step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
-    look_elsewhere = {"offset_step": 1.0, "map_error": 1.0}
-    worth = log_odds(225.0, [step, chart], look_elsewhere, 25.0) - log_odds(
-        200.0, [chart], look_elsewhere, 0.0
-    )
-    assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
 
 
 def test_each_spectrum_that_was_tried_has_its_price() -> None:
@@ -348,14 +329,6 @@ def test_a_score_is_the_ratio_its_evidence_and_the_shrunk_estimate() -> None:
     positive = score(info, slice(1, 2), sized("late", 1, positive=True))
     assert (positive.ratio, positive.evidence, positive.freedom) == (0.0, 0.0, 1)
     assert positive.estimate.tolist() == [0.0]
-
-
-def test_the_prior_of_coefficients_of_one_size_is_that_of_their_spectrum() -> None:
-    S, b = np.diag([5.0, 5.0]), np.array([20.0, -15.0])
-    spectrum = np.array([[2.0, 1.0]])
-    found = score(Information(S, b, np.zeros((1, 2))), slice(0, 2), sized("map_error", 2, spectra=spectrum))
-    precision = b / found.estimate - np.diag(S)
-    assert precision[1] / precision[0] == pytest.approx(2.0, rel=1e-6)
 
 
 # ---- calibration, effects and noise at once ----------------------------------------------------------------

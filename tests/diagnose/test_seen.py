@@ -166,10 +166,6 @@ def flown_twice(north: FloatArray) -> Returns:
     return found
 
 
-def test_a_log_without_positions_says_nothing() -> None:
-    assert returns(surveyed(np.ones((ROWS, 3)), ALONG)) is None
-
-
 def test_only_returns_at_several_times_tell_place_from_time() -> None:
     away, back, fro = (flown_twice(track) for track in TRACKS.values())
     assert away.share == away.longest == 0.0

@@ -28,11 +28,6 @@ def places() -> Places:
     return rng.uniform(10.0, 10.5, 300), rng.uniform(54.0, 54.4, 300)
 
 
-def test_passes_through_its_nodes(grid: AnomalyGrid) -> None:
-    x, y = np.meshgrid(LON, LAT)
-    np.testing.assert_allclose(grid.anomaly_at(x.ravel(), y.ravel()), hills(x, y).ravel(), atol=1e-9)
-
-
 def test_agrees_with_scipys_spline_inside(grid: AnomalyGrid) -> None:
     rng = np.random.default_rng(2)
     x, y = rng.uniform(10.15, 10.35, 200), rng.uniform(54.15, 54.25, 200)

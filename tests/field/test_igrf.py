@@ -146,10 +146,6 @@ def test_the_declination_is_that_of_another_implementation() -> None:
     assert declination < -15  # west of north off Newfoundland
 
 
-def test_a_true_heading_stays() -> None:
-    assert with_true_heading(deployment())["heading"].to_numpy().tolist() == [350.0, 10.0, 200.0]
-
-
 def test_without_a_position_a_magnetic_heading_is_unknown() -> None:
     unplaced = deployment(heading_reference="magnetic").drop_vars(["latitude", "longitude"])
     assert np.isnan(with_true_heading(unplaced)["heading"]).all()

@@ -166,14 +166,6 @@ def test_merge_across_the_antimeridian() -> None:
     np.testing.assert_allclose(both.anomaly_at([179.95, -179.9], 49.5), 5.0, atol=1e-9)
 
 
-def test_nothing_is_smoothed_unless_asked_for() -> None:
-    rough = AnomalyGrid(LON, LAT, np.random.default_rng(0).normal(size=(61, 81)))
-    same, steps = prepare([rough])
-    np.testing.assert_array_equal(same.anomaly, rough.anomaly)
-    assert same.sigma.max() == 0.0
-    assert len(steps) == 1
-
-
 def test_smoothing_is_by_wavelength_and_what_goes_becomes_sigma() -> None:
     """A wave of the cutoff length keeps half its amplitude, twice the length 84 %; sigma is the RMS loss."""
     per_latitude, _ = metres_per_degree(49.5)

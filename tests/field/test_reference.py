@@ -151,8 +151,3 @@ def test_a_reference_of_its_own_needs_no_date(undated: xr.Dataset) -> None:
     assert total.tolist() == [5e4] * N
     assert vector is None
     assert name == "reference_field"
-
-
-def test_a_log_with_a_date_has_its_field() -> None:
-    assert np.isfinite(main_field(log(1.7e9))).all()
-    assert reference_field(log(1.7e9)) == pytest.approx(reference_field(log(1.7e9, time_reference="utc")))

@@ -157,20 +157,6 @@ def test_telemetry_that_is_late_is_reported() -> None:
     assert [text for text in reported(learner) if "clock offset" in text] == reported(learner)
 
 
-def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None:
-    """An alarm that ends without a learned change leaves no evidence for changes learned meanwhile."""
-    known = calibration()
-    learner, added = Learner(known), np.zeros((300, 3))
-    added[250:] = [0.0, 0.0, 30.0]
-    learner.frozen = True
-    learn(learner, World(known, 300), added=added)
-    learner._publication.judge._to_first._sums[:, 1] = 10.0
-    assert learner.state.better > 5.0
-    assert learner.flags == Quality.UNEXPLAINED
-    learner._close_unexplained()
-    assert (learner.state.better, learner.flags) == (0.0, 0)
-
-
 def test_a_motion_that_began_before_its_telemetry_raises_no_alarm() -> None:
     """The last sample before each is off by 15 nT without a flag, as no telemetry could know."""
     known, n = calibration(), 1500

@@ -2,20 +2,16 @@
 
 from collections.abc import Mapping
 from math import inf, nan
-from pathlib import Path
 from typing import Any
 
 import pytest
 from line import Line
-from small import START, small_bridge
 
-from magbridge.bridge.events import Event
 from magbridge.config import Telemetry
 from magbridge.link.output import Output
 from magbridge.link.telemetry import Stream, StreamRequests, TelemetryMap, needed_rates
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
-from magbridge.records import Channel
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
 FIELD, HEARTBEAT, STATUS, HIGHRES_IMU, VERSION, METADATA = 60101, 0, 60102, 105, 148, 397
@@ -321,15 +317,6 @@ def test_two_sources_of_one_parameter(
     reported = [text for _, text in output.texts]
     refused = {who for (_, who), good in zip(order, admitted, strict=True) if not good}
     assert {who for who in refused if f"battpos also from 1:{who}: not used" in reported} == refused
-
-
-def test_another_component_s_value_changes_no_sample(tmp_path: Path) -> None:
-    pipeline = small_bridge(tmp_path, [])
-    for component, value in ((1, 0.25), (99, 9.0)):
-        frame = Codec(1, component).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
-        pipeline.feed(Event(START + component * 1000, Channel.LINK, frame))
-    assert pipeline._correction.aligner.by_name["battpos"].last == 0.25
-    assert "battpos also from 1:99: not used" in [text for _, text in pipeline.component.output.texts]
 
 
 @pytest.mark.parametrize(

@@ -2,19 +2,15 @@
 
 import random
 from math import inf, nan
-from pathlib import Path
 from typing import Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from line import Line, MakeLine
 
 from magbridge.config import Align, Link
-from magbridge.errors import ConfigError
 from magbridge.link.component import Component
 from magbridge.link.parameters import alignment
-from magbridge.link.publish import check_publish
 from magbridge.mavlink import Codec, FrameLogReader, Signing, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE
 
@@ -30,14 +26,6 @@ def test_heartbeat_once_a_second_at_its_own_time(link: Line) -> None:
     assert (beat.type, beat.autopilot, beat.mavlink_version) == (18, 8, 3)
     assert (beat.get_srcSystem(), beat.get_srcComponent()) == (1, 191)
     assert beat.system_status == 5  # critical: no sensor
-
-
-def test_when_it_is_woken_does_not_matter(make_link: MakeLine) -> None:
-    lazy, eager = make_link(), make_link()
-    lazy.to(30)
-    for i in range(301):
-        eager.to(i / 10)
-    assert lazy.sent == eager.sent
 
 
 def test_next_deadline_is_when_something_is_sent(link: Line) -> None:
@@ -138,18 +126,6 @@ def test_signed_both_ways(make_link: MakeLine) -> None:
     assert signing.refused == 1
     (status,) = link.only(link.to(1), "MAG_STATUS")
     assert status.link_refused == 1
-
-
-def test_publish_is_checked() -> None:
-    check_publish({"MAG_FIELD": 0, "NAMED_VALUE_FLOAT": 1, "DEBUG_VECT": -1}, Path("b.toml"))
-    for publish, complaint in (
-        ({"MAG_FILED": 0}, r"b.toml: publish.MAG_FILED: expected one of .*MAG_FIELD"),
-        ({"MAG_FIELD": 1e6}, r"publish.MAG_FIELD: expected a rate from -1 to 1000 Hz"),
-        ({"HEARTBEAT": -1}, r"publish.HEARTBEAT"),
-        ({"MAG_FIELD": float("nan")}, r"publish.MAG_FIELD"),
-    ):
-        with pytest.raises(ConfigError, match=complaint):
-            check_publish(publish, Path("b.toml"))
 
 
 SPECIAL = [nan, inf, -inf, 0.0, -0.0, -1.0, 1e38, 3.4e38, 1e-40, 1e9, 60101.0, 511.5]

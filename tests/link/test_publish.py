@@ -181,14 +181,6 @@ def test_a_text_is_sent_whole_or_in_pieces(talker: Talker, length: int) -> None:
     assert talker.at(0)[0].text == "5 ?T"
 
 
-def test_only_changes_are_reported(talker: Talker) -> None:
-    for second, state in enumerate(("ok", "ok", "lost", "lost", "ok")):
-        talker.at(second * 2)
-        talker.output.announce("sensor", state)
-        talker.output.announce("log", "ok")
-    assert [m.text for m in talker.at(20)] == ["ok"]
-
-
 def test_a_flapping_text_is_sent_once_a_second_and_its_last_state_always(talker: Talker) -> None:
     texts = []
     for i in range(201):  # 100 Hz for 2 s, ends on "up"

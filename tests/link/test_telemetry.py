@@ -139,11 +139,6 @@ def test_every_numeric_field_of_every_message_maps() -> None:
         assert all(isinstance(value, (int, float)) for _, value, _ in got)
 
 
-def test_a_delay_is_kept_in_microseconds() -> None:
-    wanted = {"late": Telemetry("ATTITUDE", "roll", delay=1.25), "prompt": Telemetry("ATTITUDE", "pitch")}
-    assert TelemetryMap(wanted).delays_us == {"late": 1_250_000, "prompt": 0}
-
-
 @pytest.mark.real
 def test_measured_telemetry(real_data: Path) -> None:
     wanted = {

@@ -148,15 +148,6 @@ def test_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert refused(path) == "cannot be read: Input/output error"
 
 
-def test_missing_channels_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "log.csv"
-    path.write_text("time,mag_x,battpos\n1,2,3\n")
-    lacking = "log.csv: column 'mag_y': expected this column; did you mean mag_x.; there are: mag_x battpos"
-    for reader in (logs.read, lambda path, required: list(logs.read_chunks(path, required=required))):
-        with pytest.raises(FormatError, match=lacking):
-            reader(path, required=CHANNELS)
-
-
 @pytest.mark.parametrize("suffix", [".nc", ".parquet"])
 def test_a_file_that_is_truncated_or_whose_time_goes_back(suffix: str, tmp_path: Path) -> None:
     path, cut = tmp_path / f"log{suffix}", tmp_path / f"cut{suffix}"

@@ -92,15 +92,6 @@ def test_a_log_of_the_times_when_times_were_in_milliseconds(tmp_path: Path) -> N
     assert (back["latitude"] == 47.5).all()
 
 
-def test_records_without_any_time_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "older.log"
-    path.write_text("FMT, 15, 21, MAG, hhh, MagX,MagY,MagZ\n" + "MAG, 100, 200, -300\n" * 9)
-    with pytest.raises(
-        FormatError, match="expected an ArduPilot log with MAG records, whose records have times"
-    ):
-        logs.read(path)
-
-
 def test_angles_currents_and_places_are_in_the_rows(tmp_path: Path) -> None:
     log = Log()
     log.write_message("BAT", 5_000_000, 1, 12.0, 0.5)
@@ -169,35 +160,6 @@ def test_the_estimators_word_goes_before_the_number(tmp_path: Path) -> None:
         log.write_message("XKFS", 4_900_000 + k, 0, int(k > 2), 0, 0, 0)
     back = logs.read(write(tmp_path, flight(compasses=2, log=log)))
     assert (back["mag_y"] == 40_000).all()
-
-
-def test_one_damaged_fix_does_not_date_a_log(tmp_path: Path) -> None:
-    log = Log()
-    log.fix(5_000_000, 1_000_000_000)
-    back = logs.read(write(tmp_path, flight(log=log)))
-    np.testing.assert_allclose(back["time"], UTC + 5 + 0.1 * np.arange(30), rtol=0, atol=1e-3)
-
-
-def test_one_damaged_time_costs_its_row(tmp_path: Path) -> None:
-    log = flight()
-    log.mag(1 << 50, 0, (1, 2, 3))
-    log.write_message("BAT", 1 << 51, 0, 99.0, 99.0)
-    back = logs.read(write(tmp_path, flight(start=8, log=log)))
-    assert back.sizes["time"] == 60
-    assert passed_over(back.attrs) == {"rows_dropped": 1}
-    np.testing.assert_allclose(back["battery_voltage"], 16.0)
-
-
-def test_two_boots_are_two_runs(tmp_path: Path) -> None:
-    log = flight(log=flight(), boot=UTC + 900)
-    path = write(tmp_path, log)
-    back = logs.read(path)
-    expected = np.concatenate([UTC + 5 + 0.1 * np.arange(30), UTC + 905 + 0.1 * np.arange(30)])
-    np.testing.assert_allclose(back["time"], expected, rtol=0, atol=1e-3)
-    assert len(logs.read_each(path)) == 2
-    assert not passed_over(back.attrs)
-    columns = {tuple(piece.data_vars) for piece in logs.read_chunks(path, 7)}
-    assert len(columns) == 1
 
 
 def test_a_boot_without_gps_is_left_out_and_counted(tmp_path: Path) -> None:
@@ -328,14 +290,6 @@ def test_every_field_is_as_pymavlink_reads_it(name: str, tmp_path: Path) -> None
     ours = (read_text if is_text else read_binary)(path, EVERYTHING)
     assert ours.skipped == 0
     assert same_as_pymavlink(path, DFReader_text if is_text else DFReader_binary, ours) == 40 * 8
-
-
-@pytest.mark.parametrize("records", [1, 2])
-def test_a_log_in_which_no_record_joins_another_holds_none(records: int, tmp_path: Path) -> None:
-    fmt = described(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
-    (tmp_path / "log.bin").write_bytes((fmt + b"?") * records)
-    ours = read_binary(tmp_path / "log.bin", EVERYTHING)
-    assert (ours.records, ours.skipped) == ({}, 90 * records)
 
 
 def test_of_a_record_with_a_field_of_unknown_length_what_stands_before_it_is_read(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from demos import demo_log
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -210,18 +209,6 @@ def test_files_that_disagree_are_not_mixed(first: str, second: str, expected: st
         logs.read([tmp_path / "a.csv", tmp_path / "b.csv"])
 
 
-@pytest.mark.parametrize("suffix", [".nc", ".parquet"])
-def test_meaning_and_attributes_are_kept(suffix: str, tmp_path: Path) -> None:
-    attrs = {"segments": "[]", "seed": 5, "time_reference": "boot"}
-    dataset = deployment("made", [1.0], {"run": [3]}, attrs=attrs, long_names={"run": "the leg"})
-    logs.write(dataset, tmp_path / f"log{suffix}")
-    back = logs.read(tmp_path / f"log{suffix}")
-    assert back["run"].attrs["long_name"] == "the leg"
-    history = back.attrs.pop("history", "written by magbridge")
-    assert history.count("written by magbridge") == 1
-    assert back.attrs == dataset.attrs | {"source": f"log{suffix} (made)"}
-
-
 def test_streams_in_bounded_memory(tmp_path: Path) -> None:
     """Eight times the rows need as much memory: the reader keeps only one piece of constant size."""
     import tracemalloc  # noqa: PLC0415 - slows everything down while it is loaded
@@ -287,18 +274,6 @@ def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
 
 
 # ---- data frames in and out --------------------------------------------------------------------------------
-
-
-def test_there_and_back_keeps_every_number_and_unit() -> None:
-    log = demo_log().isel(time=slice(0, 50))
-    frame = mb.to_frame(log)
-    assert str(frame.index.tz) == "UTC"
-    back = mb.from_frame(frame, frame.attrs)
-    assert set(back) == set(log)
-    np.testing.assert_allclose(back["time"], log["time"], atol=1e-6)  # a data frame's moments are in us
-    for name in log:
-        np.testing.assert_array_equal(back[name], log[name])
-        assert back[name].attrs["units"] == log[name].attrs["units"]
 
 
 @pytest.mark.parametrize(

@@ -224,18 +224,6 @@ def test_the_payload_s_rows_know_where_the_masses_were(name: str, tmp_path: Path
     assert "between the samples of sea035.12.gli.sub.36.gz" in back.attrs["history"]
 
 
-def test_payload_of_a_seaexplorer(tmp_path: Path) -> None:
-    path = tmp_path / "sea035.12.pld1.sub.36"
-    path.write_text(PLD)
-    back = logs.read(path, required=("mag_x", "mag_y", "mag_z"))
-    np.testing.assert_allclose(back["time"], T0 + np.array([13.737, 43.745]), atol=1e-6)
-    np.testing.assert_array_equal(back["mag_y"], [100.0, np.nan])
-    np.testing.assert_array_equal(back["water_temperature"], [15.653, np.nan])
-    np.testing.assert_array_equal(back["other"], [np.nan, 7.0])
-    (tmp_path / "sea035.12.gli.sub.36").write_text(GLI)
-    assert logs.read(sorted(tmp_path.iterdir())).sizes["time"] == 5
-
-
 IAGA = """ Format                 IAGA-2002                                    |
  Source of Data         Made                                         |
  IAGA Code              MDE                                          |
@@ -330,17 +318,6 @@ def test_the_list_of_sensors_may_be_in_a_folder(folder: str, tmp_path: Path) -> 
     (logged / folder).mkdir(exist_ok=True)
     (logged / f"{CRC}.cac").rename(logged / folder / f"{CRC}.cac")
     assert logs.read(logged / "a.sbd")["battpos"].notnull().all()
-
-
-def test_an_empty_segment_costs_itself(tmp_path: Path) -> None:
-    for k, n in enumerate((50, 1, 50)):
-        segment(tmp_path / f"{k}.sbd", flight(n, T0_SLOCUM + 1000.0 * k))
-    back = logs.read(sorted(tmp_path.iterdir()))
-    assert back.sizes["time"] == 98
-    assert passed_over(back.attrs) == {"files_skipped": 1}
-    assert named_losses(back.attrs) == [f"{tmp_path / '1.sbd'}: expected rows, there are none"]
-    with pytest.raises(FormatError, match=r"1\.sbd: expected rows, there are none"):
-        logs.read(tmp_path / "1.sbd")
 
 
 # ---- Measured data -----------------------------------------------------------------------------------------

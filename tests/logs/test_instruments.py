@@ -260,16 +260,6 @@ def test_a_magarrow_file_has_the_columns_that_the_programs_read(tmp_path: Path) 
     assert path.read_text().splitlines()[3].split(",")[3:7] == ["NaN", "NaN", "NaN", "0"]
 
 
-def test_a_magarrow_file_is_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "out.magarrow.csv"
-    write(survey(), path)
-    back = mb.read(path)
-    np.testing.assert_allclose(back["mag_x"], survey()["mag_x"])
-    np.testing.assert_allclose(back["mag_y"], survey()["mag_y"])
-    np.testing.assert_allclose(back["total_field"], [51383.1835, np.nan, np.nan])
-    np.testing.assert_allclose(back["line"], [100.0, 100.0, 200.0])
-
-
 def test_a_log_without_a_position_is_not_written_for_survey_programs(tmp_path: Path) -> None:
     path = tmp_path / "out.magarrow.csv"
     with pytest.raises(FormatError, match=r"out\.magarrow\.csv: column 'latitude': expected this column"):

@@ -58,11 +58,6 @@ def test_rows_at_one_time_become_one() -> None:
     assert passed_over(read.attrs) == {"duplicate_rows": 2}
 
 
-def test_a_log_in_another_order_is_refused() -> None:
-    with pytest.raises(FormatError, match=r"row 2, column 'time': .* run backwards: sort the rows"):
-        counted(T0 - np.arange(300.0))
-
-
 @given(time=st.lists(st.integers(0, 9), max_size=12))
 def test_no_longer_series_of_times_could_be_kept(time: list[int]) -> None:
     best = [1] * len(time)

@@ -108,16 +108,6 @@ def test_a_vehicle_with_a_compass_keeps_it_under_a_number(both: tuple[Path, Path
     assert float(log["mag2_z"].median()) == 3.0
 
 
-def test_what_headings_refer_to_is_the_vehicles(both: tuple[Path, Path], tmp_path: Path) -> None:
-    other = vehicle(tmp_path / "magnetic.csv")
-    text = other.read_text()
-    other.write_text(text.replace("heading", "heading [deg magnetic]", 1))
-    log = logs.read([both[0], other])
-    assert log.attrs["heading_reference"] == "magnetic"
-    (piece,) = logs.read_chunks([both[0], other])
-    assert piece.attrs["heading_reference"] == "magnetic"
-
-
 @pytest.mark.real
 def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Command) -> None:
     """Commands take the real telemetry of a deployment and a made fluxgate's log."""

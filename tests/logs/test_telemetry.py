@@ -14,7 +14,6 @@ from pymavlink.dialects.v10 import common as v1
 
 from magbridge import logs
 from magbridge.bridge.events import declarations
-from magbridge.config import Telemetry
 from magbridge.errors import FormatError
 from magbridge.logs import Options, telemetry
 from magbridge.logs.compasses import compasses_in
@@ -293,22 +292,6 @@ def test_a_live_log_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back["mag_x"], np.arange(500.0))
     np.testing.assert_allclose(back["time"], T0 / S + 1e-6 + np.arange(500.0), rtol=0, atol=0.5e-6)
     assert back.attrs["damages"] == 1
-
-
-def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -> None:
-    scaled: dict[str, Any] = {"scale": 0.1, "offset": -150.0, "unit": "deg"}
-    servo = Telemetry(message="SERVO_OUTPUT_RAW", field="servo2_raw", match={"port": 0}, **scaled)
-    codec = Codec(1, 1)
-    with closing(TlogWriter(tmp_path, max_size=0.01, header=declarations(1, 191, {"servo2": servo}))) as log:
-        for k in range(500):
-            log.extend([(T0 + k * S, Channel.LINK, codec.pack("SERVO_OUTPUT_RAW", servo2_raw=1600))])
-            log.extend([(T0 + k * S, Channel.LINK, codec.pack("RAW_IMU", xmag=1))])
-    files = sorted(tmp_path.iterdir())
-    assert len(files) > 2
-    for path in files:
-        back = logs.read(path)
-        np.testing.assert_allclose(back["servo2"][1:], 10)
-        assert back["servo2"].attrs["units"] == "deg"
 
 
 def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None:

@@ -358,14 +358,6 @@ def test_parquet_with_letters_next_to_its_places_and_a_time_in_two_columns(tmp_p
 THEIRS = "Zeit;Bx [mG];By [mG];Bz [mG];Batt;Kurs\n2022-05-04T12:00:00Z;300,0;50,0;450,0;12,7;90\n"
 
 
-def test_columns_are_declared_one_by_one(tmp_path: Path) -> None:
-    log = read(tmp_path, THEIRS, column=("time=Zeit", "battpos=Batt [mm]", "heading=Kurs", "mag_x=By [mG]"))
-    assert float(log["battpos"][0]) == 12.7
-    assert log["battpos"].attrs["units"] == "mm"
-    assert float(log["heading"][0]) == 90.0
-    assert float(log["mag_x"][0]) == 5_000.0
-
-
 def test_a_declared_unit_goes_before_the_heading(tmp_path: Path) -> None:
     text = "time,Bx(raw),Hdg(mag)\n1600000000,20000,0.1\n"
     assert read(tmp_path, text).attrs["heading_reference"] == "magnetic"
@@ -480,13 +472,3 @@ def test_what_is_declared_wrongly_is_one_line(
     columns = tmp_path / "c.toml" if mapping else None
     with pytest.raises(error, match=words):
         read(tmp_path, THEIRS, column=(column,) if column else (), columns=columns)
-
-
-def test_what_was_guessed_is_kept_in_the_history_of_what_is_written(tmp_path: Path) -> None:
-    log = read(tmp_path, THEIRS.replace("Zeit", "Timestamp"))
-    assert "time is 'Timestamp'" in log.attrs["guessed"]
-    for name in ("again.nc", "again.parquet", "again.csv"):
-        logs.write(log, tmp_path / name)
-        again = logs.read(tmp_path / name)
-        assert "decimal commas; fields separated by ';'" in again.attrs["history"], name
-        assert "guessed" not in again.attrs  # nothing was, this time

@@ -157,12 +157,6 @@ def test_times_that_may_be_this_or_that_are_asked_about(text: str, expected: str
         read(tmp_path, text)
 
 
-def test_the_answer_is_heeded(tmp_path: Path) -> None:
-    text = "date,time,mag_x\n040522,120000,1\n040522,120001,2\n"
-    log = read(tmp_path, text, column=["time=time [%d%m%y %H%M%S]"])
-    assert log["time"].values.tolist() == [NOON, NOON + 1]
-
-
 def test_times_of_day_are_of_a_day_that_is_given(tmp_path: Path) -> None:
     text = "time,mag_x\n12:00:00.5,1\n12:00:01.5,2\n"
     log = read(tmp_path, text)

@@ -129,9 +129,3 @@ def test_mavgen_takes_the_xml_as_it_stands(folder: Path, tmp_path: Path) -> None
     out = tmp_path / "again.py"
     subprocess.run([*command, "-o", out, folder / "magbridge.xml"], check=True, capture_output=True)
     assert load(out).MAVLINK_MSG_ID_MAG_FIELD == 60101
-
-
-def test_it_can_be_written_twice(folder: Path) -> None:
-    before = {path.name: path.read_bytes() for path in folder.glob("*.xml")}
-    write_definitions(folder)
-    assert {path.name: path.read_bytes() for path in folder.glob("*.xml")} == before

@@ -101,10 +101,6 @@ def test_stamps_increase_even_when_the_clock_goes_back() -> None:
     assert listener.parse(text(resumed))[0].known
 
 
-def test_same_events_same_bytes() -> None:
-    assert [text(codec()) for _ in range(2)] == [text(codec())] * 2
-
-
 def test_key_file_and_who_may_read_it(tmp_path: Path) -> None:
     path = tmp_path / "key.bin"
     with pytest.raises(FormatError, match="there is none"):

@@ -12,8 +12,8 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.attitude import AttitudeFilter, exponential, rotation
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.estimate import Estimate
-from magbridge.navigate.model import Block, transition
-from magbridge.navigate.options import NavigationOptions, wider_level, with_level
+from magbridge.navigate.model import Block
+from magbridge.navigate.options import NavigationOptions, with_level
 from magbridge.navigate.record import NavigationState, Rival
 
 HOUR_US = 3_600_000_000
@@ -164,14 +164,6 @@ def test_a_misled_filter_does_not_stand_by_it() -> None:
     hours_valid, hours_lost = misled(Map(30, 1500), 6)
     assert hours_lost > 0.0
     assert hours_valid < 0.5
-
-
-def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: NavigationOptions) -> None:
-    loose = wider_level(options, grid.rms)
-    assert loose.bias_sigma == grid.rms
-    assert wider_level(loose, grid.rms) == loose
-    wander = [transition(o, 20.0, 7.0)[1][4, 4] for o in (options, loose)]
-    assert wander[1] == pytest.approx(wander[0], rel=0.01)
 
 
 # ---- Attitude from rates and the field's direction while the autopilot's is wrong; gaps in telemetry -------

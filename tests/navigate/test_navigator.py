@@ -45,16 +45,6 @@ def followed(grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset) -> F
     return feed(navigator, ds)
 
 
-def test_five_lines(grid: AnomalyGrid) -> None:
-    nav = Navigator(grid, NavigationOptions(start_sigma=100.0, interval=4.0))
-    nav.fix(START_US, *PLACE)
-    nav.telemetry(START_US, heading=90.0, speed=0.35, depth=40.0)
-    corrected = Corrected(52_300.0, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0)
-    record = nav.sample(START_US + 4_000_000, corrected) or nav.sample(START_US + 8_000_000, corrected)
-    assert record is not None
-    assert record.latitude == pytest.approx(PLACE[0], abs=0.01)
-
-
 def test_it_holds_the_position(
     grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset, followed: Followed
 ) -> None:
@@ -290,11 +280,6 @@ def test_a_glider_moves_by_its_sink_rate_and_pitch() -> None:
     north, east = sailed(rows)
     assert east == pytest.approx(0.17 / np.tan(np.radians(26.0)) * 1000, rel=0.03)
     assert north == pytest.approx(0.0, abs=1e-6)
-
-
-def test_what_is_nan_or_old_changes_nothing() -> None:
-    calm = [(0.0, {"speed": 0.5, "heading": 0.0}), (1.0, {"heading": np.nan, "speed": np.nan})]
-    assert sailed([*calm, (0.5, {})]) == pytest.approx((500.0, 0.0), abs=1e-6)
 
 
 def test_a_long_silence_is_not_sailed_through() -> None:

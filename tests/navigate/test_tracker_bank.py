@@ -159,12 +159,6 @@ def test_gauss_markov_states_keep_their_variance() -> None:
     np.testing.assert_allclose((f @ P @ f.T + q)[2:, 2:], P[2:, 2:], rtol=1e-12)
 
 
-def test_no_time_is_not_motion() -> None:
-    f, q = transition(NavigationOptions(), 0.0, 0.0)
-    np.testing.assert_array_equal(f, np.eye(6))
-    np.testing.assert_array_equal(q, np.zeros((6, 6)))
-
-
 def test_resolution_follows_the_map(grid: AnomalyGrid) -> None:
     fine, coarse = resolution(grid, NavigationOptions(), 0.1), resolution(grid, NavigationOptions(), 10.0)
     assert 0 < fine < coarse <= 0.25 * grid.correlation_length
