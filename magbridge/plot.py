@@ -20,7 +20,7 @@ from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.datasets import in_standard_units
 from magbridge.errors import MissingExtra, WrongUse
-from magbridge.estimation.residual import rms
+from magbridge.estimation.residual import rms, robust_scale
 from magbridge.field.grid import AnomalyGrid
 from magbridge.pictures import save
 from magbridge.records import Quality
@@ -33,10 +33,12 @@ try:
 except ImportError:
     raise MissingExtra("matplotlib", "analysis") from None
 
-__all__ = ["corrected", "draw_corrected", "grid", "residuals"]
+__all__ = ["corrected", "draw_corrected", "draw_fit", "grid", "residuals"]
 
 DRAWN_SAMPLES = 20_000
 """Largest number of samples drawn; more would overlap."""
+HALF_HEIGHT_SIGMA = 6.0
+"""Half the height of the panels of corrected samples in :func:`draw_fit`, in robust standard deviations."""
 LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_field_sigma": "1-sigma, nT"}
 
 
@@ -151,6 +153,31 @@ def residuals(
     axes.set_ylabel("corrected minus reference, nT")
     axes.legend(frameon=False, fontsize="small")
     return axes
+
+
+def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> None:
+    """Write a plot of each sample's deviation from the reference, nT, as read and as corrected.
+
+    The abscissae are time, heading (if it is known) and each parameter. A trend in a lower panel shows an
+    error that the calibration does not describe.
+
+    WriteError: the file cannot be written.
+    """
+    known = data.attitude is not None and np.isfinite(data.attitude[:, 2]).any()
+    names = ["time", *(["heading"] if known else []), *data.names]
+    read = np.linalg.norm(data.field, axis=1) - data.reference
+    figure = Figure(figsize=(1.0 + 3.4 * len(names), 6.4), layout="constrained")
+    axes = figure.subplots(2, len(names), sharex="col", sharey="row", squeeze=False)
+    for name, (above, below) in zip(names, axes.T, strict=True):
+        residuals(calibration, data, name, below)
+        above.plot(below.lines[0].get_xdata(), read, ".", ms=2, label=f"{rms(read):.0f} nT RMS")
+    axes[0, 0].set_ylabel("as read minus reference, nT")
+    axes[0, 0].legend(frameon=False, fontsize="small")
+    # the median, because samples with masses in motion must not set the scale
+    left = np.asarray(axes[1, 0].lines[0].get_ydata(), float)
+    edge = HALF_HEIGHT_SIGMA * max(calibration.noise.sensor, robust_scale(left))
+    axes[1, 0].set_ylim(-edge, edge)
+    save(figure, path)
 
 
 def grid(anomaly: AnomalyGrid, track: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:

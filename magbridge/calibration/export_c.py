@@ -11,23 +11,22 @@ from collections.abc import Sequence
 from importlib.resources import files
 from string import Template
 
+import numpy as np
+
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.kernel import TABLE_SUMS
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.model import SLOT, Calibration, Parameter
+from magbridge.calibration.scalar import ScalarChannel
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
 
 
 def c_header(calibration: Calibration) -> str:
     """Return the text of ``magbridge_calibration.h``."""
-    lines = []
-    for k, one in enumerate(calibration.parameters):
-        listed = f"{k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}"
-        lines.append(f"/* parameter {listed.replace('*/', '')} */")
     return c_template("magbridge_calibration.h").substitute(
         id=f"{calibration_id(calibration):08x}",
         count=len(calibration.parameters),
-        names="\n".join(lines),
+        names=inputs("parameter", calibration.parameters),
         boresight=int(calibration.boresight is not None),
     )
 
@@ -43,31 +42,19 @@ def c_source(calibration: Calibration) -> str:
     # the tables of the compiled kernel, so that C and Python do the same sums in the same order
     kernel = calibration.kernel
     omega = calibration.boresight.covariance if calibration.boresight else ((0.0,) * 3,) * 3
-    place = [[0] * 3 for _ in range(3)]
-    # index of entry (i, j) among the six entries of a symmetric matrix
-    for k, (i, j) in enumerate(PAIRS):
-        place[i][j] = place[j][i] = k
     # C has no empty arrays: without parameters, write one row of zeros
-    some = calibration.parameters or ()
+    ranges = [[float(one.low), float(one.high)] for one in calibration.parameters]
     tables = [
         reals("centre[]", kernel.centre or (0.0,)),
         reals("scale[]", kernel.scale or (1.0,)),
-        rows(
-            "real",
-            "range[][2]",
-            [[hexadecimal(one.low), hexadecimal(one.high)] for one in some] or [["0", "0"]],
-        ),
-        rows("int", "parent[][2]", [[str(n) for n in one] for one in kernel.parents] or [["0", "0"]]),
-        rows("int", "pair[][2]", [[str(i), str(j)] for i, j in kernel.pairs]),
-        rows("int", "place[3][3]", [[str(n) for n in one] for one in place]),
-        rows("real", "omega[3][3]", [[hexadecimal(float(n)) for n in one] for one in omega]),
+        rows("range[][2]", ranges or [[0.0, 0.0]]),
+        rows("parent[][2]", kernel.parents or [(0, 0)]),
+        rows("pair[][2]", kernel.pairs),
+        rows("place[3][3]", SLOT),
+        rows("omega[3][3]", np.asarray(omega, float).tolist()),
         f"static const int row[6] = {{{', '.join(str(i) for i, _ in PAIRS)}}};",
         f"static const int column[6] = {{{', '.join(str(j) for _, j in PAIRS)}}};",
-        rows(
-            "real",
-            f"table[PRODUCTS][{TABLE_SUMS}]",
-            [[hexadecimal(float(n)) for n in one] for one in kernel.table.T],
-        ),
+        rows(f"table[PRODUCTS][{TABLE_SUMS}]", kernel.table.T.tolist()),
     ]
     return c_template("magbridge_calibration.c").substitute(
         id=f"{calibration_id(calibration):08x}",
@@ -83,6 +70,15 @@ def c_template(name: str) -> Template:
     return Template(files("magbridge.calibration").joinpath("c_templates", name).read_text("utf-8"))
 
 
+def inputs(kind: str, channels: Sequence[Parameter | ScalarChannel]) -> str:
+    """Return a C comment for each telemetry input: its number, name, unit and calibrated range."""
+    return "\n".join(
+        f"/* {kind} {k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}".replace("*/", "")
+        + " */"
+        for k, one in enumerate(channels)
+    )
+
+
 def hexadecimal(number: float) -> str:
     """Return a C99 hexadecimal constant that equals the number to the last bit."""
     return f"(real){number.hex()}"
@@ -93,10 +89,9 @@ def reals(name: str, numbers: Sequence[float]) -> str:
     return f"static const real {name} = {{{', '.join(map(hexadecimal, numbers))}}};"
 
 
-def rows(kind: str, name: str, table: Sequence[Sequence[str]]) -> str:
-    """Return the C definition of the constant table `name`, with elements of the C type `kind`.
-
-    `table`: the elements, row by row, as C text.
-    """
-    lines = ",\n".join(f"    {{{', '.join(row)}}}" for row in table)
-    return f"static const {kind} {name} = {{\n{lines}\n}};"
+def rows(name: str, table: Sequence[Sequence[float]]) -> str:
+    """Return the C definition of the constant table `name`; of type ``int`` if all elements are integers."""
+    whole = all(isinstance(one, int) for row in table for one in row)
+    texts = [", ".join(str(one) if whole else hexadecimal(one) for one in row) for row in table]
+    lines = ",\n".join(f"    {{{text}}}" for text in texts)
+    return f"static const {'int' if whole else 'real'} {name} = {{\n{lines}\n}};"

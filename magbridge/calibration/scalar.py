@@ -28,6 +28,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import PAIRS, robust_scale, symmetric
 
 __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "IMPOSSIBLE_FRACTION", "PLATFORM_TERMS", "RANGE_MARGIN",
@@ -49,8 +50,6 @@ MAX_MOVE_INTERVALS = 3.0
 """Intervals between two readings, across which a moved reading is not interpolated."""
 RANGE_MARGIN = 0.02
 """Fraction of a channel's range by which telemetry may exceed it without a flag."""
-INDUCED_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Row and column of the six entries of the symmetric I."""
 JUMP_SIGMA = 8.0
 """Change from one sample to the next, in robust standard deviations of the changes, that is a jump."""
 DISAGREEMENT_SIGMA = 4.0
@@ -235,7 +234,7 @@ def scalar_design(
     turn = _rate(u, series.time)  # du/dt, 1/s
     ratio = length / reference_field
     columns = [*u.T]
-    columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in INDUCED_PAIRS]
+    columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in PAIRS]
     columns += [u[:, i] * turn[:, j] for i in range(3) for j in range(3)]
     smooth = series.reference if np.isfinite(series.reference).any() else series.scalar
     known = np.isfinite(smooth)
@@ -337,9 +336,7 @@ def unknown_direction_variance(sensor: ScalarSensor, channels: FloatArray) -> Fl
     all directions, and of z_k c_k are added: an upper bound of each term's square.
     """
     mean = np.array(sensor.coefficients)
-    induced = np.zeros((3, 3))
-    for (i, j), value in zip(INDUCED_PAIRS, mean[PLATFORM_COLUMNS["induced"]], strict=True):
-        induced[i, j] = induced[j, i] = value
+    induced = symmetric(mean[None, PLATFORM_COLUMNS["induced"]])[0]
     induced -= np.trace(induced) / 3.0 * np.eye(3)
     constant = float((mean[PLATFORM_COLUMNS["permanent"]] ** 2).sum() + (induced**2).sum())
     z = np.array([(channels[:, k] - one.centre) / one.scale for k, one in enumerate(sensor.channels)])
@@ -432,12 +429,13 @@ def _expected_field(
     if len(rows) < MIN_AGREEING_SAMPLES:
         return reference, REFERENCE_SIGMA_NT
     crust = (mean - base)[rows]
-    sigma = 1.4826 * float(np.median(np.abs(crust - np.median(crust))))
-    return base + np.interp(np.arange(len(mean)), rows, crust), min(sigma, REFERENCE_SIGMA_NT)
+    sigma = min(robust_scale(crust - np.median(crust)), REFERENCE_SIGMA_NT)
+    return base + np.interp(np.arange(len(mean)), rows, crust), sigma
 
 
 def _jumps(values: FloatArray) -> BoolArray:
     """Return where values (n,), nT, change by far more than they usually do from one sample to the next."""
     change = np.abs(np.diff(values, prepend=values[:1]))
-    usual = 1.4826 * np.nanmedian(change) if np.isfinite(change).any() else 0.0
+    known = change[np.isfinite(change)]
+    usual = robust_scale(known) if len(known) else 0.0
     return np.asarray(np.nan_to_num(change) > JUMP_SIGMA * max(usual, 1e-3))

@@ -254,7 +254,7 @@ def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
     cli.note_unused_grid(truth.grid, deployment)
     found, data, worth = _fit(request, logs, deployment, site_bias, start)
     if request.plot:
-        from magbridge.calibration.fitting.draw import draw_fit
+        from magbridge.plot import draw_fit
 
         draw_fit(found.calibration, data, request.plot)
     if not found.supported:

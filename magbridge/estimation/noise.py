@@ -64,19 +64,6 @@ class NoiseModel:
         """Number of outliers."""
         return 0 if self.weight is None else int((self.weight == 0.0).sum())
 
-    def whiten(self, values: FloatArray, steps: FloatArray) -> FloatArray:
-        """Return values (n, ...) whitened, so that their noise is white with standard deviation `sigma`.
-
-        `values` (n, ...): Residuals, or columns of their Jacobian. `steps` (n,): sampling intervals since
-        the previous sample; infinite at the first of a run.
-        """
-        return Whitening(steps, *self.shape).apply(values)
-
-    def log_det(self, steps: FloatArray) -> float:
-        """Return the log-determinant of the covariance of n samples, nT²; `steps` (n,) as in `whiten`."""
-        variance = Whitening(steps, *self.shape).variance
-        return float(np.log(variance).sum() + 2.0 * len(steps) * np.log(self.sigma))
-
 
 class Whitening:
     """Whitening of noise of unit variance, applied to successive blocks of rows.

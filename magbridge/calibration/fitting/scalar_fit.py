@@ -54,6 +54,7 @@ from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_bl
 from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.priors import PriorFamily
+from magbridge.estimation.residual import robust_scale
 
 __all__ = ["ScalarFit", "adapt_to_log", "fit_scalar", "is_significant"]
 
@@ -224,7 +225,7 @@ def _agreeing(
         root = np.sqrt(weight)
         found = np.linalg.lstsq(design[valid] * root[valid, None], (difference * root)[valid], rcond=1e-10)[0]
         residual = np.abs(difference - design @ found)
-        usual = max(1.4826 * float(np.median(residual[valid])), 1e-3)
+        usual = max(robust_scale(residual[valid]), 1e-3)
         weight = 1.0 / np.maximum(residual, usual)
     return np.asarray(valid & (residual <= WITNESS_SIGMA * usual))
 
@@ -469,7 +470,7 @@ class _ScalarProblem:
     def starts(self, *, map_known: bool) -> list[FloatArray]:
         """Return the starts of the search: logs of the amplitudes, nT, and of the crustal time scale, s."""
         rough = np.diff(self.target) / np.sqrt(2.0)
-        white = np.log(max(1.4826 * float(np.median(np.abs(rough))), 1e-3))
+        white = np.log(max(robust_scale(rough), 1e-3))
         crust = [] if map_known else LOG_CRUST_CENTRES
         slow = [np.full(len(TIME_CONSTANTS_S), np.log(amplitude)) for amplitude in NOISE_STARTS_NT]
         return [np.concatenate([[white], processes, crust]) for processes in slow]
@@ -479,8 +480,7 @@ class _ScalarProblem:
         part = self.part(kept)
         y, X, _ = part.whiten(state.log_noise)
         residual = y - X @ state.mean
-        scale = 1.4826 * float(np.median(np.abs(residual)))
-        large = np.abs(residual) > OUTLIER_INNOVATION_SIGMA * max(scale, 1.0)
+        large = np.abs(residual) > OUTLIER_INNOVATION_SIGMA * max(robust_scale(residual), 1.0)
         padded = np.convolve(large, np.ones(2 * OUTLIER_PAD + 1), mode="same") > 0.5
         out = np.zeros(len(kept), bool)
         out[np.flatnonzero(kept)[padded]] = True

@@ -14,7 +14,7 @@ from magbridge.calibration.fitting.result import Fit
 from magbridge.columns import CHANNELS
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import rms
+from magbridge.estimation.residual import rms, robust_scale
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -63,8 +63,10 @@ def heterogeneous_logs(
     `data`: samples of the fit. `found`: the fit to all logs; None if it collapsed. `refit`: function that
     fits a part of the data in the same way.
     """
-    if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
-        return None  # the residuals are noise from one sample to the next
+    if len(logs) < 2:
+        return None
+    if found and found.rms < MAX_JOINT_RMS_RATIO * robust_scale(np.diff(found.residual)) / 2.0**0.5:
+        return None  # the residuals are noise from one sample to the next, as white noise is
     # compare the residual of one common fit with those of a fit to each of the largest logs
     which = source_of(logs, data.time)
     count = np.bincount(which[which >= 0], minlength=len(logs))
@@ -91,11 +93,6 @@ def _sampled(log: xr.Dataset) -> FloatArray:
         return np.empty(0)
     whole = np.logical_and.reduce([log[name].notnull().to_numpy() for name in CHANNELS])
     return np.asarray(log["time"].to_numpy()[whole], float)
-
-
-def _scatter(residual: FloatArray) -> float:
-    """Return the robust 1-sigma of a residual, nT, from its steps between samples, as for white noise."""
-    return float(np.median(np.abs(np.diff(residual)))) / (0.6745 * 2.0**0.5) if len(residual) > 1 else 0.0
 
 
 def _moving(data: Observations) -> Observations:
