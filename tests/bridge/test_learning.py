@@ -104,12 +104,6 @@ def test_what_was_learned_is_announced_and_named_in_every_message(flight: Flight
     assert any(message["text"].startswith("learned ") for message in named(messages, "STATUSTEXT"))
 
 
-def test_the_same_events_give_the_same_bytes(flight: Flight, tmp_path: Path) -> None:
-    """A replay with in-flight calibration gives the same bytes."""
-    again = bridge(tmp_path)
-    assert [one for event in events(tmp_path) for one in again.feed(event)] == flight[2]
-
-
 def test_ashore_it_learns_what_it_learned_live(flight: Flight, command: Command) -> None:
     """Offline, the bridge's own log gives the same calibration bit for bit."""
     folder, pipeline, sent = flight
@@ -155,16 +149,6 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
     assert learner.frozen
     order("MB_LEARN", 0.0)
     assert not learner.enabled
-
-
-def test_it_is_off_unless_asked_for(tmp_path: Path) -> None:
-    """Without the table, there is no in-flight calibration; with the table, it waits until it is enabled."""
-    assert bridge(tmp_path, "").learning is None
-    waiting = bridge(tmp_path, "[learning]\n")
-    for event in events(tmp_path)[:300]:
-        waiting.feed(event)
-    assert waiting.learning is not None
-    assert waiting.learning.learner.samples == 0
 
 
 def test_the_causes_bits_are_those_of_the_dialect() -> None:
@@ -291,11 +275,3 @@ def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown:
     assert path.read_bytes() == before
     kept_after_restart(folder, learning)
     assert not left.exists()
-
-
-def test_one_that_somebody_cut_short_is_not_read(flown: Flown) -> None:
-    """The bridge starts with its first calibration, and writes the learned one again."""
-    folder, _, learning = flown
-    (folder / "cal-learned.json").write_text('{"format": "magbri', encoding="utf-8")
-    kept_after_restart(folder, learning)
-    assert calibration_id(load(folder / "cal-learned.json")) == calibration_id(learning.learner.calibration)

@@ -17,7 +17,7 @@ from fed import logged, named, received, texts
 from small import START, small_bridge
 
 from magbridge import logs
-from magbridge.bridge.events import Event, HostClock, StartEvent, clock_step, declarations, standstill
+from magbridge.bridge.events import Event, HostClock, StartEvent, clock_step, standstill
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.run import SAVE_US, Keeper
 from magbridge.bridge.run import load_state as kept
@@ -102,22 +102,6 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
         }
     )
     assert f"begins {recorded.late:.1f} s into the run" in words
-
-
-def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
-    """After a pause, the sensor's bytes of a second arrive in one read and fill many records."""
-    pipeline = small_bridge(tmp_path)
-    fed = list(events(pipeline, 0, 60))
-    lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
-    header = declarations(1, 191, pipeline._config.telemetry, 0.0)
-    backlog = [Event(fed[-1].time_us, Channel.SENSOR, lines)]
-    sent = logged(pipeline, backlog, tmp_path / "logs", header=header, max_size=1e-3)
-    files = sorted((tmp_path / "logs").iterdir())
-    assert len(files) > 2
-    recorded = Recorded(files)
-    assert [event.data for event in recorded.events() if event.data] == [lines]
-    again = small_bridge(tmp_path, start=recorded.start)
-    assert [frame for event in recorded.events() for frame in again.feed(event)] == sent
 
 
 # ---- Parameters set over the link are kept on the disk, which the sensor must not wait for too often -----

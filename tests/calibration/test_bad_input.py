@@ -12,7 +12,6 @@ from commands import Command
 from demos import demo_log
 
 from magbridge.cli import main
-from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import write
 from sitl import segments
 
@@ -76,13 +75,6 @@ def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
     assert words in output
     assert output.startswith("bad.csv: ")
     assert not Path("cal.json").exists()
-
-
-def test_positions_outside_the_grid(good: tuple[Path, Path], command: Command) -> None:
-    axis = np.arange(10.0, 11.0, 0.1)
-    AnomalyGrid(axis, axis, np.zeros((len(axis), len(axis)))).save("far.nc")
-    output = command.refuses("calibrate", good[0], *PARAMETERS, "--grid", "far.nc", "-o", "cal.json")
-    assert "far.nc" in output
 
 
 def test_a_run_given_twice_counts_once(good: tuple[Path, Path], command: Command) -> None:

@@ -57,14 +57,6 @@ def test_info_says_what_is_missing() -> None:
     assert "never known: depth" in facts["hints"]
 
 
-def test_info_counts_gaps_and_rates() -> None:
-    time = START + np.concatenate([np.arange(10.0), 30.0 + np.arange(10.0)])
-    facts = info(made("log", time, {"pump": np.repeat([1.0, 2.0, 1.0, 2.0], 5)}, {"pump": "A"}))
-    assert (facts["rate_hz"], facts["gaps"], facts["longest_gap_s"]) == (1.0, 1, 21.0)
-    (pump,) = facts["columns"]
-    assert (pump["unit"], pump["known"], pump["lowest"], pump["highest"]) == ("A", 1.0, 1.0, 2.0)
-
-
 def test_seconds_too_few_to_be_since_1970_count_from_a_start() -> None:
     """The rule also holds for magbridge's column names, because a log of 1970 is not plausible."""
     facts = info(made("log", [0.0, 0.5], {"mag_x": [1.0, 2.0]}))
@@ -151,15 +143,6 @@ def test_compasses_that_are_columns_are_listed(command: Command) -> None:
     output = command("info", "two.csv")
     assert "compass 0: 2 Hz, 9 samples, read as mag_x mag_y mag_z" in output.out
     assert "compass 2: 2 Hz, 9 samples\n" in output.out
-
-
-def test_what_was_lost_is_named(command: Command) -> None:
-    rows = [f"{START + k},{k}\n" for k in range(9)]
-    Path("one.csv").write_text("".join(["time,depth\n", *rows, f"{START},3\n"]))
-    reported = command("info", "one.csv").err
-    assert "in the logs: 1 row dropped" in reported
-    assert "row 11" in reported
-    assert "row 11" in command.json("info", "one.csv")["one.csv"]["losses"][0]
 
 
 def test_a_log_without_a_date_is_given_one(here: Path, command: Command) -> None:

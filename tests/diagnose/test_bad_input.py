@@ -63,11 +63,6 @@ def test_a_full_disk_names_the_file_that_has_no_room(found: Found, tmp_path: Pat
         assert not list(tmp_path.iterdir())
 
 
-def test_a_number_beyond_all_measure_is_not_a_reading(plain: Plain) -> None:
-    wild = plain[0].assign(mag_x=plain[0]["mag_x"].where(some(plain[0], 10), 1e300))
-    assert diagnose([wild], plain[1]).diagnosis.verdict == "nothing_found"
-
-
 def test_how_old_a_parameter_was_is_not_telemetry(plain: Plain) -> None:
     """A bridge's log has the age of a parameter, to which the field cannot respond."""
     aged = plain[0].assign(age_battpos=plain[0]["time"] % 3.0)
@@ -171,12 +166,6 @@ def test_a_place_is_in_metres_on_the_ellipsoid(plain: Plain) -> None:
     track = track[np.isin(ds["time"], survey.time)]
     assert survey.place is not None
     np.testing.assert_allclose(survey.place[:, :2], track - np.median(track, axis=0), atol=0.1)
-
-
-def test_without_dives_no_dives_are_reported_as_held_out(plain: Plain) -> None:
-    ds, calibration = plain
-    assert load_survey([ds], calibration).parts == "dives"
-    assert load_survey([ds.drop_vars(["depth", "run"])], calibration).parts == "eighths of the log"
 
 
 def test_another_magnetometer_is_not_telemetry(plain: Plain) -> None:

@@ -32,14 +32,6 @@ def test_information_of_independent_data_adds() -> None:
     assert (both.constant, both.n) == pytest.approx((exact.constant, exact.n))
 
 
-def test_noise_of_another_size_scales_the_information() -> None:
-    expected = information_of(J / 3.0, Y / 3.0)
-    scaled = information_of(J, Y).divided(3.0)
-    np.testing.assert_allclose(scaled.precision, expected.precision)
-    np.testing.assert_allclose(scaled.vector, expected.vector)
-    assert scaled.constant == pytest.approx(expected.constant)
-
-
 def test_the_quadratic_at_a_point_is_that_of_the_data() -> None:
     """Cost, half gradient and half Hessian of ``|J z - y|^2`` at any z give the information at z = 0."""
     z = np.array([0.3, -1.2, 2.0, 0.1])

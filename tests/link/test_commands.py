@@ -98,12 +98,6 @@ def test_to_everybody_we_do_only_what_only_we_can(link: Line) -> None:
     assert len(link.only(received, "MAG_STATUS")) == 1
 
 
-def test_command_int(link: Line) -> None:
-    link.asked = REQUEST
-    received = link.send_message("command_int", 1, 191, 0, REQUEST, 0, 0, STATUS, 0, 0, 0, 0, 0, 0)
-    assert result(link, received) == ACCEPTED
-
-
 def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Line) -> None:
     """The flood requests metadata: the bridge replies to the first hundred requests in a second."""
     results = [result(link, link.command(REQUEST, METADATA)) for _ in range(300)]

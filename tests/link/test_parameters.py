@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from line import Line, MakeLine
 
-from magbridge.bridge.run import StoredState, load_state, save_state
+from magbridge.bridge.run import load_state
 from magbridge.config import Align, Telemetry
 from magbridge.errors import FormatError
 from magbridge.link.parameters import Parameters, Tunable, alignment, rates, real32, telemetry_ages
@@ -125,15 +125,6 @@ def test_a_default_read_and_written_back_stays_exact() -> None:
     parameters.set("MB_MOVING_RATE", 0.25)
     parameters.set("MB_MOVING_RATE", real32(exact))
     assert parameters["MB_MOVING_RATE"] == exact
-
-
-def test_store(tmp_path: Path) -> None:
-    path = tmp_path / "parameters.json"
-    assert load_state(path) == StoredState()
-    kept = StoredState({"MB_GAP_FACTOR": real32(0.1)}, 12345678901234)
-    save_state(path, kept)
-    assert load_state(path) == kept
-    assert [one.name for one in tmp_path.iterdir()] == ["parameters.json"]
 
 
 @pytest.mark.parametrize(

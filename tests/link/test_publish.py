@@ -112,12 +112,6 @@ def test_rates(make_link: MakeLine) -> None:
     assert len(received) == pytest.approx(100, abs=1)
 
 
-def test_the_latest_sample_on_request(line: Line) -> None:
-    publish(line, sample())
-    received = line.command(512, 105)
-    assert [one.get_type() for one in received] == ["HIGHRES_IMU", "COMMAND_ACK"]
-
-
 # ---- Rates, timers and announcements in event time -------------------------------------------------------
 
 

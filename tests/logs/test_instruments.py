@@ -265,12 +265,3 @@ def test_a_log_without_a_position_is_not_written_for_survey_programs(tmp_path: P
     with pytest.raises(FormatError, match=r"out\.magarrow\.csv: column 'latitude': expected this column"):
         write(survey().drop_vars("latitude"), path)
     assert not list(tmp_path.iterdir())
-
-
-def test_names_of_survey_lines_become_numbers(tmp_path: Path) -> None:
-    path = tmp_path / "sea.csv"
-    rows = [(0, "L10"), (1, "L10"), (2, "north tie"), (3, "L20"), (4, "L10"), (5, "")]
-    text = "".join(f"9-Sep-2020,12:00:0{k},5000{k}.0,56.0,24.1,{name}\n" for k, name in rows)
-    path.write_text("Reading_Date,Reading_Time,Magnetic_Field,Mag_Latitude,Mag_Longitude,Line_Name\n" + text)
-    lines = mb.read(path)["line"].to_numpy()
-    np.testing.assert_array_equal(lines, [10.0, 10.0, 1_000_001.0, 20.0, 10.0, np.nan])

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import Command
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -112,16 +111,6 @@ def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
     assert named == [f"{paths[1]}: expected text in UTF-8"]
 
 
-def test_what_was_lost_is_reported_in_a_few_lines(tmp_path: Path, command: Command) -> None:
-    paths = made(tmp_path, 12, tuple(range(1, 9)))
-    lines = command("convert", *paths, "-o", tmp_path / "x.nc").err.splitlines()
-    assert lines[0] == "magbridge: in the logs: 8 files skipped"
-    assert lines[1] == f"magbridge: {paths[1]}: row 2: expected rows after the header"
-    assert lines[-1] == "magbridge: and in 3 places more"
-    assert len(lines) == 7
-    assert not {"losses", "files_skipped"} & logs.read(tmp_path / "x.nc").attrs.keys()
-
-
 def test_a_file_is_what_its_bytes_say(tmp_path: Path) -> None:
     rows = deployment("made", T0 + np.arange(5.0), {"mag_x": np.arange(5.0)})
     for suffix in (".mcap", ".nc", ".parquet", ".tlog"):
@@ -154,14 +143,3 @@ def test_a_log_rewritten_again_and_again_names_itself_and_where_it_began(tmp_pat
     (tmp_path / "a.nc").unlink()
     (tmp_path / "ba.nc").rename(tmp_path / "a.nc")  # within the other's name
     assert logs.read(tmp_path / "a.nc").attrs["source"] == "a.nc (comet, driven by (old) p.nc)"
-
-
-def test_a_log_rewritten_from_several_names_them_all(tmp_path: Path) -> None:
-    for k, name in enumerate("ab"):
-        logs.write(deployment("comet, driven by p.nc", [float(k)], {}), tmp_path / f"{name}.nc")
-    both = "a.nc (comet, driven by p.nc), b.nc (comet, driven by p.nc)"
-    whole = logs.read([tmp_path / "a.nc", tmp_path / "b.nc"])
-    assert whole.attrs["source"] == both
-    logs.write(whole, tmp_path / "c.nc")
-    logs.write(logs.read(tmp_path / "c.nc"), tmp_path / "d.nc")
-    assert logs.read(tmp_path / "d.nc").attrs["source"] == f"d.nc ({both})"

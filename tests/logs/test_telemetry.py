@@ -103,18 +103,6 @@ def test_only_the_vehicle_with_the_magnetometer_counts(tmp_path: Path) -> None:
     assert "other" not in back
 
 
-def test_the_best_magnetometer_makes_the_rows(tmp_path: Path) -> None:
-    log = Log()
-    for k in range(3):
-        log.write_message(k, "SCALED_IMU2", xmag=5)
-        log.mag(k + 0.1, 7)
-        log.write_message(k + 0.2, "HIGHRES_IMU", xmag=0.5, ymag=0.25, zmag=-0.125)
-    back = log.read(tmp_path)
-    np.testing.assert_array_equal(back["mag_x"], [50_000] * 3)
-    np.testing.assert_array_equal(back["mag1_x"], [700] * 3)
-    np.testing.assert_array_equal(back["mag2_x"], [500] * 3)
-
-
 def test_without_a_magnetometer_attitude_makes_the_rows(tmp_path: Path) -> None:
     log = Log()
     for k in range(3):

@@ -358,14 +358,6 @@ def test_parquet_with_letters_next_to_its_places_and_a_time_in_two_columns(tmp_p
 THEIRS = "Zeit;Bx [mG];By [mG];Bz [mG];Batt;Kurs\n2022-05-04T12:00:00Z;300,0;50,0;450,0;12,7;90\n"
 
 
-def test_a_declared_unit_goes_before_the_heading(tmp_path: Path) -> None:
-    text = "time,Bx(raw),Hdg(mag)\n1600000000,20000,0.1\n"
-    assert read(tmp_path, text).attrs["heading_reference"] == "magnetic"
-    declared = read(tmp_path, text, column=("heading=Hdg(mag) [rad]", "mag_x=Bx(raw) [mG]"))
-    assert float(declared["heading"][0]) == pytest.approx(np.degrees(0.1))
-    assert float(declared["mag_x"][0]) == 2_000_000.0
-
-
 HEIGHTS = ["altitude [m]", "altitude [ft]", "alt_ft", "GPS height", "Altitude_m", "alt_msl"]
 
 

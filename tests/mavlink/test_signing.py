@@ -91,16 +91,6 @@ def test_a_forged_packet_from_the_future_locks_out_no_peer(before: bool) -> None
     assert signing(listener).last < timestamp(NOW + 10**9)
 
 
-def test_stamps_increase_even_when_the_clock_goes_back() -> None:
-    one = codec()
-    listener = codec()
-    for now in (NOW, NOW, NOW - 10**9, NOW + 5):
-        one.now_us = now
-        assert listener.parse(text(one))[0].known
-    resumed = Codec(1, 191, Signing(KEY, last=signing(one).last))
-    assert listener.parse(text(resumed))[0].known
-
-
 def test_key_file_and_who_may_read_it(tmp_path: Path) -> None:
     path = tmp_path / "key.bin"
     with pytest.raises(FormatError, match="there is none"):

@@ -15,7 +15,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate import NavigationOptions, Navigator
 from magbridge.navigate.batch import navigate
-from magbridge.navigate.draw import draw_navigation, measured_on_track
+from magbridge.navigate.draw import measured_on_track
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +59,6 @@ def test_a_batch_is_the_live_filter(
             break
     np.testing.assert_array_equal([r.latitude for r in records], result["latitude"][:100])
     np.testing.assert_array_equal([r.innovation for r in records], result["innovation"][:100])
-
-
-def test_its_picture(result: xr.Dataset, grid: AnomalyGrid, tmp_path: Path) -> None:
-    draw_navigation(result, grid, tmp_path / "track.png")
-    assert (tmp_path / "track.png").stat().st_size > 40_000
 
 
 def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result: xr.Dataset) -> None:

@@ -189,14 +189,6 @@ def test_unseen_losses_are_counted(rate: float, jitter: float) -> None:
     assert np.median(np.abs(error)) < 3_000
 
 
-def test_a_pause_without_a_clock() -> None:
-    true = np.concatenate([np.arange(0.0, 60.0, 0.1), 75.03 + np.arange(0.0, 60.0, 0.1)])
-    made = stamps(DeviceClock(period=0.1), np.full(true.size, nan), arrivals(true, 2e-3))
-    assert made[600].missing in (150, 151)
-    assert flags(made) == (0, 0, made[600].missing)
-    assert np.abs(error_us(made, true)[600:]).max() < 15_000
-
-
 def test_an_irregular_instrument_is_dated_by_arrival() -> None:
     clock = DeviceClock()
     assert [update(clock, nan, EPOCH + t).time_us - EPOCH for t in (0, 70_003, 70_003, 90_000)] == [

@@ -102,7 +102,7 @@ def left_over(found: Result, truth: FloatArray) -> float:
 
 @pytest.fixture(scope="module")
 def flown() -> Grid:
-    return grid()
+    return grid(side=800.0)
 
 
 def test_shift_and_heading_error_are_found(flown: Grid) -> None:
