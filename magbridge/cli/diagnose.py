@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -83,6 +84,23 @@ def diagnose(
     cli.print_result(facts, f"{lines}\nreport: {output / 'report.html'}", json)
 
 
+@cache
+def _texts() -> Any:
+    """Return the module of the template ``diagnose.txt``."""
+    from jinja2 import Environment, PackageLoader
+
+    from magbridge.diagnose.observed import WHITE
+    from magbridge.diagnostics import number
+
+    def plain(cause: dict[str, Any]) -> str:
+        return f"{cause['cause']} ({cause['channel']})" if cause["channel"] else str(cause["cause"])
+
+    engine = Environment(loader=PackageLoader("magbridge.cli", ""))  # noqa: S701 - text has nothing to escape
+    engine.filters |= {"plain": plain, "number": number}
+    engine.globals["WHITE"] = WHITE
+    return engine.get_template("diagnose.txt").module
+
+
 def summary(facts: dict[str, Any], parts: str) -> str:
     """Return the findings as lines: the verdict with RMS errors, the fitness for use, and each cause.
 
@@ -93,60 +111,12 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     parts : str
         Description of the parts that were held out to measure the RMS after extension; empty if none was.
     """
-    from magbridge.diagnostics import number
-
-    before, after = (number(facts[f"rms_{when}_nT"]) for when in ("before", "after"))
-    use, improvement = facts["assessment"], facts["improvement"]
-    low, high = improvement["interval"]
-    if use["reason"] == "nothing_added":
-        rms = f"{before} nT RMS" + ", not held out" * (not parts) + "; nothing is added to the calibration"
-    else:
-        rms = f"error of the corrected field {before} -> {after} nT RMS, "
-        rms += f"on {parts} left out of the fit" if parts else "not held out"
-        rms += f" ({low:.2f} to {high:.2f} times, 95 %)" + ": no improvement is shown" * (high >= 1.0)
-        rms += f"; {number(improvement['refit_nT'])} nT by a refit of the calibration alone"
-    verdict = "nothing needs explaining" if use["reason"] == "not_needed" else facts["verdict"]
-    fit = f"fit for use: {use['fit_for_use']}. {use['summary']}"
-    scalar = [one["text"] for one in facts["scalar"]]
-    return "\n  ".join([f"{verdict}: {rms}", fit, *causes_of(facts), *scalar])
+    return "\n  ".join(_texts().summary(facts, parts).splitlines())
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
     """Return a line for each cause found, with its alternatives, and a line for the unexplained residual."""
-    from magbridge.diagnose.observed import WHITE
-    from magbridge.diagnostics import number
-
-    causes = []
-    warnings = [*facts["assessment"]["warnings"], []]  # none of outliers, which stand last
-    for one, notes in zip(facts["findings"], warnings, strict=False):
-        codes = {note["code"] for note in notes}
-        walks = ["noise that wanders"] * ("random_walk" in codes)
-        others = " or ".join([*map(_plain, one["alternatives"]), *walks])
-        lines = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
-        lines += "; no improvement is shown" * ("no_improvement" in codes)
-        causes.append(lines + f"; or {others}" * bool(others))
-    if rest := facts["unexplained"]:
-        lines = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
-        left = facts["assessment"]["residual"]
-        own = f"{number(rest['rms_nT'])} of " if rest["rms_nT"] is not None else ""
-        lines += f", {own}{number(left['rms_nT'])} nT RMS"
-        lines += f", lasts {rest['correlation_time_s']:.3g} s" * (left["white_nT"] < WHITE * left["rms_nT"])
-        within = ", ".join(map(_plain, rest["alternatives"]))
-        causes.append(f"{lines}{_followed(rest['follows'])}" + f"; resembles {within}" * bool(within))
-    return causes or ["no cause"]
-
-
-def _followed(series: dict[str, Any] | None) -> str:
-    """Return the text about the series that an effect is correlated with: channel, lag and axis."""
-    if not series:
-        return ""
-    late = f" {series['lag_s']:g} s late" * bool(series["lag_s"])
-    along = f" along {series['axis']}" * bool(series["axis"])
-    return f", follows {series['channel']}{late}{along}" if series["channel"] else f",{along}" * bool(along)
-
-
-def _plain(cause: dict[str, Any]) -> str:
-    return f"{cause['cause']} ({cause['channel']})" if cause["channel"] else str(cause["cause"])
+    return list(_texts().causes(facts).splitlines())
 
 
 def _suspect(log: xr.Dataset) -> Iterator[str]:
