@@ -47,7 +47,8 @@ def check(path: Path) -> tuple[int, list[Finding]]:
     text = path.read_text(encoding="utf-8")
     is_page = path.suffix == ".md"
     words, findings = 0, []
-    for line, sentence in set(_page(text) if is_page else _code(text)):
+    read = {".md": _page, ".toml": _catalogue}.get(path.suffix, _code)
+    for line, sentence in set(read(text)):
         words += len(sentence.split())
         for rule, (pattern, advice) in RULES.items():
             hits = re.finditer(pattern, sentence, flags=re.MULTILINE)
@@ -108,9 +109,16 @@ def _code(text: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string.lstrip("# ")
 
 
+def _catalogue(text: str) -> Iterator[tuple[int, str]]:
+    """Yield 1 and each text of a catalogue of messages: a TOML file with tables of texts."""
+    for table in tomllib.loads(text).values():
+        for message in table.values():
+            yield 1, message
+
+
 def checkout() -> list[Path]:
-    """Return the Markdown pages and Python modules of the checkout, without generated and quoted files."""
-    command = ["git", "ls-files", "*.md", "*.py"]
+    """Return the Markdown pages, Python modules and messages, without generated and quoted files."""
+    command = ["git", "ls-files", "*.md", "*.py", "magbridge/diagnostics.toml"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
     skipped = (*GENERATED, *QUOTED)
     return [ROOT / name for name in listed if name not in skipped and (ROOT / name).is_file()]
