@@ -17,7 +17,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, validity_of, without_invalid
-from magbridge.logs.clocks import BY_HOUR, CountState, TimeFormat, clock_of, date_order, seconds
+from magbridge.logs.clocks import BY_HOUR, SUMS, CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.layout import BLANKS, EMPTY_CELLS, LAYOUT_LINES, Layout, Rows, cells
 from magbridge.logs.naming import HEMISPHERES, calendar_of
 from magbridge.records import Quality
@@ -86,6 +86,7 @@ class TableReader:
         ]
         self._rules += found
         self._first_number, self._counter = 1, CountState()
+        self._date, self._has_stayed = "", False
         self._lines: dict[str, float] = {}
         first = rows[: max(LAYOUT_LINES - layout.first, 1)]
         self._clock, notes = (clock, []) if clock else clock_by(path, layout, first)
@@ -187,10 +188,7 @@ class TableReader:
         if self._layout.rate:  # a dropped row also takes up its interval
             rows = np.asarray(numbers, np.float64) - self._first_number
             return rows / self._layout.rate, np.zeros(len(rows), bool)
-        first, *others = self._layout.stamp
-        column = frame[first]
-        for k in others:
-            column = column.str.strip() + " " + frame[k].str.strip()
+        column = _joined_cells(frame, self._layout.stamp)
         if self._layout.decimal == "," and not pd.api.types.is_numeric_dtype(column):
             column = column.str.replace(",", ".")
         times = seconds(self._clock, column)
@@ -200,11 +198,33 @@ class TableReader:
             if boots:
                 again = counted(boots, "time")
                 self.faults.remark(f"{self._path}: the clock started again {again}: each part is a run")
+        elif self._clock.is_dated and self._clock.kind not in SUMS and len(self._layout.stamp) > 1:
+            times = self._past_midnights(frame, times)
         times[times == self._fill] = np.nan
         times += self._start
         self.faults.count("time", len(times))
         self.faults.note("time", wrong, numbers, f"expected {self._clock.expected}", column.to_numpy())
         return times, wrong
+
+    def _past_midnights(self, frame: pd.DataFrame, times: FloatArray) -> FloatArray:
+        """Return the times (n,), s, continued past a midnight at which the column of the date does not change.
+
+        From the next change of the date on, the date counts again.
+        """
+        stamp = self._layout.stamp
+        # the columns before hour, minute and second, or before the time of day
+        dates = _joined_cells(frame, stamp[:-3] or stamp[:-1]).ffill().fillna("").to_numpy()
+        starts = [0, *(np.flatnonzero(dates[1:] != dates[:-1]) + 1).tolist()] if len(times) else []
+        continued = times.copy()
+        for start, end in zip(starts, [*starts[1:], len(times)], strict=False):
+            if dates[start] != self._date:
+                self._date, self._counter = dates[start], CountState()
+            continued[start:end], self._counter, _ = self._counter.go_on(times[start:end], self._clock)
+            if self._counter.shift_s and not self._has_stayed:
+                self._has_stayed = True
+                why = f"the date stays {self._date} when the clock passes midnight"
+                self.faults.remark(f"{self._path}: {why}: the next day is read")
+        return continued
 
     def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
         if name == "quality" and not pd.api.types.is_numeric_dtype(column):
@@ -286,6 +306,15 @@ def start_by(layout: Layout, clock: TimeFormat, rows: Rows) -> tuple[float, list
     # times cut to whole seconds are early by half a second on average, if several rows share a second
     cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
     return float(np.nanmedian(ahead)) + cut, [f"dated by {' and '.join(map(repr, headings))}"]
+
+
+def _joined_cells(frame: pd.DataFrame, places: Sequence[int]) -> pd.Series:
+    """Return the cells (n,) of a column, or those of several columns joined by blanks."""
+    first, *others = places
+    column = frame[first]
+    for k in others:
+        column = column.str.strip() + " " + frame[k].str.strip()
+    return column
 
 
 def _joined(rows: Rows, places: Sequence[int]) -> list[str]:

@@ -234,6 +234,27 @@ def test_counts_go_on(rows: int, tmp_path: Path) -> None:
     assert np.flatnonzero(np.diff(time) > 1.0).tolist() == [24]
 
 
+@pytest.mark.parametrize("rows", [7, 1 << 16])
+@pytest.mark.parametrize(
+    ("header", "form"),
+    [("date,time,mag_x", "%Y-%m-%d,%H:%M:%S"), ("year,month,day,hour,min,sec,mag_x", "%Y,%m,%d,%H,%M,%S")],
+)
+@pytest.mark.parametrize("late", [4, 2000])
+def test_a_date_that_stays_at_midnight(late: int, header: str, form: str, rows: int, tmp_path: Path) -> None:
+    """The column of the date never changes, or some rows too late; one wrong time costs its own row."""
+    true = pd.date_range("2024-02-28T23:59:30", periods=2000, freq="60s")
+    dates = pd.date_range("2024-02-28T23:59:30", periods=2000, freq="60s") - pd.Timedelta(minutes=late)
+    cells = [
+        f"{max(date, true[0]).strftime(form)[: -len('hh:mm:ss')]}{time.strftime(form)[-len('hh:mm:ss'):]}"
+        for date, time in zip(dates, true, strict=True)
+    ]
+    cells[610] = cells[610][: -len("hh:mm:ss")] + cells[0][-len("hh:mm:ss") :]
+    time, losses = in_pieces(tmp_path, f"{header}\n" + "".join(f"{cell},1\n" for cell in cells), rows)
+    expected = np.delete(true.to_numpy("datetime64[s]").astype(float), 610)
+    np.testing.assert_array_equal(time, expected)
+    assert sum("passes midnight" in line for line in losses) == 1
+
+
 def test_rows_without_times_come_at_a_rate_and_a_bad_one_leaves_its_place(tmp_path: Path) -> None:
     column = ["time=row [20 Hz]", *(f"mag_{axis}=column_{k}" for k, axis in enumerate("xyz", 1))]
     log = read(tmp_path, "187\t-420\t-538\n187\t-420\n190\t-410\t-530\n", name="sphere.txt", column=column)
