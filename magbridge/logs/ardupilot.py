@@ -67,17 +67,17 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
 def _run(fields: Fields, records: dict[str, Records]) -> BootRun:
     parameters: dict[str, float] = {}
     parm = records.get("PARM")
-    if parm is not None and "Name" in parm.texts and "Value" in parm.fields:
-        pairs = zip(parm.texts["Name"], parm.fields["Value"].tolist(), strict=True)
+    if parm is not None and {"Name", "Value"} <= parm.keys():
+        pairs = zip(parm["Name"], parm["Value"].tolist(), strict=True)
         parameters = dict(reversed(list(pairs)))  # as they were at the boot
     chosen = None
-    if (estimator := records.get("XKFS")) is not None and len(estimator.fields.get("MI", ())):
-        numbers, counts = np.unique(estimator.fields["MI"], return_counts=True)
+    if (estimator := records.get("XKFS")) is not None and len(estimator.get("MI", ())):
+        numbers, counts = np.unique(estimator["MI"], return_counts=True)
         chosen = int(numbers[counts.argmax()])  # the compass that the estimator used most
     mags = [
         _magnetometer(number, records_of, parameters, chosen)
         for number, records_of in _instances(records, "MAG").items()
-        if {"MagX", "MagY", "MagZ"} <= records_of.fields.keys()
+        if {"MagX", "MagY", "MagZ"} <= records_of.keys()
     ]
     mags += _survey_magnetometers(records.get(SURVEY), len(mags))
     return BootRun(mags, _telemetry(fields, records), _utc_offset(records))
@@ -85,46 +85,39 @@ def _run(fields: Fields, records: dict[str, Records]) -> BootRun:
 
 def _in_microseconds(name: str, records: Records) -> Records:
     """Return records with ``TimeUS``, µs since the boot, also for ArduPilot up to 3.2, which logs ms."""
-    fields = records.fields
-    if "TimeMS" not in fields or "TimeUS" in fields:
+    if "TimeMS" not in records or "TimeUS" in records:
         return records
-    if name.startswith("GPS"):
-        if not {"T", "Week"} <= fields.keys():
-            return records
-        fields = fields | {"TimeUS": 1e3 * fields["T"], "GWk": fields["Week"], "GMS": fields["TimeMS"]}
-    else:
-        fields = fields | {"TimeUS": 1e3 * fields["TimeMS"]}
-    return records._replace(fields=fields)
+    if not name.startswith("GPS"):
+        return records.scaled({"TimeUS": ("TimeMS", 1e3)})
+    if not {"T", "Week"} <= records.keys():
+        return records
+    return records.scaled({"TimeUS": ("T", 1e3), "GWk": ("Week", 1.0), "GMS": ("TimeMS", 1.0)})
 
 
 def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:
     """Yield the records of each boot."""
-    timed = [one for one in records.values() if "TimeUS" in one.fields]
+    timed = [one for one in records.values() if "TimeUS" in one]
     if not timed:
         return
     at = np.concatenate([one.at for one in timed])
     order = np.argsort(at)
-    time = np.concatenate([one.fields["TimeUS"] for one in timed])[order] * 1e-6
+    time = np.concatenate([one["TimeUS"] for one in timed])[order] * 1e-6
     starts = at[order][boots(time)]
     starts[0] = 0
     ends = [*starts[1:].tolist(), np.iinfo(np.intp).max]
     for first, last in zip(starts.tolist(), ends, strict=True):
-        found = {}
-        for name, one in records.items():
-            part = slice(*np.searchsorted(one.at, [first, last]).tolist())
-            fields = {field: values[part] for field, values in one.fields.items()}
-            texts = {field: values[part] for field, values in one.texts.items()}
-            found[name] = Records(one.at[part], fields, texts)
-        yield found
+        yield {
+            name: one.part(slice(*np.searchsorted(one.at, [first, last]).tolist()))
+            for name, one in records.items()
+        }
 
 
 def _magnetometer(
-    number: int, records: Records, parameters: Mapping[str, float], chosen: int | None
+    number: int, fields: Records, parameters: Mapping[str, float], chosen: int | None
 ) -> Magnetometer:
     """Return the compass `number` with its raw channels; `chosen` is the number that the estimator used."""
-    fields = records.fields
     field: FloatArray = np.stack([fields[f"Mag{axis}"] for axis in "XYZ"])
-    none = np.zeros(len(records.at))
+    none = np.zeros(len(fields.at))
     # the motor compensation is MOX, up to ArduPilot 4.0 MOfsX
     field -= np.stack([fields.get(f"MO{axis}", fields.get(f"MOfs{axis}", none)) for axis in "XYZ"])
     diagonal, off = ([parameters.get(f"COMPASS_{kind}{_numbered(number)}_{axis}", 0.0) for axis in "XYZ"]
@@ -151,17 +144,17 @@ def _magnetometer(
 
 def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetometer]:
     """Return the magnetometers of ``MAGH`` records, numbered from `first`; ids are node, sensor and bus."""
-    if records is None or not {"TimeUS", *SURVEY_AXES} <= records.fields.keys():
+    if records is None or not {"TimeUS", *SURVEY_AXES} <= records.keys():
         return []
-    fields = records.fields
-    parts = [fields[name] for name in SURVEY_ID if name in fields] or [np.zeros(len(records.at))]
+    ids = np.column_stack(
+        [np.zeros(len(records.at)), *(records[name] for name in SURVEY_ID if name in records)]
+    )
     found: list[Magnetometer] = []
-    for numbers in np.unique(np.column_stack(parts), axis=0):
-        here = np.all([part == number for part, number in zip(parts, numbers, strict=True)], axis=0)
-        device = f"{SURVEY} {':'.join(f'{number:g}' for number in numbers)}"
-        gauss = np.stack([fields[name][here] for name in SURVEY_AXES])
-        time = fields["TimeUS"][here] * 1e-6
-        found.append(sampled(first + len(found), time, NT_PER_UNIT["G"] * gauss, id=device))
+    for numbers in np.unique(ids, axis=0):
+        here = records.part((ids == numbers).all(axis=1))
+        device = f"{SURVEY} {':'.join(f'{number:g}' for number in numbers[1:])}"
+        gauss = np.stack([here[name] for name in SURVEY_AXES])
+        found.append(sampled(first + len(found), here["TimeUS"] * 1e-6, NT_PER_UNIT["G"] * gauss, id=device))
     return found
 
 
@@ -174,36 +167,32 @@ def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
     """Yield the columns of all records in :data:`ARDUPILOT_FIELDS`, which has no magnetometers."""
     for record in ARDUPILOT_FIELDS:
         for number, found in _instances(records, record).items():
-            time, table = found.fields["TimeUS"] * 1e-6, dict(found.fields)
-            if record == "GPS" and "Status" in table:
-                fixed = table["Status"] >= MIN_GPS_STATUS
-                table |= {key: np.where(fixed, table[key], np.nan) for key in ("Lat", "Lng") if key in table}
-            for column, unit, values in fields_of(fields[record], table, number):
+            fixed = np.ones(len(found.at), bool)
+            if record == "GPS" and "Status" in found:
+                fixed = found["Status"] >= MIN_GPS_STATUS
+            for column, unit, values in fields_of(fields[record], found, number):
                 if np.any(values) or not column.startswith("servo"):  # an output that is 0 is not in use
-                    yield time, column, unit, values
+                    yield found["TimeUS"] * 1e-6, column, unit, np.where(fixed, values, np.nan)
 
 
 def _instances(records: dict[str, Records], kind: str) -> dict[int, Records]:
     """Return number (from 0) -> records of each instance of a kind, also if the name has it (``MAG2``)."""
     found: dict[int, Records] = {}
     for number, name in enumerate((kind, *(f"{kind}{k}" for k in range(2, MAX_KIND_NUMBER + 1)))):
-        if (one := records.get(name)) is None or "TimeUS" not in one.fields or not len(one.at):
+        if (one := records.get(name)) is None or "TimeUS" not in one or not len(one.at):
             continue
-        which = next((one.fields[field] for field in INSTANCE if field in one.fields), None)
+        which = next((one[field] for field in INSTANCE if field in one), None)
         if which is None:
             found.setdefault(number, one)
             continue
-        for k in np.unique(which[np.isfinite(which)]):
-            here = np.flatnonzero(which == k)
-            fields = {key: values[here] for key, values in one.fields.items()}
-            found[int(k)] = Records(one.at[here], fields, {})
+        found |= {int(k): one.part(which == k) for k in np.unique(which[np.isfinite(which)])}
     return found
 
 
 def _utc_offset(records: dict[str, Records]) -> float | None:
     """Return UTC minus time since boot in s, the median of all GPS fixes; None without a fix."""
     offsets = []
-    for gps in (one.fields for one in _instances(records, "GPS").values()):
+    for gps in _instances(records, "GPS").values():
         if {"GWk", "GMS"} <= gps.keys():
             fixed = (gps["GWk"] > 0) & (gps.get("Status", MIN_GPS_STATUS) >= MIN_GPS_STATUS)
             ahead = GPS_EPOCH + gps["GWk"] * WEEK + gps["GMS"] * 1e-3 - gps["TimeUS"] * 1e-6
@@ -221,33 +210,16 @@ ARDUPILOT_FIELDS: Fields = field_maps("ardupilot")
 """If several records fill one column, the first in the log is used. CTUN has height and throttle in Sub and
 Copter, THR the throttle in Rover, MOTB the throttle of all motors together."""
 INSTANCE = ("I", "Instance", "Inst")
-TIME_FIELDS = ("TimeUS", "TimeMS")
-"""Time since the boot, µs, or ms up to ArduPilot 3.2."""
 SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My", "Mz")
 """Record of survey magnetometers, the fields that identify a sensor, and the fields of its axes, G."""
 POWER_MESSAGES = "CURR", "BAT"
 MAX_VOLTAGE_V = 100.0
 """Median above which integers without declared unit are in hundredths of V (and of A for the current)."""
-MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health"}
-NUMBERED = {"MAG": MAG, **{kind: {one.field for one in fields} for kind, fields in ARDUPILOT_FIELDS.items()}}
-WANTED: dict[str, set[str]] = {
-    **{
-        f"{name}{k}": {*TIME_FIELDS, *INSTANCE, *fields}
-        for name, fields in NUMBERED.items()
-        for k in ("", *range(2, MAX_KIND_NUMBER + 1))
-    },
-    SURVEY: {*TIME_FIELDS, *SURVEY_ID, *SURVEY_AXES},
-    "PARM": {"TimeUS", "Name", "Value"},
-    "XKFS": {"TimeUS", "MI"},
-    "FMT": {"Type", "Name", "Columns"},
-    "FMTU": {"FmtType", "UnitIds", "MultIds"},
-    "UNIT": {"Id", "Label"},
-    "MULT": {"Id", "Mult"},
+WANTED = {
+    *(f"{kind}{k}" for kind in ("MAG", *ARDUPILOT_FIELDS) for k in ("", *range(2, MAX_KIND_NUMBER + 1))),
+    *(SURVEY, "PARM", "XKFS", "FMT", "FMTU", "UNIT", "MULT"),
 }
-"""Kind of record -> fields that are read."""
-for _gps in ("GPS", "GPS2"):
-    WANTED[_gps] |= {"GWk", "GMS", "Status", "Week", "T"}
-
+"""Kinds of record that are read."""
 UNIT_FACTORS = {
     **{label: (label, 1.0) for label in ("deg", "m", "A", "V", "rpm", "%")},
     **dict.fromkeys(("degheading", "deglatitude", "deglongitude"), ("deg", 1.0)),
@@ -274,7 +246,7 @@ def _in_own_units(flash: Flash) -> tuple[Fields, list[str]]:
     }
     notes = []
     for name in POWER_MESSAGES:
-        volts = flash.records[name].fields.get("Volt", np.empty(0)) if name in flash.records else np.empty(0)
+        volts = flash.records[name].get("Volt", np.empty(0)) if name in flash.records else np.empty(0)
         is_whole = bool((volts == np.round(volts)).all())
         if (name, "Curr") in declared or not len(volts) or not is_whole or np.median(volts) < MAX_VOLTAGE_V:
             continue
@@ -298,15 +270,11 @@ def _declared(flash: Flash) -> dict[tuple[str, str], tuple[str, float]]:
     """Return (kind, field) -> declared unit label and multiplier; empty if the log does not declare units."""
     try:
         formats, fmtu, unit, mult = (flash.records[name] for name in ("FMT", "FMTU", "UNIT", "MULT"))
-        labels = dict(zip(_characters(unit.fields["Id"]), unit.texts["Label"], strict=True))
-        factors = dict(zip(_characters(mult.fields["Id"]), mult.fields["Mult"].tolist(), strict=True))
-        columns = {
-            number: (name, text.split(","))
-            for number, name, text in zip(
-                formats.fields["Type"].tolist(), formats.texts["Name"], formats.texts["Columns"], strict=True
-            )
-        }
-        rows = zip(fmtu.fields["FmtType"].tolist(), fmtu.texts["UnitIds"], fmtu.texts["MultIds"], strict=True)
+        labels = dict(zip(_characters(unit["Id"]), unit["Label"], strict=True))
+        factors = dict(zip(_characters(mult["Id"]), mult["Mult"].tolist(), strict=True))
+        kinds = zip(formats["Type"].tolist(), formats["Name"], formats["Columns"], strict=True)
+        columns = {number: (name, text.split(",")) for number, name, text in kinds}
+        rows = zip(fmtu["FmtType"].tolist(), fmtu["UnitIds"], fmtu["MultIds"], strict=True)
     except KeyError:  # the log declares nothing, or not all of it
         return {}
     found = {}

@@ -17,15 +17,16 @@ ArduPilot, "Logs (for developers)", https://ardupilot.org/dev/docs/code-overview
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterator, Mapping
-from itertools import pairwise
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.arrays import FloatArray, IndexArray
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.logs.fields import number_of
 
 Bytes = NDArray[np.uint8]
 
@@ -45,15 +46,38 @@ FORMAT_LAYOUT = np.dtype([("", "u1", RECORD_HEADER_BYTES),
                                            ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
 
 
-class Records(NamedTuple):
-    """Records of one kind."""
+class Records(Mapping[str, Any]):
+    """Records of one kind by field: numbers or texts (n,) in the unit of the field, decoded when asked for.
 
-    at: IndexArray
-    """(n,): Position of each record in the file, increasing: its first byte, or its line in a text."""
-    fields: dict[str, FloatArray]
-    """Numbers by field, (n,) each, in the unit of the field."""
-    texts: dict[str, list[str]]
-    """Texts by field, n each."""
+    `at` (n,): position of each record in the file, increasing: its first byte, or its line in a text.
+    `decoders`: field -> function that returns the values at such positions.
+    """
+
+    def __init__(self, positions: IndexArray, decoders: Mapping[str, Callable[[IndexArray], Any]]) -> None:
+        self.at, self._decoders = positions, decoders
+
+    def __getitem__(self, field: str) -> Any:
+        return self._decoders[field](self.at)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._decoders)
+
+    def __len__(self) -> int:
+        return len(self._decoders)
+
+    def part(self, chosen: slice | BoolArray) -> Records:
+        """Return some of the records."""
+        return Records(self.at[chosen], self._decoders)
+
+    def scaled(self, sources: Mapping[str, tuple[str, float]]) -> Records:
+        """Return the records with further fields: name -> field that holds the numbers, and a factor."""
+        further = {name: partial(_scaled, self._decoders[field], factor)
+                   for name, (field, factor) in sources.items()}  # fmt: skip
+        return Records(self.at, {**self._decoders, **further})
+
+
+def _scaled(decoder: Callable[[IndexArray], Any], factor: float, starts: IndexArray) -> FloatArray:
+    return np.asarray(factor * decoder(starts))
 
 
 class Flash(NamedTuple):
@@ -68,18 +92,16 @@ class Flash(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    """A kind of record, as an ``FMT`` record at byte `at` describes it."""
+    """A kind of record, as an ``FMT`` record describes it."""
 
-    at: int
-    number: int
     length: int
     name: str
     letters: str
-    columns: tuple[str, ...]
+    columns: list[str]
 
 
-def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
-    """Return the records of a binary log; `wanted` lists the kinds to read, and the fields of each."""
+def read_binary(path: Path, wanted: Collection[str]) -> Flash:
+    """Return the records of a binary log; `wanted` lists the kinds to read."""
     data = np.memmap(path, dtype=np.uint8, mode="r")
     found = []
     for start in range(0, data.size - 2, PASS):
@@ -88,66 +110,38 @@ def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
         found.append(start + np.flatnonzero(is_header))
     headers = np.concatenate(found) if found else np.empty(0, dtype=np.intp)
     kinds = _kinds(data, headers)
-    lengths = _lengths(data, headers, kinds)
+    table = np.zeros(256, dtype=np.intp)
+    for number, kind in kinds.items():
+        table[number] = kind.length
+    lengths = table[data[headers + 2]]  # 0 for a kind that is not described
     headers, lengths = headers[lengths > 0], lengths[lengths > 0]
     believed = _chained(headers, headers + lengths, data.size)
     at = headers[believed]
     numbers = data[at + 2]
     records: dict[str, Records] = {}
     letters: dict[tuple[str, str], str] = {}
-    for kind, first, last in _spans(kinds):
-        if kind.name not in wanted:
-            continue
-        here = at[numbers == kind.number]
-        here = here[slice(*np.searchsorted(here, (first, last)))]
-        if len(here):
+    for number, kind in kinds.items():
+        if kind.name in wanted and len(here := at[numbers == number]):
+            records[kind.name] = Records(here, _decoders(data, kind))
             fields = zip(kind.columns, kind.letters, strict=False)
             letters |= {(kind.name, name): letter for name, letter in fields}
-            decoded = _decoded(data, kind, here, wanted[kind.name])
-            before = records.get(kind.name)
-            records[kind.name] = decoded if before is None else _joined(before, decoded)
     return Flash(records, letters, int(data.size - lengths[believed].sum()))
 
 
-def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
-    """Return the kinds of record that a log describes, in file order, without contradictory descriptions."""
+def _kinds(data: Bytes, headers: IndexArray) -> dict[int, _Kind]:
+    """Return number -> kind of record that a log describes, without contradictory descriptions."""
     at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
     at = at[data[at + 2] == FMT]
-    kinds = []
-    for start, one in zip(at, _gather(data, at, FORMAT_LAYOUT), strict=True):
+    kinds: dict[int, _Kind] = {}
+    for one in _gather(data, at, FORMAT_LAYOUT):
         name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
         size = int(one["length"])
         known = all(letter in LETTERS for letter in letters)
         sizes = [np.dtype(LETTERS[letter]).itemsize for letter in letters] if known else []
         is_sound = not known or RECORD_HEADER_BYTES + sum(sizes) == size
         if is_sound and size > RECORD_HEADER_BYTES and name.isalnum():
-            names = tuple(columns.split(","))
-            kinds.append(_Kind(int(start), int(one["type"]), size, name, letters, names))
+            kinds.setdefault(int(one["type"]), _Kind(size, name, letters, columns.split(",")))
     return kinds
-
-
-def _spans(kinds: list[_Kind]) -> Iterator[tuple[_Kind, int, int]]:
-    """Yield each description with the range of bytes in which it holds, up to a new layout of the kind."""
-    for number in sorted({kind.number for kind in kinds}):
-        mine = [kind for kind in kinds if kind.number == number]
-        new = [mine[0], *(b for a, b in pairwise(mine) if a[2:] != b[2:])]
-        starts = [0, *(kind.at for kind in new[1:]), np.iinfo(np.intp).max]
-        yield from zip(new, starts, starts[1:], strict=False)
-
-
-def _lengths(data: Bytes, headers: IndexArray, kinds: list[_Kind]) -> IndexArray:
-    """Return the length (n,), bytes, of the record that each header begins; 0 for an undescribed kind."""
-    numbers = data[headers + 2]
-    spans = list(_spans(kinds))
-    table = np.zeros(256, dtype=np.intp)
-    for kind, first, _ in spans:
-        if not first:
-            table[kind.number] = kind.length
-    lengths = table[numbers]
-    for kind, first, _ in spans:
-        if first:  # described again, as after a boot with other firmware
-            lengths[(numbers == kind.number) & (headers >= first)] = kind.length
-    return lengths
 
 
 def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
@@ -189,70 +183,57 @@ def _gather(data: Bytes, starts: IndexArray, layout: np.dtype[Any], offset: int 
     return taken.view(layout)[:, 0] if len(starts) else np.empty(0, layout)
 
 
-def _decoded(data: Bytes, kind: _Kind, starts: IndexArray, wanted: Collection[str]) -> Records:
-    fields, texts, offset = {}, {}, RECORD_HEADER_BYTES
+def _decoders(data: Bytes, kind: _Kind) -> dict[str, Callable[[IndexArray], Any]]:
+    """Return field -> function that returns its values (n,) in the records that begin at given bytes."""
+    found: dict[str, Callable[[IndexArray], Any]] = {}
+    offset = RECORD_HEADER_BYTES
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
         if letter not in LETTERS or offset + layout.itemsize > kind.length:
             break  # a field of an unknown letter has no known length, so the next has no known start
-        if name in wanted and layout.kind in "iuf":
-            numbers = _gather(data, starts, layout, offset).astype(np.float64)
-            fields[name] = numbers / OWN_SCALE.get(letter, 1.0)
-        elif name in wanted and layout.kind == "S":
-            texts[name] = [text.decode("latin-1") for text in _gather(data, starts, layout, offset)]
+        if layout.kind != "V":
+            found[name] = partial(_values, data, layout, offset, OWN_SCALE.get(letter, 1.0))
         offset += layout.itemsize
-    return Records(starts, fields, texts)
+    return found
 
 
-def _joined(first: Records, second: Records) -> Records:
-    """Return two sets of records of one kind, which was described twice, as one with their common fields."""
-    return Records(
-        np.concatenate([first.at, second.at]),
-        {name: np.concatenate([first.fields[name], second.fields[name]])
-         for name in first.fields if name in second.fields},
-        {name: first.texts[name] + second.texts[name] for name in first.texts if name in second.texts},
-    )  # fmt: skip
-
-
-def number_of(text: str) -> float:
-    """Return the number in a text; NaN if the text is damaged."""
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
+def _values(data: Bytes, layout: np.dtype[Any], offset: int, scale: float, starts: IndexArray) -> Any:
+    found = _gather(data, starts, layout, offset)
+    if layout.kind == "S":
+        return [text.decode("latin-1") for text in found]
+    return found.astype(np.float64) / scale
 
 
 TEXT_TYPES = frozenset("nNZaM")
 
 
-def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
-    """Return the records of a text log; `wanted` lists the kinds to read, and the fields of each."""
-    described: dict[str, tuple[str, tuple[str, ...]]] = {}
-    lines: dict[str, list[list[str]]] = {}
-    at: dict[str, list[int]] = {}
+def read_text(path: Path, wanted: Collection[str]) -> Flash:
+    """Return the records of a text log; `wanted` lists the kinds to read."""
+    described: dict[str, tuple[str, list[str]]] = {}
+    rows: dict[str, dict[int, list[str]]] = {}
     skipped = 0
     with path.open(encoding="latin-1", newline="\n") as file:
         for k, line in enumerate(file):
-            parts = [part.strip() for part in line.split(",")]
-            if parts[0] == "FMT" and len(parts) > 5:
-                described[parts[3]] = parts[4], tuple(parts[5:])
-            elif parts[0] not in described:
-                skipped += parts != [""]
-            elif parts[0] in wanted:
-                if len(parts) - 1 == len(described[parts[0]][1]):
-                    lines.setdefault(parts[0], []).append(parts[1:])
-                    at.setdefault(parts[0], []).append(k)
-                else:
-                    skipped += 1
+            name, *parts = [part.strip() for part in line.split(",")]
+            if name == "FMT" and len(parts) > 4:
+                described[parts[2]] = parts[3], parts[4:]
+            elif name not in described:
+                skipped += (name, *parts) != ("",)
+            elif len(parts) != len(described[name][1]):
+                skipped += name in wanted
+            elif name in wanted:
+                rows.setdefault(name, {})[k] = parts
     records: dict[str, Records] = {}
-    kept: dict[tuple[str, str], str] = {}
-    for name, rows in lines.items():
-        letters, columns = described[name]
-        kept |= {(name, one): letter for one, letter in zip(columns, letters, strict=False)}
-        records[name] = Records(np.array(at[name], dtype=np.intp), {}, {})
-        for column, letter, values in zip(columns, letters, zip(*rows, strict=True), strict=False):
-            if column in wanted[name] and letter in TEXT_TYPES:
-                records[name].texts[column] = list(values)
-            elif column in wanted[name]:
-                records[name].fields[column] = np.array([number_of(value) for value in values])
-    return Flash(records, kept, skipped)
+    letters: dict[tuple[str, str], str] = {}
+    for name, lines in rows.items():
+        fields = list(enumerate(zip(described[name][1], described[name][0], strict=False)))
+        letters |= {(name, column): letter for _, (column, letter) in fields}
+        decoders = {column: partial(_cells, lines, k, letter) for k, (column, letter) in fields}
+        records[name] = Records(np.array([*lines], dtype=np.intp), decoders)
+    return Flash(records, letters, skipped)
+
+
+def _cells(lines: Mapping[int, Sequence[str]], k: int, letter: str, numbers: IndexArray) -> Any:
+    """Return the values of field `k` in the rows with line `numbers` (n,)."""
+    texts = [lines[number][k] for number in numbers.tolist()]
+    return texts if letter in TEXT_TYPES else np.array([number_of(text) for text in texts])

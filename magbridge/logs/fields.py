@@ -140,6 +140,14 @@ def linear(
     return result - period * np.floor((result - start) / period)
 
 
+def number_of(text: str) -> float:
+    """Return the number in a text; NaN for a damaged text."""
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")
+
+
 def degrees(written: ArrayLike) -> FloatArray:
     """Return degrees (n,) from degrees and minutes written together (n,): -13036.442 is -130 deg 36.442'."""
     values = np.asarray(written, np.float64)

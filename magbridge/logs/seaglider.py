@@ -38,7 +38,7 @@ from magbridge.errors import FormatError
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import sphere_radius
 from magbridge.logs.deployment import deployment, sliced, with_losses
-from magbridge.logs.fields import Track, degrees, field_maps, fields_of, interpolated, linear
+from magbridge.logs.fields import Track, degrees, field_maps, fields_of, interpolated, linear, number_of
 
 DIMENSION = "sg_data_point"
 COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
@@ -205,12 +205,12 @@ def _add_log(known: Dive, path: Path) -> None:
         if name == "GCHEAD":
             names = values
         elif name == "GC" and len(values) == len(names):
-            manoeuvres.append([_number(value) for value in values])
+            manoeuvres.append([number_of(value) for value in values])
         elif found := GPS_LINE.match(line):
             when = datetime.strptime(found[1] + found[2], "%d%m%y%H%M%S").replace(tzinfo=UTC).timestamp()
             fixes.append((when, *degrees([found[3], found[4]])))
         elif len(values) in (1, 2):  # a canonical log also states the default
-            known.settings[name] = _number(values[0])
+            known.settings[name] = number_of(values[0])
     known.manoeuvres = dict(zip(names, np.array(manoeuvres, float).reshape(-1, len(names)).T, strict=True))
     for name in {"st_secs", "end_secs"} & known.manoeuvres.keys():
         known.manoeuvres[name] += start
@@ -234,10 +234,3 @@ def _start(path: Path, header: dict[str, str]) -> float:
         return datetime(1900 + year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
     except (KeyError, ValueError):
         raise FormatError(path, "expected its start, as of a Seaglider's dive", column="start") from None
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")

@@ -207,7 +207,7 @@ class TableReader:
         return times, wrong
 
     def _past_midnights(self, frame: pd.DataFrame, times: FloatArray) -> FloatArray:
-        """Return the times (n,), s, continued past a midnight at which the column of the date does not change.
+        """Return the times (n,), s, continued past a midnight at which the date does not change.
 
         From the next change of the date on, the date counts again.
         """
