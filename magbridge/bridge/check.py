@@ -7,6 +7,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from copy import deepcopy
 from functools import partial
 from math import isnan
@@ -24,7 +25,7 @@ from magbridge.bridge.port import cut
 from magbridge.bridge.run import Keeper, leave_wrong_devices, ports
 from magbridge.bridge.sensor import needed_units, open_correction, open_drivers, other_calibrations, unmet
 from magbridge.calibration.model import Calibration
-from magbridge.config import Config, Sensor, Telemetry, load, parse
+from magbridge.config import Config, HeadingOutput, Sensor, Telemetry, load, parse
 from magbridge.errors import ConfigError, MagbridgeError
 from magbridge.link.publish import check_publish
 from magbridge.link.telemetry import MIN_RATE_FRACTION, TelemetryMap
@@ -50,6 +51,11 @@ class ConfigFault(NamedTuple):
     """True if the bridge would not start; False if it would wait, or run with less function."""
     text: str
     """One line with the file, the key, and the expected value."""
+
+
+def warning(path: Path, key: str, text: str) -> ConfigFault:
+    """Return the fault with `text` at a dotted key of the configuration, which does not prevent a start."""
+    return ConfigFault(fatal=False, text=f"{path}: {key}: {text}")
 
 
 def findings(path: Path) -> list[ConfigFault]:
@@ -126,8 +132,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
     if calibration is not None:
         yield from _parameters(config, calibration)
         if calibration.boresight is None and (config.heading.send or config.heading.nmea):
-            text = f"{path}: heading: the calibration has no boresight: no heading is sent"
-            yield ConfigFault(fatal=False, text=text)
+            yield warning(path, "heading", "the calibration has no boresight: no heading is sent")
     if config.navigation is not None:
         yield from _map(config, calibration)
     if (reference := names.get("learning.reference")) is None or config.resolve(reference).exists():
@@ -174,8 +179,7 @@ def _other_sensors(config: Config, main: Calibration | None) -> Iterator[ConfigF
             yield from _unitless(own, config)
         if used is None and not (is_scalar(driver) and sensor.sigma is not None):
             why = f"the calibration is of {own.sensor.name!r}" if own is not None else "no calibration"
-            text = f"{config.path}: {sensor.key}: {why}: every sample would be uncalibrated"
-            yield ConfigFault(fatal=False, text=text)
+            yield warning(config.path, sensor.key, f"{why}: every sample would be uncalibrated")
 
 
 def _tried(attempt: Callable[[], object]) -> Iterator[ConfigFault]:
@@ -191,32 +195,21 @@ def _device(config: Config, key: str, name: str) -> Iterator[ConfigFault]:
         return
     there = sorted(glob.glob(name))  # noqa: PTH207 - it may be absolute, which pathlib does not glob
     if not there:
-        yield ConfigFault(
-            fatal=False, text=f"{config.path}: {key}: no {name} now: the bridge would wait for it"
-        )
+        yield warning(config.path, key, f"no {name} now: the bridge would wait for it")
     for device in there:
         if reason := access(device):
-            yield ConfigFault(fatal=False, text=f"{config.path}: {key}: {reason}")
+            yield warning(config.path, key, reason)
 
 
 def access(device: str) -> str:
     """Return why this user may not open a device, and the remedy; empty if the user may open it."""
     if os.access(device, os.R_OK | os.W_OK):
         return ""
-    group = _group(device)
-    hint = (
-        f": it belongs to the group {group}: sudo usermod -aG {group} $USER, then log in again"
-        if group
-        else ""
-    )
+    hint = ""
+    with suppress(OSError, KeyError, NotImplementedError):  # gone, without a name, or not on this system
+        group = Path(device).group()
+        hint = f": it belongs to the group {group}: sudo usermod -aG {group} $USER, then log in again"
     return f"{device} may not be opened by this user{hint}"
-
-
-def _group(device: str) -> str:
-    try:
-        return Path(device).group()
-    except (OSError, KeyError, NotImplementedError):  # gone, without a name, or not on this system
-        return ""
 
 
 def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFault]:
@@ -225,17 +218,15 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFaul
     Also yield the warnings of the calibration, and a calibration of another type of sensor.
     """
     if not calibration.sensor.may_be(config.sensor.driver):
-        text = (
-            f"{config.path}: sensor.driver: the calibration is of {calibration.sensor.name!r}: every sample "
-        )
-        yield ConfigFault(fatal=False, text=text + "would be uncalibrated")
+        text = f"the calibration is of {calibration.sensor.name!r}: every sample would be uncalibrated"
+        yield warning(config.path, "sensor.driver", text)
         return
     for error in unmet(needed_units(calibration), config):
         yield ConfigFault(fatal=True, text=str(error))
     yield from _unitless(calibration, config)
     key = "calibration.file" if config.calibration else "learning.prior"
     for doubt in calibration.warnings:
-        yield ConfigFault(fatal=False, text=f"{config.path}: {key}: {doubt}")
+        yield warning(config.path, key, doubt)
 
 
 def _unitless(calibration: Calibration, config: Config) -> Iterator[ConfigFault]:
@@ -243,10 +234,8 @@ def _unitless(calibration: Calibration, config: Config) -> Iterator[ConfigFault]
     scalars = {channel.name: channel.unit for scalar in calibration.sensors for channel in scalar.channels}
     for name, unit in (scalars | needed_units(calibration)).items():
         if unit and name in config.telemetry and not config.telemetry[name].unit:
-            text = (
-                f"{config.path}: telemetry.{name}.unit: none: not compared with {unit!r}, the calibration's"
-            )
-            yield ConfigFault(fatal=False, text=text)
+            text = f"none: not compared with {unit!r}, the calibration's"
+            yield warning(config.path, f"telemetry.{name}.unit", text)
 
 
 def _unmatched(name: str, source: Telemetry, path: Path) -> Iterator[ConfigFault]:
@@ -254,7 +243,7 @@ def _unmatched(name: str, source: Telemetry, path: Path) -> Iterator[ConfigFault
     fields = spec(source.message).fields if source.message in MESSAGE_IDS else {}
     if not source.match and (key := next((key for key in ("name", "ind") if key in fields), "")):
         text = f"none: every {source.message} is used, with any {key}; add {key} = ..."
-        yield ConfigFault(fatal=False, text=f"{path}: telemetry.{name}.match: {text}")
+        yield warning(path, f"telemetry.{name}.match", text)
 
 
 def _map(config: Config, calibration: Calibration | None) -> Iterator[ConfigFault]:
@@ -270,19 +259,16 @@ def _map(config: Config, calibration: Calibration | None) -> Iterator[ConfigFaul
 
 def _log(config: Config) -> Iterator[ConfigFault]:
     if config.log is None:
-        yield ConfigFault(
-            fatal=False, text=f"{config.path}: log: none is kept: nothing can be replayed or calibrated"
-        )
+        yield warning(config.path, "log", "none is kept: nothing can be replayed or calibrated")
         return
     folder = config.resolve(config.log.directory)
     there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-    key = f"{config.path}: log.directory"
     if not there.is_dir():
-        yield ConfigFault(fatal=False, text=f"{key}: {there} is a file")
+        yield warning(config.path, "log.directory", f"{there} is a file")
     elif not os.access(there, os.W_OK):
-        yield ConfigFault(fatal=False, text=f"{key}: {there} cannot be written to")
+        yield warning(config.path, "log.directory", f"{there} cannot be written to")
     elif (free := shutil.disk_usage(there).free) < MIN_FREE_BYTES:
-        yield ConfigFault(fatal=False, text=f"{key}: {free / 1e6:.0f} MB are free")
+        yield warning(config.path, "log.directory", f"{free / 1e6:.0f} MB are free")
 
 
 LISTEN_TIME_S = 20.0
@@ -357,15 +343,16 @@ class LiveCheck:
         key = load_key(config.resolve(link.signing_key)) if link.signing_key else None
         start = keeper.start(clock.now_us())
         others = other_calibrations(config)
-        pipeline = Pipeline(replace(config, log=None), first_calibration(config), start, key, more=others)
+        config = replace(config, log=None, heading=HeadingOutput())
+        pipeline = Pipeline(config, first_calibration(config), start, key, more=others)
         pipeline.component.streams.interval_us = self._duration_us // RATE_INTERVALS
         self._begin_us = start.time_us
-        link_port, sensor_ports = ports(config)
-        edge = self._edge = LiveEdge({Channel.LINK: link_port, **sensor_ports}, clock)
+        opened = ports(config)
+        edge = self._edge = LiveEdge(opened, clock)
         keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
 
         def finish_event(time_us: int) -> None:
-            leave_wrong_devices(pipeline, sensor_ports)
+            leave_wrong_devices(pipeline, opened)
             if time_us - self._begin_us > self._duration_us:
                 edge.stop()
 
@@ -441,7 +428,12 @@ class LiveCheck:
         for text in dict.fromkeys(texts):
             if text not in denied:
                 self._warn("", text)
-        self._compare_sensor(pipeline)
+        for stream in pipeline.streams:
+            self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
+            if not stream.samples:
+                remedy = NO_READING[MAG_PORT_STATE(stream.state)]
+                text = f"no reading in {self._duration_us * 1e-6:.0f} s: {remedy}"
+                self._warn(stream.sensor.key, f"{stream.sensor.driver}: {text}")
         heartbeat = system, self._link.autopilot, spec("HEARTBEAT").id
         if heartbeat not in self._counts:
             self._warn("link", self._no_autopilot())
@@ -460,14 +452,6 @@ class LiveCheck:
         if abs(self._clock_difference_s) > MAX_CLOCK_DIFFERENCE_S:
             text = f"the host's clock differs from SYSTEM_TIME by {self._clock_difference_s:+.0f} s"
             self._warn("link", f"{text}: set it by NTP or GPS")
-
-    def _compare_sensor(self, pipeline: Pipeline) -> None:
-        for stream in pipeline.streams:
-            self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
-            if not stream.samples:
-                name, remedy = stream.sensor.driver, NO_READING[MAG_PORT_STATE(stream.state)]
-                text = f"{name}: no reading in {self._duration_us * 1e-6:.0f} s: {remedy}"
-                self._warn(stream.sensor.key, text)
 
     def _no_autopilot(self) -> str:
         """Return the text of the fault that no heartbeat of the autopilot arrived, with the remedy."""

@@ -323,10 +323,6 @@ class BusPort(Port):
         self._pump = Pump(partial(self._poll, bus), self._give_up)
         self._fd = self._pump.fd
 
-    def move_on(self) -> None:
-        """Close the port, so that opening it again configures a silent part."""
-        self.close()
-
     def _send(self, data: bytes, address: Any) -> None:
         """Drop `data`, because the part accepts no commands from the pipeline."""
 

@@ -13,17 +13,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from struct import Struct
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
+from msgspec import Meta
 
 from magbridge.bridge.port import Port
 from magbridge.bridge.position import CLOCK_SET_US
 from magbridge.bridge.sensor import SensorStream
-from magbridge.config import Config, Sensor, Telemetry
+from magbridge.config import Config
 from magbridge.errors import PortError
 from magbridge.link.output import Output
-from magbridge.mavlink import Codec, Stream, spec
+from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
 from magbridge.records import Channel
 from magbridge.sensors import Driver, is_scalar
@@ -35,16 +36,23 @@ __all__ = [
 ]  # fmt: skip
 
 
-class StartEvent(msgspec.Struct, frozen=True):
-    """State at the start of a run that a replay needs besides configuration, calibration and events."""
+Byte = Annotated[int, Meta(ge=0, le=255)]
 
-    time_us: int
+
+class StartEvent(msgspec.Struct, frozen=True, omit_defaults=True):
+    """State at the start of a run that a replay needs besides configuration, calibration and events.
+
+    Without its time, it is also the state of the bridge that is stored in a file for the next run.
+    """
+
+    time_us: int = 0
     """Start of the run, µs since 1970 UTC, a multiple of 4."""
-    parameters: dict[str, float] = {}
+    parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
     """Values that a ground station set in earlier runs, by parameter name."""
-    signing_timestamp: int = 0
-    """Last signing time stamp that an earlier run may have used (units of 10 µs since 2015-01-01)."""
-    signing_streams: list[Stream] = []
+    signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
+    """Last signing time stamp that an earlier run may have used (units of 10 µs since 2015-01-01; 48 bits on
+    the link)."""
+    signing_streams: list[tuple[Byte, Byte, Byte, bool, Annotated[int, Meta(ge=0, lt=1 << 48)]]] = []
     """Last accepted time stamp of each signed stream."""
 
 
@@ -245,12 +253,13 @@ class StateChanges:
             self.log_state = MAG_LOG_STATE.OK if well else MAG_LOG_STATE.FAILED
             self.log_lost = dropped
             self._output.announce("log", f"log: {reason or 'being written'}", severity)
-        elif port != MAG_PORT_NAME.LINK:
+        elif port not in (MAG_PORT_NAME.LINK, MAG_PORT_NAME.NMEA):
             if (sensor := self._sensors.get(source_of(port)[1])) is not None:
                 sensor.opened(time_us) if well else sensor.closed(reason)
         else:
             severity = MAV_SEVERITY.WARNING if well and reason else severity
-            self._output.announce("link", f"link: {reason or 'open'}", severity)
+            name = "link" if port == MAG_PORT_NAME.LINK else "heading.nmea"
+            self._output.announce(name, f"{name}: {reason or 'open'}", severity)
 
 
 BYTES: Final = spec("MAG_SENSOR_BYTES")
@@ -342,27 +351,19 @@ def beginning(
     return frames
 
 
-def declarations(
-    system: int,
-    component: int,
-    telemetry: Mapping[str, Telemetry],
-    nt_per_count: float = 0.0,
-    settings: Mapping[str, float] | None = None,
-    sensors: Sequence[tuple[Sensor, Driver]] = (),
-) -> list[bytes]:
+def declarations(config: Config, drivers: Sequence[Driver], settings: Mapping[str, float]) -> list[bytes]:
     """Return the frames that declare the source and the scale of each column of the log.
 
-    `nt_per_count`: field of one count of the first sensor, nT; 0 for a sensor without counts. If it is not 0,
-        readers of the log compute the channels from the counts, which are more precise than MAG_RAW's float32
-        fields.
+    If a sensor has counts, readers of the log compute its channels from them, because they are more precise
+    than MAG_RAW's float32 fields. The columns of a sensor after the first have the name of the sensor:
+    ``NAME`` for a scalar, else ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the
+    reading.
+
+    `drivers`: drivers of all sensors.
     `settings`: settings that affect flags and sigmas, by key in the configuration, as attributes of the log.
-    `sensors`: the sensors after the first. Their columns have the name of the sensor: ``NAME`` for a scalar,
-        else ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the reading.
     """
-    codec = Codec(system, component)
-    columns: list[dict[str, Any]] = [
-        {"column": key, "scale": value} for key, value in (settings or {}).items()
-    ]
+    codec = Codec(config.link.system, config.link.component)
+    columns: list[dict[str, Any]] = [{"column": key, "scale": value} for key, value in settings.items()]
     columns += [
         {
             "column": name,
@@ -374,25 +375,21 @@ def declarations(
             "offset": one.offset,
             "component": one.component or 0,
         }
-        for name, one in telemetry.items()
+        for name, one in config.telemetry.items()
     ]
-    if nt_per_count:
-        raw = {"unit": "nT", "message": "MAG_RAW", "scale": nt_per_count}
-        columns += [raw | {"column": f"mag_{axis}", "field": f"count_{axis}"} for axis in "xyz"]
-    for sensor, driver in sensors:
-        columns += _sensor_columns(sensor, driver)
+    for sensor, driver in zip(config.sensors, drivers, strict=True):
+        raw: dict[str, Any] = {"message": "MAG_RAW", "unit": "nT", "scale": driver.nt_per_count or 1.0}
+        prefix = "count_" if driver.nt_per_count else ""
+        if not sensor.id:
+            names = {axis: f"mag_{axis}" for axis in "xyz"} if prefix else {}
+        else:
+            raw["match"] = f"sensor_id={sensor.id}"
+            scalar = is_scalar(driver)
+            names = {"x": sensor.name} if scalar else {axis: f"{sensor.name}_{axis}" for axis in "xyz"}
+            time = {"column": f"{sensor.name}_time", "field": "time_usec", "unit": "s", "scale": 1e-6}
+        columns += [raw | {"column": name, "field": f"{prefix}{axis}"} for axis, name in names.items()]
+        columns += [raw | time] if sensor.id else []
     return [codec.pack("MAG_COLUMN", **column) for column in columns]
-
-
-def _sensor_columns(sensor: Sensor, driver: Driver) -> list[dict[str, Any]]:
-    """Return the declarations of the columns of a sensor after the first."""
-    raw: dict[str, Any] = {"message": "MAG_RAW", "match": f"sensor_id={sensor.id}", "unit": "nT"}
-    prefix = "count_" if driver.nt_per_count else ""
-    raw["scale"] = driver.nt_per_count or 1.0
-    names = {"x": sensor.name} if is_scalar(driver) else {axis: f"{sensor.name}_{axis}" for axis in "xyz"}
-    columns = [raw | {"column": name, "field": f"{prefix}{axis}"} for axis, name in names.items()]
-    time = {"column": f"{sensor.name}_time", "field": "time_usec", "unit": "s", "scale": 1e-6}
-    return [*columns, raw | time]
 
 
 PORT_RETRY_S = 0.25
@@ -413,12 +410,14 @@ STANDSTILL_US = 400_000
 class LiveEdge:
     """Source of live events, which reads the ports and the clock, and sends data to the ports.
 
-    `ports`: ports of the link and the sensors, by MAG_PORT_NAME; opened in this order by the constructor.
+    `ports`: ports of the link, the sensors and the NMEA sentences, by MAG_PORT_NAME; opened in this order by
+        the constructor. The port for NMEA sentences is not read.
     `clock`: clock for the times of events.
     """
 
     def __init__(self, ports: Mapping[int, Port], clock: HostClock) -> None:
         self._ports = ports
+        self._read_ports = {number: port for number, port in ports.items() if number != MAG_PORT_NAME.NMEA}
         self._clock = clock
         self._changes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._woken, self._waker = os.pipe()
@@ -441,7 +440,7 @@ class LiveEdge:
         while not self._stopping:
             # the checks need no wake-up of their own while events arrive
             wait = min(deadline() - self._clock.now_us(), CLOCK_CHECK_INTERVAL_US) * 1e-6
-            lines = {fd: number for number, port in self._ports.items() for fd in port.fds()}
+            lines = {fd: number for number, port in self._read_ports.items() for fd in port.fds()}
             full = [number for number, port in self._ports.items() if port.waiting]
             blocked = [fd for number in full for fd in self._ports[number].blocked()]
             try:

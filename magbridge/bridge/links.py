@@ -8,7 +8,6 @@ import re
 import select
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from ipaddress import IPv6Address
@@ -16,13 +15,12 @@ from math import inf
 from operator import itemgetter
 from typing import Any
 
-from magbridge.bridge import events
 from magbridge.bridge.devices import may_be_device, serial_line
 from magbridge.bridge.port import PEER_READ_BYTES, READ_BYTES, PacedPort, Peer, Peers, Port, cut
 from magbridge.config import Config
 from magbridge.errors import ConfigError, PortError
 
-__all__ = ["LINKS", "NmeaOutput", "nmea_port", "open_link"]
+__all__ = ["LINKS", "nmea_port", "open_link"]
 
 ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
 UNSENT = 4096
@@ -403,10 +401,6 @@ def open_link(
     return SHARED[kind](url, (host, port), Peers(autopilot, budget=budget, signed=signed), signed)
 
 
-NMEA_RETRY_US = 1_000_000
-"""Time between two attempts to open the NMEA port, µs."""
-
-
 def nmea_port(config: Config) -> Port | None:
     """Return the (unopened) port of ``[heading] nmea``; None if it is not configured.
 
@@ -417,40 +411,3 @@ def nmea_port(config: Config) -> Port | None:
         return None
     url = f"udpout:{name.removeprefix('udp:')}" if name.startswith("udp:") else f"serial:{name}"
     return open_link(url, config.heading.nmea_baudrate, str(config.path), "heading.nmea")
-
-
-class NmeaOutput:
-    """Sender of NMEA sentences on a port, which it opens again after a loss.
-
-    `port`: the port for the sentences.
-    `notify`: called with a state frame, once per reason, if the port is lost or cannot be opened.
-    """
-
-    def __init__(self, port: Port, notify: Callable[[bytes], None]) -> None:
-        self._port, self._notify = port, notify
-        self._reported = ""
-        self._retry_us = 0
-
-    def send(self, sentences: deque[bytes], time_us: int) -> None:
-        """Send the sentences and empty the queue; drop the sentences if the port is down."""
-        if not sentences:
-            return
-        data = b"".join(sentences)
-        sentences.clear()
-        try:
-            if not self._port.is_open:
-                if time_us < self._retry_us:
-                    return
-                self._retry_us = time_us + NMEA_RETRY_US
-                self._port.open()
-                self._reported = ""
-            self._port.write(data)
-            self._port.flush()
-        except PortError as error:
-            if error.reason != self._reported:
-                self._reported = error.reason
-                self._notify(events.notice(f"heading.nmea: {error.reason}"[:50]))
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()

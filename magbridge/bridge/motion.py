@@ -19,15 +19,15 @@ from magbridge.field.geodesy import separation
 from magbridge.field.igrf import igrf
 from magbridge.link.component import Component
 from magbridge.link.estimates import Pose, quaternion
-from magbridge.link.telemetry import AIRCRAFT, is_contradicted, is_null_position
-from magbridge.mavlink import Message, by_id
+from magbridge.link.telemetry import AIRCRAFT, EKF_STATUS, PX4_STATUS, is_contradicted, is_null_position
+from magbridge.mavlink import Message, by_id, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_SEVERITY, MAV_TYPE
 from magbridge.navigate import Navigator
 from magbridge.navigate.attitude import AttitudeFilter
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.records import Corrected, Quality
 
-__all__ = ["FIX_3D", "Frame", "Motion", "MotionSource"]
+__all__ = ["FIX_3D", "LONGEST_US", "Autopilot", "Motion", "MotionSource"]
 
 MAX_MAIN_FIELD_AGE_US = 60_000_000
 """Longest time for which the main field at one position is used, µs."""
@@ -35,29 +35,107 @@ MAX_STATE_AGE_US = 10_000_000
 """Longest time for which a received height or attitude is used, µs."""
 UNSET = (0, 0)
 """Latitude and longitude in GPS_GLOBAL_ORIGIN of an autopilot without an origin."""
+LONGEST_US = 60_000_000
+"""Time after which a report of the autopilot no longer counts, µs."""
+ATTITUDE, GLOBAL_POSITION, GPS_RAW = (
+    spec(name).id for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT")
+)
+HEARTBEAT, LOCAL_POSITION, ODOMETRY = (
+    spec(name).id for name in ("HEARTBEAT", "LOCAL_POSITION_NED", "ODOMETRY")
+)
+ORIGIN, SYS_STATUS, SYSTEM_STATE, VERSION = (
+    spec(name).id for name in ("GPS_GLOBAL_ORIGIN", "SYS_STATUS", "EXTENDED_SYS_STATE", "AUTOPILOT_VERSION")
+)
+FIX_3D = 3
+"""Smallest GPS_RAW_INT.fix_type whose position is used."""
+ARMED = 128
+"""Flag of HEARTBEAT.base_mode: the vehicle is armed."""
+STATE_UNKNOWN, ON_GROUND = 0, 1
+"""Values of EXTENDED_SYS_STATE.landed_state (MAV_LANDED_STATE)."""
+DIFFERENTIAL_PRESSURE = 16
+"""Flag of SYS_STATUS.onboard_control_sensors_present: the vehicle has an airspeed sensor."""
+VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
+"""Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS: horizontal velocity is valid; position is held
+constant."""
 
 
-class Frame:
-    """Latest origin of the autopilot's local frame, and height and attitude of the vehicle.
+class Autopilot:
+    """State of the autopilot, from its latest messages, as far as navigation needs it.
 
-    `origin`: latitude (deg), longitude (deg) and altitude (m above the sea); None if unknown.
-    `attitude`: last received attitude, as the quaternion w, x, y, z from body to north-east-down.
+    `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    `origin`: origin of its local frame: latitude (deg), longitude (deg) and altitude (m above the sea); None
+        if unknown.
+    `position_us`: time when its GPS receiver last sent a position, used or not, µs.
+    `unvouched_us`, `contradicted_us`: times when it last reported that its velocity does not hold, and that
+        its filter contradicts a sensor, µs.
     """
 
     def __init__(self) -> None:
+        self.stack = int(MAV_AUTOPILOT.GENERIC)
         self.origin: tuple[float, float, float] | None = None
-        self.attitude = 1.0, 0.0, 0.0, 0.0
+        self.position_us = self.unvouched_us = self.contradicted_us = -LONGEST_US
+        self._latest: dict[int, tuple[Message, int]] = {}
         self._altitude = self._down = self._gps_altitude = nan
-        self._altitude_us = self._down_us = self._attitude_us = self._gps_us = -MAX_STATE_AGE_US
-        self._handlers = by_id(
-            ATTITUDE=self._turn, GLOBAL_POSITION_INT=self._rise, GPS_GLOBAL_ORIGIN=self._set_origin,
-            GPS_RAW_INT=self._gps, LOCAL_POSITION_NED=self._sink, ODOMETRY=self._sink,
-        )  # fmt: skip
+        self._altitude_us = self._down_us = -MAX_STATE_AGE_US
 
     def receive(self, message: Message, time_us: int) -> None:
         """Process a message of the autopilot, received at `time_us` (µs)."""
-        if handler := self._handlers.get(message.id):
-            handler(message, time_us)
+        number = message.id
+        self._latest[number] = message, time_us
+        if number == HEARTBEAT:
+            self.stack = message["autopilot"]
+        elif number in (LOCAL_POSITION, ODOMETRY):
+            self._down, self._down_us = message["z"], time_us
+        elif number == GLOBAL_POSITION:
+            altitude = 1e-3 * message["alt"]
+            if is_null_position(message):  # without an origin, its altitude is relative to the start
+                self._down, self._down_us = -altitude, time_us
+            else:
+                self._altitude, self._altitude_us = altitude, time_us
+        elif number == GPS_RAW and message["fix_type"] >= FIX_3D:
+            self._gps_altitude, self.position_us = 1e-3 * message["alt"], time_us
+        elif number == ORIGIN and (message["latitude"], message["longitude"]) != UNSET:
+            self.origin = message["latitude"] * 1e-7, message["longitude"] * 1e-7, 1e-3 * message["altitude"]
+        elif number in (EKF_STATUS, PX4_STATUS):
+            holds = message["flags"] & VELOCITY_HORIZ and not message["flags"] & CONST_POS_MODE
+            self.unvouched_us = -LONGEST_US if holds else time_us
+            if is_contradicted(message):
+                self.contradicted_us = time_us
+
+    def value(self, number: int, field: str, unknown: Any) -> Any:
+        """Return a field of the latest message with the id `number`; `unknown` before the first one."""
+        return self._latest[number][0][field] if number in self._latest else unknown
+
+    @property
+    def is_aircraft(self) -> bool:
+        """True if the vehicle is an aircraft."""
+        return self.value(HEARTBEAT, "type", 0) in AIRCRAFT
+
+    @property
+    def is_grounded(self) -> bool:
+        """True if the vehicle is an aircraft on the ground."""
+        landed_state = self.value(SYSTEM_STATE, "landed_state", STATE_UNKNOWN)
+        is_armed = self.value(HEARTBEAT, "base_mode", 0) & ARMED
+        return self.is_aircraft and (landed_state == ON_GROUND if landed_state else not is_armed)
+
+    @property
+    def measures_airspeed(self) -> bool:
+        """False if the airspeed is not the speed through the medium.
+
+        A rover and an ArduPilot boat measure the wind. An ArduPilot without an airspeed sensor sends a speed
+        that depends on GPS.
+        """
+        kind = self.value(HEARTBEAT, "type", 0)
+        if self.stack != MAV_AUTOPILOT.ARDUPILOTMEGA or kind == MAV_TYPE.GROUND_ROVER:
+            return bool(kind != MAV_TYPE.GROUND_ROVER)
+        sensors = self.value(SYS_STATUS, "onboard_control_sensors_present", DIFFERENTIAL_PRESSURE)
+        return bool(kind != MAV_TYPE.SURFACE_BOAT and sensors & DIFFERENTIAL_PRESSURE)
+
+    @property
+    def version(self) -> tuple[int, int] | None:
+        """Major and minor version of the firmware; None if unknown."""
+        version = self.value(VERSION, "flight_sw_version", 0)
+        return (version >> 24, version >> 16 & 0xFF) if version else None
 
     def altitude(self, time_us: int) -> float:
         """Return the altitude (m above the sea) at `time_us` (µs); NaN if unknown."""
@@ -74,7 +152,7 @@ class Frame:
         frame.
         """
         altitude = self.altitude(time_us)
-        if isnan(altitude) and time_us - self._gps_us < MAX_STATE_AGE_US:
+        if isnan(altitude) and time_us - self.position_us < MAX_STATE_AGE_US:
             return -self._gps_altitude
         return self._down if isnan(altitude) and time_us - self._down_us < MAX_STATE_AGE_US else -altitude
 
@@ -82,39 +160,15 @@ class Frame:
         """Return the vehicle's pose at a position (deg) and a time, or the reason why it is unknown."""
         if self.origin is None:
             return "no origin of the autopilot's frame"
-        if time_us - self._attitude_us >= MAX_STATE_AGE_US:
+        attitude, received_us = self._latest.get(ATTITUDE, (None, 0))
+        if attitude is None or time_us - received_us >= MAX_STATE_AGE_US:
             return "no attitude from the autopilot"
-        down = (
-            self._down
-            if time_us - self._down_us < MAX_STATE_AGE_US
-            else self.origin[2] - self.altitude(time_us)
-        )
+        is_recent = time_us - self._down_us < MAX_STATE_AGE_US
+        down = self._down if is_recent else self.origin[2] - self.altitude(time_us)
         if isnan(down):
             return "no height from the autopilot"
-        return Pose(*separation(*self.origin[:2], latitude, longitude), down, self.attitude)
-
-    def _turn(self, message: Message, time_us: int) -> None:
-        self.attitude = quaternion(message["roll"], message["pitch"], message["yaw"])
-        self._attitude_us = time_us
-
-    def _rise(self, message: Message, time_us: int) -> None:
-        altitude = 1e-3 * message["alt"]
-        if is_null_position(message):  # the autopilot has no origin: its altitude is relative to the start
-            self._down, self._down_us = -altitude, time_us
-        else:
-            self._altitude, self._altitude_us = altitude, time_us
-
-    def _gps(self, message: Message, time_us: int) -> None:
-        if message["fix_type"] >= FIX_3D:
-            self._gps_altitude, self._gps_us = 1e-3 * message["alt"], time_us
-
-    def _sink(self, message: Message, time_us: int) -> None:
-        self._down, self._down_us = message["z"], time_us
-
-    def _set_origin(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
-        if (message["latitude"], message["longitude"]) != UNSET:
-            where = message["latitude"] * 1e-7, message["longitude"] * 1e-7
-            self.origin = *where, 1e-3 * message["altitude"]
+        turn = quaternion(attitude["roll"], attitude["pitch"], attitude["yaw"])
+        return Pose(*separation(*self.origin[:2], latitude, longitude), down, turn)
 
 
 MAX_SOURCE_AGE_US = 30_000_000
@@ -130,9 +184,6 @@ without an airspeed sensor sends ground speed (``GCS_Common.cpp``, vfr_hud_airsp
 m/s steps."""
 MIN_EQUAL = 5
 """Number of airspeeds in a row equal to the ground speed after which the bridge reports them."""
-VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
-"""Flags of EKF_STATUS_REPORT and ESTIMATOR_STATUS: horizontal velocity is valid; position is held
-constant."""
 CONTRADICTED_US = 10_000_000
 """Time for which the autopilot's attitude stays doubtful after its filter contradicted a sensor, µs."""
 MIN_HEADING_SIGMA_RAD, HEADING_INTERVAL_US = 0.07, 5_000_000
@@ -146,14 +197,6 @@ MAX_RATE_RAD_S, MAX_FIELD_NT = 50.0, 1e6
 """Limits of a rate, rad/s, and of a field, nT, that no vehicle reaches."""
 NO_DIRECTION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.NO_BORESIGHT | Quality.LATE_JOIN)
 """Flags of samples whose direction is not used."""
-FIX_3D = 3
-"""Smallest GPS_RAW_INT.fix_type whose position is used."""
-ARMED = 128
-"""Flag of HEARTBEAT.base_mode: the vehicle is armed."""
-STATE_UNKNOWN, ON_GROUND = 0, 1
-"""Values of EXTENDED_SYS_STATE.landed_state (MAV_LANDED_STATE)."""
-DIFFERENTIAL_PRESSURE = 16
-"""Flag of SYS_STATUS.onboard_control_sensors_present: the vehicle has an airspeed sensor."""
 JUMP = 10.0
 """Step of a position, in excess of the motion by its velocity, that counts as a reset, m."""
 
@@ -177,7 +220,7 @@ class MotionSource(IntEnum):
 class Motion:
     """Selector that passes the vehicle's motion from the best available source to the navigator.
 
-    `frame`: local frame; the caller has passed each message to it before.
+    `autopilot`: state of the autopilot; the caller has passed each message to it before.
     `velocity_stays`: returns True if a fix does not change the autopilot's velocity, so that the velocity
         remains an independent measurement.
     `source`: present source of the motion.
@@ -186,39 +229,47 @@ class Motion:
     """
 
     def __init__(
-        self, navigator: Navigator, component: Component, frame: Frame, velocity_stays: Callable[[], bool]
+        self,
+        navigator: Navigator,
+        component: Component,
+        autopilot: Autopilot,
+        velocity_stays: Callable[[], bool],
     ) -> None:
         self.source, self.fed_back, self.gps_trusted = MotionSource.NONE, False, True
-        self._navigator, self._component, self._frame = navigator, component, frame
+        self._navigator, self._output, self._autopilot = navigator, component.output, autopilot
+        self._autopilot_id = component.peer[1]
         self._velocity_stays = velocity_stays
         self._received_us = 0
         self._heading = self._pitch = self._last = nan
         self._steep_us = -GLIDING_US
         self._dive_from = nan  # depth at which the pitch became steep, m
-        self._ground_speed, self._equal = nan, 0  # m/s, by GPS; airspeeds in a row that were equal to it
-        self._unvouched_us = (
-            -MAX_SOURCE_AGE_US
-        )  # when the autopilot last reported that its velocity does not hold
-        self._contradicted_us = self._gps_us = self._widened_us = -MAX_SOURCE_AGE_US
+        self._equal = 0  # airspeeds in a row that were equal to the speed over ground
+        self._widened_us = -MAX_SOURCE_AGE_US
         self._filter = AttitudeFilter()
         self._main_field = np.zeros(3)  # north, east, down, nT, at the time _main_us
         self._main_us = -MAX_MAIN_FIELD_AGE_US
-        self._is_aircraft = self._armed = self._grounded = self._measures_wind = False
-        self._is_ardupilot = self._lacks_airspeed = False
-        self._landed_state = STATE_UNKNOWN
+        self._grounded = False
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
         self._jumps = 0.0, 0.0
         self._measured: set[tuple[int, int]] = set()  # streams with a velocity that is not always zero
         self._handlers = by_id(
-            ATTITUDE=self._attitude, EKF_STATUS_REPORT=self._vouch, ESTIMATOR_STATUS=self._vouch,
-            EXTENDED_SYS_STATE=self._extended, GLOBAL_POSITION_INT=self._global, GPS_RAW_INT=self._gps,
-            HEARTBEAT=self._heartbeat, LOCAL_POSITION_NED=self._local, ODOMETRY=self._odometry,
-            RAW_IMU=self._gyro, SYS_STATUS=self._sensors, VFR_HUD=self._speed,
+            ATTITUDE=self._attitude, GLOBAL_POSITION_INT=self._global, LOCAL_POSITION_NED=self._local,
+            ODOMETRY=self._odometry, RAW_IMU=self._gyro, VFR_HUD=self._speed,
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Process a message of the vehicle, received at `time_us` (µs)."""
+        """Process a message of the vehicle, received at `time_us` (µs).
+
+        On the ground, dead reckoning by airspeed does not estimate the wind, because the wind does not move
+        the aircraft. The estimate is restarted at take-off.
+        """
+        grounded = self._autopilot.is_grounded
+        if self._grounded and not grounded:
+            self._navigator.new_motion(time_us)
+        self._grounded = grounded
+        if self.source is MotionSource.SPEED and not self._autopilot.measures_airspeed:
+            self.source = MotionSource.NONE  # the next best source is used at once
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
@@ -247,15 +298,15 @@ class Motion:
         self._filter.direct(time_us * 1e-6, field, self._main_field)
 
     def _gyro(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
-        if message.component == self._component.peer[1]:
+        if message.component == self._autopilot_id:
             rates = 1e-3 * np.array([message["xgyro"], message["ygyro"], message["zgyro"]])
             self._filter.gyro(message["time_usec"] * 1e-6, rates)
 
     def _turn(self, message: Message, time_us: int) -> float:
         """Return the heading of an ATTITUDE, rad; while it is wrong, return that of rates and field."""
         # While GPS is used, GPS is the more likely fault, and dead reckoning has to test GPS.
-        uses_gps = self.gps_trusted and time_us - self._gps_us < CONTRADICTED_US
-        vouched = uses_gps or time_us - self._contradicted_us >= CONTRADICTED_US
+        uses_gps = self.gps_trusted and time_us - self._autopilot.position_us < CONTRADICTED_US
+        vouched = uses_gps or time_us - self._autopilot.contradicted_us >= CONTRADICTED_US
         angles = message["roll"], message["pitch"], message["yaw"]
         rates = np.array([message["rollspeed"], message["pitchspeed"], message["yawspeed"]])
         received, heading, sigma = time_us * 1e-6, float(message["yaw"]), UNCHECKED_HEADING_SIGMA_RAD
@@ -271,13 +322,13 @@ class Motion:
         return heading
 
     def _attitude(self, message: Message, time_us: int) -> None:
-        own = message.component == self._component.peer[1]
+        own = message.component == self._autopilot_id
         heading = self._turn(message, time_us) if own else message["yaw"]
         self._heading, self._pitch = degrees(heading) % 360.0, degrees(message["pitch"])
         self._watch_for_glide(time_us)
         if self.source is MotionSource.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
             self._pass(time_us, heading=self._heading, pitch=self._pitch)
-        elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
+        elif time_us - self._steep_us < GLIDING_US and isfinite(self._autopilot.depth(time_us)):
             if self._use(MotionSource.GLIDE, time_us, "heading, pitch and depth"):
                 self._pass(time_us, heading=self._heading, pitch=self._pitch)
         elif isfinite(self._last):
@@ -292,7 +343,7 @@ class Motion:
 
         A vehicle with thrusters may also be steep when it accelerates.
         """
-        depth = self._frame.depth(time_us)
+        depth = self._autopilot.depth(time_us)
         if abs(self._pitch) < GLIDE or isnan(depth):
             self._dive_from = nan
         elif isnan(self._dive_from):
@@ -300,52 +351,22 @@ class Motion:
         elif abs(depth - self._dive_from) >= MIN_DIVE_M:
             self._steep_us = time_us
 
-    def _heartbeat(self, message: Message, time_us: int) -> None:
-        if message.component == self._component.peer[1]:
-            kind, stack = message["type"], message["autopilot"]
-            self._is_aircraft, self._armed = kind in AIRCRAFT, bool(message["base_mode"] & ARMED)
-            self._is_ardupilot = stack == MAV_AUTOPILOT.ARDUPILOTMEGA
-            is_ardupilot_boat = kind == MAV_TYPE.SURFACE_BOAT and self._is_ardupilot
-            self._measures_wind = kind == MAV_TYPE.GROUND_ROVER or is_ardupilot_boat
-            self._take_off_or_land(time_us)
-
-    def _sensors(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
-        """Note if an ArduPilot has an airspeed sensor; without one, it sends a speed that depends on GPS."""
-        if message.component == self._component.peer[1] and self._is_ardupilot:
-            present = message["onboard_control_sensors_present"] & DIFFERENTIAL_PRESSURE
-            self._lacks_airspeed = not present
-            if self._lacks_airspeed and self.source is MotionSource.SPEED:
-                self.source = MotionSource.NONE  # the next best source is used at once
-
-    def _extended(self, message: Message, time_us: int) -> None:
-        if message.component == self._component.peer[1]:
-            self._landed_state = message["landed_state"]
-            self._take_off_or_land(time_us)
-
-    def _take_off_or_land(self, time_us: int) -> None:
-        """Update whether an aircraft is on the ground; restart the estimate of the wind at take-off.
-
-        On the ground, dead reckoning by airspeed does not estimate the wind, because the wind does not move
-        the aircraft.
-        """
-        known = self._landed_state != STATE_UNKNOWN
-        resting = self._landed_state == ON_GROUND if known else not self._armed
-        grounded = self._is_aircraft and resting
-        if self._grounded and not grounded:
-            self._navigator.new_motion(time_us)
-        self._grounded = grounded
-
     def _speed(self, message: Message, time_us: int) -> None:
-        # the airspeed of a rover or an ArduPilot boat is not the speed of its medium
-        if self._measures_wind or self._lacks_airspeed:
+        if not self._autopilot.measures_airspeed:
             return
         speed = message["airspeed"]  # 0 of a vehicle that does not measure it
-        is_ground = min(abs(speed - message["groundspeed"]), abs(speed - self._ground_speed)) < EQUAL_M_S
+        is_ground = (
+            min(
+                abs(speed - message["groundspeed"]),
+                abs(speed - self._autopilot.value(GPS_RAW, "vel", nan) * 1e-2),
+            )
+            < EQUAL_M_S
+        )
         if is_ground and speed > 0.0:
             text = "VFR_HUD.airspeed is the speed over ground: not used"
             self._equal += 1
             if self._equal >= MIN_EQUAL:
-                self._component.output.announce("airspeed", text, MAV_SEVERITY.WARNING)
+                self._output.announce("airspeed", text, MAV_SEVERITY.WARNING)
         elif speed > 0.0 and isfinite(self._heading):
             self._equal = 0
             self._last = speed
@@ -357,24 +378,10 @@ class Motion:
                 speed = message["groundspeed"] if self._grounded else level
                 self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
 
-    def _gps(self, message: Message, time_us: int) -> None:
-        self._ground_speed = message["vel"] * 1e-2
-        if message["fix_type"] >= FIX_3D:
-            self._gps_us = time_us
-
-    def _vouch(self, message: Message, time_us: int) -> None:
-        """Process the autopilot's report of the validity of its velocity and attitude."""
-        if message.component == self._component.peer[1]:
-            flags = message["flags"]
-            holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
-            self._unvouched_us = -MAX_SOURCE_AGE_US if holds else time_us
-            if is_contradicted(message):
-                self._contradicted_us = time_us
-
     def rise(self, time_us: int) -> None:
         """Pass the depth, and an aircraft's height, to the navigator."""
-        depth = self._frame.depth(time_us)
-        self._pass(time_us, depth=depth, height=-depth if self._is_aircraft else nan)
+        depth = self._autopilot.depth(time_us)
+        self._pass(time_us, depth=depth, height=-depth if self._autopilot.is_aircraft else nan)
 
     def _global(self, message: Message, time_us: int) -> None:
         self.rise(time_us)
@@ -403,8 +410,8 @@ class Motion:
 
         `resets`: reset counter of the message, which changes when the position jumps.
         """
-        stream, own = (message.component, message.id), message.component == self._component.peer[1]
-        if own and (not self.gps_trusted or time_us - self._unvouched_us < MAX_SOURCE_AGE_US):
+        stream, own = (message.component, message.id), message.component == self._autopilot_id
+        if own and (not self.gps_trusted or time_us - self._autopilot.unvouched_us < MAX_SOURCE_AGE_US):
             return
         if isfinite(hypot(*velocity)) and velocity != (0.0, 0.0):
             self._measured.add(stream)
@@ -456,7 +463,7 @@ class Motion:
             self.source, self._stream, self._step = source, stream, None
         self._received_us = time_us
         severity = MAV_SEVERITY.WARNING if source is MotionSource.LAST else MAV_SEVERITY.INFO
-        self._component.output.announce("motion", f"dead reckoning by {words}", severity)
+        self._output.announce("motion", f"dead reckoning by {words}", severity)
         return True
 
     def _pass(self, time_us: int, **values: Any) -> None:

@@ -8,7 +8,7 @@ from math import cos, hypot, inf, radians, sin
 
 import numpy as np
 
-from magbridge.bridge.motion import FIX_3D, Frame, Motion, MotionSource
+from magbridge.bridge.motion import FIX_3D, GPS_RAW, LONGEST_US, Autopilot, Motion, MotionSource
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.config import Navigation as Wanted
@@ -32,8 +32,9 @@ from magbridge.wording import one_of
 
 __all__ = ["NavigationService", "open_navigation"]
 
-SHORTEST_US, LONGEST_US = 5_000_000, 60_000_000
-"""Limits of the time without a position after which GPS counts as lost, which is three GPS periods, µs."""
+SHORTEST_US = 5_000_000
+"""Shortest time without a position after which GPS counts as lost, µs. The time is three GPS periods, at most
+`LONGEST_US`."""
 HELD_US = 60_000_000
 """Time of good GPS after which the autopilot's position is equal to the GPS position, µs."""
 ASK_US = 5_000_000
@@ -60,56 +61,25 @@ HINTS = {
 """Result of a fix -> its meaning in the replies of ArduPilot (setLatLng) and PX4 (EKF2.cpp)."""
 
 
-class Gps:
-    """State of the autopilot's GPS: has it a recent position, and for how long."""
-
-    def __init__(self) -> None:
-        self._last_us = self._since_us = -LONGEST_US
-        self._allowed_us = 0
-
-    def receive(self, message: Message, time_us: int, *, used: bool = True) -> bool:
-        """Process a GPS_RAW_INT received at `time_us` (µs); return True if it has a usable position.
-
-        `used`: False if the bridge rejects or suspects the position.
-        """
-        good: bool = message["fix_type"] >= FIX_3D and used
-        if not good:
-            self._allowed_us = 0
-            return False
-        if not self.good(time_us):
-            self._since_us = time_us
-        period_us = time_us - self._last_us
-        self._last_us = time_us
-        self._allowed_us = min(max(3 * period_us, SHORTEST_US), LONGEST_US)
-        return True
-
-    def good(self, time_us: int) -> bool:
-        """Return True if the GPS has a recent position at `time_us` (µs)."""
-        return time_us - self._last_us < self._allowed_us
-
-    def held(self, time_us: int) -> bool:
-        """Return True if GPS has been good for `HELD_US`, so that the autopilot has adopted its position."""
-        return self.good(time_us) and time_us - self._since_us > HELD_US
-
-
 class Fixing:
     """Sender of fixes while the autopilot has no good GPS, and handler of the autopilot's replies.
 
     `kind`: message of the fixes, a value of :data:`~magbridge.link.estimates.FIX_MESSAGES`.
-    `frame`: local frame; the caller has passed each message to it before.
+    `autopilot`: state of the autopilot; the caller has passed each message to it before.
     `gnss`: monitor of GPS; the caller has passed each GPS position to it before.
-    `stack`: MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
     `sent`, `accepted`, `refused`: number of sent fixes, and of fixes accepted and rejected by the autopilot.
     """
 
-    def __init__(self, kind: Kind, component: Component, frame: Frame, gnss: GnssMonitor) -> None:
-        self.gps, self.stack = Gps(), int(MAV_AUTOPILOT.GENERIC)
+    def __init__(self, kind: Kind, component: Component, autopilot: Autopilot, gnss: GnssMonitor) -> None:
         self.sent = self.accepted = self.refused = 0
-        self._kind, self._component, self._frame = kind, component, frame
+        self._kind, self._component, self._autopilot = kind, component, autopilot
+        self._output = component.output
         self._gnss = gnss
-        self._position_us = -LONGEST_US  # when the receiver last sent a position, used or not
+        # times (µs) of the last usable GPS position, and since when GPS is good; how long it counts as good
+        self._gps_us = self._gps_since_us = -LONGEST_US
+        self._gps_allowed_us = 0
+        self._stack = int(MAV_AUTOPILOT.GENERIC)
         self._reported_unused = False
-        self._version: tuple[int, int] | None = None  # of the autopilot's firmware
         self._last: Fix | None = None
         self._agreed_us = 0  # when the autopilot's position was last that of our fixes
         self._before_us: int | None = None
@@ -117,30 +87,34 @@ class Fixing:
         self._result, self._report_us = -1, 0  # the answer that was reported; when another may be
         self._reboots = component.vehicle.reboots
         self._handlers = by_id(
-            AUTOPILOT_VERSION=self._read_version, COMMAND_ACK=self._answer,
-            GLOBAL_POSITION_INT=self._compare, GPS_RAW_INT=self._gps, HEARTBEAT=self._heartbeat,
+            COMMAND_ACK=self._answer, GLOBAL_POSITION_INT=self._compare, GPS_RAW_INT=self._gps,
+            HEARTBEAT=self._heartbeat,
         )  # fmt: skip
         if kind.local:
-            component.output.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
+            self._output.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
 
     @property
     def velocity_stays(self) -> bool:
         """True if a fix does not change the autopilot's velocity, as ArduPilot's setLatLng."""
-        return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4 and not self._ardupilot_fuses
+        return (
+            not self._kind.fused and self._autopilot.stack != MAV_AUTOPILOT.PX4 and not self._ardupilot_fuses
+        )
 
     @property
     def is_fused(self) -> bool:
         """True if the autopilot fuses fixes with its own position: their covariance is then inflated."""
-        replaced = self._version is not None and self._version <= PX4_KEEPS_CLAIM
-        fused_by_px4 = self.stack == MAV_AUTOPILOT.PX4 and not replaced
+        version = self._autopilot.version
+        replaced = version is not None and version <= PX4_KEEPS_CLAIM
+        fused_by_px4 = self._autopilot.stack == MAV_AUTOPILOT.PX4 and not replaced
         return self._kind.fused or fused_by_px4 or self._ardupilot_fuses
 
     @property
     def _ardupilot_fuses(self) -> bool:
         """True if the autopilot is an ArduPilot of version :data:`ARDUPILOT_FUSES` or later."""
-        if ARDUPILOT_FUSES is None or self._version is None:
+        version = self._autopilot.version
+        if ARDUPILOT_FUSES is None or version is None:
             return False
-        return self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._version >= ARDUPILOT_FUSES
+        return self._autopilot.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and version >= ARDUPILOT_FUSES
 
     def receive(self, message: Message, time_us: int) -> None:
         """Process a message of the autopilot, received at `time_us` (µs)."""
@@ -179,7 +153,9 @@ class Fixing:
         unwanted = self._unwanted(now_us)
         if unwanted or reckoned is None:
             return unwanted or "no valid position"
-        pose = self._frame.pose(now_us, reckoned.latitude, reckoned.longitude) if self._kind.local else None
+        pose = (
+            self._autopilot.pose(now_us, reckoned.latitude, reckoned.longitude) if self._kind.local else None
+        )
         if isinstance(pose, str):
             return pose
         fix = Fix(
@@ -189,20 +165,20 @@ class Fixing:
             covariance_nn=reckoned.covariance_nn,
             covariance_ne=reckoned.covariance_ne,
             covariance_ee=reckoned.covariance_ee,
-            altitude=self._frame.altitude(now_us),
+            altitude=self._autopilot.altitude(now_us),
             pose=pose,
             resets=resets,
         )
-        if self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._kind.overrated(fix):
+        if self._autopilot.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._kind.overrated(fix):
             return OVERRATED
         return fix
 
     def _unwanted(self, now_us: int) -> str:
         """Return the reason why the autopilot does not need or accept a fix; empty if it needs a fix."""
         accepted = self._ardupilot_fuses and not self._kind.local
-        if self.stack in self._kind.refused_by and not accepted:
-            return self._kind.refused_by[self.stack]
-        if self.gps.good(now_us):
+        if (stack := self._autopilot.stack) in self._kind.refused_by and not accepted:
+            return self._kind.refused_by[stack]
+        if self.has_good_gps(now_us):
             return "GPS is good"
         suspect = self._gnss.state is GnssState.SUSPECT and self._has_gps(now_us)
         return "GPS is suspect" if suspect else ""
@@ -212,7 +188,7 @@ class Fixing:
         self._waiting += 1
         if self._waiting > UNANSWERED:
             text = "the autopilot does not answer fixes"
-            self._component.output.announce("answer", text, MAV_SEVERITY.WARNING)
+            self._output.announce("answer", text, MAV_SEVERITY.WARNING)
 
     def _answer(self, message: Message, time_us: int) -> None:
         if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:
@@ -226,12 +202,12 @@ class Fixing:
         if result != self._result:
             self._result, self._report_us = result, time_us + ANSWER_PAUSE_US
         if accepted:
-            self._component.output.announce("answer", "the autopilot takes fixes")
+            self._output.announce("answer", "the autopilot takes fixes")
             return
         known = result in set(MAV_RESULT)
         name = MAV_RESULT(result).name if known else f"result {result}"
         text = f"the autopilot refuses fixes: {name}{HINTS.get(result, '')}"
-        self._component.output.announce("answer", text, MAV_SEVERITY.WARNING)
+        self._output.announce("answer", text, MAV_SEVERITY.WARNING)
 
     def _compare(self, message: Message, time_us: int) -> None:
         """Compare the autopilot's position with the last fix; report a difference that lasts `UNUSED_US`."""
@@ -241,47 +217,55 @@ class Fixing:
         distance = hypot(*separation(self._last.latitude, self._last.longitude, *own))
         if distance < MIN_DIFFERENCE_M + DIFFERENCE_SIGMA * self._last.sigma:
             self._agreed_us = time_us
-            self._component.output.forget("use")
+            self._output.forget("use")
         elif time_us - self._agreed_us > UNUSED_US:
             text = f"the autopilot does not use the fixes: its position is {distance:.0f} m off"
             # report only once, although the distance in the text changes
             if not self._reported_unused:
-                self._component.output.announce("use", text, MAV_SEVERITY.WARNING)
+                self._output.announce("use", text, MAV_SEVERITY.WARNING)
         self._reported_unused = distance >= MIN_DIFFERENCE_M and time_us - self._agreed_us > UNUSED_US
 
-    def _read_version(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
-        version = message["flight_sw_version"]
-        if version:
-            self._version = version >> 24, version >> 16 & 0xFF
+    def has_good_gps(self, time_us: int) -> bool:
+        """Return True if the GPS has a recent usable position at `time_us` (µs)."""
+        return time_us - self._gps_us < self._gps_allowed_us
+
+    def gps_held(self, time_us: int) -> bool:
+        """Return True if GPS has been good for `HELD_US`, so that the autopilot has adopted its position."""
+        return self.has_good_gps(time_us) and time_us - self._gps_since_us > HELD_US
 
     def _has_gps(self, time_us: int) -> bool:
         """Return True if the GPS receiver has recently sent positions, even if the bridge rejects them."""
-        return time_us - self._position_us < LONGEST_US
+        return time_us - self._autopilot.position_us < LONGEST_US
 
     def _gps(self, message: Message, time_us: int) -> None:
-        if message["fix_type"] >= FIX_3D:
-            self._position_us = time_us
-        used = self._gnss.state in (GnssState.NONE, GnssState.GOOD)
-        if self.gps.receive(message, time_us, used=used) and self._before_us is not None:
+        """Use a GPS_RAW_INT; the bridge may reject or suspect its position."""
+        if message["fix_type"] < FIX_3D or self._gnss.state not in (GnssState.NONE, GnssState.GOOD):
+            self._gps_allowed_us = 0
+            return
+        if not self.has_good_gps(time_us):
+            self._gps_since_us = time_us
+        self._gps_allowed_us = min(max(3 * (time_us - self._gps_us), SHORTEST_US), LONGEST_US)
+        self._gps_us = time_us
+        if self._before_us is not None:
             self._before_us = self._last = None
             self._report_none("GPS is good")
 
     def _heartbeat(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
-        if self.stack != message["autopilot"] and self._version is None:
+        if self._stack != message["autopilot"] and self._autopilot.version is None:
             self._request("AUTOPILOT_VERSION")
-        self.stack = message["autopilot"]
+        self._stack = message["autopilot"]
 
     def _ask_origin(self, time_us: int) -> None:  # noqa: ARG002 - a timer's action
         component = self._component
         if component.vehicle.reboots != self._reboots:
-            self._reboots, self._frame.origin = component.vehicle.reboots, None
-        if self._frame.origin is None:
+            self._reboots, self._autopilot.origin = component.vehicle.reboots, None
+        if self._autopilot.origin is None:
             self._request("GPS_GLOBAL_ORIGIN")
 
     def _request(self, name: str) -> None:
         """Request one message `name` from the autopilot."""
         system, autopilot = self._component.peer
-        self._component.output.send(
+        self._output.send(
             "COMMAND_LONG",
             command=MAV_CMD.REQUEST_MESSAGE,
             param1=float(spec(name).id),
@@ -296,10 +280,10 @@ class Fixing:
         )
 
     def _state(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        self._component.output.announce("fixes", text, severity)
+        self._output.announce("fixes", text, severity)
 
 
-GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
+INTEGRITY = spec("GNSS_INTEGRITY").id
 GPS_AGE_S, GPS_AGE_SIGMA_S = 0.15, 0.1
 """Delay from the GPS measurement to the arrival of GPS_RAW_INT and its standard deviation, s. It is 0.1 to
 0.2 s in the receiver (ArduPilot's and PX4's defaults), and up to 0.2 s until the autopilot sends the
@@ -346,9 +330,9 @@ class NavigationService:
     ) -> None:
         self.navigator = Navigator(grid, options)
         self._component = component
-        self._frame = Frame()
-        self.fixing = Fixing(fix, component, self._frame, self.navigator.gnss)
-        self.motion = Motion(self.navigator, component, self._frame, lambda: self.fixing.velocity_stays)
+        self._autopilot_id, self._autopilot = component.peer[1], Autopilot()
+        self.fixing = Fixing(fix, component, self._autopilot, self.navigator.gnss)
+        self.motion = Motion(self.navigator, component, self._autopilot, lambda: self.fixing.velocity_stays)
         self._gnss_state = GnssState.GOOD
         self._gps_time = own_time(spec("GPS_RAW_INT"))
         self._with_updates = fix.rate == 0.0
@@ -360,17 +344,17 @@ class NavigationService:
 
     def receive(self, message: Message, time_us: int) -> None:
         """Pass the motion or GPS position in a message, received at `time_us` (µs), to the navigator."""
-        if message.component == self._component.peer[1]:
-            self._frame.receive(message, time_us)
+        if message.component == self._autopilot_id:
+            self._autopilot.receive(message, time_us)
         if message.id == INTEGRITY:
             states = message["jamming_state"], message["spoofing_state"]
             self.navigator.gnss.receive_integrity(time_us, *states)
-        elif message.id == GPS:
+        elif message.id == GPS_RAW:
             self._gps(message, time_us)
-        if message.component == self._component.peer[1]:
+        if message.component == self._autopilot_id:
             self.fixing.receive(message, time_us)
         self.motion.receive(message, time_us)
-        if message.id == GPS and self._with_updates and not self.fixing.gps.good(time_us):
+        if message.id == GPS_RAW and self._with_updates and not self.fixing.has_good_gps(time_us):
             self._send()  # the first fix does not wait for the next update
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
@@ -397,7 +381,7 @@ class NavigationService:
         self.motion.rise(time_us)
         self._notify(self.navigator.gnss_position(time_us, latitude, longitude, sigma))
         gnss = self.navigator.gnss
-        if gnss.state is GnssState.GOOD and self.fixing.gps.held(time_us):
+        if gnss.state is GnssState.GOOD and self.fixing.gps_held(time_us):
             self.motion.gps_held()
         self.motion.gps_trusted = gnss.state is GnssState.GOOD
         if gnss.state is not self._gnss_state:

@@ -34,7 +34,7 @@ from magbridge.link.publish import MASK, check_publish
 from magbridge.link.telemetry import EKF_STATUS, PX4_STATUS, TelemetryMap, is_possible, needed_rates
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Message, Signing, Spec, load_key, spec
-from magbridge.mavlink.enums import MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_PORT_NAME, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.scalar_correction import ScalarCorrection
 from magbridge.sensors import Driver
@@ -168,12 +168,10 @@ class Pipeline:
     @property
     def declarations(self) -> list[bytes]:
         """Frames at the begin of each log file, which declare its columns."""
-        own, parameters = self._config.link, self.component.parameters
+        parameters = self.component.parameters
         keys = [row.key for row in parameters.table.values()]
         settings = {key: parameters.value_of(key) for key in keys if key.startswith(("align.", "telemetry."))}
-        telemetry, nt_per_count = self._config.telemetry, self.streams[0].driver.nt_per_count
-        others = [(one.sensor, one.driver) for one in self.streams[1:]]
-        return declarations(own.system, own.component, telemetry, nt_per_count, settings, others)
+        return declarations(self._config, [one.driver for one in self.streams], settings)
 
     @property
     def deadline(self) -> int:
@@ -447,7 +445,7 @@ class Edge(Protocol):
         ...
 
     def send(self, number: int, data: bytes) -> None:
-        """Send `data` to the link or to a sensor; `number` is the MAG_PORT_NAME of the port."""
+        """Send `data` to the port `number` (MAG_PORT_NAME)."""
         ...
 
     def credit(self, frames: list[bytes]) -> None:
@@ -486,6 +484,9 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after_event: C
             if commands := stream.to_send:
                 edge.send(port_number(stream.sensor_id), b"".join(commands))
                 commands.clear()
+        if pipeline.heading is not None and (sentences := pipeline.heading.nmea):
+            edge.send(MAG_PORT_NAME.NMEA, b"".join(sentences))
+            sentences.clear()
         records = pipeline.recorder.drain()
         if log is not None and records:
             log.extend(records)

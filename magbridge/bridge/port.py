@@ -253,6 +253,10 @@ class Port(ABC):
     def tend(self) -> None:  # noqa: B027 - most ports need nothing
         """Do periodic slow work while the port is open; called by the thread that opens it."""
 
+    def move_on(self) -> None:
+        """Close the port, which is then opened again; for a pattern, with the next matching device."""
+        self.close()
+
     def fds(self) -> list[int]:
         """Return the file descriptors to wait for."""
         return [self._fd] if self._fd >= 0 else []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from math import atan2, cos, degrees, hypot, inf, isfinite, isnan, nan, radians, sin, tan
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.config import HeadingOutput
 from magbridge.errors import MagbridgeError
 from magbridge.field.geodesy import separation
+from magbridge.field.igrf import HeldField, igrf
 from magbridge.link.component import Component
 from magbridge.link.estimates import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
 from magbridge.link.output import Rate
@@ -36,9 +37,6 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT
 from magbridge.records import Corrected, Vector
 
-if TYPE_CHECKING:
-    from magbridge.field.igrf import NearbyField
-
 __all__ = [
     "CLOCK_SET_US",
     "LiveHeading",
@@ -51,8 +49,8 @@ MAX_POSITION_AGE_US: Final = 60_000_000
 changes by less than 0.1 nT."""
 CLOCK_SET_US: Final = 10**15
 """Time in 2001, µs since 1970; if the host's clock is earlier, it was never set, and the date is unknown."""
-FIELD_INTERVAL_US: Final = 1_000_000
-"""Time after which the bridge computes the main field again, µs."""
+FIELD_RETRY_US: Final = 1_000_000
+"""Time after which the bridge tries again to compute the main field, µs."""
 MAX_VECTOR_AGE_US: Final = 3_600_000_000
 MAX_VECTOR_DISTANCE_DEG: Final = 0.01
 """Time (µs) and difference of latitude or longitude (deg) after which the bridge computes the main field's
@@ -87,12 +85,11 @@ class Position:
         self._notify = notify
         self._where: tuple[float, float] | None = None
         self._depth = 0.0
-        self._when_us = self._evaluated_us = 0
-        self._field = nan
+        self._when_us = self._failed_us = 0
+        self._held = HeldField()
         self._vector = UNKNOWN_VECTOR
         self._vector_us, self._vector_at = 0, (nan, nan)
         self._vector_where: tuple[float, float] | None = None  # for which the vector was checked
-        self._model: NearbyField | None = None
         self._trusted: tuple[float, float] | None = None
         self._first_us = self._trusted_us = self._jumped_us = 0
 
@@ -121,7 +118,7 @@ class Position:
             altitude = 0.0
         latitude, longitude = lat * 1e-7, lon * 1e-7
         if self._where != (latitude, longitude) or self._depth != -altitude:
-            self._where, self._depth, self._evaluated_us = (latitude, longitude), -altitude, 0
+            self._where, self._depth, self._failed_us = (latitude, longitude), -altitude, 0
         self._when_us = time_us
         self._watch_for_jumps(time_us)
 
@@ -160,12 +157,15 @@ class Position:
             or self._jumped_us
             or utc_us < CLOCK_SET_US
             or abs(time_us - self._when_us) > MAX_POSITION_AGE_US
+            or abs(utc_us - self._failed_us) <= FIELD_RETRY_US
         ):
             return nan
-        if abs(utc_us - self._evaluated_us) > FIELD_INTERVAL_US:
-            self._evaluated_us = utc_us
-            self._field = self._evaluate(utc_us)
-        return self._field
+        try:
+            return self._held.field_at((*self._where, self._depth), utc_us)
+        except (OSError, MagbridgeError) as error:  # OSError: no file handle is left
+            self._failed_us = utc_us
+            self._notify(str(error))
+            return nan
 
     def direction(self, main_field: float, utc_us: int) -> tuple[float, float, float]:
         """Return the IGRF's field vector near the position, nT, north-east-down.
@@ -187,22 +187,8 @@ class Position:
         distance_deg = max(abs(latitude - last_latitude), abs(longitude - last_longitude))
         if distance_deg < MAX_VECTOR_DISTANCE_DEG and abs(utc_us - self._vector_us) <= MAX_VECTOR_AGE_US:
             return
-        from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
-
         north, east, down = igrf(longitude, latitude, self._depth, utc_us * 1e-6)[0].tolist()
         self._vector, self._vector_us, self._vector_at = (north, east, down), utc_us, self._where
-
-    def _evaluate(self, utc_us: int) -> float:
-        assert self._where is not None
-        try:
-            if self._model is None:
-                from magbridge.field.igrf import NearbyField  # noqa: PLC0415 - the field model is optional live
-
-                self._model = NearbyField()
-            return self._model.field_and_slopes(*self._where, self._depth, utc_us * 1e-6)[0]
-        except (ImportError, OSError, MagbridgeError) as error:  # OSError: no file handle is left
-            self._notify(str(error))
-            return nan
 
 
 ATTITUDE, HEARTBEAT = spec("ATTITUDE"), spec("HEARTBEAT").id

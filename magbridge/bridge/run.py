@@ -19,16 +19,14 @@ from contextlib import suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import Annotated
 
 import msgspec
-from msgspec import Meta
 
 from magbridge.bridge import events
-from magbridge.bridge.devices import BusPort, SerialPort, sensor_port
+from magbridge.bridge.devices import sensor_port
 from magbridge.bridge.events import HostClock, LiveEdge, StartEvent, port_number
 from magbridge.bridge.learning import keep, kept_path
-from magbridge.bridge.links import NmeaOutput, nmea_port, open_link
+from magbridge.bridge.links import nmea_port, open_link
 from magbridge.bridge.pipeline import Pipeline, drive, set_up
 from magbridge.bridge.port import Port
 from magbridge.config import Config, load
@@ -48,34 +46,21 @@ __all__ = [
     "run",
 ]
 
-Byte = Annotated[int, Meta(ge=0, le=255)]
 
-
-class StoredState(msgspec.Struct, frozen=True):
-    """State of the bridge that is stored in a file for the next run."""
-
-    parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
-    """Values of parameters that differ from the configuration, by name."""
-    signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
-    """Last signing time stamp that may have been used (10 µs since 2015-01-01); 48 bits on the link."""
-    signing_streams: list[tuple[Byte, Byte, Byte, bool, Annotated[int, Meta(ge=0, lt=1 << 48)]]] = []
-    """Last accepted time stamp of each signed stream."""
-
-
-def load_state(path: str | Path) -> StoredState:
+def load_state(path: str | Path) -> StartEvent:
     """Return the state in the file at `path`; an empty state if the file does not exist.
 
     FormatError: the file does not have the format of :func:`save_state`.
     """
     try:
-        return msgspec.json.decode(Path(path).read_bytes(), type=StoredState)
+        return msgspec.json.decode(Path(path).read_bytes(), type=StartEvent)
     except FileNotFoundError:
-        return StoredState()
+        return StartEvent()
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FormatError(path, f"kept parameters as JSON: {error}") from error
 
 
-def save_state(path: str | Path, kept: StoredState) -> None:
+def save_state(path: str | Path, kept: StartEvent) -> None:
     """Write the state to the file at `path`, atomically and synchronised to the disk."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))
@@ -101,7 +86,7 @@ class Keeper:
         try:
             self._kept = load_state(self._path)
         except (FormatError, OSError):  # the bridge starts without the stored state
-            self._kept, self._spoilt = StoredState(), True
+            self._kept, self._spoilt = StartEvent(), True
         self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
         self._saved_us = self._next_try_us = 0
         self._saved_revision: int | None = 0
@@ -121,8 +106,7 @@ class Keeper:
 
     def start(self, time_us: int) -> StartEvent:
         """Return the start event of a run at `time_us` (µs), with the stored state."""
-        kept = self._kept
-        return StartEvent(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
+        return msgspec.structs.replace(self._kept, time_us=time_us)
 
     def save_changes(self, pipeline: Pipeline, time_us: int) -> None:
         """Save a new learned calibration, changed parameters, and, every `STAMP_INTERVAL_US`, time stamps."""
@@ -143,10 +127,10 @@ class Keeper:
 
         `last`: True at the end of a run, when no time stamps need be reserved for later frames.
         """
-        kept = StoredState(pipeline.component.parameters.changed())
+        kept = StartEvent(parameters=pipeline.component.parameters.changed())
         if signing := pipeline.signing:
             stamp = signing.last if last else signing.reserved(pipeline.component.codec.utc_us, self.AHEAD)
-            kept = StoredState(kept.parameters, stamp, signing.streams)
+            kept = StartEvent(0, kept.parameters, stamp, signing.streams)
         if kept == self._kept:
             return True
         try:
@@ -180,10 +164,8 @@ def run(path: Path) -> None:
     config, clock = load(path), HostClock()
     keeper = Keeper(config)
     pipeline = set_up(config, keeper.start(clock.now_us()))
-    link, sensors = ports(config)
-    nmea = nmea_port(config)
-    # the link first, so that the bridge can report a sensor's port that does not open
-    edge = LiveEdge({Channel.LINK: link, **sensors}, clock)
+    opened = ports(config)
+    link, edge = opened[Channel.LINK], LiveEdge(opened, clock)
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
@@ -196,35 +178,45 @@ def run(path: Path) -> None:
     # would delay the first heartbeat by 20 ms and free only 0.1 MB.
     gc.freeze()
     gc.enable()
-    sentences = NmeaOutput(nmea, edge.notify) if nmea is not None else None
-    upkeep = Upkeep(config, pipeline, edge, keeper, link, log, sentences)
+    component, folder = pipeline.component, config.resolve(config.log.directory) if config.log else None
+    parameters = component.parameters
+    files = FileServer(component.metadata, folder, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.notify)
+    monitor = LogMonitor(log, pipeline, edge) if log is not None else None
 
     def finish_event(time_us: int) -> None:
-        upkeep.finish_event(time_us)
-        leave_wrong_devices(pipeline, sensors)
+        while component.file_requests:
+            files.ask(component.file_requests.popleft())
+        if not link.waiting:
+            station, messages = files.drain()
+            if messages:
+                edge.answer(station, pipeline.interleaved(messages))
+        keeper.save_changes(pipeline, time_us)
+        if monitor is not None:
+            monitor.check(time_us)
+        leave_wrong_devices(pipeline, opened)
 
     try:
         drive(pipeline, edge, log, finish_event)
     finally:
         keeper.save(pipeline, last=True)
-        upkeep.files.close()
+        files.close()
         edge.close()
-        if sentences is not None:
-            sentences.close()
         if log is not None:
             log.close()
 
 
-def leave_wrong_devices(pipeline: Pipeline, sensors: Mapping[int, SerialPort | BusPort]) -> None:
+def leave_wrong_devices(pipeline: Pipeline, ports: Mapping[int, Port]) -> None:
     """For each sensor on whose port another instrument seems to send, switch to the next matching device."""
     for stream in pipeline.streams:
         if stream.wrong_device:
             stream.wrong_device = False
-            sensors[port_number(stream.sensor_id)].move_on()
+            ports[port_number(stream.sensor_id)].move_on()
 
 
-def ports(config: Config) -> tuple[Port, dict[int, SerialPort | BusPort]]:
-    """Return the (unopened) port of the link, and the ports of the sensors by MAG_PORT_NAME.
+def ports(config: Config) -> dict[int, Port]:
+    """Return the (unopened) ports of the link, of the sensors and of NMEA sentences, by MAG_PORT_NAME.
+
+    The link is the first, so that the bridge can report another port that does not open.
 
     ConfigError: a port's name is not valid.
     """
@@ -238,7 +230,8 @@ def ports(config: Config) -> tuple[Port, dict[int, SerialPort | BusPort]]:
         signed=own.signing_key is not None,
     )
     sensors = {port_number(one.id or 0): sensor_port(one, config.path) for one in config.sensors}
-    return link, sensors
+    nmea = nmea_port(config)
+    return {Channel.LINK: link, **sensors, **({MAG_PORT_NAME.NMEA: nmea} if nmea is not None else {})}
 
 
 def _stop_on_signals(edge: LiveEdge) -> None:
@@ -276,52 +269,20 @@ def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter 
     )
 
 
-class Upkeep:
-    """Tasks between two events: serve files, save the state, report on the log, send NMEA sentences."""
+class LogMonitor:
+    """Reporter of failures, recoveries and losses of the log, which also updates its records of the start."""
 
-    def __init__(
-        self,
-        config: Config,
-        pipeline: Pipeline,
-        edge: LiveEdge,
-        keeper: Keeper,
-        link: Port,
-        log: TlogWriter | None,
-        sentences: NmeaOutput | None,
-    ) -> None:
-        self._pipeline, self._edge, self._keeper, self._link = pipeline, edge, keeper, link
-        self._log, self._sentences = log, sentences
-        component = pipeline.component
-        self._parameters, self._requests = component.parameters, component.file_requests
-        folder = config.resolve(config.log.directory) if config.log else None
-        self.files = FileServer(
-            component.metadata, folder, lambda: 1e3 * self._parameters["MB_FILE_RATE"], edge.notify
-        )
-        self._beginning_revision: int | None = None
-        self._reported = ("", 0)
-        self._log_check_us = 0
+    def __init__(self, log: TlogWriter, pipeline: Pipeline, edge: LiveEdge) -> None:
+        self._log, self._pipeline, self._edge = log, pipeline, edge
+        self._reported, self._check_us = ("", 0), 0
 
-    def finish_event(self, time_us: int) -> None:
-        """Run the tasks that are due after an event at `time_us` (µs)."""
-        while self._requests:
-            self.files.ask(self._requests.popleft())
-        if not self._link.waiting:
-            station, messages = self.files.drain()
-            if messages:
-                self._edge.answer(station, self._pipeline.interleaved(messages))
-        self._keeper.save_changes(self._pipeline, time_us)
-        if self._log is not None and time_us >= self._log_check_us:
-            self._log_check_us = time_us + LOG_CHECK_US
-            self._check_log(self._log)
-        if self._sentences is not None and self._pipeline.heading is not None:
-            self._sentences.send(self._pipeline.heading.nmea, time_us)
-
-    def _check_log(self, log: TlogWriter) -> None:
-        """Report failures, recoveries and losses of the log; update the first records of its next file."""
-        if self._parameters.revision != self._beginning_revision:
-            self._beginning_revision = self._parameters.revision
-            log.beginning = self._pipeline.beginning(self._parameters.changed())
-        state = log.failure, log.lost
+    def check(self, time_us: int) -> None:
+        """Report changes of the log's state, at most once in `LOG_CHECK_US`, at `time_us` (µs)."""
+        if time_us < self._check_us:
+            return
+        self._check_us = time_us + LOG_CHECK_US
+        self._log.beginning = self._pipeline.beginning(self._pipeline.component.parameters.changed())
+        state = self._log.failure, self._log.lost
         if state != self._reported:
             self._reported = state
             self._edge.notify(events.port_state(MAG_PORT_NAME.LOG, *state))

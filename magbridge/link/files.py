@@ -13,7 +13,6 @@ import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 from io import BytesIO
@@ -81,11 +80,8 @@ LOGS = ("@MAV_LOG", "logs")
 """Names of the log folder: the name in the MAVLink guide, and a readable alias."""
 
 
-class Entry(NamedTuple):
-    """Entry of a folder: its name, and its size in bytes, which is None for a folder."""
-
-    name: str
-    size: int | None
+Entry = tuple[str, int | None]
+"""Entry of a folder: its name, and its size in bytes, which is None for a folder."""
 
 
 class Tree:
@@ -103,8 +99,8 @@ class Tree:
         """Return the entries of a folder, in a fixed order; raise OSError if the folder does not exist."""
         match parts(path):
             case []:
-                texts = [Entry(name, len(text)) for name, text in self._texts.items()]
-                return [*(Entry(name, None) for name in LOGS if self._logs is not None), *texts]
+                texts = [(name, len(text)) for name, text in self._texts.items()]
+                return [*((name, None) for name in LOGS if self._logs is not None), *texts]
             case [name] if name in LOGS and self._logs is not None:
                 return self.logs()
         raise FileNotFoundError(errno.ENOENT, path)
@@ -124,12 +120,8 @@ class Tree:
         if self._logs is None or not self._logs.is_dir():
             return []
         with os.scandir(self._logs) as found:
-            logs = [
-                Entry(one.name, one.stat().st_size)
-                for one in found
-                if LOG.fullmatch(one.name) and one.is_file(follow_symlinks=False)
-            ]
-        return sorted(logs)
+            logs = [one for one in found if LOG.fullmatch(one.name) and one.is_file(follow_symlinks=False)]
+            return sorted((one.name, one.stat().st_size) for one in logs)
 
 
 def parts(path: str) -> list[str]:
@@ -169,10 +161,10 @@ class LogTransfer:
         count = len(self._logs)
         if not count:
             yield LOG_ENTRY, LOG_ENTRY.payload()
-        for number, one in enumerate(self._logs, 1):
+        for number, (name, size) in enumerate(self._logs, 1):
             if start <= number <= end:
-                fields = {"id": number, "num_logs": count, "last_log_num": count, "size": one.size or 0}
-                yield LOG_ENTRY, LOG_ENTRY.payload(**fields, time_utc=began_s(one.name))
+                fields = {"id": number, "num_logs": count, "last_log_num": count, "size": size or 0}
+                yield LOG_ENTRY, LOG_ENTRY.payload(**fields, time_utc=began_s(name))
 
     def data(self, number: int, offset: int, count: int) -> Iterator[tuple[Spec, bytes]]:
         """Yield the LOG_DATA messages with `count` bytes from `offset` of the log `number`.
@@ -185,7 +177,7 @@ class LogTransfer:
                 self._logs = self._tree.logs()[-LAST_LOG_ID:]
         end = offset + count
         try:
-            name = self._logs[number - 1].name if 0 < number <= len(self._logs) else ""
+            name = self._logs[number - 1][0] if 0 < number <= len(self._logs) else ""
             file, _ = self._tree.open(f"logs/{name}")
         except OSError:
             yield LOG_DATA, LOG_DATA.payload(id=number, ofs=offset)
@@ -219,6 +211,8 @@ FTP_BLOCK_BYTES = 1 << 20
 
 Sender = tuple[int, int]
 """System id and component id of a station."""
+SessionKey = tuple[Sender, int]
+"""Station, and number of its session."""
 
 
 class Opcode(IntEnum):
@@ -294,19 +288,6 @@ class Request(NamedTuple):
         return (header + data).ljust(FTP_HEADER.size + DATA, b"\0")
 
 
-@dataclass
-class Session:
-    """File that a station has open, and the time of its last use, s of the server's clock."""
-
-    file: BinaryIO
-    used: float
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes from `offset`; empty beyond the end of the file."""
-        self.file.seek(offset)
-        return self.file.read(size)
-
-
 class FtpServer:
     """MAVLink FTP server for all stations.
 
@@ -316,7 +297,8 @@ class FtpServer:
 
     def __init__(self, tree: Tree, now_s: Callable[[], float]) -> None:
         self._tree, self._now = tree, now_s
-        self._sessions: dict[tuple[Sender, int], Session] = {}
+        self._files: dict[SessionKey, BinaryIO] = {}
+        self._used_s: dict[SessionKey, float] = {}  # time of the last use of each session
         self._last: dict[Sender, tuple[Request, bytes]] = {}
 
     def handle(self, sender: Sender, payload: bytes) -> Iterator[bytes]:
@@ -330,6 +312,8 @@ class FtpServer:
             yield reply
             return
         try:
+            if request.size > DATA:
+                raise Refused(Error.INVALID_SIZE)  # noqa: TRY301 - as the other operations do
             if request.opcode == Opcode.BURST:
                 self._last.pop(sender, None)
                 yield from self._burst(sender, request)
@@ -355,26 +339,27 @@ class FtpServer:
 
     def close(self) -> None:
         """Close all open files."""
-        for key in list(self._sessions):
+        for key in list(self._files):
             self._close(key)
 
     def _answer(self, sender: Sender, request: Request) -> bytes:
-        self._check(request)
         match request.opcode:
             case Opcode.NONE:
                 pass
             case Opcode.TERMINATE:
-                self._session(sender, request)
+                self._file(sender, request)
                 self._close((sender, request.session))
             case Opcode.RESET:  # closes no file of another station
-                for key in [key for key in self._sessions if key[0] == sender]:
+                for key in [key for key in self._files if key[0] == sender]:
                     self._close(key)
             case Opcode.LIST:
                 return self._list(request)
             case Opcode.OPEN_READ:
                 return self._open(sender, request)
             case Opcode.READ:
-                return self._read(sender, request)
+                if data := self._read(sender, request, request.size or DATA):
+                    return request.reply(Opcode.ACK, data)
+                raise Refused(Error.END_OF_FILE)
             case Opcode.CRC32:
                 return self._crc32(request)
             case _:
@@ -386,8 +371,8 @@ class FtpServer:
         if request.offset >= len(entries):
             raise Refused(Error.END_OF_FILE)
         data = b""
-        for entry in entries[request.offset :]:
-            text = f"D{entry.name}" if entry.size is None else f"F{entry.name}\t{entry.size}"
+        for name, size in entries[request.offset :]:
+            text = f"D{name}" if size is None else f"F{name}\t{size}"
             text_data = text.encode("utf-8", "replace") + b"\0"
             if len(data) + len(text_data) > DATA:
                 break
@@ -397,15 +382,23 @@ class FtpServer:
     def _open(self, sender: Sender, request: Request) -> bytes:
         number = self._free(sender, request.session)
         file, size = self._tree.open(request.path)
-        self._sessions[sender, number] = Session(file, self._now())
+        self._files[sender, number], self._used_s[sender, number] = file, self._now()
         size_data = min(size, 0xFFFFFFFF).to_bytes(4, "little")
         return request.reply(Opcode.ACK, size_data, session=number)
 
-    def _read(self, sender: Sender, request: Request) -> bytes:
-        data = self._session(sender, request).read(request.offset, request.size or DATA)
-        if not data:
-            raise Refused(Error.END_OF_FILE)
-        return request.reply(Opcode.ACK, data)
+    def _file(self, sender: Sender, request: Request) -> BinaryIO:
+        """Return the open file of the session of a request; Refused: it does not exist."""
+        key = sender, request.session
+        if key not in self._files:
+            raise Refused(Error.INVALID_SESSION)
+        self._used_s[key] = self._now()
+        return self._files[key]
+
+    def _read(self, sender: Sender, request: Request, size: int) -> bytes:
+        """Return up to `size` bytes from the offset of a request; empty beyond the end of the file."""
+        file = self._file(sender, request)
+        file.seek(request.offset)
+        return file.read(size)
 
     def _crc32(self, request: Request) -> bytes:
         file, _ = self._tree.open(request.path)
@@ -417,13 +410,12 @@ class FtpServer:
 
     def _burst(self, sender: Sender, request: Request) -> Iterator[bytes]:
         """Yield the payloads of a burst of file data; the burst ends early if its session is closed."""
-        self._check(request)
-        session, size = self._session(sender, request), request.size or DATA
-        block = session.read(request.offset, BURST * size)
+        size, key = request.size or DATA, (sender, request.session)
+        file, block = self._file(sender, request), self._read(sender, request, BURST * size)
         for count in range(BURST):
-            if self._sessions.get((sender, request.session)) is not session:
+            if self._files.get(key) is not file:
                 return
-            session.used = self._now()
+            self._used_s[key] = self._now()
             data = block[count * size : (count + 1) * size]
             opcode, complete = (Opcode.ACK, count == BURST - 1) if data else (Opcode.NAK, False)
             yield request.reply(
@@ -436,33 +428,22 @@ class FtpServer:
             if not data:
                 return
 
-    @staticmethod
-    def _check(request: Request) -> None:
-        if request.size > DATA:
-            raise Refused(Error.INVALID_SIZE)
-
-    def _session(self, sender: Sender, request: Request) -> Session:
-        session = self._sessions.get((sender, request.session))
-        if session is None:
-            raise Refused(Error.INVALID_SESSION)
-        session.used = self._now()
-        return session
-
     def _free(self, sender: Sender, wanted: int) -> int:
         """Return a free session number of `sender`, preferably `wanted`; close an unused session if needed.
 
         Refused: too many sessions are open, and each was used within `SESSION_TIMEOUT_S`.
         """
-        own = [key for key in self._sessions if key[0] == sender]
-        crowd = own if len(own) >= EACH else list(self._sessions) if len(self._sessions) >= SESSIONS else []
+        own = [key for key in self._files if key[0] == sender]
+        crowd = own if len(own) >= EACH else list(self._files) if len(self._files) >= SESSIONS else []
         if crowd:
-            oldest: tuple[Sender, int] = min(crowd, key=lambda key: self._sessions[key].used)
-            if self._now() - self._sessions[oldest].used < SESSION_TIMEOUT_S:
+            oldest = min(crowd, key=self._used_s.__getitem__)
+            if self._now() - self._used_s[oldest] < SESSION_TIMEOUT_S:
                 raise Refused(Error.NO_SESSIONS)
             self._close(oldest)
-        taken = {number for who, number in self._sessions if who == sender}
+        taken = {number for who, number in self._files if who == sender}
         return wanted if wanted not in taken else min(set(range(256)) - taken)
 
-    def _close(self, key: tuple[Sender, int]) -> None:
+    def _close(self, key: SessionKey) -> None:
+        del self._used_s[key]
         with suppress(OSError):
-            self._sessions.pop(key).file.close()
+            self._files.pop(key).close()

@@ -197,39 +197,30 @@ DISTANCE_AND_SPEED = dict.fromkeys("xyz", MAX_DISTANCE_M) | dict.fromkeys(
 )
 
 
-def limits(**of: dict[str, float]) -> dict[int, list[tuple[Field, float]]]:
-    """Return fields with their largest valid magnitudes, by message id, from both by name."""
-    return {
-        spec(name).id: [(spec(name).fields[field], largest) for field, largest in fields.items()]
-        for name, fields in of.items()
-    }
-
-
-REQUIRED: Final = limits(
-    ATTITUDE={"roll": MAX_ANGLE_RAD, "pitch": MAX_ANGLE_RAD, "yaw": MAX_ANGLE_RAD},
-    GLOBAL_POSITION_INT={"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
-    GPS_RAW_INT={"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
-    GPS_GLOBAL_ORIGIN={"latitude": LATITUDE_E7, "longitude": LONGITUDE_E7},
-)
-"""Message id -> fields that must not be NaN, with their largest valid magnitudes."""
-LIMITED: Final = limits(
-    LOCAL_POSITION_NED=DISTANCE_AND_SPEED,
-    ODOMETRY=DISTANCE_AND_SPEED,
-    VFR_HUD={"airspeed": MAX_VALID_SPEED_M_S, "groundspeed": MAX_VALID_SPEED_M_S},
-)
-"""Message id -> fields that may be NaN (unknown), with their largest valid magnitudes."""
+VALID_BY_NAME: Final[dict[str, dict[str, float]]] = {
+    "ATTITUDE": dict.fromkeys(("roll", "pitch", "yaw"), MAX_ANGLE_RAD),
+    "GLOBAL_POSITION_INT": {"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
+    "GPS_RAW_INT": {"lat": LATITUDE_E7, "lon": LONGITUDE_E7},
+    "GPS_GLOBAL_ORIGIN": {"latitude": LATITUDE_E7, "longitude": LONGITUDE_E7},
+    "LOCAL_POSITION_NED": DISTANCE_AND_SPEED,
+    "ODOMETRY": DISTANCE_AND_SPEED,
+    "VFR_HUD": dict.fromkeys(("airspeed", "groundspeed"), MAX_VALID_SPEED_M_S),
+}
+VALID_LIMITS: Final = {
+    spec(name).id: [(spec(name).fields[field], largest) for field, largest in fields.items()]
+    for name, fields in VALID_BY_NAME.items()
+}
+"""Message id -> fields with their largest valid magnitudes."""
 MAX_QUATERNION: Final = 1.1
-ODOMETRY: Final = spec("ODOMETRY").id
+ATTITUDE, ODOMETRY = spec("ATTITUDE").id, spec("ODOMETRY").id
 
 
 def is_possible(message: Message) -> bool:
-    """Return False if a used field of a message is infinite, out of range, or NaN without permission."""
-    for field, largest in REQUIRED.get(message.id, ()):
-        if not abs(field.get(message.payload)) <= largest:  # also NaN
-            return False
-    for field, largest in LIMITED.get(message.id, ()):
+    """Return False if a used field of a message is infinite, out of range, or NaN in an ATTITUDE."""
+    may_be_unknown = message.id != ATTITUDE
+    for field, largest in VALID_LIMITS.get(message.id, ()):
         value = field.get(message.payload)
-        if not (isnan(value) or abs(value) <= largest):
+        if not (abs(value) <= largest or (may_be_unknown and isnan(value))):
             return False
     if message.id == ODOMETRY:
         return all(isnan(part) or abs(part) <= MAX_QUATERNION for part in message["q"])

@@ -321,17 +321,11 @@ class Codec:
             self.signing.skip(count, self.utc_us)
 
     def _accept(self, message: Message) -> Message:
-        if message.id in SECRET:
-            frame = without_secret(message.frame)
-            return Message(
-                REFUSED, message.system, message.component, message.sequence, b"", frame, known=False
-            )
-        if self.signing and not self.signing.accept(
-            message.frame, (message.system, message.component), message.id, self.utc_us
-        ):
-            return Message(
-                REFUSED, message.system, message.component, message.sequence, b"", message.frame, known=False
-            )
+        sender, frame, signing = (message.system, message.component), message.frame, self.signing
+        is_secret = message.id in SECRET
+        if is_secret or (signing and not signing.accept(frame, sender, message.id, self.utc_us)):
+            frame = without_secret(frame) if is_secret else frame
+            return Message(REFUSED, *sender, message.sequence, b"", frame, known=False)
         self.frames += 1
         return message
 

@@ -13,6 +13,7 @@ from functools import cache
 from struct import Struct
 from typing import Any, Final, TypeVar
 
+import msgspec
 from pymavlink.dialects.v20 import all as upstream
 from pymavlink.dialects.v20.all import (
     MAVLINK_IFLAG_SIGNED,
@@ -148,30 +149,21 @@ def by_id(**of: T) -> dict[int, T]:
     return {spec(name).id: value for name, value in of.items()}
 
 
-class Message:
-    """Received message, whose fields are read by name: ``message["roll"]``.
+class Message(msgspec.Struct, frozen=True, gc=False):
+    """Received message, whose fields are read by name: ``message["roll"]``."""
 
-    `id`: message id; `BAD_DATA` for bytes without a frame, `REFUSED` for a rejected frame.
-    `system`, `component`, `sequence`: system id, component id and sequence number of the sender.
-    `payload`: payload, with the final zeros that MAVLink 2 does not transmit.
-    `frame`: all received bytes of the frame.
-    `known`: true if the message is in the dialect and its checksum is correct.
-    """
-
-    __slots__ = ("component", "frame", "id", "known", "payload", "sequence", "system")
-
-    def __init__(
-        self,
-        number: int,
-        system: int,
-        component: int,
-        sequence: int,
-        payload: bytes,
-        frame: bytes,
-        known: bool,
-    ) -> None:
-        self.id, self.system, self.component, self.sequence = number, system, component, sequence
-        self.payload, self.frame, self.known = payload, frame, known
+    id: int
+    """Message id; `BAD_DATA` for bytes without a frame, `REFUSED` for a rejected frame."""
+    system: int
+    component: int
+    sequence: int
+    """`system`, `component`, `sequence`: System id, component id and sequence number of the sender."""
+    payload: bytes
+    """Payload, with the final zeros that MAVLink 2 does not transmit."""
+    frame: bytes
+    """All received bytes of the frame."""
+    known: bool
+    """True if the message is in the dialect and its checksum is correct."""
 
     @property
     def name(self) -> str:
@@ -191,15 +183,6 @@ class Message:
         if field is None:
             raise KeyError(f"{layout.name} has no field {name}")
         return field.get(self.payload)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Message) and (self.id, self.frame) == (other.id, other.frame)
-
-    def __hash__(self) -> int:
-        return hash((self.id, self.frame))
-
-    def __repr__(self) -> str:
-        return f"<Message {self.name} of {self.system}:{self.component}>"
 
 
 def split_index(field: str) -> tuple[str, int | None]:

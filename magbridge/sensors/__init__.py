@@ -54,6 +54,8 @@ class Driver(Protocol):
         Nominal time between the readings of an instrument without a clock, s; 0 if unknown or irrelevant.
     is_scalar : bool
         True if the instrument measures only the total field F; its readings are (F, 0, 0).
+    frames_bad : int
+        Number of frames with a wrong length, checksum or content.
     """
 
     Options: ClassVar[Any]
@@ -63,17 +65,13 @@ class Driver(Protocol):
     time_modulo: float = 0.0
     period: float = 0.0
     is_scalar: bool = False
+    frames_bad: int = 0
 
     def __init__(self, options: Any) -> None: ...
 
     @property
     def bytes_skipped(self) -> int:
         """Number of bytes that belonged to no valid frame (delimiters are not counted)."""
-        ...
-
-    @property
-    def frames_bad(self) -> int:
-        """Number of frames with a wrong length, checksum or content."""
         ...
 
     def start(self) -> tuple[bytes, ...]:

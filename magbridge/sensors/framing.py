@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import pairwise
-from math import inf, nan
+from math import nan
 from operator import sub, xor
 from struct import Struct, error
 from time import monotonic
 from typing import ClassVar
 
 from magbridge.records import MAX_DEVICE_TIME_S, Reading
-from magbridge.sensors import Bus
+from magbridge.sensors import Bus, Driver
 
 __all__ = [
     "CRC32_RESIDUE", "BusDriver", "FixedFramer", "FramedDriver", "Framer", "cobs_decode", "cobs_encode",
@@ -71,25 +71,15 @@ class Framer:
         return frames
 
 
-class FramedDriver:
+class FramedDriver(Driver):
     """Base of drivers whose readings are frames between delimiters; a subclass defines :meth:`read_frame`.
-
-    :class:`magbridge.sensors.Driver` documents the attributes.
 
     `delimiter`: one byte.
     `limit`: length of the longest frame without its delimiter, bytes.
     """
 
-    range_nt: float = inf
-    nt_per_count: float = 0.0
-    sequence_modulo: int = 0
-    time_modulo: float = 0.0
-    period: float = 0.0
-    is_scalar: bool = False
-
     def __init__(self, delimiter: bytes, limit: int) -> None:
         self._framer = Framer(delimiter, limit)
-        self.frames_bad = 0
 
     @property
     def bytes_skipped(self) -> int:

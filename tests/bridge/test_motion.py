@@ -171,9 +171,9 @@ def test_depth_counts_from_the_sea_on_high_ground() -> None:
     bench.to(1)
     bench.receive("GPS_GLOBAL_ORIGIN", latitude=1, longitude=1, altitude=350_000)
     bench.receive("LOCAL_POSITION_NED", z=4.0)
-    assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-346.0)
+    assert bench.navigation.motion._autopilot.depth(bench.now_us) == pytest.approx(-346.0)
     bench.receive("GLOBAL_POSITION_INT", lat=495_000_000, lon=-579_000_000, alt=347_000)
-    assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-347.0)
+    assert bench.navigation.motion._autopilot.depth(bench.now_us) == pytest.approx(-347.0)
 
 
 def test_an_airspeed_that_is_the_speed_over_ground_is_not_used() -> None:

@@ -180,7 +180,7 @@ def test_paths_outside_are_not_found(server: FtpServer, path: str) -> None:
         assert station.refused(opcode, path.encode("latin-1")) in (Error.FILE_NOT_FOUND, Error.FAIL_ERRNO)
     if path not in ("/", "@MAV_LOG"):
         assert station.refused(Opcode.LIST, path.encode("latin-1")) is Error.FILE_NOT_FOUND
-    assert len(server._sessions) == 0
+    assert len(server._files) == 0
 
 
 @pytest.mark.parametrize("opcode", [6, 7, 8, 9, 10, 11, 12, 13])
@@ -198,7 +198,7 @@ def test_a_request_that_comes_again_gets_the_same_reply(server: FtpServer) -> No
         (Opcode.TERMINATE,),
     ):
         assert station.ask(*request) == station.ask(*request, again=True)
-    assert len(server._sessions) == 0
+    assert len(server._files) == 0
 
 
 def test_sessions_have_an_owner_and_an_end(server: FtpServer, clock: list[float]) -> None:
@@ -227,7 +227,7 @@ def test_a_crowd_cannot_take_all_sessions_for_ever(server: FtpServer, clock: lis
     assert station.refused(Opcode.OPEN_READ, "general.json") is Error.NO_SESSIONS
     clock[0] += 11.0
     station.open("general.json")
-    assert len(server._sessions) == SESSIONS
+    assert len(server._files) == SESSIONS
 
 
 def test_a_burst_ends_with_its_session(server: FtpServer) -> None:
@@ -247,7 +247,7 @@ def test_whatever_is_asked_is_answered(requests: list[tuple[tuple[int, int], byt
         replies = list(server.handle(sender, payload))
         assert 1 <= len(replies) <= BURST
         assert {Request.from_payload(one).opcode for one in replies} <= {Opcode.ACK, Opcode.NAK}
-    assert len(server._sessions) <= SESSIONS
+    assert len(server._files) <= SESSIONS
 
 
 def sent(replies: Any) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from pymavlink.dialects.v10 import common as v1
 
 from magbridge import logs
 from magbridge.bridge.events import declarations
+from magbridge.config import Config, Link, Sensor
 from magbridge.errors import FormatError
 from magbridge.logs import Options, telemetry
 from magbridge.logs.compasses import compasses_in
@@ -22,6 +23,7 @@ from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, pack_record
 from magbridge.mavlink.tlog import blocks
 from magbridge.records import Channel, Quality
+from magbridge.sensors import open_driver
 
 T0 = 1_700_000_000_000_000  # µs
 S = 1_000_000
@@ -282,13 +284,20 @@ def test_a_live_log_is_read_back(tmp_path: Path) -> None:
     assert back.attrs["damages"] == 1
 
 
+def header_of(driver: str, options: dict[str, Any]) -> list[bytes]:
+    """Return the frames at the begin of each log file of a bridge with one sensor."""
+    config = Config(Sensor(driver, "/dev/ttyUSB0"), Link("udpout:h:1"))
+    return declarations(config, [open_driver(driver, options)], {})
+
+
 def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None:
     """Bit for bit, where MAG_RAW's float32 is off by up to 0.002 nT; counts of another number are none."""
-    nt_per_count = 0.0119209  # of a digitizer at 100,000 nT
+    options = {"sensitivity": 2.5e-5}  # of a digitizer at 100,000 nT
+    nt_per_count = open_driver("digitizer", options).nt_per_count
     counts = np.random.default_rng(1).integers(-(2**22), 2**22, (100, 3))
     field = counts * nt_per_count
     codec = Codec(1, 191)
-    with closing(TlogWriter(tmp_path, header=declarations(1, 191, {}, nt_per_count))) as log:
+    with closing(TlogWriter(tmp_path, header=header_of("digitizer", options))) as log:
         log.extend([(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))])
         for k, (channels, numbers) in enumerate(zip(field, counts.tolist(), strict=True)):
             values = dict(zip("xyz", channels, strict=True))
