@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import glob
 import os
 import re
@@ -21,9 +20,9 @@ from urllib.parse import urlsplit
 
 import serial
 
-from magbridge.bridge.port import READ_BYTES, PacedPort, Port
+from magbridge.bridge.port import READ_BYTES, PacedPort, Port, reason_of
 from magbridge.config import Sensor
-from magbridge.errors import ConfigError, PortError
+from magbridge.errors import ConfigError
 from magbridge.sensors import Bus, open_driver
 from magbridge.sensors.framing import BusDriver
 
@@ -51,9 +50,9 @@ class SerialPort(PacedPort):
         self._serial: Any = None
         self._pump: Pump | None = None
 
-    def open(self) -> None:
-        """Open the first device of the name or pattern; raise :class:`PortError` if none can be opened."""
-        reason: object = "no such device"
+    def _open(self) -> int:
+        """Open the first device of the name or pattern that can be opened."""
+        failure: Exception = OSError("no such device")
         for name in self._names():
             try:
                 opened = serial.serial_for_url(
@@ -62,18 +61,16 @@ class SerialPort(PacedPort):
                 # two programs on one line would each read only some of the bytes
                 opened.exclusive = None if "://" in name else True
                 opened.open()
-            except (serial.SerialException, OSError, ValueError) as error:
-                reason = _reason(error)
+            except (OSError, ValueError) as error:
+                failure = error
                 continue
-            try:
-                descriptor = opened.fileno()
-            except (AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
-                opened.timeout, opened.write_timeout = 0.05, 1.0
-                self._pump = Pump(partial(_wait_for_bytes, opened))
-                descriptor = self._pump.fd
-            self._serial, self._last, self._fd = opened, name, descriptor
-            return
-        raise PortError(self.name, str(reason))
+            self._serial, self._last = opened, name
+            with suppress(AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
+                return int(opened.fileno())
+            opened.timeout, opened.write_timeout = 0.05, 1.0
+            self._pump = Pump(partial(_wait_for_bytes, opened))
+            return self._pump.fd
+        raise failure
 
     def move_on(self) -> None:
         """Close the device if the pattern matches further devices, so that the next one is opened."""
@@ -133,8 +130,8 @@ class SerialPort(PacedPort):
         if self._pump is not None:
             try:
                 self._serial.write(data)
-            except (serial.SerialException, OSError) as error:
-                raise self.lost(_reason(error)) from error
+            except OSError as error:
+                raise self.lost(reason_of(error)) from error
             return len(data)
         sent = super()._put(data)
         if self._idle_at > -inf:
@@ -181,14 +178,6 @@ def may_be_device(name: str) -> bool:
     if path.exists():
         return not (path.is_file() or path.is_dir())
     return "/" in name or os.name == "nt"  # names on Windows, such as COM3, have no slash
-
-
-def _reason(error: Exception) -> str:
-    """Return why a port did not open, without the port's name, so that the text fits a STATUSTEXT."""
-    beneath = error.__context__ if isinstance(error.__context__, OSError) else error
-    if isinstance(beneath, OSError) and beneath.errno == errno.EAGAIN:
-        return "in use by another program"
-    return getattr(beneath, "strerror", None) or str(error)
 
 
 def _wait_for_bytes(line: Any) -> bytes:
@@ -308,20 +297,18 @@ class BusPort(Port):
         self._errors = self._repeated = 0
         self._heard, self._last = 0.0, b""
 
-    def open(self) -> None:
-        """Open the bus, configure the part and start to poll it; raise :class:`PortError` if this fails."""
-        bus = None
+    def _open(self) -> int:
+        """Open the bus, configure the part and start to poll it."""
+        bus = open_bus(self.name)
         try:
-            bus = open_bus(self.name)
             self._driver.configure(bus)
-        except OSError as error:
-            if bus is not None:
-                bus.close()
-            raise PortError(self.name, error.strerror or str(error)) from error
+        except OSError:
+            bus.close()
+            raise
         self._bus, self._heard = bus, time.monotonic()
         self._errors = self._repeated = 0
         self._pump = Pump(partial(self._poll, bus), self._give_up)
-        self._fd = self._pump.fd
+        return self._pump.fd
 
     def _send(self, data: bytes, address: Any) -> None:
         """Drop `data`, because the part accepts no commands from the pipeline."""

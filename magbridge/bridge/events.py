@@ -474,8 +474,9 @@ class LiveEdge:
             yield clock_step(now_us, step_us)
         if text := self._ports[Channel.LINK].notice():
             yield notice(text)
-        if self._too_slow(now_us):
-            link = self._ports[Channel.LINK]
+        link = self._ports[Channel.LINK]
+        if link.overrun != self._overrun and now_us >= self._slow_us:
+            self._overrun, self._slow_us = link.overrun, now_us + SLOW_US
             reason = f"too slow, {link.overrun} bytes not sent so far"
             yield port_state(Channel.LINK, reason, link.dropped, is_open=True)
 
@@ -556,17 +557,6 @@ class LiveEdge:
             data += piece
         return data
 
-    def _too_slow(self, now_us: int) -> bool:
-        """Return True if the link has dropped data since the last report because it is too slow.
-
-        After a report, return False for `SLOW_US`.
-        """
-        overrun = self._ports[Channel.LINK].overrun
-        if overrun == self._overrun or now_us < self._slow_us:
-            return False
-        self._overrun, self._slow_us = overrun, now_us + SLOW_US
-        return True
-
     def _report(self, number: int, reason: str) -> None:
         """Add an event that a port is not open because of `reason`, or, without a reason, that it opened."""
         port = self._ports[number]
@@ -577,9 +567,7 @@ class LiveEdge:
         """Open the port whenever it is down; report each change once; set `tried` after the first attempt."""
         reported: str | None = None
         while not self._stopping:
-            if port.is_open:
-                port.tend()
-            else:
+            if not port.is_open:
                 try:
                     port.open()
                     reason = ""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import errno
-import os
 import re
 import select
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from ipaddress import IPv6Address
 from math import inf
@@ -31,8 +30,6 @@ GREETING = 0.2
 """Time in which a client may send its first valid frame before another client can replace it, s."""
 ACCEPTED = 4
 """Most clients that are accepted before the sensors are read."""
-PEER_TIMEOUT = 30.0
-"""Time without a packet after which ``udpout`` resolves the address of its peer again, s."""
 DATAGRAM = 1400
 """Most bytes of one packet, which any usual network transmits without fragmentation."""
 DATAGRAMS = 512
@@ -73,23 +70,18 @@ class TcpConnection(PacedPort):
         self.since = 0.0
         """Time at which the connection was made, s of the monotonic clock."""
 
-    def open(self) -> None:
-        """Connect within a second; raise :class:`PortError` if this fails."""
-        if self._address is None:
-            raise PortError(self.name, "not connected")
-        try:
-            self.adopt(socket.create_connection(self._address, timeout=1.0))
-        except OSError as error:
-            raise PortError(self.name, error.strerror or str(error)) from error
+    def _open(self) -> int:
+        """Connect within a second."""
+        assert self._address is not None
+        return self.adopt(socket.create_connection(self._address, timeout=1.0))
 
-    def adopt(self, connection: socket.socket) -> None:
-        """Use `connection` as the port's socket."""
+    def adopt(self, connection: socket.socket) -> int:
+        """Use `connection` as the port's socket, and return its descriptor."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
-        self.close()
-        self.since = time.monotonic()
-        self._connection, self._fd = connection, connection.fileno()
+        self.since, self._connection, self._fd = time.monotonic(), connection, connection.fileno()
+        return self._fd
 
     def _send(self, data: bytes, address: Any) -> None:
         """Send `data` as other paced ports do; without a connection, drop `data`."""
@@ -131,16 +123,13 @@ class TcpServer(Port):
         self._listener: socket.socket | None = None
         self._clients: dict[int, TcpConnection] = {}
 
-    def open(self) -> None:
-        """Start to listen; raise :class:`PortError` if this fails."""
-        try:
-            family, address = resolve(self._address, socket.SOCK_STREAM, listen=True)
-            both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-            listener = socket.create_server(address, family=family, dualstack_ipv6=both)
-        except OSError as error:
-            raise PortError(self.name, error.strerror or str(error)) from error
-        listener.setblocking(False)
-        self._listener, self._fd = listener, listener.fileno()
+    def _open(self) -> int:
+        """Start to listen."""
+        family, address = resolve(self._address, socket.SOCK_STREAM, listen=True)
+        both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
+        self._listener = socket.create_server(address, family=family, dualstack_ipv6=both)
+        self._listener.setblocking(False)
+        return self._listener.fileno()
 
     def fds(self) -> list[int]:
         """Return the file descriptors of the listening socket and of the clients."""
@@ -246,29 +235,9 @@ class UdpPort(Port):
         super().__init__(name, peers)
         self._address = address
         self._socket: socket.socket | None = None
-        self._received = 0.0
 
-    def open(self) -> None:
-        """Bind or connect the socket; raise :class:`PortError` if this fails."""
-        try:
-            opened = self._new()
-        except OSError as error:
-            raise PortError(self.name, error.strerror or str(error)) from error
-        self._socket, self._received, self._fd = opened, time.monotonic(), opened.fileno()
-
-    def tend(self) -> None:
-        """Reconnect ``udpout`` if nothing arrived for `PEER_TIMEOUT` and an address of the link changed."""
-        opened, now = self._socket, time.monotonic()
-        if opened is None or self._peers is not None or now - self._received < PEER_TIMEOUT:
-            return
-        self._received = now
-        with suppress(OSError), self._new() as new:  # the host is unknown at present, or the port was closed
-            if _ends(new) != _ends(opened):
-                # keep the descriptor, because the bridge may be waiting for it
-                os.dup2(new.fileno(), opened.fileno(), inheritable=False)
-
-    def _new(self) -> socket.socket:
-        """Return a new socket, bound for ``udpin``, connected for ``udpout``; raise OSError if this fails."""
+    def _open(self) -> int:
+        """Bind the socket of ``udpin``, or connect the socket of ``udpout``."""
         listen = self._peers is not None
         family, address = resolve(self._address, socket.SOCK_DGRAM, listen=listen)
         opened = socket.socket(family, socket.SOCK_DGRAM)
@@ -279,7 +248,8 @@ class UdpPort(Port):
         except OSError:
             opened.close()
             raise
-        return opened
+        self._socket = opened
+        return opened.fileno()
 
     def _receive(self) -> list[tuple[Any, bytes]]:
         """Return the received datagrams, each with its sender; an unreachable peer is not an error.
@@ -301,8 +271,6 @@ class UdpPort(Port):
                 raise self.lost(error.strerror) from error
             size += len(datagram)
             datagrams.append((address, datagram))
-        if datagrams:
-            self._received = time.monotonic()
         return datagrams
 
     def _send(self, data: bytes, address: Any) -> None:
@@ -347,19 +315,8 @@ def _datagrams(data: bytes) -> Iterator[bytes]:
     yield begun
 
 
-def _ends(connected: socket.socket) -> tuple[Any, Any]:
-    """Return our own address without its port, and the address of the peer with its port."""
-    return connected.getsockname()[0], connected.getpeername()
-
-
-CLIENT_LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpConnection}
-"""Kinds of link to one peer -> class of the port; the kind is the first part of the URL."""
-SHARED: dict[str, Callable[[str, tuple[str, int], Peers, bool], Port]] = {
-    "udpin": lambda name, address, peers, _: UdpPort(name, address, peers),
-    "tcpin": lambda name, address, peers, signed: TcpServer(name, address, peers, signed=signed),
-}
-"""Kinds of link with any number of peers -> function that returns the port."""
 LINKS = ("udpin", "udpout", "tcp", "tcpin")
+"""Kinds of link, the first part of the URL; ``udpin`` and ``tcpin`` have any number of peers."""
 
 
 def open_link(
@@ -396,9 +353,12 @@ def open_link(
             raise ValueError(url)  # noqa: TRY301 - as `parse_address` does
     except ValueError as error:
         raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
-    if kind in CLIENT_LINKS:
-        return CLIENT_LINKS[kind](url, (host, port))
-    return SHARED[kind](url, (host, port), Peers(autopilot, budget=budget, signed=signed), signed)
+    peers = Peers(autopilot, budget=budget, signed=signed) if kind.endswith("in") else None
+    if kind.startswith("udp"):
+        return UdpPort(url, (host, port), peers)
+    if peers is not None:
+        return TcpServer(url, (host, port), peers, signed=signed)
+    return TcpConnection(url, (host, port))
 
 
 def nmea_port(config: Config) -> Port | None:

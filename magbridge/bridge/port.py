@@ -11,6 +11,7 @@ id comes first.
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from abc import ABC, abstractmethod
@@ -24,7 +25,7 @@ from magbridge.link.publish import LIMITS
 from magbridge.mavlink import BAD_DATA, Codec, spec
 from magbridge.mavlink.messages import SIGNATURE, V2, is_signed
 
-__all__ = ["PEER_READ_BYTES", "READ_BYTES", "PacedPort", "Peer", "Peers", "Port", "cut"]
+__all__ = ["PEER_READ_BYTES", "READ_BYTES", "PacedPort", "Peer", "Peers", "Port", "cut", "reason_of"]
 
 PEER_SILENCE_S = 30.0
 """Time after its last valid frame for which the bridge sends to a peer, s."""
@@ -246,12 +247,16 @@ class Port(ABC):
         """True if bytes can be read and written."""
         return self._fd >= 0
 
-    @abstractmethod
     def open(self) -> None:
         """Open the port; raise :class:`PortError` if this fails."""
+        try:
+            self._fd = self._open()
+        except (OSError, ValueError) as error:  # includes pyserial's SerialException
+            raise PortError(self.name, reason_of(error)) from error
 
-    def tend(self) -> None:  # noqa: B027 - most ports need nothing
-        """Do periodic slow work while the port is open; called by the thread that opens it."""
+    @abstractmethod
+    def _open(self) -> int:
+        """Open the port and return its descriptor; raise OSError or ValueError if this fails."""
 
     def move_on(self) -> None:
         """Close the port, which is then opened again; for a pattern, with the next matching device."""
@@ -348,6 +353,14 @@ class Port(ABC):
         """Close the port because of `reason`, and return the error for the caller to raise."""
         self.close()
         return PortError(self.name, str(reason))
+
+
+def reason_of(error: Exception) -> str:
+    """Return why a port did not open, without the port's name, so that the text fits a STATUSTEXT."""
+    beneath = error.__context__ if isinstance(error.__context__, OSError) else error
+    if isinstance(beneath, OSError) and beneath.errno == errno.EAGAIN:
+        return "in use by another program"
+    return getattr(beneath, "strerror", None) or str(error)
 
 
 class PacedPort(Port):

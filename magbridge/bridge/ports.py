@@ -7,7 +7,6 @@ import os
 import re
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,23 +93,11 @@ def listen(
 def _refusal(device: str, error: Exception) -> str:
     """Return why a port cannot be opened, and the remedy."""
     if getattr(error, "errno", None) in BUSY:
-        users = _users(device)
-        return f"busy: {users or 'another program'} has opened it; stop that program, then repeat"
+        return "busy: another program has opened it; stop that program, then repeat"
     there = "://" in device or Path(device).exists()
     number = getattr(error, "errno", None)
     reason = os.strerror(number) if number else str(error)  # pyserial repeats the port and the number
     return (access(device) if there else "") or f"cannot be opened: {reason}"
-
-
-def _users(device: str) -> str:
-    """Return the programs that hold a device open, as far as this user may see them; empty if unknown."""
-    found, real = set(), Path(device).resolve()
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        with suppress(OSError):  # another user's process, or a process that has ended
-            process = link.parts[2]
-            if link.readlink() == real and int(process) != os.getpid():
-                found.add(f"{Path('/proc', process, 'comm').read_text().strip()} (process {process})")
-    return " and ".join(sorted(found))
 
 
 def _read(device: str, baudrate: int, seconds: float) -> bytes:

@@ -47,10 +47,6 @@ MAX_SENTENCE_BYTES = 128
 """Length of the longest NMEA sentence plus a margin, bytes."""
 TEXT_BYTES = re.compile(rb"[\t\r\n -~]+")
 NOT_A_NUMBER = re.compile(rb"\bnan\b", re.IGNORECASE)
-SAME_US: Final = 60_000_000
-MIN_REPEATED_READINGS: Final = 10
-"""Time (µs) and number of equal readings after which a STATUSTEXT reports that the sensor may hang. Samples
-get no flag, because a sensor with steps of 100 nT may send equal readings at rest."""
 LINE_CHECK_INTERVAL_US = 1_000_000
 """Time between two checks that readings arrive, µs."""
 
@@ -182,7 +178,6 @@ class SensorStream:
         self._component, self._output = component, component.output
         suffix = f" {sensor.id}" if sensor.id else ""
         self.timer, self._command_timer = f"sensor{suffix}", f"command{suffix}"
-        self._reading_key = f"reading{suffix}"
         self._timeout_us = round(sensor.timeout * 1e6)
         self.state = MAG_PORT_STATE.ABSENT
         self.to_send: list[bytes] = []
@@ -193,9 +188,6 @@ class SensorStream:
         self._commands: tuple[bytes, ...] = ()
         self._tail = b""
         self._unparsed_us = 0
-        self._field: Vector | None = None
-        self._repeats = self._since_us = 0
-        self._hangs = False
         self.samples = self.quality = self._missing = 0
         self._rate = self.clock.rate
         self.overload_rate = Rate(OVERLOAD_HZ)
@@ -240,7 +232,6 @@ class SensorStream:
         self.samples += 1
         self._missing += reading.missing
         self._times.append(time_us)
-        self._watch_for_repeats(reading.field, time_us)
         if isinstance(correction, Correction):
             return [
                 correction.reading(reading, time_us, main_field=main_field, position=position, depth=depth)
@@ -262,20 +253,6 @@ class SensorStream:
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
         """Apply the settings of the alignment, and the age (s) beyond which each telemetry value is stale."""
         self.correction.aligner.tune(own_settings(self.sensor, self.driver, settings), ages)
-
-    def _watch_for_repeats(self, field: Vector, time_us: int) -> None:
-        """Compare a reading (nT) with earlier ones; report one that does not change for `SAME_US`."""
-        if field != self._field:
-            self._field, self._repeats, self._since_us = field, 0, time_us
-            if self._hangs:
-                self._hangs = False
-                self._output.announce(self._reading_key, f"{self.sensor.label}'s readings change again")
-            return
-        self._repeats += 1
-        if not self._hangs and self._repeats >= MIN_REPEATED_READINGS and time_us - self._since_us >= SAME_US:
-            self._hangs = True
-            text = f"{self.sensor.label} sends the same reading for {SAME_US // 1_000_000} s"
-            self._output.announce(self._reading_key, text, MAV_SEVERITY.WARNING)
 
     def _receive_unparsed(self, data: bytes, time_us: int) -> None:
         """Record the arrival of bytes that complete no reading, and detect NMEA 0183 in them."""

@@ -11,7 +11,6 @@ import threading
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 from checks import soon
@@ -322,46 +321,6 @@ def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
     assert port.read() == b""
     assert port.is_open
     port.close()
-
-
-def test_a_named_host_that_gets_another_address_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The link looks the host up again only after silence since the last packet or the last look-up."""
-    host, look_up, looks = ["127.0.0.1"], socket.getaddrinfo, []
-
-    def resolver(name: str, *rest: Any, **options: Any) -> object:
-        looks.append(name)
-        return look_up(host[0], *rest, **options)
-
-    monkeypatch.setattr(socket, "getaddrinfo", resolver)
-    with udp_socket(1.0) as before, udp_socket(1.0, "127.0.0.2", before.getsockname()[1]) as after:
-        port = open_link(f"udpout:topside.local:{before.getsockname()[1]}", 0)
-        port.open()
-        port.write(b"1")
-        _, peer = before.recvfrom(9)
-        host[0] = "127.0.0.2"
-        monkeypatch.setattr("magbridge.bridge.links.PEER_TIMEOUT", 0.3)
-        for _ in range(4):
-            time.sleep(0.1)
-            before.sendto(b"here", peer)
-            assert select.select(port.fds(), [], [], 1.0)[0]
-            assert port.read() == b"here"
-            port.tend()
-        assert len(looks) == 1
-        came_from = set()
-        for message in (b"2", b"3"):  # the second time, nothing has changed
-            time.sleep(0.3)
-            port.tend()
-            port.write(message)
-            received, sender = after.recvfrom(9)
-            assert received == message
-            came_from.add(sender)
-        assert len(looks) == 3
-        assert len(came_from) == 1
-        after.sendto(b"there", sender)
-        assert select.select(port.fds(), [], [], 1.0)[0]
-        assert port.read() == b"there"
-        port.close()
-        port.tend()  # as the thread that opens it may, just then
 
 
 def test_what_is_sent_at_once_after_a_standstill_goes_in_datagrams_that_a_network_takes() -> None:

