@@ -68,7 +68,7 @@ class SerialPort(PacedPort):
             with suppress(AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
                 return int(opened.fileno())
             opened.timeout, opened.write_timeout = 0.05, 1.0
-            self._pump = Pump(partial(_wait_for_bytes, opened))
+            self._pump = Pump(lambda: self._serial.read(max(1, self._serial.in_waiting)))
             return self._pump.fd
         raise failure
 
@@ -178,12 +178,6 @@ def may_be_device(name: str) -> bool:
     if path.exists():
         return not (path.is_file() or path.is_dir())
     return "/" in name or os.name == "nt"  # names on Windows, such as COM3, have no slash
-
-
-def _wait_for_bytes(line: Any) -> bytes:
-    """Return the received bytes of a pyserial port; empty if none arrived within its timeout."""
-    data: bytes = line.read(max(1, line.in_waiting))
-    return data
 
 
 class Pump:

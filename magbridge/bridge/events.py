@@ -267,7 +267,7 @@ RAW: Final = spec("MAG_RAW")
 BYTES_HEADER: Final = Struct("<BB")
 """Layout of the fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
 RECORDED_BYTES: Final = BYTES.fields["data"].count
-SENT, LINK, SENSOR, STATE = Channel
+SENT, _, SENSOR, STATE = Channel
 
 
 class Recorder:
@@ -283,16 +283,17 @@ class Recorder:
         self._records: list[tuple[int, Channel, bytes]] = []
         self._scribe = Codec(system, component)
 
+    def record(self, time_us: int, channel: Channel, frame: bytes) -> None:
+        """Record a frame that was received over the link, a state frame, or a frame of the start."""
+        if self.active:
+            self._records.append((time_us, channel, frame))
+            self.count += 1
+
     def sent(self, frames: list[tuple[int, bytes]]) -> None:
         """Record the frames sent over the link, each with its event time (µs)."""
         if self.active and frames:
             self._records += [(time_us, SENT, frame) for time_us, frame in frames]
             self.count += len(frames)
-
-    def link(self, time_us: int, frames: list[bytes]) -> None:
-        """Record the frames that were received over the link at `time_us` (µs)."""
-        for frame in frames:
-            self._add(time_us, LINK, frame)
 
     def sensor(self, time_us: int, data: bytes, sensor_id: int = 0) -> None:
         """Record the bytes that were received from a sensor at `time_us` (µs)."""
@@ -304,23 +305,14 @@ class Recorder:
             self._records.append((time_us, SENSOR, frame))
             self.count += 1
 
-    def state(self, time_us: int, frame: bytes) -> None:
-        """Record a state frame, or a frame of the start of the run."""
-        self._add(time_us, STATE, frame)
-
     def raw(self, time_us: int, payload: bytes) -> None:
         """Record a MAG_RAW payload that is not sent over the link; a calibration needs every sample."""
-        self._add(time_us, STATE, self._scribe.frame(RAW, payload))
+        self.record(time_us, STATE, self._scribe.frame(RAW, payload))
 
     def drain(self) -> list[tuple[int, Channel, bytes]]:
         """Return the collected records in order, as event time (µs), channel and frame; then clear them."""
         records, self._records = self._records, []
         return records
-
-    def _add(self, time_us: int, channel: Channel, frame: bytes) -> None:
-        if self.active:
-            self._records.append((time_us, channel, frame))
-            self.count += 1
 
 
 def beginning(

@@ -325,24 +325,7 @@ class Motion:
         own = message.component == self._autopilot_id
         heading = self._turn(message, time_us) if own else message["yaw"]
         self._heading, self._pitch = degrees(heading) % 360.0, degrees(message["pitch"])
-        self._watch_for_glide(time_us)
-        if self.source is MotionSource.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
-            self._pass(time_us, heading=self._heading, pitch=self._pitch)
-        elif time_us - self._steep_us < GLIDING_US and isfinite(self._autopilot.depth(time_us)):
-            if self._use(MotionSource.GLIDE, time_us, "heading, pitch and depth"):
-                self._pass(time_us, heading=self._heading, pitch=self._pitch)
-        elif isfinite(self._last):
-            was_known = self.source is not MotionSource.LAST
-            if self._use(MotionSource.LAST, time_us, "heading and the last known speed: no other is sent"):
-                self._pass(time_us, heading=self._heading, speed=self._last)
-                if was_known:
-                    self._navigator.widen_heading(time_us, UNKNOWN_SPEED_RAD)
-
-    def _watch_for_glide(self, time_us: int) -> None:
-        """Note when the vehicle last glided: while it is steep, its depth changes.
-
-        A vehicle with thrusters may also be steep when it accelerates.
-        """
+        # the vehicle glides if its depth changes while it is steep; with thrusters it may only accelerate
         depth = self._autopilot.depth(time_us)
         if abs(self._pitch) < GLIDE or isnan(depth):
             self._dive_from = nan
@@ -350,6 +333,17 @@ class Motion:
             self._dive_from = depth
         elif abs(depth - self._dive_from) >= MIN_DIVE_M:
             self._steep_us = time_us
+        if self.source is MotionSource.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
+            self._navigator.telemetry(time_us, heading=self._heading, pitch=self._pitch)
+        elif time_us - self._steep_us < GLIDING_US and isfinite(depth):
+            if self._use(MotionSource.GLIDE, time_us, "heading, pitch and depth"):
+                self._navigator.telemetry(time_us, heading=self._heading, pitch=self._pitch)
+        elif isfinite(self._last):
+            was_known = self.source is not MotionSource.LAST
+            if self._use(MotionSource.LAST, time_us, "heading and the last known speed: no other is sent"):
+                self._navigator.telemetry(time_us, heading=self._heading, speed=self._last)
+                if was_known:
+                    self._navigator.widen_heading(time_us, UNKNOWN_SPEED_RAD)
 
     def _speed(self, message: Message, time_us: int) -> None:
         if not self._autopilot.measures_airspeed:
@@ -376,12 +370,12 @@ class Motion:
                 # the horizontal part of the airspeed in a climb or dive
                 level = sqrt(max(speed * speed - message["climb"] ** 2, 0.0))
                 speed = message["groundspeed"] if self._grounded else level
-                self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
+                self._navigator.telemetry(time_us, heading=heading, pitch=self._pitch, speed=speed)
 
     def rise(self, time_us: int) -> None:
         """Pass the depth, and an aircraft's height, to the navigator."""
         depth = self._autopilot.depth(time_us)
-        self._pass(time_us, depth=depth, height=-depth if self._autopilot.is_aircraft else nan)
+        self._navigator.telemetry(time_us, depth=depth, height=-depth if self._autopilot.is_aircraft else nan)
 
     def _global(self, message: Message, time_us: int) -> None:
         self.rise(time_us)
@@ -423,7 +417,7 @@ class Motion:
         clean = not (own and self.fed_back)
         if own and measured and (self._velocity_stays() or (clean and place is None)):
             if self._use(source, time_us, "the autopilot's velocity", stream):
-                self._pass(time_us, velocity_north=velocity[0], velocity_east=velocity[1])
+                self._navigator.telemetry(time_us, velocity_north=velocity[0], velocity_east=velocity[1])
         elif place is not None and clean:
             words = "the autopilot's position" if own else f"the position from component {stream[0]}"
             if self._use(source, time_us, words, stream):
@@ -446,7 +440,7 @@ class Motion:
             if resets != count or unexplained:
                 self._jumps = self._jumps[0] + odd[0], self._jumps[1] + odd[1]
         self._step = time_us, *place, resets
-        self._pass(time_us, north=place[0] - self._jumps[0], east=place[1] - self._jumps[1])
+        self._navigator.telemetry(time_us, north=place[0] - self._jumps[0], east=place[1] - self._jumps[1])
 
     def _use(
         self, source: MotionSource, time_us: int, words: str, stream: tuple[int, int] | None = None
@@ -465,9 +459,6 @@ class Motion:
         severity = MAV_SEVERITY.WARNING if source is MotionSource.LAST else MAV_SEVERITY.INFO
         self._output.announce("motion", f"dead reckoning by {words}", severity)
         return True
-
-    def _pass(self, time_us: int, **values: Any) -> None:
-        self._navigator.telemetry(time_us, **values)
 
 
 def rotate(q: tuple[float, float, float, float], v: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -145,7 +145,10 @@ class Fixing:
         rejected = self._gnss.state is GnssState.REJECTED and self._has_gps(now_us)
         self._state(f"fixes go to the autopilot: GPS is {'rejected' if rejected else 'lost'}")
         if not self._kind.fused:
-            self._await_answer()
+            self._waiting += 1
+            if self._waiting > UNANSWERED:
+                text = "the autopilot does not answer fixes"
+                self._output.announce("answer", text, MAV_SEVERITY.WARNING)
         return True
 
     def _fix(self, reckoned: Reckoned | None, resets: int, now_us: int) -> Fix | str:
@@ -182,13 +185,6 @@ class Fixing:
             return "GPS is good"
         suspect = self._gnss.state is GnssState.SUSPECT and self._has_gps(now_us)
         return "GPS is suspect" if suspect else ""
-
-    def _await_answer(self) -> None:
-        """Count a fix without a reply; report more than `UNANSWERED` of them in a row."""
-        self._waiting += 1
-        if self._waiting > UNANSWERED:
-            text = "the autopilot does not answer fixes"
-            self._output.announce("answer", text, MAV_SEVERITY.WARNING)
 
     def _answer(self, message: Message, time_us: int) -> None:
         if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:

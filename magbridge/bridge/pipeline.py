@@ -203,7 +203,7 @@ class Pipeline:
         elif channel is LINK:
             self._receive_link(data, time_us)
         elif data:
-            recorder.state(time_us, data)
+            recorder.record(time_us, Channel.STATE, data)
             self._changes.receive(data, time_us)
             if self._changes.until_us >= time_us:
                 self._late = True
@@ -218,7 +218,7 @@ class Pipeline:
         `messages`: layout and packed payload of each message.
         """
         codec = self.component.codec
-        self.recorder.state(codec.now_us, events.interleaved(len(messages)))
+        self.recorder.record(codec.now_us, Channel.STATE, events.interleaved(len(messages)))
         return b"".join([codec.frame(layout, payload) for layout, payload in messages])
 
     def _set_late(self, since_us: int) -> None:
@@ -332,7 +332,8 @@ class Pipeline:
                 self.heading.receive(message, time_us)
             if self.navigation is not None:
                 self._parts.call("navigation", None, self.navigation.receive, message, time_us)
-        self.recorder.link(time_us, component.received)
+        for frame in component.received:
+            self.recorder.record(time_us, LINK, frame)
         component.received.clear()
 
     def _is_autopilot(self, message: Message) -> bool:
@@ -369,7 +370,8 @@ class Pipeline:
         names = Quality(doubtful).names().replace("_", " ")
         severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
         key = f"quality {stream.sensor_id}" if stream.sensor_id else "quality"
-        self.component.output.announce(key, f"{self._field_of(stream)}: {names or 'good'}", severity)
+        field = f"field of {stream.sensor.label}" if len(self.streams) > 1 else "field"
+        self.component.output.announce(key, f"{field}: {names or 'good'}", severity)
         stream.quality = doubtful
 
     def _report_implausible(self, stream: SensorStream) -> None:
@@ -377,10 +379,6 @@ class Pipeline:
         for text in stream.correction.notices:
             self.component.output.send_statustext(prefix + text, MAV_SEVERITY.ERROR)
         stream.correction.notices.clear()
-
-    def _field_of(self, stream: SensorStream) -> str:
-        """Return the name of a sensor's field for STATUSTEXTs."""
-        return f"field of {stream.sensor.label}" if len(self.streams) > 1 else "field"
 
     def _report_no_anomaly(self, reason: str) -> None:
         self.component.output.announce("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
@@ -391,7 +389,7 @@ class Pipeline:
         `foreign`: True if the calibration is of another type of sensor, and so is not used.
         """
         for frame in self.beginning(start.parameters):
-            self.recorder.state(start.time_us, frame)
+            self.recorder.record(start.time_us, Channel.STATE, frame)
         self._changes.check_clock()
         send_statustext = self.component.output.send_statustext
         if foreign:

@@ -125,9 +125,9 @@ class Position:
     def _watch_for_jumps(self, time_us: int) -> None:
         """Compare the last position with the last trusted position, and detect or end a jump."""
         assert self._where is not None
-        if self._trusted is not None and not self._within_reach(
-            self._trusted, (self._jumped_us or time_us) - self._trusted_us
-        ):
+        elapsed = abs((self._jumped_us or time_us) - self._trusted_us) * 1e-6
+        reach = MAX_JUMP_M + MAX_VEHICLE_SPEED_M_S * elapsed
+        if self._trusted is not None and hypot(*separation(*self._trusted, *self._where)) >= reach:
             if not self._jumped_us and time_us - self._first_us < FIRST_US:
                 self._first_us = time_us
             elif not self._jumped_us:
@@ -138,12 +138,6 @@ class Position:
         elif self._trusted is None:
             self._first_us = time_us
         self._trusted, self._trusted_us, self._jumped_us = self._where, time_us, 0
-
-    def _within_reach(self, trusted: tuple[float, float], elapsed_us: int) -> bool:
-        """Return True if a vehicle can reach its position from `trusted` (deg) in `elapsed_us` (µs)."""
-        assert self._where is not None
-        north, east = separation(*trusted, *self._where)
-        return hypot(north, east) < MAX_JUMP_M + MAX_VEHICLE_SPEED_M_S * abs(elapsed_us) * 1e-6
 
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field at the position, nT.

@@ -168,8 +168,16 @@ def run(path: Path) -> None:
     link, edge = opened[Channel.LINK], LiveEdge(opened, clock)
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
-    log = _open_log(config, edge, pipeline)
-    _stop_on_signals(edge)
+    log = None
+    if (limits := config.log) is not None:
+        edge.notify(events.port_state(MAG_PORT_NAME.LOG))
+        log = TlogWriter(
+            config.resolve(limits.directory), max_size=limits.max_size, max_age=limits.max_age,
+            header=pipeline.declarations,
+        )  # fmt: skip
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
+            signal.signal(number, lambda *_: edge.stop())
     # after the signal handlers are set, because a program may send a signal when it reads the first text
     texts = pipeline.component.output.texts
     Thread(target=_print_statustexts, args=(texts,), name="voice", daemon=True).start()
@@ -234,12 +242,6 @@ def ports(config: Config) -> dict[int, Port]:
     return {Channel.LINK: link, **sensors, **({MAG_PORT_NAME.NMEA: nmea} if nmea is not None else {})}
 
 
-def _stop_on_signals(edge: LiveEdge) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
-            signal.signal(number, lambda *_: edge.stop())
-
-
 def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
     """Print `texts` (severity and text) to stderr, in a thread: a blocked terminal then stops nothing.
 
@@ -256,17 +258,6 @@ def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
             with suppress(OSError):  # stderr is closed, or the disk is full
                 os.write(stderr, f"{prefix}{text}\n".encode())
         time.sleep(NOTICE_PAUSE)
-
-
-def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter | None:
-    if config.log is None:
-        return None
-    directory = config.resolve(config.log.directory)
-    edge.notify(events.port_state(MAG_PORT_NAME.LOG))
-    limits = config.log
-    return TlogWriter(
-        directory, max_size=limits.max_size, max_age=limits.max_age, header=pipeline.declarations
-    )
 
 
 class LogMonitor:

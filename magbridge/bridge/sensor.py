@@ -72,12 +72,6 @@ def unmet(units: Mapping[str, str], config: Config) -> list[ConfigError]:
     return errors
 
 
-def check(units: Mapping[str, str], config: Config) -> None:
-    """Check that ``[telemetry]`` has every channel of `units`; ConfigError: a channel or unit is missing."""
-    for error in unmet(units, config):
-        raise error
-
-
 OVERLOAD_HZ = 5.0
 """Rate of the samples that get all optional work during an overload, Hz."""
 RATE_SAMPLES = 64
@@ -138,7 +132,8 @@ def scalar_entry(
             raise ConfigError(config.path, f"{sensor.key}.calibration", text)
         entry = entries[0]
     if entry is not None:
-        check({channel.name: channel.unit for channel in entry.channels}, config)
+        for error in unmet({channel.name: channel.unit for channel in entry.channels}, config):
+            raise error
     return entry
 
 
@@ -360,7 +355,8 @@ def open_correction(
         used = None if entry is None else own_calibration or main
         return ScalarCorrection(entry, settings, sensor.sigma), used
     if own_calibration is not None:
-        check(needed_units(own_calibration), config)
+        for error in unmet(needed_units(own_calibration), config):
+            raise error
         if not own_calibration.sensor.may_be(sensor.driver):
             return Correction(None, settings, learner), None
     return Correction(own_calibration, settings, learner), own_calibration

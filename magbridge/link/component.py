@@ -79,7 +79,8 @@ class Commands:
         target = message["target_component"]
         number = message["command"]
         values = [message["param1"], message["param2"]]
-        if target == 0 and not self._only_us(number, values[0]):
+        is_ours = number in ABOUT_MESSAGES and values[0] >= FIRST_DIALECT_ID and values[0] in self._messages
+        if target == 0 and not is_ours:
             return
         command = self._commands.get(number)
         if self._is_flood(message.system, message.component):
@@ -93,7 +94,10 @@ class Commands:
             self._output.announce("rate", text, MAV_SEVERITY.WARNING, recurring=True)
             result = MAV_RESULT.DENIED
         else:
-            result = command(values) if command else self._unsupported(number)
+            result = command(values) if command else MAV_RESULT.UNSUPPORTED
+            if number in CALIBRATES:
+                text = "this magnetometer is calibrated from its logs: magbridge calibrate"
+                self._output.announce("calibrate", text, MAV_SEVERITY.NOTICE, recurring=True)
         self._output.send(
             "COMMAND_ACK",
             command=number,
@@ -113,16 +117,6 @@ class Commands:
             who = system, component
         self._asked[who] = self._asked.get(who, 0) + 1
         return self._asked[who] > MAX_COMMAND_RATE
-
-    def _unsupported(self, number: int) -> MAV_RESULT:
-        if number in CALIBRATES:
-            text = "this magnetometer is calibrated from its logs: magbridge calibrate"
-            self._output.announce("calibrate", text, MAV_SEVERITY.NOTICE, recurring=True)
-        return MAV_RESULT.UNSUPPORTED
-
-    def _only_us(self, number: int, first: float) -> bool:
-        about_message = number in ABOUT_MESSAGES
-        return about_message and first >= FIRST_DIALECT_ID and first in self._messages
 
     def _request(self, values: list[float]) -> MAV_RESULT:
         if values[0] == MESSAGE_INTERVAL:  # the successor of GET_MESSAGE_INTERVAL
@@ -261,11 +255,11 @@ class Component:
             PARAM_REQUEST_LIST=self._if_ours(service.list),
             PARAM_REQUEST_READ=self._if_ours(service.read),
             PARAM_SET=self._if_ours(service.write),
-            TIMESYNC=self._timesync,
+            TIMESYNC=self._if_ours(self._timesync),
             HEARTBEAT=service.heartbeat,
-            LOG_ERASE=self._if_to_us_alone(self._erase),
+            LOG_ERASE=self._if_ours(self._erase, is_exact=True),
             **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), command),
-            **dict.fromkeys(FILE_REQUESTS, self._if_to_us_alone(self.file_requests.append)),
+            **dict.fromkeys(FILE_REQUESTS, self._if_ours(self.file_requests.append, is_exact=True)),
         )
 
     @property
@@ -289,7 +283,9 @@ class Component:
         self.received += self._frame_log.frames(messages, self.codec.pending)
         if self.codec.signing is not None:
             self.signed_frames = [one.frame for one in messages if one.known and is_signed(one.frame)]
-            self._report_clock(self.codec.signing)
+            if (days := self.codec.signing.followed_days) >= 1.0:  # the autopilot rejects older signatures
+                text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
+                self.output.announce("signing clock", text, MAV_SEVERITY.WARNING)
         for message in messages:
             if not message.known:
                 if message.id == REFUSED:
@@ -320,33 +316,21 @@ class Component:
             self.output.announce(f"refused: {why}", text, MAV_SEVERITY.WARNING)
         self._refusals_reported = len(refusals)
 
-    def _report_clock(self, signing: Signing) -> None:
-        """Send a STATUSTEXT if the bridge's clock is a day or more behind the autopilot's.
-
-        The bridge's signatures then follow the autopilot's time, because the autopilot rejects older ones.
-        """
-        if (days := signing.followed_days) >= 1.0:
-            text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
-            self.output.announce("signing clock", text, MAV_SEVERITY.WARNING)
-
-    def _for_us(self, message: Message) -> bool:
-        return message["target_system"] in (0, self._link.system) and message["target_component"] in (
-            0,
-            self._link.component,
-        )
-
-    def _if_ours(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
-        return lambda message: handler(message) if self._for_us(message) else None
-
-    def _if_to_us_alone(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
-        """Return a handler that ignores messages whose target is not exactly this component.
+    def _if_ours(
+        self, handler: Callable[[Message], None], *, is_exact: bool = False
+    ) -> Callable[[Message], None]:
+        """Return a handler that ignores messages for others; if `is_exact`, also messages for all components.
 
         The autopilot serves files and logs too, so a broadcast request for them is not for the bridge.
         """
-        us = self._link.system, self._link.component
-        return lambda message: (
-            handler(message) if (message["target_system"], message["target_component"]) == us else None
-        )
+        system, component = self._link.system, self._link.component
+        systems, components = ((system,), (component,)) if is_exact else ((0, system), (0, component))
+
+        def handle(message: Message) -> None:
+            if message["target_system"] in systems and message["target_component"] in components:
+                handler(message)
+
+        return handle
 
     def _erase(self, _: Message) -> None:
         text = "logs are not erased over the link"
@@ -354,8 +338,6 @@ class Component:
 
     def _timesync(self, message: Message) -> None:
         now_us = self.codec.now_us
-        if not self._for_us(message):
-            return
         if message["tc1"] == 0:
             answer = TIMESYNC.struct.pack(now_us * 1000, message["ts1"], message.system, message.component)
             self.output.put(TIMESYNC, answer)

@@ -132,12 +132,6 @@ def parts(path: str) -> list[str]:
     return names
 
 
-def began_s(name: str) -> int:
-    """Return the start time in the name of a log, s since 1970 UTC; 0 if the name is not a log's."""
-    found = LOG.fullmatch(name)
-    return int(datetime.strptime(found[1], "%Y%m%dT%H%M%S").replace(tzinfo=UTC).timestamp()) if found else 0
-
-
 LOG_ENTRY, LOG_DATA = spec("LOG_ENTRY"), spec("LOG_DATA")
 LOG_DATA_BYTES = LOG_DATA.fields["data"].count
 LOG_BLOCK_BYTES = 256 * LOG_DATA_BYTES
@@ -163,8 +157,9 @@ class LogTransfer:
             yield LOG_ENTRY, LOG_ENTRY.payload()
         for number, (name, size) in enumerate(self._logs, 1):
             if start <= number <= end:
+                began = datetime.strptime(name[:15], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)  # as LOG demands
                 fields = {"id": number, "num_logs": count, "last_log_num": count, "size": size or 0}
-                yield LOG_ENTRY, LOG_ENTRY.payload(**fields, time_utc=began_s(name))
+                yield LOG_ENTRY, LOG_ENTRY.payload(**fields, time_utc=int(began.timestamp()))
 
     def data(self, number: int, offset: int, count: int) -> Iterator[tuple[Spec, bytes]]:
         """Yield the LOG_DATA messages with `count` bytes from `offset` of the log `number`.

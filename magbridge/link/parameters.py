@@ -117,7 +117,7 @@ class Parameters:
         self.table = {row.name: row for row in table}
         self.names = list(self.table)
         self.revision = 0
-        self._watchers: list[Callable[[str], None]] = []
+        self._watchers: list[tuple[str, Callable[[str], None]]] = []
         self._values = {row.name: float(row.default) for row in self.table.values()}
         self._names_of = {row.key: row.name for row in self.table.values()}
 
@@ -132,9 +132,9 @@ class Parameters:
         """Return the values that differ from their defaults, by name; the bridge stores these values."""
         return {name: value for name, value in self._values.items() if value != self.table[name].default}
 
-    def watch(self, watcher: Callable[[str], None]) -> None:
-        """Register a function that is called with a parameter's name after every change of its value."""
-        self._watchers.append(watcher)
+    def watch(self, watcher: Callable[[str], None], only: str = "") -> None:
+        """Register a function to call with a parameter's name after each change, of all or `only` one."""
+        self._watchers.append((only, watcher))
 
     def set(self, name: str, value: float) -> bool:
         """Set a value and return True; return False and change nothing if it is NaN or out of range."""
@@ -148,8 +148,9 @@ class Parameters:
             return True
         self._values[name] = row.default if short == real32(row.default) else short
         self.revision += 1
-        for watcher in self._watchers:
-            watcher(name)
+        for only, watcher in self._watchers:
+            if only in ("", name):
+                watcher(name)
         return True
 
     def restore(self, values: Mapping[str, float]) -> list[str]:

@@ -223,21 +223,27 @@ class MessageRates:
 
     def __init__(self, parameters: Parameters, output: Output) -> None:
         self._parameters, self._output = parameters, output
-        self.by_name = {name: Rate(parameters[rate_name(name)]) for name in LIMITS}
-        self._by_clock: dict[str, Callable[[], object]] = {}
-        self._rates = [(rate_name(name), rate) for name, rate in self.by_name.items()]
-        parameters.watch(self._changed)
+        self.by_name = {name: self.another(name) for name in LIMITS}
 
     def another(self, name: str) -> Rate:
         """Return a further rate limit of message `name`, for the samples of another sensor."""
-        rate = Rate(self.by_name[name].hertz)
-        self._rates.append((rate_name(name), rate))
+        parameters = self._parameters
+        rate = Rate(parameters[rate_name(name)])
+        parameters.watch(lambda parameter: rate.set(parameters[parameter]), rate_name(name))
         return rate
 
     def send_by_clock(self, name: str, report: Callable[[], object]) -> None:
         """Send message `name` by a timer that calls `report`; here a rate of 0 is off."""
-        self._by_clock[rate_name(name)] = report
-        self._changed(rate_name(name))
+
+        def schedule(parameter: str) -> None:
+            hertz, output = self._parameters[parameter], self._output
+            if hertz > 0:
+                output.every(parameter, period_us(hertz), lambda _: report(), output.codec.now_us)
+            else:
+                output.cancel(parameter)
+
+        self._parameters.watch(schedule, rate_name(name))
+        schedule(rate_name(name))
 
     def interval_us(self, number: int, sample_rate: float) -> int:
         """Return the interval (µs) of the message with id `number`; -1 if off, 0 if unknown.
@@ -261,16 +267,3 @@ class MessageRates:
         parameter = rate_name(name)
         value = self._parameters.table[parameter].default if hertz is None else hertz
         return parameter if self._parameters.set(parameter, value) else ""
-
-    def _changed(self, parameter: str) -> None:
-        """Apply the new value of a parameter to the message whose rate it is, if any."""
-        for name, rate in self._rates:
-            if name == parameter and rate.hertz != self._parameters[parameter]:
-                rate.set(self._parameters[parameter])
-        if (report := self._by_clock.get(parameter)) is None:
-            return
-        hertz = self._parameters[parameter]
-        if hertz > 0:
-            self._output.every(parameter, period_us(hertz), lambda _: report(), self._output.codec.now_us)
-        else:
-            self._output.cancel(parameter)

@@ -33,7 +33,7 @@ YEAR_2001_US = 10**15
 class Extractor:
     """Reader of one parameter from the payloads of one message type."""
 
-    __slots__ = ("field", "index", "match", "name", "offset", "scale", "texts")
+    __slots__ = ("field", "index", "match", "name", "offset", "scale")
 
     def __init__(self, name: str, quantity: Telemetry, layout: Spec, path: Path) -> None:
         key = f"telemetry.{name}"
@@ -48,27 +48,19 @@ class Extractor:
                 f"{field_name}[0] to {field_name}[{count - 1}]" if count else f"{field_name} without an index"
             )
             raise ConfigError(path, f"{key}.field", f"{wanted}, not {quantity.field!r}")
-        self.match: list[tuple[Field, float]] = []
-        self.texts: list[tuple[int, bytes]] = []  # offset in the payload, and text with its final zero
+        self.match: list[tuple[Field, str | float]] = []
         for one, value in quantity.match.items():
-            field = find(layout, one, path, f"{key}.match.{one}")
+            place = f"{key}.match.{one}"
+            field = find(layout, one, path, place)
             if isinstance(value, str) != (field.code == "s"):
                 kind = "text" if field.code == "s" else "a number"
-                raise ConfigError(path, f"{key}.match.{field.name}", f"{kind}, not {value!r}")
+                raise ConfigError(path, place, f"{kind}, not {value!r}")
             if isinstance(value, str) and len(value.encode()) > field.struct.size:
-                raise ConfigError(
-                    path, f"{key}.match.{field.name}", f"at most {field.struct.size} bytes, not {value!r}"
-                )
-            if isinstance(value, str):
-                self.texts.append((field.offset, (value.encode() + b"\0")[: field.struct.size]))
-            else:
-                self.match.append((field, value))
+                raise ConfigError(path, place, f"at most {field.struct.size} bytes, not {value!r}")
+            self.match.append((field, value))
 
     def value(self, payload: bytes) -> float | None:
         """Return the parameter's value; NaN if the field is marked as unknown, None if ``match`` fails."""
-        for offset, text in self.texts:
-            if not payload.startswith(text, offset):
-                return None
         for field, wanted in self.match:
             if field.get(payload) != wanted:
                 return None

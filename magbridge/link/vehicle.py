@@ -105,17 +105,14 @@ class VehicleClock:
             if abs(new.offset_us - self.offset_us(middle_us)) > allowed_us:
                 self.reset()
         if len(self._exchanges) == CLOCK_EXCHANGES:
-            self._keep_fastest(self._exchanges[0])
+            old = self._exchanges[0]  # of each block, the fastest exchange is kept
+            if self._count % CLOCK_EXCHANGES == 0:
+                self._fastest.append(old)
+            elif old.trip_us < self._fastest[-1].trip_us:
+                self._fastest[-1] = old
+            self._count += 1
         self._exchanges.append(new)
         self._fit()
-
-    def _keep_fastest(self, old: Exchange) -> None:
-        """Keep an exchange that leaves the latest ones if it is the fastest of its block."""
-        if self._count % CLOCK_EXCHANGES == 0:
-            self._fastest.append(old)
-        elif old.trip_us < self._fastest[-1].trip_us:
-            self._fastest[-1] = old
-        self._count += 1
 
     def _fit(self) -> None:
         exchanges = (*self._fastest, *self._exchanges)
@@ -248,7 +245,10 @@ class VehicleState:
     def receive(self, message: Message, t_us: int) -> bool:
         """Update the state with a message received at `t_us` (µs); return True if it is from our vehicle."""
         if message.system != self.system:
-            self._other_sender(message)
+            is_vehicle = message.id == HEARTBEAT and message["autopilot"] != MAV_AUTOPILOT.INVALID
+            if is_vehicle and message["type"] != MAV_TYPE.GCS:
+                text = f"vehicle {message.system} is on the link too: ignored"
+                self._output.announce(f"system {message.system}", text, MAV_SEVERITY.NOTICE)
             return False
         if message.component == self.component:
             self._output.announce(
@@ -291,27 +291,17 @@ class VehicleState:
             elif received and not lost:
                 self._output.forget(f"losses {component}")
 
-    def _other_sender(self, message: Message) -> None:
-        """Send a STATUSTEXT if the heartbeat of another vehicle, not of a ground station, is on the link."""
-        if message.id != HEARTBEAT:
-            return
-        if message["type"] != MAV_TYPE.GCS and message["autopilot"] != MAV_AUTOPILOT.INVALID:
-            self._output.announce(
-                f"system {message.system}",
-                f"vehicle {message.system} is on the link too: ignored",
-                MAV_SEVERITY.NOTICE,
-            )
-
     def _present(self, t_us: int) -> None:
         who = f"autopilot {self.system}:{self.autopilot}"
         if self.state != MAG_PORT_STATE.OK:
             self._output.announce("autopilot", f"{who} found", MAV_SEVERITY.INFO)
         self.state = MAG_PORT_STATE.OK
-        self._output.run_once("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
 
-    def _vanish(self, sender: str) -> None:
-        self.state = MAG_PORT_STATE.LOST
-        self._output.announce("autopilot", f"{sender} is silent", MAV_SEVERITY.WARNING)
+        def vanish(_: int) -> None:
+            self.state = MAG_PORT_STATE.LOST
+            self._output.announce("autopilot", f"{who} is silent", MAV_SEVERITY.WARNING)
+
+        self._output.run_once("autopilot", t_us + ABSENT_US, vanish)
 
     def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
         """Process the boot time of the message id `kind`, and detect a reboot or a second autopilot.

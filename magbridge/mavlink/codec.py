@@ -239,16 +239,6 @@ class Codec:
         self._looked = 0
 
     @property
-    def sequence(self) -> int:
-        """Sequence number of the next frame."""
-        number: int = self._mav.seq
-        return number
-
-    @sequence.setter
-    def sequence(self, number: int) -> None:
-        self._mav.seq = number
-
-    @property
     def utc_us(self) -> int:
         """UNIX time for signatures and time fields of messages, µs."""
         return self.now_us + self.utc_offset_us

@@ -104,7 +104,7 @@ def test_wrong_names_and_values_are_refused() -> None:
         codec.pack("HEARTBEAT", colour=1)
     with pytest.raises(KeyError):
         spec("NO_SUCH_MESSAGE")
-    assert codec.sequence == 0
+    assert codec._mav.seq == 0
 
 
 def test_garbage_is_cheap_even_byte_by_byte() -> None:

@@ -133,15 +133,15 @@ def test_a_restart_loses_nothing(air: Air) -> None:
     """The sequence numbers restart; losses before and after are counted."""
     for k in range(100):
         air.field(NOW + k * 0.1)
-    air.bridge.sequence += 3
+    air.bridge._mav.seq += 3
     air.feed(NOW + 11, "MAG_STATUS", uptime=11)
     assert air.state.lost == 3
     air.bridge = Codec(1, 191)
-    air.bridge.sequence = 200
+    air.bridge._mav.seq = 200
     air.field(NOW + 12)
     air.feed(NOW + 12, "MAG_STATUS", uptime=1)
     assert air.state.lost == 3
-    air.bridge.sequence += 2
+    air.bridge._mav.seq += 2
     air.field(NOW + 13)
     assert air.state.lost == 5
 
