@@ -28,7 +28,7 @@ from magbridge.estimation.sparse import SparseFactor
 
 __all__ = ["ColumnProducts", "FieldEliminated", "LinearisedRows", "SampleSums", "eliminate_field", "sum_rows"]
 
-WORST = 1e16
+MAX_CONDITION = 1e16
 """Largest condition number of a prior's precision. Beyond it, rounding changes the log evidence by 3 to 10,
 which can lead the maximisation to a field of ten times the length."""
 
@@ -163,7 +163,7 @@ def eliminate_field(sums: SampleSums, field: GaussianField, ratio: float, rho: f
 
     LinAlgError: a precision is not positive definite in floating point, or too badly conditioned.
     """
-    if field.condition > WORST:
+    if field.condition > MAX_CONDITION:
         raise np.linalg.LinAlgError("the nodes are too fine for so long a field")
     # Normal equations of (z, w) with the field's prior precision Q / ratio^2 on w.
     products = sums.whitened(rho)

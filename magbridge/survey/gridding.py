@@ -19,15 +19,16 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.field_search import (
+    ENOUGH_RATIO,
     Choice,
     Weighed,
     about_the_middle,
     choose,
     climb,
-    fine_enough,
     ladder,
     nodes_for,
     plausible,
+    too_coarse,
 )
 from magbridge.estimation.blocks import (
     NO_COEFFICIENTS,
@@ -36,7 +37,7 @@ from magbridge.estimation.blocks import (
     in_chunks,
     with_blocks,
 )
-from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
+from magbridge.estimation.elimination import MAX_CONDITION, FieldEliminated, SampleSums, eliminate_field
 from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.estimation.hyperparameters import Hyperparameters, maximise_evidence
 from magbridge.estimation.information import covariance_of
@@ -216,10 +217,10 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
     # 1. Field and noise from a part of the samples, or from a joint fit.
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1) if start is None else FINE_NOISE_NT
     choice, roughness = _searched(samples, sigma, local=local, start=start)
-    finer = 1.0 if start is None else FINER_NODES
     # 2. Nodes for the whole area at that length.
-    nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MAX_GRID_NODES, finer)
-    choice = replace(choice, field=replace(choice.field, nodes=nodes))
+    finer = 1.0 if start is None else FINER_NODES
+    choice = _on_nodes(choice, samples.place, finer)
+    nodes = choice.field.nodes
     every = np.arange(len(samples.value))
     # 3. Sums over all samples; keep slow changes only if the evidence wants them.
     problem = Rows(samples, level_blocks(samples), roughness)
@@ -261,10 +262,23 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
         float(samples.value[problem.kept].mean()), problem.kept, widths,
     )  # fmt: skip
     # 7. Krige from the nearest samples where the nodes are coarser than the field.
-    if fine_enough(nodes, choice.field.length, choice.field.alpha, finer):
+    if not too_coarse(nodes, choice.field.length, choice.field.alpha, finer):
         return found
     levelled, kept = samples.value - found.levels, problem.kept
     return replace(found, kriged=kriged(samples.part(kept), levelled[kept], choice.field.length))
+
+
+def _on_nodes(choice: Choice, place: FloatArray, finer: float) -> Choice:
+    """Return the choice on nodes for places (n, 2), m, at least `finer` times as many per length as usual."""
+    # The splines' error decreases with the fourth power of the spacing, and must stay below the noise.
+    wanted, field = max((choice.ratio / ENOUGH_RATIO) ** 0.25, finer), choice.field
+    while True:
+        nodes = nodes_for(place, field.length, field.alpha, MAX_GRID_NODES, wanted)
+        field = replace(field, nodes=nodes)
+        # The prior of a smooth field on very fine nodes is singular to rounding.
+        if field.condition <= MAX_CONDITION or wanted <= finer:
+            return replace(choice, field=field)
+        wanted = max(0.9 * wanted, finer)
 
 
 def _posterior(

@@ -34,7 +34,8 @@ RUNGS = 7
 NODES_PER_LENGTH = {2: 8.0, 3: 8.0, 4: 5.0}
 SMOOTH, ENOUGH = 6, 3.0
 """Number of nodes per correlation length for each power alpha; from the power SMOOTH on it is ENOUGH. With
-these numbers the error of a field of 40 times the noise is below the noise."""
+these numbers the error of a field of ENOUGH_RATIO times the noise is below the noise."""
+ENOUGH_RATIO = 40.0
 PAD_LENGTHS = 1.0
 """Width of the margin around the track that has nodes, in correlation lengths."""
 MAX_FIELD_NODES = 4_000
@@ -45,9 +46,15 @@ MIN_LENGTH_M = 60.0
 """Shortest correlation length, m; a twentieth of an area smaller than that."""
 
 
-def fine_enough(nodes: Nodes, length: float, alpha: int, finer: float = 1.0) -> bool:
+def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:
     """Return True if the spacing of `nodes` suits a field of correlation `length`, m, and power `alpha`."""
-    return 0.7 <= length / nodes.spacing / _nodes_per_length(alpha, finer) <= 1.5
+    too_fine = length / nodes.spacing > 1.5 * _nodes_per_length(alpha, 1.0)
+    return not too_fine and not too_coarse(nodes, length, alpha)
+
+
+def too_coarse(nodes: Nodes, length: float, alpha: int, finer: float = 1.0) -> bool:
+    """Return True if `nodes` are too far apart for a field of correlation `length`, m, and power `alpha`."""
+    return length / nodes.spacing < 0.7 * _nodes_per_length(alpha, finer)
 
 
 def _nodes_per_length(alpha: int, finer: float) -> float:
