@@ -237,9 +237,18 @@ def _with_log_columns(
     meaning = {name: value for name, value in lasting(log.attrs).items() if name in MEANING}
     kept = {name: log[name] for name in names}
     if "heading" in corrected and "heading" in log:
-        kept["vehicle_heading"] = log["heading"]
+        kept["vehicle_heading"] = _from_true_north(log, corrected)
         meaning = {name: value for name, value in meaning.items() if name != "heading_reference"}
     return corrected.assign(kept).assign_attrs(meaning | attrs)
+
+
+def _from_true_north(log: xr.Dataset, corrected: xr.Dataset) -> xr.DataArray:
+    """Return the log's heading, from true north where its attributes say magnetic."""
+    heading = log["heading"]
+    if log.attrs.get("heading_reference") != "magnetic":
+        return heading
+    turned = (heading + corrected["declination"]) % 360.0
+    return turned.assign_attrs(heading.attrs)
 
 
 def _counts(corrected: list[xr.Dataset], rows: int, source: Path) -> tuple[dict[str, Any], str]:

@@ -38,7 +38,15 @@ from magbridge.logs.deployment import (
 )  # fmt: skip
 from magbridge.logs.mapping import Options
 from magbridge.logs.merge import combine, merge, refuse_offset
-from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_of, is_bag, metadata_path
+from magbridge.logs.registry import (
+    DECOMPRESSION_ERRORS,
+    LEADS,
+    Format,
+    format_of,
+    is_bag,
+    metadata_path,
+    seaexplorer_dive,
+)
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
@@ -170,8 +178,11 @@ def _paths(paths: Paths, options: Options) -> list[Path]:
 def without_companions(paths: Sequence[Path]) -> list[Path]:
     """Return the files without those that are read together with another, as a Slocum's science file."""
     given = set(paths)
+    payloads = {(path.parent, *dive) for path in paths if (dive := seaexplorer_dive(path.name, "pld"))}
 
     def is_companion(path: Path) -> bool:
+        if dive := seaexplorer_dive(path.name, "gli"):
+            return (path.parent, *dive) in payloads
         leads = LEADS.get(path.suffix.lower())
         return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
 

@@ -36,10 +36,18 @@ FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd"
 """Suffix of a Slocum's science file -> suffix of its flight file; if both exist, both are read."""
 LEADS = {**FLIGHT, ".log": ".eng"}
 """Suffix of a file that is read with another file of the same name -> suffix of the other file."""
+SEAEXPLORER = re.compile(r"(?P<mission>.+)\.(?P<kind>gli|pld)\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
+"""Name of a SeaExplorer's file of one dive, as sea035.12.pld1.raw.36.gz; gli: navigation, pld: payload."""
 PACKED = ".gz", ".bz2", ".xz"
 """Suffixes of compressed files; the suffix before them states the format."""
 SIGNATURE_BYTES = 4096
 """Number of bytes at the beginning of a file by which its format is recognised."""
+
+
+def seaexplorer_dive(name: str, kind: str) -> tuple[str, str] | None:
+    """Return mission and dive of a SeaExplorer's file of this kind (``gli``, ``pld``); None for others."""
+    named = SEAEXPLORER.fullmatch(name)
+    return (named["mission"], named["dive"]) if named and named["kind"] == kind else None
 
 
 class Format(NamedTuple):

@@ -13,7 +13,6 @@ of 6 deg.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,10 +26,8 @@ from magbridge.logs.clocks import epoch
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
 from magbridge.logs.fields import FieldMap, degrees, field_maps, linear
 from magbridge.logs.naming import aliases
-from magbridge.logs.registry import opened
+from magbridge.logs.registry import opened, seaexplorer_dive
 
-PAYLOAD = re.compile(r"(?P<mission>.+)\.pld\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
-"""Name of a payload file, as sea035.12.pld1.raw.36.gz; a navigation file is sea035.12.gli.sub.36.gz."""
 MAX_NAVIGATION_GAP_S = 120.0
 """Longest interval between navigation samples that is interpolated, s; samples come every 10 to 30 s."""
 CLOCK_COLUMNS = "Timestamp", "PLD_REALTIMECLOCK"
@@ -48,10 +45,9 @@ NAV_ONLY = {
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the file in pieces of at most `rows` rows; the whole file is in memory."""
     whole = _read(path)
-    if named := PAYLOAD.fullmatch(path.name):
-        dive = re.compile(rf"{re.escape(named['mission'])}\.gli\.\w+\.{named['dive']}(\.gz)?")
-        navigation = min((file for file in path.parent.iterdir() if dive.fullmatch(file.name)), default=None)
-        if navigation:
+    if dive := seaexplorer_dive(path.name, "pld"):
+        siblings = [file for file in path.parent.iterdir() if seaexplorer_dive(file.name, "gli") == dive]
+        if navigation := min(siblings, default=None):
             whole = _with_navigation(whole, _read(navigation), navigation)
     yield from sliced(whole, rows)
 

@@ -105,8 +105,10 @@ def survey(samples: Samples, start: Choice | None = None) -> Result:
     ties = crossovers(samples.place, samples.line)
     B = found.at_samples(samples)
     residual = samples.value - found.levels - B
-    before = ties.misties(samples.value)
-    after = ties.misties(samples.value - found.levels)
+    # Two passes at different depths read different fields: compare them at the map's depth.
+    deeper = B - found.at_samples(replace(samples, depth=np.full(len(B), found.middle)))
+    before = ties.misties(samples.value - deeper)
+    after = ties.misties(samples.value - found.levels - deeper)
     if not len(before) and samples.line.any():
         warnings.append(Diagnostic("no_crossing_lines"))
     elif not samples.line.any() and not sum(

@@ -76,6 +76,12 @@ def test_what_headings_are_counted_from_may_be_told(deployment: Path, command: C
         boresights.append(load_calibration("cal.json").boresight)
     assert boresights[0] is not None
     assert boresights[0] == boresights[1]  # roll and pitch determine it, not the headings
+    command("correct", "magnetic.csv", "--calibration", "cal.json", "-o", "corrected.csv")
+    corrected = read("corrected.csv")
+    logged = read("magnetic.csv")["heading"].sel(time=corrected["time"])
+    turned = (corrected["vehicle_heading"] - logged - corrected["declination"] + 180.0) % 360.0 - 180.0
+    assert abs(turned).max() < 1e-3
+    assert abs(corrected["declination"]).min() > 5.0
 
 
 def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:

@@ -222,6 +222,9 @@ def test_the_payload_s_rows_know_where_the_masses_were(name: str, tmp_path: Path
     assert back["battpos"].attrs["units"] == "mm"
     np.testing.assert_allclose(back["depth"], [3.424, 2.514])
     assert "between the samples of sea035.12.gli.sub.36.gz" in back.attrs["history"]
+    both = logs.read([tmp_path / "sea035.12.gli.sub.36.gz", tmp_path / name])
+    assert not both.attrs.get("duplicate_rows")  # the navigation is not read twice
+    np.testing.assert_array_equal(both["time"], back["time"])
 
 
 IAGA = """ Format                 IAGA-2002                                    |

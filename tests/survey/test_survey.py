@@ -156,8 +156,13 @@ def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
 
     value = rock(place, depth) + rng.normal(0.0, 1.0, n)
     zero = np.zeros(n, int)
-    found = survey(Samples(place, depth, np.arange(4.0, 4 * n + 4, 4), value, zero, zero > 0, ORIGIN)).gridded
+    result = survey(Samples(place, depth, np.arange(4.0, 4 * n + 4, 4), value, zero, zero > 0, ORIGIN))
+    found = result.gridded
     assert found.field.harmonic
+    # crossings at different depths are compared at one depth
+    assert np.sqrt(np.mean(result.found.misties(value) ** 2)) > 3.0
+    assert np.sqrt(np.mean(result.after**2)) < 2.0
+    assert "misties_remain" not in [warning.code for warning in result.warnings]
     at = place[rng.integers(n, size=400)] + rng.normal(0.0, 250.0, (400, 2))
     anomaly, sigma = found.evaluate(at)
     error = anomaly - rock(at, middle)
