@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import ConfigError
 from magbridge.toml import Table, check_entries, convert, load_toml
 
@@ -171,7 +172,7 @@ class Align(Table, frozen=True):
     """Growth of the sigma with the age of stale telemetry, nT/s."""
     turn_on_sigma: NotNegative = 20.0
     """1-sigma of the change of the sensor's offset at a power-on, nT."""
-    reference_sigma: Positive = 145.0
+    reference_sigma: Positive = MAIN_FIELD_SIGMA_NT
     """1-sigma of the Earth's total field about the main-field model, nT. A corrected field that differs by
     more than five sigma is flagged ``implausible``."""
 

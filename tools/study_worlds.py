@@ -19,8 +19,9 @@ from studies import Column, percentile
 
 from magbridge import Calibration, fit, observations, reference_field
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit
+from magbridge.calibration.fitting.fit import Fit
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree

@@ -32,10 +32,13 @@ from itertools import product
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import correct, forward
+from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.heading import heading
 from magbridge.calibration.model import Calibration
 from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 
 AUTOPILOT_AXES = "X", "Y", "Z"
 OFF = (0, 1), (0, 2), (1, 2)
@@ -94,12 +97,6 @@ def compass_of(calibration: Calibration) -> Compass:
         lost.append(f"the boresight, a turn of {angle:.1f} deg: set the compass' orientation")
     lost.append("uncertainties and flags")
     return Compass(matrix, offset, slopes[0] if slopes else None, tuple(lost))
-
-
-def matrix_and_offset(calibration: Calibration, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return A (3, 3) and T (3,), nT, without effects, at the parameters' `values` (k,)."""
-    A, T = calibration.matrices(np.reshape(values, (1, -1)))
-    return A[0], T[0]
 
 
 def _middle(calibration: Calibration) -> FloatArray:
@@ -187,9 +184,9 @@ def rotation(calibration: Calibration) -> FloatArray:
 def seaglider(calibration: Calibration, nT_per_count: float) -> str:
     """Return the text of a Seaglider's ``tcm2mat.cal``; CalibrationError: the boresight is missing."""
     S = TO_SEAGLIDER_AXES
-    A, T = matrix_and_offset(calibration, _middle(calibration))
-    hard = S @ T / nT_per_count
-    soft = S @ rotation(calibration) @ A @ S
+    A, T = calibration.matrices(_middle(calibration)[None])
+    hard = S @ T[0] / nT_per_count
+    soft = S @ rotation(calibration) @ A[0] @ S
     hard_text = " ".join(f"{value:.1f}" for value in hard)
     soft_text = " ".join(f"{value:.5f}" for value in soft.ravel())
     return f'hard0="{hard_text}"\nsoft0="{soft_text}"\n'
@@ -202,52 +199,38 @@ def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
     parameter. `dip_deg`: inclination of the Earth's field, which determines its horizontal part; the error is
     inversely proportional to this part.
     """
-    ends = [(one.low, one.high) for one in calibration.parameters]
-    centre = _middle(calibration)
-    R = rotation(calibration)
+    rotation(calibration)  # the error of a missing boresight
+    ends: list[tuple[float, ...]] = [(one.low, one.high) for one in calibration.parameters]
+    if not ends:
+        return []
+    cases = [("", ends)]  # all parameters, then each alone with the others at the middle
+    if len(ends) > 1:
+        fixed = [(middle,) for middle in _middle(calibration).tolist()]
+        for k, one in enumerate(calibration.parameters):
+            cases.append((one.name, [*fixed[:k], ends[k], *fixed[k + 1 :]]))
     costs = []
-    for k in range(-1, len(ends) if len(ends) > 1 else 0):
-        moved = list(product(*ends)) if k < 0 else [_moved_mass(centre, k, end) for end in ends[k]]
-        errors = np.concatenate([_errors(calibration, R, np.array(one), dip_deg) for one in moved])
-        name = calibration.parameters[k].name if k >= 0 else ""
-        costs.append(HeadingCost(name, float(np.sqrt(np.mean(errors**2))), float(np.abs(errors).max())))
-    return costs if ends else []
+    for name, ranges in cases:
+        errors = np.concatenate([_errors(calibration, np.array(one), dip_deg) for one in product(*ranges)])
+        costs.append(HeadingCost(name, rms(errors), float(np.abs(errors).max())))
+    return costs
 
 
-def _moved_mass(centre: FloatArray, k: int, value: float) -> FloatArray:
-    positions = centre.copy()
-    positions[k] = value
-    return positions
-
-
-def _errors(calibration: Calibration, R: FloatArray, positions: FloatArray, dip_deg: float) -> FloatArray:
+def _errors(calibration: Calibration, positions: FloatArray, dip_deg: float) -> FloatArray:
     """Return heading errors, deg, at several headings and pitches, with masses at `positions` (k,).
 
-    The readings are corrected as if all masses were at the middle of their ranges. `R` (3, 3): boresight.
+    The readings are corrected as if all masses were at the middle of their ranges.
     """
-    A_0, T_0 = matrix_and_offset(calibration, _middle(calibration))
-    A, T = matrix_and_offset(calibration, positions)
-    F, dip = calibration.reference.field, np.radians(dip_deg)
-    errors = []
-    for pitch in np.radians(PITCHES_DEG):
-        psi = np.radians(HEADINGS_DEG)
-        # the Earth's field in level axes, then in body axes of this pitch
-        ahead, right = F * np.cos(dip) * np.cos(psi), -F * np.cos(dip) * np.sin(psi)
-        down = np.full(len(psi), F * np.sin(dip))
-        body = np.stack(
-            [
-                np.cos(pitch) * ahead - np.sin(pitch) * down,
-                right,
-                np.sin(pitch) * ahead + np.cos(pitch) * down,
-            ],
-            axis=1,
-        )
-        # reading of the sensor in this attitude: h = A^-1 R^T b + T
-        raw = np.linalg.solve(A, (body @ R).T).T + T
-        corrected = (raw - T_0) @ (R @ A_0).T
-        found = heading(corrected, 0.0, np.full(len(psi), pitch)).magnetic
-        errors.append((found - HEADINGS_DEG + 180.0) % 360.0 - 180.0)
-    return np.concatenate(errors)
+    pitch, psi = np.array(list(product(np.radians(PITCHES_DEG), np.radians(HEADINGS_DEG)))).T
+    level = np.zeros(len(psi))
+    dip = np.radians(dip_deg)
+    earth = calibration.reference.field * np.array([np.cos(dip), 0.0, np.sin(dip)])
+    body = field_body(np.column_stack([level, pitch, psi]), np.tile(earth, (len(psi), 1)))
+    # the sensor's readings in these attitudes, and their correction at the middle of the ranges
+    model = calibration.without_effects()
+    reading = forward(model, body, np.tile(positions, (len(psi), 1)), level)
+    corrected = correct(model, reading, np.tile(_middle(calibration), (len(psi), 1)), level).vector
+    found = heading(corrected, 0.0, pitch).magnetic
+    return np.asarray((found - np.degrees(psi) + 180.0) % 360.0 - 180.0)
 
 
 def position_table(calibration: Calibration, parameter: str) -> str:
@@ -264,8 +247,9 @@ def position_table(calibration: Calibration, parameter: str) -> str:
     axes = "xyz"
     header = [f"{parameter} [{one.unit or 1}]", *(f"offset_{axis} [nT]" for axis in axes)]
     header += [f"matrix_{row}{column}" for row in axes for column in axes]
-    lines = [",".join(header)]
-    for position in np.linspace(one.low, one.high, TABLE_POSITIONS):
-        A, T = matrix_and_offset(calibration, _moved_mass(_middle(calibration), k, position))
-        lines.append(",".join(f"{value:.9g}" for value in (position, *T, *(R @ A).ravel())))
+    positions = np.tile(_middle(calibration), (TABLE_POSITIONS, 1))
+    positions[:, k] = np.linspace(one.low, one.high, TABLE_POSITIONS)
+    A, T = calibration.matrices(positions)
+    table = np.column_stack([positions[:, k], T, (R @ A).reshape(TABLE_POSITIONS, 9)])
+    lines = [",".join(header), *(",".join(f"{value:.9g}" for value in row) for row in table)]
     return "\n".join(lines) + "\n"

@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.constants import DECLINATION_SIGMA_DEG, DECLINATION_SIGMA_NT_DEG
 from magbridge.records import Quality
 
 Components = Sequence[Any]
@@ -41,12 +42,6 @@ Components = Sequence[Any]
 
 DEFAULT_TILT_SIGMA_DEG = 0.3
 """1-sigma of roll and of pitch where the log does not state one, deg."""
-MODEL_DECLINATION_SIGMA_DEG = 0.26
-"""1-sigma of a main-field model's declination in a strong horizontal field, deg: the constant term of the
-error model ``sqrt(0.26^2 + (5417 nT / H)^2)`` of the World Magnetic Model 2025 (technical report, NOAA NCEI,
-2025)."""
-MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
-"""Term of the same error model that is inversely proportional to the horizontal field H, deg nT."""
 UNIFORM_SIGMA_DEG = 180.0 / sqrt(3.0)
 """Standard deviation of an unknown angle, uniform over a full turn, deg."""
 NO_HEADING_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT)
@@ -256,6 +251,6 @@ def model_declination_sigma(horizontal: FloatArray, crustal_sigma: float = 0.0) 
     those of WMM2025.
     """
     with np.errstate(divide="ignore"):
-        model = np.hypot(MODEL_DECLINATION_SIGMA_DEG, MODEL_DECLINATION_SIGMA_NT_DEG / horizontal)
+        model = np.hypot(DECLINATION_SIGMA_DEG, DECLINATION_SIGMA_NT_DEG / horizontal)
         crustal = np.degrees(crustal_sigma / (np.sqrt(2.0) * horizontal))
     return np.asarray(np.minimum(np.hypot(model, crustal), UNIFORM_SIGMA_DEG))

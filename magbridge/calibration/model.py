@@ -22,6 +22,7 @@ like an error of T, is part of ``S_TT``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import permutations
@@ -42,7 +43,8 @@ from magbridge.wording import counted
 
 __all__ = [
     "LEVEL_STEP_SIGMA", "MIN_HALF_RANGE", "Boresight", "CalibratedRange", "CalibratedSensor", "Calibration",
-    "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "facts", "identity", "to_paper",
+    "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "facts", "identity", "rotation_matrix",
+    "skew", "to_paper",
 ]  # fmt: skip
 
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
@@ -228,15 +230,25 @@ class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     """1-sigma of roll and of pitch in the runs that determined the rotation, deg."""
 
     def matrix(self) -> FloatArray:
-        """Return the rotation matrix (3, 3), by Rodrigues' formula."""
-        # R = I + sinc(a) K + (1 - cos a)/a^2 K^2; 1 - cos a = 2 sin^2(a/2), so that both factors stay
-        # finite at a = 0
-        x, y, z = self.rotation
-        angle = float(np.sqrt(x * x + y * y + z * z))
-        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.asarray(
-            np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K
-        )
+        """Return the rotation matrix (3, 3)."""
+        return rotation_matrix(self.rotation)
+
+
+def skew(vector: Sequence[float] | FloatArray) -> FloatArray:
+    """Return the matrix (3, 3) of the cross product ``v x``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_matrix(vector: Sequence[float] | FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) by a rotation vector (3,), rad, by Rodrigues' formula."""
+    # R = I + sinc(a) K + (1 - cos a)/a^2 K^2; 1 - cos a = 2 sin^2(a/2), so that both factors stay
+    # finite at a = 0
+    K = skew(vector)
+    angle = float(np.linalg.norm(vector))
+    return np.asarray(
+        np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * K @ K
+    )
 
 
 MIN_HALF_RANGE = {"depth": 10.0, "sensor_temperature": 2.0}

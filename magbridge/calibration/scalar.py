@@ -27,12 +27,13 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS, robust_scale, symmetric
 
 __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "IMPOSSIBLE_FRACTION", "PLATFORM_TERMS", "RANGE_MARGIN",
-    "REFERENCE_SIGMA_NT", "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality",
+    "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarQuality",
     "ScalarSensor", "ScalarSeries", "SensorDisagreement", "compare_sensors", "correct_scalar",
     "moved_earlier", "scalar_design", "term_columns", "unknown_direction_variance",
 ]  # fmt: skip
@@ -54,8 +55,6 @@ JUMP_SIGMA = 8.0
 """Change from one sample to the next, in robust standard deviations of the changes, that is a jump."""
 DISAGREEMENT_SIGMA = 4.0
 """Difference of two sensors, in its standard deviations, from which on it is flagged."""
-REFERENCE_SIGMA_NT = 145.0
-"""1-sigma of the main-field model where no map is known (error model of the WMM 2020), nT."""
 IMPOSSIBLE_FRACTION = 0.2
 """Distance from the reference, as a fraction of it, that neither crust nor vehicle explains."""
 MIN_AGREEING_SAMPLES = 10
@@ -427,9 +426,9 @@ def _expected_field(
     base = reference if np.isfinite(reference).any() else np.zeros(len(mean))
     rows = rows[np.isfinite(base[rows])]
     if len(rows) < MIN_AGREEING_SAMPLES:
-        return reference, REFERENCE_SIGMA_NT
+        return reference, MAIN_FIELD_SIGMA_NT
     crust = (mean - base)[rows]
-    sigma = min(robust_scale(crust - np.median(crust)), REFERENCE_SIGMA_NT)
+    sigma = min(robust_scale(crust - np.median(crust)), MAIN_FIELD_SIGMA_NT)
     return base + np.interp(np.arange(len(mean)), rows, crust), sigma
 
 

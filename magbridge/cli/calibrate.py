@@ -127,7 +127,7 @@ class ReferenceOptions:
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site; sigma and level_sigma
         include it. By default 0 if the log has reference_field, the map's sigma with --grid (20 if the map
-        states none), else 145 (error model of the World Magnetic Model 2020).
+        states none), else 138 (error model of the World Magnetic Model 2025).
     """
 
     grid: Path | None = None

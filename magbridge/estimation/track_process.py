@@ -24,7 +24,14 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "Course", "ReferenceSteps", "TrackProcess"]
+__all__ = [
+    "CORRELATION_LENGTH_M",
+    "TRACK_STATES",
+    "Course",
+    "ReferenceSteps",
+    "TrackProcess",
+    "matern_transition",
+]
 
 TRACK_STATES = 4
 """Number of states: crustal field (nT), its slope (nT/m), slow noise (nT), and the constant (nT)."""
@@ -85,6 +92,13 @@ class ReferenceSteps:
         self.reference, self._time_us = reference, time_us
 
 
+def matern_transition(rate: float, metres: float) -> tuple[float, float, float, float]:
+    """Return the four entries of F of the module's notes, row by row, for `rate` lambda, 1/m."""
+    x = min(rate * metres, 300.0)
+    fall = exp(-x)
+    return fall * (1.0 + x), fall * x / rate, -fall * rate * x, fall * (1.0 - x)
+
+
 class TrackProcess:
     """Dynamics of the reference's error along a track.
 
@@ -141,14 +155,9 @@ class TrackProcess:
         `metres`, `seconds`: distance and time. `turn`: change of course before the distance, rad.
         `stretch`: ratio of `metres` to the true distance, if it is scaled to the field's roughness.
         """
-        # Matern 3/2 along the track, (value, slope): F = exp(-x) [[1 + x, x / l], [-l x, 1 - x]], x = l d.
-        rate = self._lambda
-        x = min(rate * metres, 300.0)
         rho, interval = self._decay
         F = np.zeros((TRACK_STATES, TRACK_STATES))
-        fall = exp(-x)
-        F[0, 0], F[0, 1] = fall * (1.0 + x), fall * x / rate
-        F[1, 0], F[1, 1] = -fall * rate * x, fall * (1.0 - x)
+        F[0, 0], F[0, 1], F[1, 0], F[1, 1] = matern_transition(self._lambda, metres)
         # The slope per scaled metre of a field that is smoother than assumed may be steeper than b'.
         steeper = self.initial[1, 1] * max(stretch**-2 - 1.0, 0.0) * sin(turn) ** 2
         steep = steeper * np.outer(F[:, 1], F[:, 1])

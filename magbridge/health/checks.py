@@ -11,8 +11,8 @@ readings of a moving vehicle a standard deviation of at least :math:`q / \sqrt{1
 A value at which a channel was stuck is a limit of the channel's range, if no reading was ever beyond it.
 
 The Earth's total field is the sum of the main field and the crustal field. It differs from the main field by
-145 nT (1-sigma over the Earth, with disturbances: the error model of Chulliat et al. 2020, *The US/UK World
-Magnetic Model for 2020-2025*), or by the configured ``align.reference_sigma``. A total field that differs by
+138 nT (1-sigma over the Earth, with disturbances: the error model of the World Magnetic Model 2025, see
+:mod:`magbridge.constants`), or by the configured ``align.reference_sigma``. A total field that differs by
 more than :data:`MAX_LEVEL_SIGMA` is not the Earth's. If no position is known, the limits are the extremes on
 the Earth. Sigma includes the difference once it exceeds :data:`FAR_SIGMA`, until it is below
 :data:`NEAR_SIGMA`.

@@ -32,6 +32,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Noise
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.sequential import SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
@@ -43,7 +44,6 @@ MIN_INTERVAL_S: Final = 1.0
 MAX_INTERVAL_S: Final = 4.0
 INTERVAL_M: Final = 25.0
 """Interval between two tested samples: shortest and longest time (s), and preferred distance (m)."""
-CRUST_SIGMA_NT: Final = 145.0
 CONSTANT_SIGMA_NT: Final = 1000.0
 MAX_GAP_S: Final = 1e5
 """Largest elapsed time between tested samples, s; after it, nothing is known of the field."""
@@ -131,7 +131,7 @@ class ConsistencyCheck:
     def __init__(self, noise: Noise, masses: int, messages: Messages) -> None:
         self._messages = messages
         self._process = TrackProcess(
-            max(noise.sensor, 0.1), CRUST_SIGMA_NT, CONSTANT_SIGMA_NT,
+            max(noise.sensor, 0.1), MAIN_FIELD_SIGMA_NT, CONSTANT_SIGMA_NT,
             autocorrelation=noise.autocorrelation, interval=noise.interval, white=noise.white,
         )  # fmt: skip
         self._masses = masses

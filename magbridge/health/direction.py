@@ -22,7 +22,7 @@ from magbridge.records import NEVER, Quality
 
 INCLINED: Final = radians(10.0)
 """Inclination error that is flagged, rad: five sigmas of 2 deg. The attitude has 1.5 deg, the boresight 1,
-the main field 0.2 (Chulliat et al. 2020, table 14), the crustal field the rest."""
+the main field 0.2 (error model of the World Magnetic Model 2025), the crustal field the rest."""
 MAX_HEADING_ERROR: Final = radians(60.0)
 """Heading difference that is reported, rad: five sigmas of a compass with an error of 12 deg."""
 MIN_HORIZONTAL_FRACTION: Final = 0.2

@@ -26,6 +26,7 @@ from collections import deque
 from math import exp, log, nan
 from typing import Final, NamedTuple
 
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.health.checks import Messages
 from magbridge.health.scatter import Scatter
 from magbridge.records import NEVER
@@ -33,9 +34,8 @@ from magbridge.records import NEVER
 GATE_SIGMA: Final = 7.0
 """Innovation above which a sample is an outlier, in sigmas. Gaussian noise exceeds 5.5 once a month."""
 GATE: Final = GATE_SIGMA * GATE_SIGMA
-CRUST_SIGMA_NT: Final = 145.0
 CRUST_LENGTH_M: Final = 1000.0
-CURVATURE_PER_SPEED_CUBED: Final = 4.0 * (3.0**0.5 / CRUST_LENGTH_M) ** 3 * CRUST_SIGMA_NT**2
+CURVATURE_PER_SPEED_CUBED: Final = 4.0 * (3.0**0.5 / CRUST_LENGTH_M) ** 3 * MAIN_FIELD_SIGMA_NT**2
 """Ratio of q to the cube of the speed for a crustal field, nT²/m³."""
 MIN_INTENSITY: Final = 1e-4
 """Value of q while the speed is unknown, nT²/s³: the slope changes by 0.05 nT/s in half a minute."""
@@ -124,7 +124,9 @@ class TrendCheck:
         if floor < self._min_log_q - LARGE_CHANGE:  # the assumed speed was too high
             self._log_q = floor + LARGE_CHANGE
         self._min_log_q, self._has_speed = floor, True
-        self._slope_variance = max(SLOPE_NT_PER_S, 3.0**0.5 * CRUST_SIGMA_NT / CRUST_LENGTH_M * speed) ** 2
+        self._slope_variance = (
+            max(SLOPE_NT_PER_S, 3.0**0.5 * MAIN_FIELD_SIGMA_NT / CRUST_LENGTH_M * speed) ** 2
+        )
 
     def check(self, time_us: int, total: float, sigma: float, turned: float, *, learn: bool) -> float:
         """Update the trend with a sample; return the variance (nT²) that outliers add to the sample.

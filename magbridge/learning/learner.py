@@ -11,6 +11,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.learning.alarms import NO_COEFFICIENT, AlarmState, LearningAlarm, named
 from magbridge.learning.estimator import BEYOND_CHANCE, Nuisance
 from magbridge.learning.judge import FIRST
@@ -59,8 +60,6 @@ value shows that the true cause is another, such as a current without telemetry.
 MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 """Flags that exclude a sample from learning."""
-MAIN_FIELD_SIGMA_NT: Final = 145.0
-"""1-sigma of the Earth's field about the main field, nT."""
 
 
 class Learner:
@@ -105,7 +104,7 @@ class Learner:
         calibration: Calibration,
         *,
         grid: AnomalyGrid | None = None,
-        spread: float = 145.0,
+        spread: float = MAIN_FIELD_SIGMA_NT,
         turn_on: float = 20.0,
         max_rate: float = 1.0,
         currents: tuple[str, ...] = (),

@@ -12,6 +12,7 @@ from math import atan2, cos, exp, inf, pi, sin, sqrt
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.model import rotation_matrix, skew
 
 __all__ = ["AttitudeFilter"]
 
@@ -120,7 +121,7 @@ class AttitudeFilter:
         sampling = SAMPLING_FRACTION * seconds * np.linalg.norm(rates - self._rates)
         self._P[:3, :3] += np.eye(3) * (RATE_NOISE_RAD_SQRT_S**2 * seconds + sampling**2)
         self._P[3:, 3:] += np.eye(3) * drift**2 * seconds
-        self._C = self._C @ exponential(mean * seconds)
+        self._C = self._C @ rotation_matrix(mean * seconds)
         self._rates, self._time, self._received = rates, time, received
         if not vouched:
             self._contradicted = time
@@ -153,7 +154,7 @@ class AttitudeFilter:
             return
         self._directed = self._time
         body, expected = field / np.linalg.norm(field), main / np.linalg.norm(main)
-        turned = exponential(self._rates * since) @ body
+        turned = rotation_matrix(self._rates * since) @ body
         weight = 1.0 - exp(-0.1 / ANGLE_TIME_S)
         angle = sqrt(float(np.sum(np.square(np.cross(self._autopilot @ turned, expected)))))
         self._angle += weight * (angle - self._angle)
@@ -172,24 +173,9 @@ class AttitudeFilter:
         squared = float(residual @ np.linalg.solve(S, residual))
         self._P = (np.eye(6) - K @ H) @ self._P
         self._P = 0.5 * (self._P + self._P.T)
-        self._C = exponential(change[:3]) @ self._C
+        self._C = rotation_matrix(change[:3]) @ self._C
         self._bias = self._bias + change[3:]
         return squared
-
-
-def skew(v: FloatArray) -> FloatArray:
-    """Return the matrix of the cross product ``v ×``."""
-    x, y, z = v.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def exponential(v: FloatArray) -> FloatArray:
-    """Return the rotation by the vector `v`, rad (Rodrigues)."""
-    angle = float(np.linalg.norm(v))
-    a = skew(v)
-    if angle < 1e-6:
-        return np.eye(3) + a
-    return np.eye(3) + sin(angle) / angle * a + (1.0 - cos(angle)) / angle**2 * (a @ a)
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> FloatArray:

@@ -13,11 +13,12 @@ filter is right, these odds are a martingale. They then ever exceed c with a pro
 from __future__ import annotations
 
 from enum import Enum
-from math import exp, expm1, log, pi, sqrt
+from math import expm1, log, pi, sqrt
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.estimation.track_process import matern_transition
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.deadreckoning import Step
@@ -55,8 +56,7 @@ class Unmapped:
 
     Notes
     -----
-    ``F = exp(-λd) [[1 + λd, d], [-λ²d, 1 - λd]]``, ``λ = √3/L``, stationary covariance ``diag(σ², λ²σ²)``
-    (Hartikainen & Särkkä 2010, sec. 4).
+    F is that of :mod:`magbridge.estimation.track_process`, the stationary covariance ``diag(σ², λ²σ²)``.
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
@@ -74,12 +74,10 @@ class Unmapped:
         `curvature_variance` (nT²) is the variance that the filter adds to the measurement for the map's
         curvature. This model adds it too; otherwise a searching filter would lose by its larger variance.
         """
-        o, rate = self._options, self._rate
+        o = self._options
         seconds, metres, _ = step
         # Prediction over the distance d: F = [[a, b], [c, d]] of the Matern process (see Notes).
-        kept = exp(-rate * metres)
-        a, b = kept * (1.0 + rate * metres), kept * metres
-        c, d = -kept * rate * rate * metres, kept * (1.0 - rate * metres)
+        a, b, c, d = matern_transition(self._rate, metres)
         value, slope = a * self._x[0] + b * self._x[1], c * self._x[0] + d * self._x[1]
         p, q, r = self._p
         v, w = self._value, self._slope

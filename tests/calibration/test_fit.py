@@ -8,12 +8,13 @@ import pytest
 from gliders import Glider, Gliders, codes
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, METHODS, fit
+from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.methods import ellipsoid
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import full_order
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import CalibrationError
 from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.information import GaussianInformation

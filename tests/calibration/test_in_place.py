@@ -15,12 +15,13 @@ from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting import in_place
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import too_rough
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit, fit
+from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.methods import fit_auto
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.fitting.uncertainty import apart_from_level, level_of, with_level
 from magbridge.calibration.model import Noise, identity
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.diagnostics import Diagnostic
 from magbridge.survey.gridding import gridded
 from magbridge.survey.samples import Samples

@@ -7,9 +7,10 @@ import pytest
 from msgspec.structs import replace
 from voyages import OUTSIDE, PLACE, Map, blocks, misled, sail, track_over
 
+from magbridge.calibration.model import rotation_matrix
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.attitude import AttitudeFilter, exponential, rotation
+from magbridge.navigate.attitude import AttitudeFilter, rotation
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.model import Block
@@ -182,7 +183,7 @@ def flown(*, wrong: bool) -> tuple[float, float, float]:
     for tick in range(1200):
         time = 0.1 * tick
         rates = np.array([0.2 * sin(time), 0.1 * cos(0.7 * time), 0.15 * sin(0.2 * time)])
-        attitude = attitude @ exponential(rates * 0.1)
+        attitude = attitude @ rotation_matrix(rates * 0.1)
         bad = wrong and time > 60.0
         bias = radians(3.0) * np.array([1.0, -1.0, 2.0]) if bad else np.zeros(3)
         tilt = rotation(radians(15.0), radians(-10.0), radians(40.0)) if bad else np.eye(3)

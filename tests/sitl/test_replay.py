@@ -13,11 +13,11 @@ import xarray as xr
 
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.calibration.model import Noise, identity
 from magbridge.cli import bridge as commands
 from magbridge.cli.common import FailedResult
 from magbridge.config import load as load_config
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
 from magbridge.field.geodesy import offset
 from magbridge.logs import Options, read, write

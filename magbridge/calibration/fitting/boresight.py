@@ -53,7 +53,7 @@ from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 
 INCLINATION_SIGMA_DEG = 0.2
-"""1-sigma of a main-field model's inclination (Chulliat et al. 2020, table 14), deg."""
+"""1-sigma of a main-field model's inclination (error model of the World Magnetic Model 2025), deg."""
 RUN_TILT_SIGMA_DEG = 0.2
 """Expected 1-sigma of the offset of roll and of pitch in one run, deg."""
 RUN_TILT_PRIOR_COUNT = 2.0

@@ -20,6 +20,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.calibration.fitting.uncertainty import with_level
 from magbridge.columns import CHANNELS
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.datasets import expect, expect_number
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError, NoSolutionError, WrongUse
@@ -27,7 +28,7 @@ from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
 from magbridge.wording import one_of
 
-__all__ = ["MAIN_FIELD_SIGMA_NT", "METHODS", "Fit", "fit"]
+__all__ = ["METHODS", "Fit", "fit"]
 
 METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.methods:fit_auto",
@@ -44,9 +45,6 @@ ONE_ATTITUDE = 5.0
 """Angle from the mean field direction within which 95 % of the samples count as a single attitude, deg."""
 UNKNOWN_LENGTH = 500.0
 """Correlation length assumed for the crustal field by fits that do not estimate this field, m."""
-MAIN_FIELD_SIGMA_NT = 145.0
-"""1-sigma of the total field at a site about a main-field model, nT. The model lacks high degrees, mainly the
-crustal field (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 MAX_FIT_SAMPLES = 250_000
 """Largest number of samples of a fit: more cost time, but the model's error does not average out."""
 MAX_CRUST_NT = 3.0 * MAIN_FIELD_SIGMA_NT

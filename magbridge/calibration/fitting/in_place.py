@@ -63,7 +63,7 @@ from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import rms
 
 REFERENCE_ERROR_LENGTH_M = 25_000.0
-"""Distance over which the reference's bias changes by its 1-sigma, m; 6 nT/km for 145 nT."""
+"""Distance over which the reference's bias changes by its 1-sigma, m; 6 nT/km for 138 nT."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """Prior 1-sigma of the slow change with time on a magnetically quiet day, nT, and 1-sigma of its
 logarithm."""

@@ -28,7 +28,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve, solve_discrete_are
+from scipy.linalg import block_diag, solve_discrete_are
 from scipy.optimize import minimize
 from scipy.signal import sosfilt, zpk2sos
 from scipy.special import chdtrc
@@ -39,7 +39,6 @@ from magbridge.calibration.scalar import (
     CYCLE_LEVEL_SIGMA_NT,
     IMPOSSIBLE_FRACTION,
     PLATFORM_TERMS,
-    REFERENCE_SIGMA_NT,
     ScalarChannel,
     ScalarNoise,
     ScalarSensor,
@@ -48,11 +47,12 @@ from magbridge.calibration.scalar import (
     scalar_design,
     term_columns,
 )
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
 from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
 from magbridge.estimation.hyperparameters import log_evidence
-from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.information import GaussianInformation, covariance_of
 from magbridge.estimation.priors import PriorFamily
 from magbridge.estimation.residual import robust_scale
 
@@ -142,7 +142,7 @@ class ScalarFit:
                 f"{self.sensor.column} reads {self.sensor.reference_field + self.removed:.0f} nT and the "
                 f"reference is {self.sensor.reference_field:.0f} nT: is the sign of the latitude right?"
             )
-        if self.rms_after > max(LEAST_GAIN * self.rms_before, REFERENCE_SIGMA_NT):
+        if self.rms_after > max(LEAST_GAIN * self.rms_before, MAIN_FIELD_SIGMA_NT):
             return (
                 f"the compensation of {self.sensor.column} improves nothing: {self.rms_before:.0f} -> "
                 f"{self.rms_after:.0f} nT about the mean; its reading or the reference is wrong"
@@ -504,16 +504,9 @@ def _choose_widths(data: GaussianInformation, family: PriorFamily, log_widths: F
 
 
 def _coefficients(data: GaussianInformation, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the posterior mean (m,) and covariance (m, m) of the coefficients for a prior's 1-sigma (m,).
-
-    Notes
-    -----
-    With ``B = 1 + W X^T X W``, W the prior's 1-sigma on the diagonal, the posterior mean is ``W B^-1 W X^T
-    y`` and its covariance ``W B^-1 W``.
-    """
-    factor = cho_factor(np.eye(len(sigma)) + sigma[:, None] * data.precision * sigma, lower=True)
-    mean = sigma * cho_solve(factor, sigma * data.vector)
-    return mean, sigma[:, None] * cho_solve(factor, np.eye(len(sigma))) * sigma
+    """Return the posterior mean (m,) and covariance (m, m) of the coefficients for a prior's 1-sigma (m,)."""
+    covariance = covariance_of(data.precision + np.diag(sigma**-2.0))
+    return covariance @ data.vector, covariance
 
 
 def _width_covariance(data: GaussianInformation, family: PriorFamily, log_widths: FloatArray) -> FloatArray:

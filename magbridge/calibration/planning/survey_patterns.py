@@ -19,12 +19,12 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
 from magbridge.calibration.fitting.field_search import nodes_for
-from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import Mission
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.planning.plan import Design, expected_calibration, mission_samples
 from magbridge.columns import require_units
+from magbridge.constants import MAIN_FIELD_SIGMA_NT
 from magbridge.errors import CalibrationError
 from magbridge.estimation.elimination import LinearisedRows, eliminate_field, sum_rows
 from magbridge.estimation.gaussian_field import GaussianField
