@@ -17,6 +17,7 @@ from magbridge.calibration.fitting.uncertainty import apart_from_level, expected
 from magbridge.calibration.model import Calibration
 from magbridge.diagnostics import Diagnostic
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
@@ -38,12 +39,6 @@ DIVE_PITCH_DEG = 5.0
 """Smallest absolute pitch of a dive or climb, deg."""
 OPEN = 60.0
 """Smallest gap in the headings that is reported, deg."""
-
-
-def expected_ratio(calibration: Calibration, data: Observations) -> float:
-    """Return the RMS error expected near the runs, over the noise of a sample (:func:`nearby_mission`)."""
-    error = expected_error(calibration, nearby_mission(calibration, data))
-    return float(np.sqrt(np.mean(error**2)) / max(calibration.noise.sensor, 1e-9))
 
 
 def _positions(calibration: Calibration, data: Observations) -> Iterator[Diagnostic]:
@@ -182,8 +177,8 @@ def judged(found: Fit, data: Observations) -> Fit:
         if magnetic := magnetic_headings(calibration, data):
             mismatch.append(magnetic)
     # the level is common to all samples, and no manoeuvre reduces it: exclude it from the expected error
-    ratio = expected_ratio(apart_from_level(calibration), data)
-    noise = calibration.noise.sensor
+    noise, known = calibration.noise.sensor, apart_from_level(calibration)
+    ratio = rms(expected_error(known, nearby_mission(known, data))) / max(noise, 1e-9)
     warnings = tuple(_reasons(found, data, ratio, noise))
     if ratio > UNSUPPORTED:
         warnings = (*warnings, *found.open)
@@ -244,7 +239,7 @@ def _suspicions(found: Fit) -> Iterator[Diagnostic]:
             values = {"slope": slope, "late": late, "channel": effect.channel}
             yield Diagnostic("temperature_removed", values)
     if found.creep is not None:
-        size = float(np.sqrt(np.mean((found.creep.offset**2).sum(axis=1))))
+        size = rms(np.linalg.norm(found.creep.offset, axis=1))
         yield Diagnostic("offset_crept", {"rms_nT": size})
     if ends := found.details.get("ends", 0):
         yield Diagnostic("ends_left_out", {"samples": counted(ends, "sample")})

@@ -66,22 +66,15 @@ def tells_rock(data: Observations) -> bool:
     return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(revisits_cells, PLACES))
 
 
-def left_open(data: Observations, length: float) -> Iterator[Diagnostic]:
-    """Yield a warning if the track of `data` hardly crosses itself, over an unmapped crustal field.
+def left_open(track: FloatArray | None, length: float) -> Iterator[Diagnostic]:
+    """Yield a warning if a `track` (n, 2+), m, passes too few places again on another course.
 
-    `length`: correlation length of the crustal field, m.
+    `track`: track over an unmapped crustal field; None if there is no such track. `length`: correlation
+    length of the crustal field, m.
     """
-    if data.place is None or data.unmapped is None or not data.unmapped.all():
+    if track is None:
         return
-    yield from left_open_by(data.place[:, :2], length)
-
-
-def left_open_by(track: FloatArray, length: float) -> Iterator[Diagnostic]:
-    """Yield a warning if a `track` (n, 2), m, passes too few places again on another course.
-
-    `length`: correlation length of the unmapped crustal field, m.
-    """
-    place, course = courses(track)
+    place, course = courses(track[:, :2])
     if not len(place) or np.ptp(place, axis=0).max() < PLACE_LENGTH_FRACTION * length:
         return  # all at one place: the crustal field is a constant
     cells, reversed_cells = crossed(place, course, PLACE_LENGTH_FRACTION * length)
@@ -177,15 +170,7 @@ def courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     `place` (n, 2): positions, m.
     """
-    moved = _thinned(place)
+    way = np.cumsum(np.hypot(*np.diff(place, axis=0, prepend=place[:1]).T))
+    moved = np.diff(np.floor(way / MIN_COURSE_M), prepend=-1) > 0
     step = np.diff(place[moved], axis=0)
     return place[moved][:-1], np.arctan2(step[:, 1], step[:, 0])
-
-
-def _thinned(place: FloatArray) -> BoolArray:
-    """Return a mask (n,) that selects about one position in each :data:`MIN_COURSE_M` m of travel.
-
-    `place` (n, 2): positions, m.
-    """
-    way = np.cumsum(np.hypot(*np.diff(place, axis=0, prepend=place[:1]).T))
-    return np.asarray(np.diff(np.floor(way / MIN_COURSE_M), prepend=-1) > 0)

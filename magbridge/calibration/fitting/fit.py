@@ -124,7 +124,7 @@ def fit(
             data = data.part(~(far_off(data.place[:, :2]) & known))
         found, method, notes = _first_solution(data, method, order, bias, in_place, options)
         if method == "auto":
-            found = replace(found, open=tuple(left_open(data, UNKNOWN_LENGTH)))
+            found = replace(found, open=tuple(left_open(data.unmapped_place, UNKNOWN_LENGTH)))
         found = replace(found, open=(*away, *notes, *found.open))
         flight = found.details.pop("flown", None)
         if flight is not None and not flight.all():

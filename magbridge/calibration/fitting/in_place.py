@@ -97,7 +97,11 @@ def fit_in_place(
     posed = pose(data, order, vehicle, known)
     samples, q = posed.samples, posed.family.E.shape[1]
     groups = (*_groups(data, level), *offered(data))
-    survey = SurveySamples(data, samples, groups, _drift(data, position_sigma))
+    # a drift of positions is a random walk
+    waves = SlowFunctions(data.time, DRIFTING)
+    moves = position_sigma > 0.0 and len(waves.shape) > 0
+    drift = ParameterBlock("drift", waves, waves.shape, position_sigma) if moves else None
+    survey = SurveySamples(data, samples, groups, drift)
     try:
         found, survey = _settled(survey, posed.family)
     except np.linalg.LinAlgError as problem:
@@ -122,7 +126,7 @@ def fit_in_place(
     calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
     if level:
         calibration = with_level(calibration, lifted, float(z[q]), level)
-    unclear = [*left_open(data, found.choice.field.length)]
+    unclear = [*left_open(data.unmapped_place, found.choice.field.length)]
     if level and contradicts(bias := float(z[q]), level):
         unclear.append(Diagnostic("level_of_reference", {"level_nT": level, "bias_nT": bias}))
     fit = replace(fit, calibration=calibration, open=tuple(unclear))
@@ -162,12 +166,6 @@ def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, Survey
     survey.keep(tuple(group for group in survey.groups if group.name in best.names))
     best.go_on(survey, step)
     return best.settle(), survey
-
-
-def _drift(data: Observations, sigma: float) -> ParameterBlock | None:
-    """Return a block for the drift of positions, a random walk of 1-sigma `sigma` (m); None without drift."""
-    waves = SlowFunctions(data.time, DRIFTING)
-    return ParameterBlock("drift", waves, waves.shape, sigma) if sigma and len(waves.shape) else None
 
 
 def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:

@@ -334,21 +334,14 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
     # least squares by singular values: the normal equations would lose the directions that no run determines
     U, singular, Vt = np.linalg.svd(np.vstack(rows_of_runs), full_matrices=False)
     coefficients = (Vt.T / singular) @ (U.T @ np.concatenate(values))
-    return _assembled(data, posed, coefficients, (Vt.T / singular**2) @ Vt, "runs")
-
-
-def _assembled(
-    data: Observations, posed: Posed, coefficients: FloatArray, covariance: FloatArray, method: str
-) -> Fit:
-    """Return a fit with coefficients (9 m,), nT, and a covariance from a method without a joint posterior."""
-    samples, free = posed.samples, 0.0 if method == "runs" else 9.0
+    covariance = (Vt.T / singular**2) @ Vt
     check_scales(samples, coefficients)
-    noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, free)
-    none = Prior(np.zeros_like(covariance), np.eye(len(coefficients)))
-    found = CoefficientPosterior(
+    noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 0.0)
+    none = Prior(np.zeros((size, size)), np.eye(size))
+    joint = CoefficientPosterior(
         samples, none, coefficients, covariance, noise, noise, settled=True, objective=0.0
     )
-    return assemble(data, posed, found, method)
+    return assemble(data, posed, joint, "runs")
 
 
 # ---- The vertical component ----

@@ -165,6 +165,11 @@ class Observations:
         return self.unmapped is not None and bool(self.unmapped.any())
 
     @property
+    def unmapped_place(self) -> FloatArray | None:
+        """Positions (n, 3), m, if the reference lacks the crustal field at all samples; else None."""
+        return self.place if self.unmapped is not None and bool(self.unmapped.all()) else None
+
+    @property
     def steps(self) -> FloatArray:
         """Number of sampling intervals since the run's previous sample, (n,); infinite at its first sample.
 
@@ -268,16 +273,14 @@ def monomials(
 def polynomial_samples(
     data: Observations,
     exponents: tuple[Exponents, ...],
-    kappa: float = 0.0,
     ranges: Sequence[Parameter] | None = None,
 ) -> ResidualSamples:
     """Return the samples of `data` for a fit of polynomials, with the monomials of their positions.
 
-    `kappa`: 1-sigma of the reference over that of a sensor channel. `ranges`: parameters whose scales apply;
-    default: the ranges in the data.
+    `ranges`: parameters whose scales apply; default: the ranges in the data.
     """
     phi = monomials(data.parameters, data.ranges() if ranges is None else ranges, exponents)
-    return ResidualSamples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
+    return ResidualSamples(data.field, data.reference, phi, data.steps, float(data.reference.mean()))
 
 
 MIN_SLOPE_TIME_CONSTANTS = 4.0

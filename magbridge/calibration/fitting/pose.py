@@ -247,9 +247,10 @@ class Known:
                 ", ".join(f"{name} [{unit}]" for name, unit in both) or "none" for both in (mine, theirs)
             ]
             raise CalibrationError(f"known are coefficients for {listed[0]}, and the log has {listed[1]}")
-        return tuple(
-            _widened(one, column) for one, column in zip(self.parameters, data.parameters.T, strict=True)
-        )
+        low = np.minimum([one.low for one in self.parameters], data.parameters.min(axis=0)).tolist()
+        high = np.maximum([one.high for one in self.parameters], data.parameters.max(axis=0)).tolist()
+        ends = zip(self.parameters, low, high, strict=True)
+        return tuple(msgspec.structs.replace(one, low=least, high=most) for one, least, most in ends)
 
     def prior(self, F_0: float) -> PriorFamily:
         """Return the prior of a fit whose coefficients refer to the field `F_0` (nT)."""
@@ -271,12 +272,6 @@ class Known:
         L = rescaling(self.exponents, self.parameters, parameters, self.field, field)
         P = L @ self.covariance @ L.T
         return replace(self, parameters=parameters, field=field, mean=L @ self.mean, covariance=P)
-
-
-def _widened(parameter: Parameter, column: FloatArray) -> Parameter:
-    """Return a parameter with the same scaling whose range includes the values of `column` (n,)."""
-    low, high = min(parameter.low, float(column.min())), max(parameter.high, float(column.max()))
-    return Parameter(parameter.name, parameter.unit, low, high, parameter.centre, parameter.scale)
 
 
 def rescaling(

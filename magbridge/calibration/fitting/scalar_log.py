@@ -73,7 +73,8 @@ def telemetry_columns(ds: xr.Dataset, column: str) -> tuple[str, ...]:
             continue
         values = ds[name].to_numpy().astype(float)
         values = values[np.isfinite(values)]
-        if len(values) > 1 and values.min() < values.max() and not _is_field(ds[name]):
+        unit = usual(str(ds[name].attrs.get("units", "")))  # a magnetic field is another sensor's
+        if len(values) > 1 and values.min() < values.max() and unit not in NT_PER_UNIT:
             names.append(name)
     return tuple(names)
 
@@ -309,8 +310,3 @@ def moved_to_sensor(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dat
     for k, name in enumerate(("latitude", "longitude")):
         moved[name] = "time", ds[name].to_numpy() + turned[:, k] / degrees[k], ds[name].attrs
     return ds.assign(moved)
-
-
-def _is_field(column: xr.DataArray) -> bool:
-    """Return True for a column in units of magnetic flux density: another sensor, not telemetry."""
-    return usual(str(column.attrs.get("units", ""))) in NT_PER_UNIT

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
-from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
+from magbridge.calibration.fitting.crossings import courses, crossed, left_open
 from magbridge.calibration.fitting.field_search import nodes_for
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.uncertainty import Mission
@@ -117,9 +117,7 @@ def propose(
             positions = data.parameters[known][as_flown]
             rms, worst = _expected(design, flown, where, positions, noise)
             met = sum(crossed(*courses(where), 0.25 * LENGTH))
-            found.append(
-                Proposal(name, rms, worst, met, tuple(one.text for one in left_open_by(where, LENGTH)))
-            )
+            found.append(Proposal(name, rms, worst, met, tuple(one.text for one in left_open(where, LENGTH))))
     return sorted(found, key=lambda one: one.worst)
 
 
