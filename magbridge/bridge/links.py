@@ -275,24 +275,21 @@ class UdpPort(Port):
 
     def _send(self, data: bytes, address: Any) -> None:
         """Send `data` as one or more datagrams; drop and count datagrams that cannot be sent."""
-        for datagram in _datagrams(data):
-            self._send_one(datagram, address)
-
-    def _send_one(self, data: bytes, peer: Any) -> None:
         assert self._socket is not None
-        try:
-            if peer is None:
-                self._socket.send(data)
-            else:
-                self._socket.sendto(data, peer)
-        except BlockingIOError:
-            self.overran(data)
-        except OSError as error:
-            self.dropped += len(data)
-            if self._peers is not None:  # a peer with an invalid address, such as port 0, is not a fault
-                self._peers.forget(peer)
-            elif error.errno not in NO_LISTENER_ERRORS:
-                raise self.lost(error.strerror) from error
+        for datagram in _datagrams(data):
+            try:
+                if address is None:
+                    self._socket.send(datagram)
+                else:
+                    self._socket.sendto(datagram, address)
+            except BlockingIOError:
+                self.overran(datagram)
+            except OSError as error:
+                self.dropped += len(datagram)
+                if self._peers is not None:  # a peer with an invalid address, such as port 0, is not a fault
+                    self._peers.forget(address)
+                elif error.errno not in NO_LISTENER_ERRORS:
+                    raise self.lost(error.strerror) from error
 
     def close(self) -> None:
         """Close the socket."""

@@ -143,7 +143,8 @@ class Fixing:
         self._kind.send(self._component.output, fix, *self._component.peer)
         self.sent += 1
         rejected = self._gnss.state is GnssState.REJECTED and self._has_gps(now_us)
-        self._state(f"fixes go to the autopilot: GPS is {'rejected' if rejected else 'lost'}")
+        text = f"fixes go to the autopilot: GPS is {'rejected' if rejected else 'lost'}"
+        self._output.announce("fixes", text)
         if not self._kind.fused:
             self._waiting += 1
             if self._waiting > UNANSWERED:
@@ -270,13 +271,8 @@ class Fixing:
         )
 
     def _report_none(self, reason: str) -> None:
-        wanted = "GPS" not in reason
-        self._state(
-            f"no fixes to the autopilot: {reason}", MAV_SEVERITY.WARNING if wanted else MAV_SEVERITY.INFO
-        )
-
-    def _state(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
-        self._output.announce("fixes", text, severity)
+        severity = MAV_SEVERITY.INFO if "GPS" in reason else MAV_SEVERITY.WARNING
+        self._output.announce("fixes", f"no fixes to the autopilot: {reason}", severity)
 
 
 INTEGRITY = spec("GNSS_INTEGRITY").id

@@ -114,7 +114,7 @@ class Pipeline:
         self.navigation = navigate(self.component) if navigate else None
         self.learning = LearningService(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
-        self._parts, self._ignored_positions = main.parts, set[int]()
+        self._parts = main.parts
         self._position = Position(self._report_no_anomaly)
         has_boresight = used is not None and used.boresight is not None
         self.heading = LiveHeading(config.heading, self.component) if has_boresight else None
@@ -324,8 +324,11 @@ class Pipeline:
                     MAV_SEVERITY.WARNING,
                 )  # fmt: skip
                 continue
-            if message.id == Position.MESSAGE:
-                self._use_position(message, time_us)
+            if message.id == Position.MESSAGE and self._is_autopilot(message):
+                self._parts.call("position", None, self._position.update, message, time_us)
+            elif message.id == Position.MESSAGE:
+                text = f"position of component {message.component} ignored"
+                component.output.announce(text, text, MAV_SEVERITY.WARNING)
             elif message.id == ATTITUDE_ID and self._is_autopilot(message):
                 self._parts.call("direction check", None, self._use_attitude, message, time_us)
             if self.heading is not None and message.id in HEADING_INPUTS and self._is_autopilot(message):
@@ -339,16 +342,6 @@ class Pipeline:
     def _is_autopilot(self, message: Message) -> bool:
         """Return True if the autopilot sent `message`."""
         return message.component == self._config.link.autopilot
-
-    def _use_position(self, message: Message, time_us: int) -> None:
-        """Use a position of the autopilot; ignore the position of another component and report it once."""
-        if self._is_autopilot(message):
-            self._parts.call("position", None, self._position.update, message, time_us)
-        elif message.component not in self._ignored_positions:
-            self._ignored_positions.add(message.component)
-            self.component.output.send_statustext(
-                f"position of component {message.component} ignored", MAV_SEVERITY.WARNING
-            )
 
     def _use_attitude(self, message: Message, time_us: int) -> None:
         """Pass the vehicle's attitude and the main field to the check of the measured field's direction."""

@@ -50,7 +50,7 @@ __all__ = [
 def load_state(path: str | Path) -> StartEvent:
     """Return the state in the file at `path`; an empty state if the file does not exist.
 
-    FormatError: the file does not have the format of :func:`save_state`.
+    FormatError: the file is not a stored state as JSON.
     """
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=StartEvent)
@@ -58,12 +58,6 @@ def load_state(path: str | Path) -> StartEvent:
         return StartEvent()
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FormatError(path, f"kept parameters as JSON: {error}") from error
-
-
-def save_state(path: str | Path, kept: StartEvent) -> None:
-    """Write the state to the file at `path`, atomically and synchronised to the disk."""
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))
 
 
 STAMP_INTERVAL_US = 60_000_000
@@ -134,7 +128,8 @@ class Keeper:
         if kept == self._kept:
             return True
         try:
-            save_state(self._path, kept)
+            with atomic_path(self._path) as temporary:
+                temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))
         except OSError as error:
             self._notify(events.notice(f"parameters not kept: {error.strerror or error}"))
             return False
@@ -291,8 +286,8 @@ READY = 8
 """Most messages that wait to be sent; then no file is read."""
 POLL_INTERVAL_S = 0.01
 """Time between two checks if the link accepts more messages, s."""
-IDLE = 1.0
-"""Longest wait for a request while no request is in process, s."""
+CLOSE_S = 1.0
+"""Longest wait for the end of the thread, s."""
 
 Reply = tuple[Spec, bytes]
 Sender = tuple[int, int]
@@ -342,29 +337,18 @@ class FileServer:
         """End the thread, which closes its files."""
         self._ending = True
         self._asked.put(None)
-        self._thread.join(IDLE)
+        self._thread.join(CLOSE_S)
 
     def _serve(self) -> None:
         try:
-            while True:
-                busy = bool(self._under_way)
-                for request in self._waiting(0.0 if busy else IDLE):
-                    if request is None:
-                        return
-                    self._begin(request)
+            while not self._ending:
+                with suppress(Empty):  # while requests are under way, wait for no further request
+                    while (request := self._asked.get(block=not self._under_way)) is not None:
+                        self._begin(request)
                 if self._under_way:
                     self._prepare_replies()
         finally:
             self._ftp.close()
-
-    def _waiting(self, timeout: float) -> Iterator[Message | None]:
-        """Yield the pending requests; if none is pending, wait up to `timeout` (s) for a request."""
-        try:
-            yield self._asked.get(timeout=timeout) if timeout else self._asked.get_nowait()
-            for _ in range(self._asked.qsize()):
-                yield self._asked.get_nowait()
-        except Empty:
-            return
 
     def _begin(self, request: Message) -> None:
         sender = request.system, request.component
