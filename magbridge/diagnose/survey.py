@@ -55,8 +55,6 @@ DAY_S, NIGHT_S = 86400.0, 21600.0
 """Longest duration of a day, and shortest gap that ends a day, s."""
 MIN_SAMPLES_A_DAY = 100
 """Least number of samples of a day in cross-validation."""
-Table = dict[str, FloatArray]
-"""Columns (n,) in order of time, none empty. ``learned`` is 1 in logs that are only compared with."""
 MAX_LAG = 1000
 """Largest lag, in sampling intervals. A sample so long ago does not predict the noise of the present one."""
 MIN_SURVEY_SAMPLES = 60
@@ -101,17 +99,21 @@ def _is_among(part: str, words: str) -> bool:
     )
 
 
-def dives_of(table: Table) -> IntArray:
-    """Return the dive number (n,) of each sample: by the log, else by depth, else the eighth of the log."""
+def dives_of(table: pd.DataFrame) -> IntArray:
+    """Return the dive number (n,) of each sample: by the log, else by depth, else the eighth of the log.
+
+    `table` has the samples in order of time, and no empty column. ``learned`` is True in logs that are only
+    compared with.
+    """
     # As the log counts; a log that lacks the count has its dives found by itself
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
             dive = np.unique(table[name], return_inverse=True)[1].astype(np.int64)
-            for log in (table["learned"] > 0.5, table["learned"] < 0.5):
-                if log.any() and not np.isfinite(table[name][log]).any():
-                    dive[log] = dive.max() + 1 + dives_of(_part(table, log))
+            for log in (table["learned"], ~table["learned"]):
+                if log.any() and table[name][log].isna().all():
+                    dive[log] = dive.max() + 1 + dives_of(table[log].dropna(axis=1, how="all"))
             return dive
-    if "depth" in table and np.nanmax(table["depth"]) > 5.0:
+    if "depth" in table and table["depth"].max() > 5.0:
         depth = held(table["depth"])
         # A dive begins where the vehicle leaves the surface
         shallow = depth < 0.15 * np.quantile(depth, 0.98)
@@ -143,20 +145,14 @@ def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
     return day if number > 0 else None
 
 
-def held(values: FloatArray) -> FloatArray:
-    """Fill the gaps of (n,) values with the last known one, and the beginning with the first."""
-    return np.asarray(pd.Series(values).ffill().bfill(), float)
+def held(values: pd.Series | pd.DataFrame) -> FloatArray:
+    """Return columns (n, ...) with gaps filled by the last known value, and the beginning by the first."""
+    return np.array(values.ffill().bfill(), float)
 
 
 def eighths(n: int) -> IntArray:
     """Return the number (n,), 0 to 7, of the eighth of a log to which each of n samples belongs."""
     return np.arange(n) * 8 // n
-
-
-def _part(table: Table, rows: BoolArray) -> Table:
-    """Return the selected rows of a table, without columns that have no value in them."""
-    part = {name: column[rows] for name, column in table.items()}
-    return {name: column for name, column in part.items() if np.isfinite(column).any()}
 
 
 class Past:
@@ -272,71 +268,67 @@ class Survey:
         return np.array(columns).reshape(len(names), len(self)).T
 
 
-def assemble(
-    table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
-) -> Survey:
-    """Return the survey of complete columns (n,) in order of time; find its channels, dives and gaps.
+def assemble(table: pd.DataFrame, units: dict[str, str], source: str, needed: Sequence[str]) -> Survey:
+    """Return the survey of complete columns in order of time; find its channels, dives and gaps.
 
     Channels in `needed` are kept even if they never change.
     """
-    time = table["time"]
+    time, learned = (np.array(table[name]) for name in ("time", "learned"))
     step = np.diff(time, prepend=np.nan)
     # Steps in whole sampling intervals; a change of log is as a gap
     interval = float(np.nanquantile(step, SHORT))
-    steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), MAX_LAG), MAX_LAG).astype(
-        np.int64
-    )
-    steps[1:][table["learned"][1:] != table["learned"][:-1]] = MAX_LAG
+    steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), MAX_LAG), MAX_LAG)
+    steps[1:][learned[1:] != learned[:-1]] = MAX_LAG
     channels, still = _channels(table, units, needed)
-    table = {name: column for name, column in table.items() if np.isfinite(column).any()}
-    cycles = np.empty(0)
+    table = table.dropna(axis=1, how="all")
+    cycles, attitude, place = np.empty(0), None, None
     if "power_cycle" in table:
         cycles = time[1:][np.diff(table["power_cycle"]) > 0]
-    attitude = place = None
     if {"roll", "pitch", "heading"} <= set(table):
-        attitude = np.stack([held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
+        attitude = held(table[["roll", "pitch", "heading"]])
     if {"latitude", "longitude"} <= set(table):
         # m from the middle of the track, on the sphere, also across the date line
-        latitude, longitude = table["latitude"], table["longitude"]
+        latitude, longitude = np.array(table["latitude"]), np.array(table["longitude"])
         middle = float(np.median(latitude)), float(longitude[0] + np.median(wrap(longitude - longitude[0])))
         down = held(table["depth"]) if "depth" in table else np.zeros(len(time))
         place = np.stack([*separation(*middle, latitude, longitude), down], axis=1)
     return Survey(
         time=time,
-        field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
-        reference=table["reference_field"],
+        field=np.array(table[list(CHANNELS)]),
+        reference=np.array(table["reference_field"]),
         channels=channels,
         still=still,
-        steps=steps,
+        steps=steps.astype(np.int64),
         dive=dives_of(table),
         place=place,
         attitude=attitude,
-        fitted=table["fitted"] > 0.5,
-        learned=table["learned"] > 0.5,
+        fitted=np.array(table["fitted"]),
+        learned=learned,
         cycles=cycles,
         source=source,
     )
 
 
 def _channels(
-    table: dict[str, FloatArray], units: dict[str, str], needed: Sequence[str]
+    table: pd.DataFrame, units: dict[str, str], needed: Sequence[str]
 ) -> tuple[dict[str, TelemetryChannel], tuple[str, ...]]:
     """Return the telemetry that varies or is needed, and the names of the channels that never change."""
     channels, still = {}, []
     for name in sorted(table):
         if name in NOT_TELEMETRY or name.startswith(INTERNAL_PREFIXES):
             continue
-        values, unit = table[name], units.get(name, "")
+        unit = units.get(name, "")
         unit = "" if unit == "1" else unit
         if unit in FIELDS and name not in needed:
             continue
-        known = values[np.isfinite(values)]
+        known = np.array(table[name][np.isfinite(table[name])])
+        kinds = kinds_of(name, unit)
         if known.size < MIN_SURVEY_SAMPLES or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
             still.append(name)
-            if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
-                channels[name] = TelemetryChannel(held(values), unit, ())
-            continue
-        channels[name] = TelemetryChannel(held(values), unit, kinds_of(name, unit))
+            if name not in needed or not known.size:
+                continue
+            kinds = ()  # the correction takes it, but nothing can be learned from it
+        channels[name] = TelemetryChannel(held(table[name]), unit, kinds)
     return channels, tuple(still)
 
 
@@ -360,27 +352,23 @@ def load_survey(
     parts = [_columns(ds, calibration, grid, fitted) for ds, fitted in zip(datasets, own, strict=True)]
     parts += [_columns(ds, calibration, grid, fitted=True, learned=True) for ds in apart]
     # The columns of all logs in order of time; NaN where a log lacks one
-    table = {
-        name: np.concatenate([part.get(name, np.full(part["time"].size, np.nan)) for part in parts])
-        for name in {name for part in parts for name in part}
-    }
-    order = np.argsort(table["time"], kind="stable")
-    table = {name: column[order] for name, column in table.items()}
+    table = pd.concat(parts).sort_values("time", kind="stable", ignore_index=True)
     twice = int(np.sum(np.diff(table["time"]) == 0.0))
-    if twice > 0.1 * table["time"].size:
+    if twice > 0.1 * len(table):
         raise DataError(
             f"{source}: {twice} samples are given twice: a log is either diagnosed or learned from"
         )
     table = _comparable(table, calibration, source)
     for parameter in calibration.parameters:
-        far = np.abs(table[parameter.name] - parameter.centre) > MAX_HALF_RANGES * parameter.scale
+        values = np.array(table[parameter.name])
+        far = np.abs(values - parameter.centre) > MAX_HALF_RANGES * parameter.scale
         if far.any():
             raise DataError(
-                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of "
+                f"{source}: {parameter.name!r} is {values[far][0]:g} in {int(far.sum())} of "
                 f"{far.size} samples, and {parameter.low:g} to {parameter.high:g} in the calibration: "
                 "expected its unit, and nothing where it is not known"
             )
-    if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
+    if not np.ptp(table[list(CHANNELS)].to_numpy(), axis=0).any():
         raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
     units = {str(k): str(v.attrs.get("units", "")) for ds in logs for k, v in ds.data_vars.items()}
     return assemble(table, units, _sources(datasets), calibration.channels)
@@ -391,58 +379,55 @@ def _sources(logs: Sequence[xr.Dataset]) -> str:
     return ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
 
 
-def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
+def _comparable(table: pd.DataFrame, calibration: Calibration, source: str) -> pd.DataFrame:
     """Return the rows with field, reference and all parameters; DataError: too few rows."""
-    needed = [*CHANNELS, "reference_field", *calibration.units]
-    size = table["time"].size
-    if size < MIN_SURVEY_SAMPLES:
-        raise DataError(f"{source}: {counted(size, 'sample')}, at least {MIN_SURVEY_SAMPLES} needed")
+    if len(table) < MIN_SURVEY_SAMPLES:
+        raise DataError(f"{source}: {counted(len(table), 'sample')}, at least {MIN_SURVEY_SAMPLES} needed")
     for name in CHANNELS:
-        table[name][~(np.abs(table[name]) < MAX_MEASURED_NT)] = np.nan
+        table[name] = table[name].where(table[name].abs() < MAX_MEASURED_NT)
     # Rows that have field, reference and the position of every mass
-    whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
+    known = np.isfinite(table[[*CHANNELS, "reference_field", *calibration.units]])
+    whole, counts = known.all(axis=1), known.sum()
     if whole.sum() < MIN_SURVEY_SAMPLES:
-        worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
+        worst = counts.idxmin()
         raise DataError(
-            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least "
-            f"{MIN_SURVEY_SAMPLES} needed (column {worst!r} has {np.isfinite(table[worst]).sum()} numbers)"
+            f"{source}: only {whole.sum()} of {len(table)} samples can be compared, at least "
+            f"{MIN_SURVEY_SAMPLES} needed (column {worst!r} has {counts[worst]} numbers)"
         )
-    table = {name: column[whole] for name, column in table.items()}
-    once = np.diff(table["time"], prepend=-np.inf) > 0.0  # a sample that two logs share is kept once
-    return {name: column[once] for name, column in table.items()}
+    table = table[whole]
+    return table[np.diff(table["time"], prepend=-np.inf) > 0.0]  # a sample that two logs share is kept once
 
 
 def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
-) -> dict[str, FloatArray]:
+) -> pd.DataFrame:
     """Return a log's numeric columns and reference; its axes are interpolated to the rows' times."""
     require(ds, (*CHANNELS, *calibration.units))
     refuse_unsuited(calibration, ds)
     time = ds["time"].to_numpy().astype(float)
-    table = {
-        str(name): column.to_numpy().astype(float)
-        for name, column in ds.data_vars.items()
-        if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
-    }
+    table = pd.DataFrame(
+        {
+            str(name): column.to_numpy().astype(float)
+            for name, column in ds.data_vars.items()
+            if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
+        }
+    )
     in_turn, trusted = False, TRUSTED * calibration.noise.sensor
-    for axis in "xyz":  # a log of axes that were sampled in turn has a time for each
-        sampled = table.pop(f"mag_time_{axis}", None)
-        if sampled is not None and np.isfinite(sampled).all() and not np.array_equal(sampled, time):
-            values, cubic = interpolate_to_rows(time, sampled, table[f"mag_{axis}"])
+    for axis in CHANNELS:  # a log of axes that were sampled in turn has a time for each
+        sampled = table.pop(f"mag_time_{axis[-1]}").to_numpy() if f"mag_time_{axis[-1]}" in table else time
+        if np.isfinite(sampled).all() and not np.array_equal(sampled, time):
+            values, cubic = interpolate_to_rows(time, sampled, table[axis].to_numpy())
             # where the cubic term is large or unknown, the channel is not known well enough
-            table[f"mag_{axis}"] = np.where(np.abs(cubic) <= trusted, values, np.nan)
-            in_turn = True
-    marks = {"fitted": fitted, "learned": learned}
-    table |= {"time": time} | {name: np.full(time.size, float(mark)) for name, mark in marks.items()}
+            table[axis], in_turn = np.where(np.abs(cubic) <= trusted, values, np.nan), True
     if in_turn:
         # Next to a moving mass the axes saw it at different places and form no vector. Where they are sampled
         # at once such samples are kept: only they reveal an offset of the clocks
         parameters = calibration.parameters
-        values = np.array([table[one.name] for one in parameters]).reshape(len(parameters), time.size)
-        moving = beside_motion(time, values.T, np.array([one.high - one.low for one in parameters]))
-        for axis in "xyz":
-            table[f"mag_{axis}"][moving] = np.nan
-    table["reference_field"] = reference_field(ds, grid, calibration.reference.bias)
+        values = table[[one.name for one in parameters]].to_numpy()
+        moving = beside_motion(time, values, np.array([one.high - one.low for one in parameters]))
+        table.loc[moving, list(CHANNELS)] = np.nan
+    reference = reference_field(ds, grid, calibration.reference.bias)
+    table = table.assign(time=time, fitted=fitted, learned=learned, reference_field=reference)
     if {"latitude", "longitude"} <= set(table):
         table["longitude"], table["latitude"], _ = positions(ds)
     return table
