@@ -14,16 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate
 
 import msgspec
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.effects import ClockEffect, RateEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.terms import Effect
-from magbridge.diagnose.columns import Candidate, Columns, slices
+from magbridge.diagnose.columns import Candidate, Columns, places, slices
 from magbridge.diagnose.evidence import IDEAL, information
 from magbridge.diagnose.joint import Joint, JointDesign, fit_joint
 from magbridge.diagnose.problem import Problem, derivatives, linearised, row_blocks, samples_of
@@ -71,6 +69,15 @@ def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
             return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / STEP_CELL_FRACTION)[:, None]
 
         yield columns
+
+
+def refitted(
+    problem: Problem, columns: Sequence[Columns], fit: Joint, kept: slice | IndexArray = slice(None)
+) -> Joint:
+    """Fit `columns` with noise order, level and prior of `fit`, starting at its coefficients `kept`."""
+    start, noise = np.append(fit.z, fit.coefficients[kept]), fit.noise
+    ridge = fit.prior[len(fit.z) :][kept]
+    return fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
 
 
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
@@ -137,15 +144,14 @@ def _power(survey: Survey, calibration: Calibration) -> float:
     return float(np.mean(residuals_of(*samples_of(survey, calibration))[~survey.learned] ** 2))
 
 
-def without_effects_at(calibration: Calibration, places: Sequence[int]) -> Calibration:
-    """Return the calibration without the effects at these indices."""
-    if not places:
+def without_effects_at(calibration: Calibration, dropped: Sequence[int]) -> Calibration:
+    """Return the calibration without the effects at the indices `dropped`."""
+    if not dropped:
         return calibration
     # Coefficients stand in the order of terms, then effects
-    first = sum(term.size for term in calibration.terms)
-    starts = list(accumulate((effect.size for effect in calibration.effects), initial=first))
-    own = np.concatenate([np.arange(starts[place], starts[place + 1]) for place in places])
-    kept = [effect for place, effect in enumerate(calibration.effects) if place not in places]
+    at = places((one.size for one in calibration.effects), sum(term.size for term in calibration.terms))
+    own = np.r_[*(at[k] for k in dropped)]
+    kept = [effect for k, effect in enumerate(calibration.effects) if k not in dropped]
     return replace(
         calibration,
         effects=tuple(kept),
@@ -162,7 +168,6 @@ def relinearised(
     Return the problem linearised at the last point, the columns of the model's pieces there, and the fit.
     Rates of change are computed as in the search, not as in the live correction.
     """
-    ridge, order, blocks = fit.prior[len(fit.z) :], fit.noise.past.order, fit.noise.uneven
     # The calibration as given is the point that a step which overshoots is halved towards
     origin = replace(fit, z=np.zeros_like(fit.z), coefficients=np.zeros_like(fit.coefficients))
     last, last_cost = origin, _cost(problem.residual, origin, problem)
@@ -185,8 +190,7 @@ def relinearised(
         if missed < MAX_MISMATCH * float(np.median(fit.noise.scale)) and cost <= last_cost:
             break
         last, last_cost = fit, cost
-        start = np.append(fit.z, fit.coefficients)
-        fit = fit_joint(settled, columns, order, start, blocks=blocks, ridge=ridge)
+        fit = refitted(settled, columns, fit)
         settled.let_go()
     return settled, columns, fit
 
@@ -225,19 +229,17 @@ def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> 
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
     pieces = [piece for candidate in model for piece in candidate.pieces]
-    first = samples.phi.shape[1] - sum(_counts(extended))
-    added = sum(_counts(extended)[len(problem.calibration.effects) :])
-    smooth = [piece.regressors for piece in pieces for _ in piece.effects]
-    places = accumulate(_counts(extended), initial=first)
-    for place, rates in zip(list(places)[len(problem.calibration.effects) :], smooth, strict=False):
-        if rates is not None:
+    # Regressors of the added effects are the last; each piece's own rates and onset apply to its effects
+    listed = [(effect, piece) for piece in pieces for effect in piece.effects]
+    counts = [effect.columns(extended.reference.field).shape[1] for effect, _ in listed]
+    first = samples.phi.shape[1] - sum(counts)
+    for (_, piece), place in zip(listed, places(counts, first), strict=True):
+        if piece.regressors is not None:
             # Central differences of the search replace the live, noisy ones
-            central = rates(slice(0, len(problem)))
-            samples.phi[:, place : place + len(central)] = central.T
-    # Causes that appeared later have no regressors in the logs that were learned from
-    absent = [np.full(sum(_counts_of(piece.effects, extended)), piece.since) for piece in pieces]
-    late = samples.phi.shape[1] - added + np.flatnonzero(np.concatenate([np.empty(0, bool), *absent]))
-    samples.phi[np.ix_(problem.survey.learned, late)] = 0.0
+            samples.phi[:, place] = piece.regressors(slice(0, len(problem))).T
+        # Causes that appeared later have no regressors in the logs that were learned from
+        if piece.since:
+            samples.phi[problem.survey.learned, place] = 0.0
     e, g, reference_jacobian, _ = linearised(samples, coefficients)
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
@@ -255,13 +257,3 @@ def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> 
         columns.append(block.__getitem__)
         at += piece.size
     return rebuilt, columns
-
-
-def _counts(calibration: Calibration) -> list[int]:
-    """Return the number of regressors of each effect of a calibration."""
-    return _counts_of(calibration.effects, calibration)
-
-
-def _counts_of(effects: Sequence[Effect], calibration: Calibration) -> list[int]:
-    """Return the number of regressors of each of these effects."""
-    return [effect.columns(calibration.reference.field).shape[1] for effect in effects]

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import CorrectedArrays, correct
@@ -31,11 +32,12 @@ from magbridge.diagnose.extend import (
     extend,
     flyable,
     loosened,
+    refitted,
     relinearised,
     with_misfit,
     without_effects_at,
 )
-from magbridge.diagnose.joint import HeldOut, Joint, fit_joint, held_out, normal, paired
+from magbridge.diagnose.joint import HeldOut, Joint, held_out, normal, paired
 from magbridge.diagnose.problem import DELAYS, Problem, derivatives, floor, isotropic, samples_of
 from magbridge.diagnose.survey import Survey, days_of
 from magbridge.estimation.residual import ResidualSamples, residuals, rms
@@ -122,10 +124,8 @@ def attempt(
 ) -> Extension:
     """Return the extension with the calibration's prior sigma multiplied by `factor`, and its checks."""
     if factor < 1.0:
-        ridge, start = fit.prior[len(fit.z) :], np.append(factor * fit.z, fit.coefficients)
         problem = tightened(problem, factor)
-        columns, noise = [candidate.columns for candidate in model], fit.noise
-        fit = fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+        fit = refitted(problem, [one.columns for one in model], replace(fit, z=factor * fit.z))
     # Converge, hold every fold out, then widen the covariance for nonlinear parameters and misfit
     settled, blocks, fit = relinearised(problem, model, fit)
     out = held_out(settled, blocks, fit)
@@ -234,19 +234,13 @@ def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
 
 def _turned(samples: ResidualSamples) -> ResidualSamples:
     """Return the samples seven times: as they are, and with readings turned both ways about each axis."""
-    angle, readings = np.radians(DOMAIN_TURN_DEG), [samples.field]
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        for a in (angle, -angle):
-            # Rotation by the angle in the plane of the other two axes
-            R = np.eye(3)
-            R[i, i] = R[j, j] = np.cos(a)
-            R[i, j], R[j, i] = -np.sin(a), np.sin(a)
-            readings.append(samples.field @ R.T)
-    count = len(readings)
+    turns = Rotation.from_rotvec(
+        DOMAIN_TURN_DEG * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]), degrees=True
+    )
+    count = len(turns)
     return replace(
         samples,
-        field=np.concatenate(readings),
+        field=np.concatenate([turn.apply(samples.field) for turn in turns]),
         reference=np.tile(samples.reference, count),
         phi=np.tile(samples.phi, (count, 1)),
         steps=np.tile(samples.steps, count),
@@ -349,6 +343,4 @@ def fit_without(
     others = [candidate for k, candidate in enumerate(model) if k not in left_out]
     own = slices(model)
     kept = np.delete(np.arange(fit.coefficients.size), np.r_[*(own[k] for k in left_out)])
-    ridge, start = fit.prior[len(fit.z) + kept], np.append(fit.z, fit.coefficients[kept])
-    columns, noise = [candidate.columns for candidate in others], fit.noise
-    return others, fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+    return others, refitted(problem, [candidate.columns for candidate in others], fit, kept)

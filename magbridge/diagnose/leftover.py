@@ -362,36 +362,21 @@ def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
     return np.asarray(part.reshape(len(part), -1, 3) @ direction)
 
 
-def unlisted(
-    problem: Problem,
-    fit: Joint,
-    named: Sequence[Hypothesis],
-    wrong: Outliers | None,
-    error: FloatArray,
-    counts: BoolArray,
-) -> Leftover | None:
-    """Return the structure that `named` causes leave unexplained, other than by a description; or None.
-
-    `error` (n,), nT, is the residual of held-out parts. Samples with `counts` (n,) true are tested.
-    """
-    return _passing(wrong) or _slow(problem, fit, named) or _loud(problem, error, counts)
-
-
 def switching(
     problem: Problem, fit: Joint, named: Sequence[Hypothesis], wrong: Outliers | None, *, ended: bool
 ) -> Leftover | None:
     """Return a switching signal if it is stronger than all `named` causes, or has `ended` the search."""
     if wrong is None or not wrong.lasting:
         return None
-    slow = _slow(problem, fit, named)
+    slow = slow_remainder(problem, fit, named)
     if not ended and (slow is None or any(one.signal_to_noise >= slow.signal_to_noise for one in named)):
         return None
     within = tuple(CompetingHypothesis(one.candidate, 0.0) for one in named)
-    rest = slow or _passing(wrong)
+    rest = slow or not_isolated(wrong)
     return rest and rest._replace(kind="switching", within=within, shifts=tuple(wrong.rows.tolist()))
 
 
-def _passing(wrong: Outliers | None) -> Leftover | None:
+def not_isolated(wrong: Outliers | None) -> Leftover | None:
     """Return outliers that are not isolated as a transient or switching signal; None if all are isolated."""
     if wrong is None or wrong.isolated:
         return None
@@ -402,8 +387,11 @@ def _passing(wrong: Outliers | None) -> Leftover | None:
     )
 
 
-def _loud(problem: Problem, error: FloatArray, counts: BoolArray) -> Leftover | None:
-    """Return a structureless residual above :data:`LOUD` times the calibration's stated sigma, or None."""
+def loud(problem: Problem, error: FloatArray, counts: BoolArray) -> Leftover | None:
+    """Return a structureless residual above :data:`LOUD` times the calibration's stated sigma, or None.
+
+    `error` (n,), nT, is the residual of held-out parts. Samples with `counts` (n,) true are tested.
+    """
     # Chi-square of the error by the variance that the calibration states
     power = float(np.sum(error[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
@@ -418,7 +406,7 @@ def far_from_white(problem: Problem, found: Memory) -> bool:
     return lasts and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference))
 
 
-def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
+def slow_remainder(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
     """Return the drift in a residual: far from white, or slow noise above the causes' remnants; or None."""
     # Slow noise belongs to the unexplained structure: no sensor makes it
     slow = problem.slow_noise(fit.z)

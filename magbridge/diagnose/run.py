@@ -41,9 +41,11 @@ from magbridge.diagnose.leftover import (
     Leftover,
     amplitude_evidence,
     leftover,
+    loud,
+    not_isolated,
+    slow_remainder,
     soft_iron_evidence,
     switching,
-    unlisted,
     varying,
 )
 from magbridge.diagnose.noise import autoregressive_order
@@ -319,7 +321,8 @@ def _examine(
     fit = extension.fit if model else outcome.null
     before = corrected(problem.survey, calibration).total - problem.survey.reference
     after = extension.error - extension.reference_error if model else before
-    rest = rest or unlisted(problem, fit, named, off, after * problem.reference_jacobian, counts)
+    rest = rest or not_isolated(off) or slow_remainder(problem, fit, named)
+    rest = rest or loud(problem, after * problem.reference_jacobian, counts)
     dive, stands = problem.survey.dive, bool(model) and not extension.refused
     total, beyond = (paired(since, after, dive, counts) for since in (before, refit.error))
     day = days_of(problem.survey.time, problem.survey.learned)

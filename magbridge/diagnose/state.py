@@ -82,9 +82,12 @@ class SearchState:
     ) -> Joint:
         """Return the joint fit of a model, with arguments as for :func:`~.joint.fit_joint`."""
         columns = [candidate.columns for candidate in model]
+        # Prior precision 1 for errors of the reference and common sizes
+        natural = [not c.effects or c.spectra is not None for c in model]
+        ridge = np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
         return fit_joint(
             self.problem, columns, self.order, *starts, plain=plain, spectra=[c.spectra for c in model],
-            like=like, blocks=self.blocks, brief=self.brief, ridge=_ridge(model), rounds=rounds,
+            like=like, blocks=self.blocks, brief=self.brief, ridge=ridge, rounds=rounds,
         )  # fmt: skip
 
     def ratio(self, fit: Joint, null: Joint | None = None) -> float:
@@ -216,12 +219,6 @@ def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
     shared = [X for X, _ in join_columns(columns).parts]
     known = dict(zip(shared, precomputed(n, shared), strict=True))
     return [Mixture(tuple((known[X], M) for X, M in parts(column))) for column in columns]
-
-
-def _ridge(model: Sequence[Candidate]) -> FloatArray:
-    """Return the initial prior precision (k,): :data:`.RIDGE`, or 1 for reference errors and common sizes."""
-    natural = [not c.effects or c.spectra is not None for c in model]
-    return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
 
 
 def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:

@@ -8,7 +8,6 @@ from itertools import product
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ResponseEffect, TimeEffect
 from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
@@ -134,15 +133,12 @@ def _loudest_periods(problem: Problem) -> list[float]:
         peak = int(np.argmax(ratio))
         if ratio[peak] <= 0.0:
             break
-        periods.append(float(1.0 / (_top(power, peak) * frequency[1])))
+        # Maximum of a parabola through the peak and its two neighbours
+        low, top, high = power[[peak - 1, peak, peak + 1 if peak + 1 < len(power) else peak - 1]]
+        off = 0.5 * (low - high) / (low - 2.0 * top + high) if top > max(low, high) else 0.0
+        periods.append(float(1.0 / ((peak + off) * frequency[1])))
         ratio[max(peak - 4, 0) : peak + 5] = 0.0
     return periods
-
-
-def _top(power: FloatArray, peak: int) -> float:
-    """Return the position, in bins, of the maximum of a parabola through a peak and its two neighbours."""
-    low, top, high = power[[peak - 1, peak, peak + 1 if peak + 1 < len(power) else peak - 1]]
-    return peak + (0.5 * (low - high) / (low - 2.0 * top + high) if top > max(low, high) else 0.0)
 
 
 class Nonlinearity(Cause):
