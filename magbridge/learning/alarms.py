@@ -25,7 +25,7 @@ like outliers to the other tests, so this test uses them even if the sensor seem
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import log, sqrt
 from typing import Final, NamedTuple
 
@@ -35,8 +35,8 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import TEMPERATURE
 from magbridge.estimation.sequential import ALARM_LOG_RATIO, SequentialTest
 from magbridge.learning.estimator import Estimator
-from magbridge.learning.samples import LearnedTerms, LearningSample, Observation
-from magbridge.records import NEVER, Quality, Vector
+from magbridge.learning.samples import LearnedTerms, LearningSample
+from magbridge.records import NEVER, Quality
 
 CAUSE_UNITS: Final = {
     "offset_step": 20.0,
@@ -297,11 +297,12 @@ class LateTelemetryTest:
         time_us: int,
         phi: FloatArray,
         positions: list[float],
-        observe: Callable[[Vector, FloatArray, float], Observation],
+        model: LearnedTerms,
+        coefficients: FloatArray,
     ) -> LearningAlarm | None:
         """Test the stored samples with the regressors `phi` (m,) and the positions reported now.
 
-        `observe` compares a field (nT), measured at some regressors, with a reference (nT).
+        The `coefficients` (K,) of `model` predict the samples.
         """
         for test in self._tests:
             stored = test.reported_since(time_us, self._kept)
@@ -310,8 +311,9 @@ class LateTelemetryTest:
             sample = stored.sample
             if np.abs(np.subtract(positions, sample.positions)).max(initial=0.0) < MIN_MOTION:
                 continue
-            then = observe(sample.field, sample.phi, sample.reference).e
-            now = observe(sample.field, phi, sample.reference).e
+            then, now = (
+                model.observe(sample.field, at, coefficients, sample.reference).e for at in (sample.phi, phi)
+            )
             if alarm := test.add(stored, now - then):
                 return alarm
         return None

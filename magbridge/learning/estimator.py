@@ -422,10 +422,8 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
 class BatchFit:
     """Batch fit of all samples since the start, from a prior (K,) of covariance (K, K)."""
 
-    def __init__(
-        self, model: LearnedTerms, coefficients: FloatArray, covariance: FloatArray, field: float
-    ) -> None:
-        self._model, self._prior, self._field = model, coefficients, field
+    def __init__(self, model: LearnedTerms, coefficients: FloatArray, covariance: FloatArray) -> None:
+        self._model, self._prior = model, coefficients
         values, vectors = np.linalg.eigh(covariance)
         # square root L of a prior that may be singular
         seen = values > values[-1] * 1e-14
@@ -488,7 +486,7 @@ class BatchFit:
         states, P = np.zeros((TRACK_STATES, K + 1)), nuisance.initial.copy()
         for k, (field, phi, reference, way) in enumerate(self._samples):
             F, Q = nuisance.transition(*way)
-            one = observe(field, phi @ weights, self._field, reference)
+            one = observe(field, phi @ weights, self._model.field, reference)
             row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
             h = nuisance.row(one.s)
             # Kalman filter of the residual and of every column of J: innovations are white

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -21,8 +20,7 @@ from magbridge.learning.alarms import (
 )
 from magbridge.learning.estimator import BatchFit, Estimator, EstimatorBank, Nuisance
 from magbridge.learning.judge import CANDIDATE, FIRST, PUBLISHED, Coverage, Judge
-from magbridge.learning.samples import LearnedTerms, LearningSample, Observation, Way, observe
-from magbridge.records import Vector
+from magbridge.learning.samples import LearnedTerms, LearningSample, Observation, Way
 
 MAX_LINEAR_SIGMA_NT: Final = 300.0
 """Offset uncertainty above which learning begins with a batch fit, nT, 1-sigma of an axis."""
@@ -50,7 +48,7 @@ class Knowledge:
         turn_on: float,
     ) -> None:
         self._model, self._mapless, self.nuisance, self.noise = model, mapless, nuisance, first.noise
-        self._field, offsets = first.reference.field, model.offsets
+        offsets = model.offsets
         coefficients, covariance = model.coefficients(first)
         quiet = Estimator(coefficients, covariance, offsets, nuisance, OFFSET_WALK)
         quiet.open(turn_on**2)
@@ -62,7 +60,7 @@ class Knowledge:
         self._reference_steps = ReferenceSteps()
         self.start: BatchFit | None = None
         if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * MAX_LINEAR_SIGMA_NT**2:
-            self.start = BatchFit(model, coefficients, covariance, self._field)
+            self.start = BatchFit(model, coefficients, covariance)
         else:
             self.bank.suppose()
 
@@ -71,16 +69,6 @@ class Knowledge:
         """Model of the reference's error in use: during a map alarm, the model without the map."""
         return self._mapless if self.bank.map_doubted and self._mapless else self.nuisance
 
-    def observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
-        """Return the observation of a raw field (nT) with nine coefficients (9,), see :func:`.observe`."""
-        return observe(field, nine, self._field, reference)
-
-    def _observation_with(self, estimator: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
-        """Return a function that observes a field at regressors (m,) with an estimator's coefficients."""
-        return lambda field, phi, reference: self.observe(
-            field, phi @ self._model.weights(estimator.coefficients), reference
-        )
-
     def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> LearningAlarm | None:
         """Test whether the telemetry reported now fits earlier samples better than the earlier telemetry.
 
@@ -88,7 +76,8 @@ class Knowledge:
         """
         if self.start is not None:
             return None
-        return self.late_telemetry.test(time_us, phi, positions, self._observation_with(self.bank.quiet))
+        coefficients = self.bank.quiet.coefficients
+        return self.late_telemetry.test(time_us, phi, positions, self._model, coefficients)
 
     def keep(self, sample: LearningSample, innovation: float) -> None:
         """Store a sample and its innovation (nT) for the test of late telemetry."""
@@ -97,7 +86,7 @@ class Knowledge:
     def keep_faulty(self, sample: LearningSample) -> None:
         """Store a faulty sensor's sample for the test of late telemetry, without updating a filter."""
         quiet = self.bank.quiet
-        now = self._observation_with(quiet)(sample.field, sample.phi, sample.reference)
+        now = self._model.observe(sample.field, sample.phi, quiet.coefficients, sample.reference)
         self.keep(sample, now.e - quiet.expected)
 
     def predict(self, sample: LearningSample, way: Way) -> Observation:
@@ -122,7 +111,7 @@ class Knowledge:
         return best
 
     def _predict(self, estimator: Estimator, sample: LearningSample) -> Observation:
-        live = self._observation_with(estimator)(sample.field, sample.phi, sample.reference)
+        live = self._model.observe(sample.field, sample.phi, estimator.coefficients, sample.reference)
         estimator.predict(live.e, live.s, self._model.derivative(sample.phi, live.by_nine))
         estimator.follow(live.s)
         return live
@@ -146,7 +135,7 @@ class Knowledge:
         quiet, now, by_delay = self.bank.quiet, self._quiet_observation, 0.0
         # derivative of the residual by the telemetry's delay
         if self._before is not None and 0.0 < seconds < 30.0:
-            late = self._observation_with(quiet)(sample.field, self._before, sample.reference)
+            late = self._model.observe(sample.field, self._before, quiet.coefficients, sample.reference)
             by_delay = (late.e - now.e) / seconds
         # without a map and without steps, the reference is smooth and has no error to test
         may_step = self._mapless is not None or self._reference_steps.total != 0.0

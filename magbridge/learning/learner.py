@@ -16,7 +16,7 @@ from magbridge.learning.alarms import NO_COEFFICIENT, AlarmState, LearningAlarm,
 from magbridge.learning.estimator import BEYOND_CHANCE, Nuisance
 from magbridge.learning.judge import FIRST
 from magbridge.learning.knowledge import NO_METHOD, Knowledge, Publication
-from magbridge.learning.samples import Intake, LearnedTerms, LearningSample, Observation, Way
+from magbridge.learning.samples import Intake, LearnedTerms, LearningSample, Observation, Way, observe
 from magbridge.records import Quality, Vector
 
 if TYPE_CHECKING:
@@ -323,16 +323,16 @@ class Learner:
         """Predict a sample by every calibration; return the observation by the published calibration."""
         publication, judge = self._publication, self._publication.judge
 
-        def observe(nine: FloatArray) -> Observation:
-            return self._knowledge.observe(sample.field, nine, sample.reference)
+        def observed(nine: FloatArray) -> Observation:
+            return observe(sample.field, nine, self._model.field, sample.reference)
 
-        direction = observe(publication.nine(sample.phi)[FIRST]).direction
+        direction = observed(publication.nine(sample.phi)[FIRST]).direction
         if judge.is_due(way.metres, way.seconds, direction) and self._knowledge.start is None:
             publication.propose(self._knowledge.bank.best.coefficients)
-        seen = [observe(nine) for nine in publication.nine(sample.phi)]
+        seen = [observed(nine) for nine in publication.nine(sample.phi)]
         # a replaced calibration keeps the level of its crustal field
         for which, nine in publication.replaced(sample.phi).items():
-            judge.replace(which, seen[which].e - observe(nine).e, seen[which].s)
+            judge.replace(which, seen[which].e - observed(nine).e, seen[which].s)
         first, published, candidate = seen
         # the judge's filters use the same transition as the estimators
         F = self._knowledge.believed.transition(*way)[0]

@@ -173,7 +173,7 @@ class LearnedTerms:
     `currents` are the names of telemetry in ampere, `parameters` those of the calibration's parameters.
     `watched` are the temperature and the currents; `further` are the watched channels for which the
     calibration has no term. `size` is the number K of coefficients, with three for each further channel.
-    `offsets` (3,) are the indices of the constant offset.
+    `offsets` (3,) are the indices of the constant offset. `field` is the reference field F_0, nT.
 
     Raises
     ------
@@ -182,7 +182,7 @@ class LearnedTerms:
     """
 
     def __init__(self, calibration: Calibration, currents: tuple[str, ...]) -> None:
-        self._base = calibration
+        self._base, self.field = calibration, calibration.reference.field
         self.parameters = tuple(parameter.name for parameter in calibration.parameters)
         self.watched = (TEMPERATURE, *currents)
         self._further = [k for k, name in enumerate(self.watched) if name not in calibration.channels]
@@ -282,6 +282,12 @@ class LearnedTerms:
     def weights(self, coefficients: FloatArray) -> FloatArray:
         """Return the weights (m, 9) of the regressors in the nine coefficients of :func:`observe`, nT."""
         return np.asarray((coefficients @ self._flat).reshape(self._tensor.shape[1:]))
+
+    def observe(
+        self, field: Vector, phi: FloatArray, coefficients: FloatArray, reference: float
+    ) -> Observation:
+        """Observe a raw field (nT), as :func:`observe`, with coefficients (K,) at the regressors (m,)."""
+        return observe(field, phi @ self.weights(coefficients), self.field, reference)
 
     def derivative(self, phi: FloatArray, by_nine: FloatArray) -> FloatArray:
         """Convert a derivative by the nine coefficients (9,) to a derivative by all K coefficients (K,)."""
