@@ -1,13 +1,15 @@
 """Define the columns of a deployment: names, units and meanings.
 
-The names are public: files, the command line and the link use them. A column of any other name is telemetry
-in the unit that it declares.
+The file ``standard_columns.toml`` lists them. The names are public: files, the command line and the link use
+them. A column of any other name is telemetry in the unit that it declares.
 """
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from magbridge.errors import FormatError
@@ -41,48 +43,10 @@ AGE = "age_"
 
 TEMPERATURE = "sensor_temperature"
 """Column of the temperature at the fluxgate: the only calibration channel that comes with a reading."""
-COLUMNS: dict[str, Column] = {
-    "time": Column("s", "seconds since 1970-01-01 UTC"),
-    "mag_x": Column("nT", "raw magnetic field, sensor x (forward)"),
-    "mag_y": Column("nT", "raw magnetic field, sensor y (starboard)"),
-    "mag_z": Column("nT", "raw magnetic field, sensor z (down)"),
-    "mag_time_x": Column("s", "time at which channel x was sampled"),
-    "mag_time_y": Column("s", "time at which channel y was sampled"),
-    "mag_time_z": Column("s", "time at which channel z was sampled"),
-    "sensor_temperature": Column("degC", "temperature at the fluxgate"),
-    "roll": Column("deg", "roll, starboard down positive"),
-    "pitch": Column("deg", "pitch, nose up positive"),
-    "heading": Column("deg", "heading, clockwise from north"),
-    "latitude": Column("deg", "latitude, north positive (WGS84)"),
-    "longitude": Column("deg", "longitude, east positive (WGS84)"),
-    "depth": Column("m", "depth below the surface"),
-    "reference_field": Column("nT", "true total magnetic field"),
-    "daily_variation": Column("nT", "variation of the Earth's field with time, by a base station"),
-    "velocity_north": Column("m/s", "velocity by dead reckoning, north"),
-    "velocity_east": Column("m/s", "velocity by dead reckoning, east"),
-    "water_speed": Column("m/s", "speed through the water"),
-    "local_north": Column("m", "local position, north"),
-    "local_east": Column("m", "local position, east"),
-    "dr_latitude": Column("deg", "dead-reckoned latitude"),
-    "dr_longitude": Column("deg", "dead-reckoned longitude"),
-    "total_field": Column("nT", "corrected total magnetic field"),
-    "total_field_sigma": Column("nT", "1-sigma of the corrected total field"),
-    "level_sigma": Column("nT", "the part of total_field_sigma that all samples share"),
-    "field_x": Column("nT", "corrected magnetic field, body x (forward)"),
-    "field_y": Column("nT", "corrected magnetic field, body y (starboard)"),
-    "field_z": Column("nT", "corrected magnetic field, body z (down)"),
-    "magnetic_heading": Column("deg", "heading by the corrected field, clockwise from magnetic north"),
-    "heading_sigma": Column("deg", "1-sigma of heading"),
-    "declination": Column("deg", "declination of the main-field model, east positive"),
-    "declination_sigma": Column("deg", "1-sigma of declination"),
-    "vehicle_heading": Column("deg", "the vehicle's own heading, clockwise from north"),
-    "anomaly": Column("nT", "corrected total field minus the reference model"),
-    "quality": Column("1", "flags of a doubtful sample"),
-    "scalar_field": Column("nT", "compensated total field of the scalar magnetometer"),
-    "scalar_field_sigma": Column("nT", "1-sigma of the compensated scalar field"),
-    "scalar_level_sigma": Column("nT", "the part of scalar_field_sigma that a power cycle's samples share"),
-    "scalar_quality": Column("1", "flags of a compensated scalar sample"),
-}
+_TABLES: dict[str, dict[str, list[str]]] = tomllib.loads(
+    Path(__file__).with_name("standard_columns.toml").read_text("utf-8")
+)
+COLUMNS = {name: Column(units, meaning) for name, (units, meaning) in _TABLES["columns"].items()}
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
 """Columns that ``magbridge correct`` writes in addition to ``time``."""
 
@@ -103,42 +67,8 @@ _FACTORS = {
     ("km", "m"): 1e3,
     ("cm/s", "m/s"): 1e-2,
 }
-_SPELLINGS = {
-    "deg": (
-        *("degrees", "degree", "Decimal Degrees", "decimal degrees", "angular_degree", "arc_degree"),
-        *("°", "WGS84"),
-        # CF Conventions, sections 4.1 and 4.2
-        *(f"degree{s}{sep}{to}" for s in ("", "s") for sep in ("_", "") for to in "NE"),
-        *(f"degree{s}_{to}" for s in ("", "s") for to in ("north", "east", "true")),
-    ),
-    "m": ("metres", "meters", "metre", "meter"),
-    "cm": ("centimetres", "centimeters", "centimetre", "centimeter"),
-    "mm": ("millimetres", "millimeters", "millimetre", "millimeter"),
-    "km": ("kilometres", "kilometers", "kilometre", "kilometer"),
-    "m/s": ("m s-1",),
-    "cm/s": ("cm s-1",),
-    "s": ("seconds", "second", "sec"),
-    "h": ("hours", "hour"),
-    "degC": ("celsius", "degrees_celsius", "degree_celsius", "degree_C", "deg_C", "deg C", "°C"),
-    "A": ("amperes", "ampere", "amps", "amp"),
-    "mA": ("milliamperes", "milliampere", "milliamps", "milliamp"),
-    "V": ("volts", "volt"),
-    "W": ("watts", "watt"),
-    "%": ("percent",),
-    "nT": ("nanotesla", "ntesla", "gamma", "gammas"),
-    "uT": ("microtesla", "utesla", "µtesla"),
-    "mT": ("millitesla", "mtesla"),
-    "T": ("tesla",),
-    "uG": ("microgauss",),
-    "mG": ("milligauss", "mgauss"),
-    "G": ("gauss", "Oe", "oersted"),  # an oersted is of the same size in air
-    "rad": ("radian", "radians"),
-    "in": ("inch", "inches"),
-    "cm3": ("cc", "ccm", "mL", "ml", "millilitres", "milliliters", "millilitre", "milliliter"),
-    "L": ("l", "dm3", "litres", "liters", "litre", "liter"),
-}
-"""Unit of magbridge -> spellings of it in other programs' files; powers as in ``cm3``."""
-_SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
+_SAME = {other: unit for unit, others in _TABLES["spellings"].items() for other in others}
+"""Spelling of a unit in other programs' files -> unit of magbridge."""
 _CHARACTERS = str.maketrans({"²": "2", "³": "3", "\N{GREEK SMALL LETTER MU}": "\N{MICRO SIGN}"})
 _POWER = re.compile(r"(\^|\*\*)(?=[-\d])")
 

@@ -111,7 +111,7 @@ def _code(text: str) -> Iterator[tuple[int, str]]:
 
 def checkout() -> list[Path]:
     """Return the Markdown pages, Python modules and messages, without generated and quoted files."""
-    command = ["git", "ls-files", "*.md", "*.py", "magbridge/diagnostics.toml"]
+    command = ["git", "ls-files", "*.md", "*.py", ":(glob)magbridge/*.toml"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
     return [ROOT / name for name in listed if name not in SKIPPED and (ROOT / name).is_file()]
 
