@@ -186,40 +186,35 @@ def goal_of(name: str) -> str:
 
 def compare(old: dict[str, list[float]], new: dict[str, list[float]]) -> list[str]:
     """Return a line for each figure that changed significantly, the worse figures first."""
-    worse: list[str] = []
-    better: list[str] = []
+    found: dict[str, list[str]] = {kind: [] for kind in ("CASES", "MISSING", "WORSE", "GONE", "better")}
     for name, values in new.items():
         before, after = np.array(old.get(name, [])), np.array(values)
         if before.shape != after.shape:
-            worse.append(f"CASES   {name}: {before.size} cases before, {after.size} now")
+            found["CASES"].append(f"{name}: {before.size} cases before, {after.size} now")
             continue
+        counts = [int(np.isfinite(one).sum()) for one in (before, after)]
+        if counts[0] != counts[1]:
+            found["MISSING"].append(f"{name}: {counts[0]} values before, {counts[1]} now")
         known = np.isfinite(before) & np.isfinite(after)
-        if np.isfinite(before).sum() != np.isfinite(after).sum():
-            worse.append(
-                f"MISSING {name}: {np.isfinite(before).sum()} values before, {np.isfinite(after).sum()} now"
-            )
         before, after = before[known], after[known]
-        if not moved(before, after):
-            continue
-        distance = [np.abs(v - 1.0) if goal_of(name) == ONE else v for v in (before, after)]
-        is_better = (distance[1].mean() < distance[0].mean()) != (goal_of(name) == HIGH)
-        text = f"{name}: {describe(before)} -> {describe(after)}"
-        (better if is_better else worse).append(f"{'better ' if is_better else 'WORSE  '} {text}")
-    missing = [f"GONE    {name}" for name in old if name not in new]
-    return [*worse, *missing, *better]
+        if moved(before, after):
+            distance = [np.abs(v - 1.0) if goal_of(name) == ONE else v for v in (before, after)]
+            is_better = (distance[1].mean() < distance[0].mean()) != (goal_of(name) == HIGH)
+            line = f"{name}: {describe(before)} -> {describe(after)}"
+            found["better" if is_better else "WORSE"].append(line)
+    found["GONE"] = [name for name in old if name not in new]
+    return [f"{kind:7} {line}" for kind, lines in found.items() for line in lines]
 
 
 def moved(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return True if the mean difference of paired values is significant."""
-    difference = after - before
-    if before.size == 0:
+    """Return True if the mean difference of paired values (n,) is significant."""
+    n = before.size
+    if n == 0:
         return False
-    scale = max(abs(float(before.mean())), 1e-9)
-    if before.size == 1:
-        return abs(float(difference[0])) > MIN_RELATIVE_CHANGE_SINGLE * scale
-    error = float(difference.std(ddof=1)) / np.sqrt(difference.size)
-    change = abs(float(difference.mean()))
-    return change > MIN_STANDARD_ERRORS * error and change > MIN_RELATIVE_CHANGE * scale
+    change, scale = abs(float((after - before).mean())), max(abs(float(before.mean())), 1e-9)
+    error = float((after - before).std(ddof=1)) / np.sqrt(n) if n > 1 else 0.0
+    least = MIN_RELATIVE_CHANGE if n > 1 else MIN_RELATIVE_CHANGE_SINGLE
+    return change > max(MIN_STANDARD_ERRORS * error, least * scale)
 
 
 def describe(values: np.ndarray) -> str:

@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 from msgspec.structs import replace
 from referee import ArduPilot, Autopilot, Px4
-from referee.loop import Passage, sail
+from referee.loop import outage, sail
 from studies import Column, Row, Study
 from voyages import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 
@@ -45,22 +45,6 @@ PAIRS = (
 """Fixes and the autopilots that get them."""
 
 
-def passage(kind: Map, seed: int, hours: float) -> Passage:
-    """Return a glider's track of the navigation study on one kind of map."""
-    grid = synthetic(kind, seed % 10)
-    ds = track_over(grid, GLIDER, 1000 + seed, hours=hours, speed=SPEEDS[seed % 3])
-    return Passage(
-        ds["time"].to_numpy(),
-        ds["truth_latitude"].to_numpy(),
-        ds["truth_longitude"].to_numpy(),
-        np.column_stack([ds["velocity_north"], ds["velocity_east"]]),
-        ds["total_field"].to_numpy(),
-        ds["total_field_sigma"].to_numpy(),
-        30.0,
-        lambda s: s < LOST_S or s > hours * HOUR - BACK_S,
-    )
-
-
 def rms(values: np.ndarray) -> float:
     """Return the root mean square of the values that are not NaN."""
     return float(np.sqrt(np.nanmean(np.square(values))))
@@ -70,13 +54,15 @@ def run(pair: str, telemetry: str, chart: int, seed: int, hours: float) -> list[
     """Simulate a glider with an autopilot that uses fixes and with one that ignores fixes; return the row."""
     fix, autopilot = pair.split()
     kind = MAPS[chart]
-    grid, way = synthetic(kind, seed % 10), passage(kind, seed, hours)
+    grid, end = synthetic(kind, seed % 10), hours * HOUR - BACK_S
+    flown = track_over(grid, GLIDER, 1000 + seed, hours=hours, speed=SPEEDS[seed % 3])
     options = replace(GLIDER, start_sigma=0.2 * grid.correlation_length)
 
     make = partial(AUTOPILOTS[autopilot], streams=STREAMS[telemetry])
-    using, _, _ = sail(way, grid, options, fix, partial(make, obeys=True))
-    ignoring, _, _ = sail(way, grid, options, fix, partial(make, obeys=False))
-    end = hours * HOUR - BACK_S
+    using, ignoring = (
+        sail(flown, outage(LOST_S, end + 1.0), grid, options, fix, partial(make, obeys=obeys))[0]
+        for obeys in (True, False)
+    )
     lost = (using.seconds > LOST_S) & (using.seconds < end)
     fed = lost & (using.sent > 0)
     fed &= np.cumsum(fed) > LOST_S  # after it has converged

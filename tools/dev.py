@@ -19,9 +19,7 @@ import shutil
 import ssl
 import subprocess
 import sys
-import time
 import venv
-from difflib import unified_diff
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -94,26 +92,6 @@ def install(extra: str) -> None:
     run(BIN / "python", "-m", "compileall", "-q", "magbridge", "sitl")
 
 
-def check_collection() -> None:
-    """Exit with the differences if two processes do not collect the same tests in the same order.
-
-    pytest-xdist's workers collect independently. If an identifier depends on the time, on random numbers or
-    on the order of a set, the run ends before the first test.
-    """
-    found: list[list[str]] = []
-    for seed in ("1", "2"):
-        time.sleep(3.0 * bool(found))  # longer than the resolution of a time stamp in an archive
-        command = [str(BIN / "python"), "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"]
-        variables = {**os.environ, "PYTHONHASHSEED": seed}
-        done = subprocess.run(command, cwd=ROOT, env=variables, capture_output=True, text=True, check=False)
-        if done.returncode:
-            sys.exit(done.stdout[-4000:] + done.stderr[-4000:])
-        found.append([line for line in done.stdout.splitlines() if "::" in line])
-    if found[0] != found[1]:
-        print(*unified_diff(found[0], found[1], "first", "second", lineterm="", n=0), sep="\n")
-        sys.exit("the tests' identifiers differ between two processes: give the parameters ids")
-
-
 def install_stations() -> None:
     """Install MAVProxy, MAVSDK, pymavlink's tools and node-mavlink in their pinned versions into ``.peers``.
 
@@ -155,7 +133,6 @@ def main() -> None:
     elif what == "check":
         for command in CHECKS:
             run(BIN / command[0], *command[1:])
-        check_collection()
     elif what == "stations":
         install_stations()
     elif what == "size":

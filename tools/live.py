@@ -37,6 +37,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Parameter
 from magbridge.columns import CHANNELS
 from magbridge.config import Align
+from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.residual import rms
 from magbridge.estimation.sequential import ALARM_LOG_RATIO
 from magbridge.estimation.track_process import TRACK_STATES
@@ -161,19 +162,16 @@ def filtered(
     north, east = separation(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:])
     metres, seconds = (np.r_[0.0, step] for step in (np.hypot(north, east), np.diff(log["time"].to_numpy())))
     k = columns.shape[1]
-    x, P = np.zeros(k + TRACK_STATES), np.diag(np.full(k + TRACK_STATES, CHANGE_SIGMA_NT**2))
+    P = np.diag(np.full(k + TRACK_STATES, CHANGE_SIGMA_NT**2))
     P[k:, k:] = nuisance.initial
-    A, h = np.eye(k + TRACK_STATES), np.r_[np.zeros(k), -nuisance.row(1.0)]
+    estimate = KalmanFilter(np.zeros(len(P)), P)
     for i, moved in enumerate(zip(metres.tolist(), seconds.tolist(), strict=True)):
-        A[k:, k:], Q = nuisance.transition(*moved)
-        h[:k] = columns[i]
-        x, P = A @ x, A @ P @ A.T
-        P[k:, k:] += Q
-        v, S = float(series[i] - h @ x), float(h @ P @ h) + nuisance.white_variance
-        yield x[:k], v, S
+        estimate.predict(*nuisance.transition(*moved), slice(k, None))
+        row = np.r_[columns[i], -nuisance.row(1.0)]
+        estimate.innovate(-float(series[i]), row, nuisance.white_variance)
+        yield estimate.mean[:k].copy(), estimate.innovation, estimate.variance
         if rest[i]:
-            gain = P @ h / S
-            x, P = x + gain * v, P - np.outer(gain, h @ P)
+            estimate.update()
 
 
 def best_delay(

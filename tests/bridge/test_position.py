@@ -141,7 +141,7 @@ NEVER = 1e9
 def fly(receiver: Receiver = honest, lost: float = NEVER, minutes: float = 9.0, back: float = END) -> Run:
     make = partial(ArduPilot, streams=("VFR_HUD",))
     passage = flight(minutes, lost, back if lost < NEVER else NEVER, receiver)
-    return sail(passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
+    return sail(*passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
 
 
 @cache
@@ -241,7 +241,7 @@ def test_the_claimed_sigma_is_that_of_a_wind_that_changes_as_the_options_state()
     for seed in (2, 4):
         passage = flight(15.0, BEGIN, 840.0, seed=seed, changing_wind=True)
         make = partial(ArduPilot, streams=("VFR_HUD",))
-        run = sail(passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
+        run = sail(*passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
         alone = window(run, BEGIN, 840.0)
         standardised += list(run.error[alone] ** 2 / 2.0 / run.sigma[alone] ** 2)
         assert (run.error[alone] < 200.0).all()

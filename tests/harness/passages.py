@@ -3,7 +3,8 @@
 from functools import cache
 
 import numpy as np
-from referee.loop import Passage, Receiver, honest
+import xarray as xr
+from referee.loop import Receiver, honest, outage
 from voyages import Map, synthetic
 
 from magbridge.field.geodesy import metres_per_degree, offset
@@ -38,8 +39,25 @@ def hills(seed: int = 4) -> AnomalyGrid:
     return AnomalyGrid(PLACE[1] + along / per_longitude, PLACE[0] + along / per_latitude, anomaly)
 
 
+def _track(
+    time: np.ndarray, away: np.ndarray, velocity: np.ndarray, grid: AnomalyGrid, rng: np.random.Generator,
+    depth: float,
+) -> xr.Dataset:  # fmt: skip
+    """Return a track at `away` (n, 2), m from :data:`PLACE`, with readings of 1 nT of noise."""
+    latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
+    anomaly = grid.evaluate(longitude, latitude).anomaly
+    assert np.isfinite(anomaly).all()
+    columns = {
+        "truth_latitude": latitude, "truth_longitude": longitude,
+        "velocity_north": velocity[:, 0], "velocity_east": velocity[:, 1],
+        "total_field": total_field(longitude, latitude, depth, time) + anomaly + rng.normal(size=time.size),
+        "total_field_sigma": np.ones(time.size), "depth": np.full(time.size, depth),
+    }  # fmt: skip
+    return xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": time})
+
+
 @cache
-def passage(seed: int = 1, current: float = 0.1) -> Passage:
+def passage(seed: int = 1, current: float = 0.1) -> tuple[xr.Dataset, Receiver]:
     """Return a track of two legs at 1.5 m/s through an unmeasured current (m/s, north)."""
     rng = np.random.default_rng(seed)
     time = START + np.arange(0.0, LAST + 1.0)
@@ -47,12 +65,7 @@ def passage(seed: int = 1, current: float = 0.1) -> Passage:
     velocity = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
     away = np.cumsum(velocity + np.array([current, 0.0]), axis=0)
     away = np.vstack([[0.0, 0.0], away[:-1]])
-    latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
-    field = total_field(longitude, latitude, 2.0, time) + hills().evaluate(longitude, latitude).anomaly
-    noisy = field + rng.normal(size=time.size)
-    return Passage(
-        time, latitude, longitude, velocity, noisy, np.ones(time.size), 2.0, lambda s: s < LOST or s > BACK
-    )
+    return _track(time, away, velocity, hills(), rng, 2.0), outage(LOST, BACK + 1.0)
 
 
 @cache
@@ -81,7 +94,7 @@ def flight(
     turn_every: float = 300.0,
     *,
     changing_wind: bool = False,
-) -> Passage:
+) -> tuple[xr.Dataset, Receiver]:
     """Return a plane's flight at 22 m/s in a wind of 4 m/s, with a turn of 90 degrees every 5 minutes.
 
     A turn takes 6 s. There is no GPS between `lost` and `back`, s. A changing wind is a Gauss-Markov process
@@ -98,11 +111,4 @@ def flight(
     wind = _changing_wind(rng, time.size) if changing_wind else np.array([3.0, -2.6])
     away = np.vstack([[0.0, 0.0], np.cumsum(velocity + wind, axis=0)[:-1]])
     away -= 0.5 * (away.min(axis=0) + away.max(axis=0))  # centre the track on the map
-    latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
-    anomaly = steep_map().evaluate(longitude, latitude).anomaly
-    assert np.isfinite(anomaly).all()
-    field = total_field(longitude, latitude, 0.0, time) + anomaly + rng.normal(size=time.size)
-    return Passage(
-        time, latitude, longitude, velocity, field, np.ones(time.size), 0.0,
-        lambda s: s < lost or s >= back, receiver,
-    )  # fmt: skip
+    return _track(time, away, velocity, steep_map(), rng, 0.0), outage(lost, back, receiver)

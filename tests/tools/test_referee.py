@@ -206,7 +206,7 @@ def rms(values: Any) -> float:
 
 def sail_again(kind: str, stack: str, stream: str, *, obeys: bool = True) -> tuple[Run, Autopilot]:
     make = partial(STACKS[stack], streams=(stream,), obeys=obeys)
-    run, autopilot, _ = sail(passage(), hills(), OPTIONS, kind, make)
+    run, autopilot, _ = sail(*passage(), hills(), OPTIONS, kind, make)
     return run, autopilot
 
 

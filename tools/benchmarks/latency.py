@@ -25,7 +25,7 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-from benchmarks.row import Row
+from benchmarks.row import Row, alternating
 from benchmarks.workload import OPTIONS, TELEMETRY_HZ, Feed, write_config
 
 from magbridge.arrays import FloatArray
@@ -254,13 +254,9 @@ def commands(folder: Path, repetitions: int) -> list[Row]:
     }  # fmt: skip
     rows = []
     for what, (command, floor, most) in measured.items():
-        times, bare = [], []
-        for _ in range(repetitions + 1):  # the first repetition fills the caches
-            times.append(_spent(command))
-            bare.append(_spent([sys.executable, "-c", floor]))
-        rows.append(
-            Row(what, median(times[1:]), "s", median(bare[1:]), floor, most=most)
-        )  # fmt: skip
+        bare = [sys.executable, "-c", floor]
+        ours, floors = alternating(repetitions, partial(_spent, command), partial(_spent, bare))
+        rows.append(Row(what, median(ours), "s", median(floors), floor, most=most))
     return rows
 
 

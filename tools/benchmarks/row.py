@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
+import resource
 import time
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from statistics import median
 from typing import Any, NamedTuple
 
 
@@ -37,12 +37,15 @@ class Row(NamedTuple):
         return judged >= self.least if self.least is not None else None
 
 
-def in_own_process(script: str, *arguments: object) -> Any:
-    """Run a script with arguments in another process; return its output parsed as JSON, None if empty."""
-    command = [sys.executable, "-c", script, *map(str, arguments)]
-    place = Path(__file__).parents[1]
-    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout or "null")
+def in_own_process(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the result of a function that runs in a new process, so that its memory can be measured."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def peak_memory() -> float:
+    """Return the largest memory of this process so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1.024e-3
 
 
 def processor_time(work: Callable[[], object]) -> float:
@@ -50,3 +53,17 @@ def processor_time(work: Callable[[], object]) -> float:
     begun = time.process_time()
     work()
     return time.process_time() - begun
+
+
+def alternating(repetitions: int, *measures: Callable[[], float]) -> list[list[float]]:
+    """Take measurements in turn, so that a busy computer slows all; return the values of each.
+
+    The first repetition, which fills the caches, is left out.
+    """
+    rows = [[measure() for measure in measures] for _ in range(repetitions + 1)]
+    return [list(values) for values in zip(*rows[1:], strict=True)]
+
+
+def median_ratio(above: Sequence[float], below: Sequence[float]) -> float:
+    """Return the median over the repetitions of a value divided by another."""
+    return median(a / b for a, b in zip(above, below, strict=True))

@@ -8,6 +8,7 @@ from math import hypot
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.bridge.navigation import NavigationService
@@ -29,6 +30,11 @@ and the accuracy (m) that the receiver claims, or None without a fix."""
 def honest(second: float, place: Place) -> tuple[Place, float]:  # noqa: ARG001 - as the other receivers
     """Return the true position and accuracy, as an undisturbed receiver does."""
     return place, GPS_SIGMA
+
+
+def outage(start: float, end: float, receiver: Receiver = honest) -> Receiver:
+    """Return a receiver that has no reception between two times (s)."""
+    return lambda second, place: None if start <= second < end else receiver(second, place)
 
 
 def carried_off(start: float, north: float, east: float) -> Receiver:
@@ -92,26 +98,6 @@ def jammed(start: float, end: float, seed: int = 0, accuracy: float | None = Non
 SECOND_US = 1_000_000
 
 
-class Passage(NamedTuple):
-    """True track of a vehicle, and the readings of its corrected magnetometer; n samples, evenly spaced.
-
-    `time` (n,) is s since 1970 UTC, `latitude` and `longitude` (n,), deg, are true, `velocity` (n, 2), m/s
-    north and east, is through the water until the next sample, `total_field` and `sigma` (n,) are in nT,
-    `depth` in m. `gps` returns True if there is reception at a time, s since the start; `receiver` is one of
-    the receivers above.
-    """
-
-    time: FloatArray
-    latitude: FloatArray
-    longitude: FloatArray
-    velocity: FloatArray
-    total_field: FloatArray
-    sigma: FloatArray
-    depth: float
-    gps: Callable[[float], bool]
-    receiver: Receiver = honest
-
-
 class Run(NamedTuple):
     """Errors and states of bridge and autopilot, once a second (n,).
 
@@ -134,25 +120,31 @@ class Run(NamedTuple):
 
 
 def sail(
-    passage: Passage,
+    flown: xr.Dataset,
+    receiver: Receiver,
     grid: AnomalyGrid,
     options: NavigationOptions,
     kind: str,
     make: Callable[[tuple[float, float, float], int], Autopilot],
     seed: int = 0,
 ) -> tuple[Run, Autopilot, NavigationService]:
-    """Run bridge and autopilot (from ``make(origin, start_us)``) over a passage, with fixes of one `kind`."""
-    start_us = round(passage.time[0] * 1e6) // 4 * 4
+    """Run bridge and autopilot (from ``make(origin, start_us)``) over a track, with fixes of one `kind`.
+
+    `flown` has evenly spaced samples with ``total_field`` and ``total_field_sigma`` (nT), ``truth_latitude``
+    and ``truth_longitude`` (deg), ``depth`` (m), and ``velocity_north`` and ``velocity_east`` (m/s) through
+    the water until the next sample.
+    """
+    start_us = round(float(flown["time"][0]) * 1e6) // 4 * 4
     component = Component(Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us)
     navigation = NavigationService(grid, options, FIX_MESSAGES[kind], component)
-    origin = float(passage.latitude[0]), float(passage.longitude[0]), 3.0
+    origin = float(flown["truth_latitude"][0]), float(flown["truth_longitude"][0]), 3.0
     autopilot = make(origin, start_us)
     rows: list[tuple[float, ...]] = []
     texts: list[tuple[float, str]] = []
     answers = b""
-    columns = passage.time.tolist(), passage.total_field.tolist(), passage.sigma.tolist()
+    columns = (flown[name].to_numpy().tolist() for name in ("time", "total_field", "total_field_sigma"))
     samples = deque(zip(*columns, strict=True))
-    for seconds, truth in truths(passage, seed):
+    for seconds, truth in truths(flown, receiver, seed):
         now_us = start_us + round(seconds * SECOND_US) // 4 * 4
         for when_us, corrected in due(samples, now_us - 1):
             navigation.sample(when_us, corrected)
@@ -199,20 +191,22 @@ def own_error(navigation: NavigationService, now_us: int, truth: Truth) -> float
     return hypot(*separation(*truth.place, *offset(*navigator.reckoned(now_us), north, east)))
 
 
-def truths(passage: Passage, seed: int) -> Iterator[tuple[float, Truth]]:
+def truths(flown: xr.Dataset, receiver: Receiver, seed: int) -> Iterator[tuple[float, Truth]]:
     """Yield time and true state of the vehicle every second, interpolated between the samples."""
     rng = np.random.default_rng(seed)
-    time, every = passage.time, float(passage.time[1] - passage.time[0])
-    heading = np.degrees(np.arctan2(passage.velocity[:, 1], passage.velocity[:, 0])) % 360.0
-    speed = np.hypot(*passage.velocity.T)
-    seconds = np.arange(0.0, time[-1] - time[0])
-    latitude = np.interp(seconds, time - time[0], passage.latitude)
-    longitude = np.interp(seconds, time - time[0], passage.longitude)
+    time = flown["time"].to_numpy() - float(flown["time"][0])
+    velocity = flown["velocity_north"].to_numpy(), flown["velocity_east"].to_numpy()
+    heading, speed = np.degrees(np.arctan2(velocity[1], velocity[0])) % 360.0, np.hypot(*velocity)
+    seconds = np.arange(0.0, time[-1])
+    places = zip(
+        *(np.interp(seconds, time, flown[f"truth_{name}"]).tolist() for name in ("latitude", "longitude")),
+        strict=True,
+    )
     noise = rng.normal(size=(len(seconds), 2)) * GPS_SIGMA
-    for k, second in enumerate(seconds.tolist()):
-        place = float(latitude[k]), float(longitude[k])
-        i = int(second / every)
-        measured = passage.receiver(second, place) if passage.gps(second) else None
+    depths = flown["depth"].to_numpy()
+    for k, (second, place) in enumerate(zip(seconds.tolist(), places, strict=True)):
+        i = int(second / time[1])
+        measured = receiver(second, place)
         gps = offset(*measured[0], *noise[k].tolist()) if measured else None
         accuracy = measured[1] if measured else GPS_SIGMA
-        yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps, accuracy)
+        yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, float(depths[i]), gps, accuracy)
