@@ -341,19 +341,12 @@ def _file(name: str, function: Callable[[Path], object], *writers: Callable[[Pat
 
 def _log() -> xr.Dataset:
     t = 1.7e9 + 4.0 * np.arange(60)
-    columns = {
-        name: ("time", 2e4 + 100.0 * np.sin(t / 50.0 + k))
-        for k, name in enumerate(("mag_x", "mag_y", "mag_z"))
-    }
-    more = {
-        "roll": 5.0 * np.sin(t / 30.0),
-        "latitude": 54.0 + (t - t[0]) * 1e-6,
-        "longitude": 10.0 + 0.0 * t,
+    columns = {f"mag_{axis}": 2e4 + 100.0 * np.sin(t / 50.0 + k) for k, axis in enumerate("xyz")}
+    columns |= {
+        "roll": 5.0 * np.sin(t / 30.0), "latitude": 54.0 + (t - t[0]) * 1e-6, "longitude": 10.0 + 0.0 * t,
         "battpos": np.where(t % 40 < 20, 0.1, 0.4),
-    }
-    return xr.Dataset(
-        {**columns, **{k: ("time", v) for k, v in more.items()}}, {"time": t}, {"source": "fuzz"}
-    )
+    }  # fmt: skip
+    return xr.Dataset({k: ("time", v) for k, v in columns.items()}, {"time": t}, {"source": "fuzz"})
 
 
 def _write_ardupilot(path: Path) -> None:

@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 from accuracy import ellipsoid
+from measured import FLIGHT_MIDNIGHT_S, aircraft_line
 from scipy.spatial.transform import Rotation
 from studies import DATA, Column, Row, Study
 from study_worlds import MASSES, glider, measure_trials
@@ -40,9 +41,6 @@ PAIRS = (1, 5)
 CUTOFF_HZ = 0.33
 """Cut-off of the simulated anti-alias filter, Hz; a spiral turns at 1.6 deg/s."""
 ANGLES = ("roll", "pitch")
-AIRCRAFT = "magnav_flt1002/Flt1002_1002.02.txt"
-FLOWN = 1_592_611_200.0
-"""Start of the day of the aircraft's flight, s since 1970 UTC."""
 AIRCRAFT_STEP = 10
 """Step between the samples of the aircraft's line (10 Hz) that are used."""
 SIMULATED = ("gliders", "gliders, tilt offsets", "gliders, filter", "Bonne Bay twin")
@@ -146,15 +144,16 @@ def after_pairs(
 
 def aircraft() -> Iterator[Row]:
     """Yield the rows of the aircraft: each half of its line is fitted and tested on the other half."""
-    if not (DATA / AIRCRAFT).exists():
+    if not DATA.exists():
         yield {"method": "auto", "failed": "no measured data"}
         return
-    rows = np.loadtxt(DATA / AIRCRAFT)[::AIRCRAFT_STEP]
+    rows = aircraft_line(DATA, AIRCRAFT_STEP)
     pitch, roll, heading = rows[:, 4:7].T
     ned = rows[:, 7:10]
     line = Observations(
-        rows[:, 1:4], np.linalg.norm(ned, axis=1), np.empty((len(rows), 0)), time=FLOWN + rows[:, 0],
-        attitude=np.radians(np.column_stack([roll, pitch, heading])), reference_ned=ned,
+        rows[:, 1:4], np.linalg.norm(ned, axis=1), np.empty((len(rows), 0)),
+        time=FLIGHT_MIDNIGHT_S + rows[:, 0], attitude=np.radians(np.column_stack([roll, pitch, heading])),
+        reference_ned=ned,
     )  # fmt: skip
     first = np.arange(len(line)) < len(line) // 2
     declination = np.degrees(np.arctan2(ned[:, 1], ned[:, 0]))

@@ -80,25 +80,9 @@ def hours_of(log: xr.Dataset) -> np.ndarray:
     return np.asarray((time - time[0]) / 3600.0)
 
 
-def nothing(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:  # noqa: ARG001
-    """Return a zero field (n, 3): no change."""
-    return np.zeros((log.sizes["time"], 3))
-
-
-def turn_on(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Return a constant offset (n, 3) of `size` nT in a random direction."""
-    return np.tile(size * direction(rng), (log.sizes["time"], 1))
-
-
-def bolt(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Return an offset step (n, 3) of `size` nT after 40 % of the survey."""
-    return np.asarray((hours_of(log) > 0.4 * hours_of(log)[-1])[:, None] * size * direction(rng))
-
-
-def drift(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Return an offset (n, 3) that drifts to three times `size` nT, from 20 % of the survey on."""
-    later = np.maximum(hours_of(log) - 0.2 * hours_of(log)[-1], 0.0)
-    return np.asarray((later / later[-1])[:, None] * 3.0 * size * direction(rng))
+def offset(course: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Return a change by an offset (n, 3) in a random direction, with a course (n,) of the hours (n,)."""
+    return lambda log, rng, size: np.outer(course(hours_of(log)), size * direction(rng))
 
 
 def warming(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
@@ -117,34 +101,35 @@ def pump(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
     )
 
 
-def clock(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+def clock(log: xr.Dataset, _: np.random.Generator, size: float) -> np.ndarray:
     """Delay the telemetry of the masses by half of `size`, in s, after 40 % of the survey."""
     time = log["time"].to_numpy()
     later = hours_of(log) > 0.4 * hours_of(log)[-1]
     for name in MASSES:
         values = log[name].to_numpy()
         log[name] = "time", np.where(later, np.interp(time - 0.5 * size, time, values), values)
-    return nothing(log, rng, size)
+    return np.zeros((len(time), 3))
 
 
-def sheet(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+def sheet(log: xr.Dataset, _: np.random.Generator, size: float) -> np.ndarray:
     """Shift the reference by three times `size` nT after 40 % of the survey, as another map sheet does."""
     log["reference_error"] = "time", 3.0 * size * (hours_of(log) > 0.4 * hours_of(log)[-1])
-    return nothing(log, rng, size)
+    return np.zeros((log.sizes["time"], 3))
 
 
 CHANGES: dict[str, tuple[Change, str, float]] = {
-    "nothing": (nothing, "", 0.0),
-    "turn-on step": (turn_on, "offset_step", 0.0),
-    "bolt magnetised": (bolt, "offset_step", 0.4),
-    "drift": (drift, "offset_drift", 0.2),
+    "nothing": (offset(np.zeros_like), "", 0.0),
+    "turn-on step": (offset(np.ones_like), "offset_step", 0.0),
+    "bolt magnetised": (offset(lambda hours: hours > 0.4 * hours[-1]), "offset_step", 0.4),
+    "drift": (offset(lambda hours: 3.75 * np.maximum(hours / hours[-1] - 0.2, 0.0)), "offset_drift", 0.2),
     "warming (trial 1)": (warming, "temperature_offset", 0.0),
     "pump": (pump, "current_field", 0.4),
     "clock": (clock, "clock_offset", 0.4),
     "map": (sheet, "map_error", 0.4),
-    "straight over rock": (nothing, "", 0.0),
+    "straight over rock": (offset(np.zeros_like), "", 0.0),
 }
-"""Change by name: function, cause, and the fraction of the survey after which it begins."""
+"""Change by name: function, cause, and the fraction of the survey after which it begins. The drift reaches
+three times the size."""
 
 # ---- the bounds --------------------------------------------------------------------------------------------
 

@@ -69,11 +69,15 @@ class Vehicle(NamedTuple):
     parameters: tuple[str, ...] = ()
 
 
+def aircraft_line(folder: Path, step: int) -> FloatArray:
+    """Return every `step`-th complete row of an aircraft's line: time, field, pitch, roll, heading, IGRF."""
+    rows = np.genfromtxt(folder / "magnav_flt1002" / "Flt1002_1002.02.txt", invalid_raise=False)[::step]
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
 def flight(folder: Path) -> Vehicle:
     """Return the halves of an aircraft's calibration flight, without parameters."""
-    numbers = np.genfromtxt(folder / "magnav_flt1002" / "Flt1002_1002.02.txt", invalid_raise=False)
-    numbers = numbers[::FLIGHT_ROWS]
-    numbers = numbers[np.isfinite(numbers).all(axis=1)]
+    numbers = aircraft_line(folder, FLIGHT_ROWS)
     names = ("mag_x", "mag_y", "mag_z", "pitch", "roll", "heading")
     columns = {name: ("time", numbers[:, k]) for k, name in enumerate(names, 1)}
     columns["reference_field"] = ("time", np.linalg.norm(numbers[:, 7:10], axis=1))

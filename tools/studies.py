@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -26,13 +25,10 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from magbridge.errors import CalibrationError
+from magbridge.progress import track
 
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
-REPORT_EVERY = 10
-"""Number of cases between two lines of progress if stderr is not a terminal."""
-
-
 DATA = Path(os.environ.get("MAGBRIDGE_REAL_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 """Folder of the logs of real vehicles."""
 
@@ -82,18 +78,10 @@ def as_done(
     function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace
 ) -> Iterator[tuple[Any, Future[Any]]]:
     """Run a function on cases (tuples of arguments) in parallel; yield case and future as each finishes."""
-    is_terminal = sys.stderr.isatty()
     with ProcessPoolExecutor(options.workers, initializer=threadpool_limits, initargs=(1,)) as pool:
         futures = {pool.submit(function, *case): case for case in cases}
-        for count, future in enumerate(as_completed(futures), 1):
+        for future in track(as_completed(futures), "cases", len(futures), in_lines=True):
             yield futures[future], future
-            if is_terminal or count % REPORT_EVERY == 0:
-                print(
-                    f"{count} of {len(futures)}",
-                    end="\r" if is_terminal else "\n",
-                    file=sys.stderr,
-                    flush=True,
-                )
 
 
 def in_order(function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace) -> list[Any]:

@@ -63,8 +63,7 @@ def passage(seed: int = 1, current: float = 0.1) -> tuple[xr.Dataset, Receiver]:
     time = START + np.arange(0.0, LAST + 1.0)
     heading = np.where(time - START < 0.5 * LAST, np.radians(50.0), np.radians(-40.0))
     velocity = 1.5 * np.column_stack([np.cos(heading), np.sin(heading)])
-    away = np.cumsum(velocity + np.array([current, 0.0]), axis=0)
-    away = np.vstack([[0.0, 0.0], away[:-1]])
+    away = np.vstack([[0.0, 0.0], np.cumsum(velocity + np.array([current, 0.0]), axis=0)[:-1]])
     return _track(time, away, velocity, hills(), rng, 2.0), outage(LOST, BACK + 1.0)
 
 
@@ -103,10 +102,8 @@ def flight(
     rng = np.random.default_rng(seed)
     time = START + np.arange(0.0, 60.0 * minutes + 1.0)
     seconds = time - START
-    heading = (
-        30.0 + 90.0 * np.cumsum(np.clip((seconds % turn_every) - turn_every + 6.0, 0.0, None) > 0.0) / 12.0
-    )
-    radians = np.radians(heading)
+    turns = (seconds % turn_every) - turn_every + 6.0 > 0.0
+    radians = np.radians(30.0 + 90.0 * np.cumsum(turns) / 12.0)
     velocity = 22.0 * np.column_stack([np.cos(radians), np.sin(radians)])
     wind = _changing_wind(rng, time.size) if changing_wind else np.array([3.0, -2.6])
     away = np.vstack([[0.0, 0.0], np.cumsum(velocity + wind, axis=0)[:-1]])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from closed_loop import rms
 from passages import BACK, LAST, LOST, OPTIONS, PLACE, hills, passage
 from referee import ArduPilot, Autopilot, Px4, Truth
 from referee.ardupilot import COPTER_RATES_HZ, PLANE_RATES_HZ
@@ -198,10 +199,6 @@ def test_the_filter_is_kalmans() -> None:
 
 
 # ---- closed loop ---------------------------------------------------------------------------------------
-
-
-def rms(values: Any) -> float:
-    return float(np.sqrt(np.nanmean(np.square(values))))
 
 
 def sail_again(kind: str, stack: str, stream: str, *, obeys: bool = True) -> tuple[Run, Autopilot]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from dataclasses import field as attribute
+from dataclasses import replace
 from datetime import timedelta
 from functools import lru_cache
 from typing import NamedTuple
@@ -24,7 +23,7 @@ from sitl.inject import HiddenEffect, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.signals import correlated, first_order
 from sitl.trajectory import Track
-from sitl.world import Water, World
+from sitl.world import Water
 
 Rows = IndexArray
 MEMORY = 0.8
@@ -55,22 +54,6 @@ TURN_ON = 20.0
 DAY = timedelta(days=1)
 CHARTS = ("map at its depth", "map")
 """Maps that serve as reference: aeromagnetic, continued down to the glider, or at flight level."""
-
-
-@dataclass(frozen=True)
-class Remembered(World):
-    """Simulated world that caches the field along a track, because all cases of a vehicle share a track."""
-
-    known: dict[bytes, FloatArray] = attribute(default_factory=dict)
-
-    def field(
-        self, time: FloatArray, latitude: FloatArray, longitude: FloatArray, depth: FloatArray
-    ) -> FloatArray:
-        """Return the field of :meth:`~sitl.world.World.field`, (n, 3) nT, from the cache if possible."""
-        way = np.stack([time, latitude, longitude, depth]).tobytes()
-        if way not in self.known:
-            self.known[way] = super().field(time, latitude, longitude, depth)
-        return self.known[way]
 
 
 class Deployment(NamedTuple):
@@ -153,7 +136,6 @@ def rebuilt(deployment: Deployment, later: timedelta = timedelta()) -> Deploymen
 
 
 def _flown(twin: Twin, calibration: Calibration) -> Deployment:
-    twin = replace(twin, world=Remembered(twin.world.origin, twin.world.rock, twin.world.water))
     track = twin.fly()
     # the hull's inertia: without it the attitude would change in steps, and a delay of a millisecond would
     # look like noise
