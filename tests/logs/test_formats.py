@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from demos import demo_log
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -93,6 +94,17 @@ def assert_same(back: xr.Dataset, dataset: xr.Dataset) -> None:
 TOLERANCES = {"latitude": 0.6e-7, "longitude": 0.6e-7, "depth": 0.6e-3, "heading": 5e-5, "total_field": 0.0}
 
 
+def assert_close(back: xr.Dataset, dataset: xr.Dataset) -> None:
+    """Assert equality as :func:`assert_same`, to the precision of the messages: float32, 1e-7 deg, mm, µs."""
+    assert set(back.data_vars) == set(dataset.data_vars)
+    for name, column in dataset.variables.items():
+        atol = TOLERANCES.get(str(name), 0.6e-6 if "time" in str(name) else 1e-30)
+        rtol = 0.0 if name in TOLERANCES or "time" in str(name) else 1.3e-7
+        np.testing.assert_allclose(back[name].values, column.values, rtol, atol, err_msg=str(name))
+        assert back[name].attrs == column.attrs
+    assert back.attrs.get("heading_reference") == dataset.attrs.get("heading_reference")
+
+
 @pytest.mark.parametrize("suffix", EXACT)
 @given(dataset=deployments(width=64))
 @settings(max_examples=25, deadline=None)
@@ -115,6 +127,19 @@ def test_any_numbers_pass_through_a_telemetry_log(dataset: xr.Dataset) -> None:
     for name in set(dataset.data_vars) - set(COLUMNS):
         np.testing.assert_array_equal(back[name], dataset[name], err_msg=name)
         assert back[name].attrs == dataset[name].attrs
+
+
+@pytest.mark.parametrize("suffix", WRITABLE)
+def test_in_pieces_is_as_whole(suffix: str, tmp_path: Path) -> None:
+    dataset = example()
+    whole, pieces = tmp_path / f"whole{suffix}", tmp_path / f"pieces{suffix}"
+    logs.write(dataset, whole)
+    with logs.Writer(pieces) as writer:
+        for piece in logs.read_chunks(whole, 17):
+            assert piece.sizes["time"] <= 17
+            assert set(piece.data_vars) == set(dataset.data_vars)
+            writer.append(piece)
+    assert_close(logs.read(pieces), dataset)
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)
@@ -250,6 +275,18 @@ def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
 
 
 # ---- data frames in and out --------------------------------------------------------------------------------
+
+
+def test_there_and_back_keeps_every_number_and_unit() -> None:
+    log = demo_log().isel(time=slice(0, 50))
+    frame = mb.to_frame(log)
+    assert str(frame.index.tz) == "UTC"
+    back = mb.from_frame(frame, frame.attrs)
+    assert set(back) == set(log)
+    np.testing.assert_allclose(back["time"], log["time"], atol=1e-6)  # a data frame's moments are in us
+    for name in log:
+        np.testing.assert_array_equal(back[name], log[name])
+        assert back[name].attrs["units"] == log[name].attrs["units"]
 
 
 @pytest.mark.parametrize(

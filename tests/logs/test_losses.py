@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -109,6 +110,16 @@ def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
     assert passed_over(*(piece.attrs for piece in pieces)) == {"files_skipped": 1}
     named = [line for piece in pieces for line in named_losses(piece.attrs)]
     assert named == [f"{paths[1]}: expected text in UTF-8"]
+
+
+def test_what_was_lost_is_reported_in_a_few_lines(tmp_path: Path, command: Command) -> None:
+    paths = made(tmp_path, 12, tuple(range(1, 9)))
+    lines = command("convert", *paths, "-o", tmp_path / "x.nc").err.splitlines()
+    assert lines[0] == "magbridge: in the logs: 8 files skipped"
+    assert lines[1] == f"magbridge: {paths[1]}: row 2: expected rows after the header"
+    assert lines[-1] == "magbridge: and in 3 places more"
+    assert len(lines) == 7
+    assert not {"losses", "files_skipped"} & logs.read(tmp_path / "x.nc").attrs.keys()
 
 
 def test_a_file_is_what_its_bytes_say(tmp_path: Path) -> None:
