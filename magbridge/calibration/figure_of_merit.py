@@ -106,10 +106,8 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
     fourfold = np.exp(4j * np.radians([one.heading for one in found])).mean()
     first = float(np.degrees(np.angle(fourfold))) / 4.0
     longest: dict[tuple[int, str], Manoeuvre] = {}
-    for one in found:
-        key = round((one.heading - first) / QUARTER_TURN_DEG) % 4, one.axis
-        if key not in longest or _length(one) > _length(longest[key]):
-            longest[key] = one
+    for one in sorted(found, key=lambda one: one.rows.start - one.rows.stop):  # the longest first
+        longest.setdefault((round((one.heading - first) / QUARTER_TURN_DEG) % 4, one.axis), one)
     return tuple(
         longest[key] for key in sorted(longest, key=lambda key: (key[0], MANOEUVRE_AXES.index(key[1])))
     )
@@ -148,10 +146,6 @@ def merit_text(merit: dict[str, Any]) -> str:
         f"figure of merit {merit['before_nT']:.2f} -> {merit['after_nT']:.2f} nT over "
         f"{merit['manoeuvres']} manoeuvres, improvement ratio {merit['improvement_ratio']:.1f}"
     )
-
-
-def _length(manoeuvre: Manoeuvre) -> int:
-    return int(manoeuvre.rows.stop - manoeuvre.rows.start)
 
 
 def _filled(values: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from fleets import fly
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.file import load
-from magbridge.calibration.fitting.pose import LATENT, MOMENT, Mounting, mass_columns
+from magbridge.calibration.fitting.pose import LATENT, MOMENT, Mounting, mass_columns, rescaling
 from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
@@ -224,9 +224,10 @@ def test_it_teaches_what_its_data_determined(
         command(*adding(catalogue, cal), "--date", "2026-05-01")
     assert status(catalogue)["vehicles"][0]["given"] == 1
     (given,) = lessons(catalogue, "comet")
-    known = fleet_of(catalogue, "comet").known("comet", "may").rescaled(load(cal).parameters, given.field)
-    sigma = np.sqrt(np.diag(known.covariance))
-    assert (np.abs(known.mean - load(cal).coefficients) < 3.0 * sigma).all()
+    known = fleet_of(catalogue, "comet").known("comet", "may")
+    L = rescaling(known.exponents, known.parameters, load(cal).parameters, known.field, given.field)
+    sigma = np.sqrt(np.diag(L @ known.covariance @ L.T))
+    assert (np.abs(L @ known.mean - load(cal).coefficients) < 3.0 * sigma).all()
     assert sigma[6:9].max() < 200.0  # against 3,000 of a vehicle of which nothing is known
     # the same data calibrated here, too, count once
     add_logs(catalogue, "comet", Deployment("may", ()), [log])

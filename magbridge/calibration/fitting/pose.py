@@ -267,12 +267,6 @@ class Known:
             names=(DEPARTURE,),
         )
 
-    def rescaled(self, parameters: tuple[Parameter, ...], field: float) -> Known:
-        """Return this prior for the scaling of other `parameters` and for another F_0 `field` (nT)."""
-        L = rescaling(self.exponents, self.parameters, parameters, self.field, field)
-        P = L @ self.covariance @ L.T
-        return replace(self, parameters=parameters, field=field, mean=L @ self.mean, covariance=P)
-
 
 def rescaling(
     exponents: Sequence[Exponents],

@@ -77,8 +77,6 @@ class Limits:
     """Smallest and largest roll in a spiral, deg."""
     pitch: tuple[float, float] = (14.0, 30.0)
     """Smallest and largest absolute pitch of dives and climbs, deg."""
-    parameters: tuple[tuple[float, float], ...] = ()
-    """Smallest and largest value of each parameter, in its unit; empty: those of the calibration."""
     pitch_at: Callable[[FloatArray], float] | None = None
     """Function of the positions (k,) that returns the pitch (deg) of the trimmed vehicle; None: any pitch."""
     flown: FloatArray | None = None
@@ -118,10 +116,9 @@ def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray
 def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
     """Return all runs within the limits, on a grid with `levels` values of each position."""
     # Grid over positions, pitch and roll; only positions near flown ones, and pitches near their trim.
-    ends = limits.parameters or tuple((p.low, p.high) for p in parameters)
     rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
     found = []
-    for positions in product(*(np.linspace(low, high, levels) for low, high in ends)):
+    for positions in product(*(np.linspace(one.low, one.high, levels) for one in parameters)):
         if limits.flown is not None and not _is_near_flown(np.array(positions), limits.flown, parameters):
             continue
         if limits.pitch_at is None:
