@@ -84,7 +84,7 @@ class Position:
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify = notify
         self._where: tuple[float, float] | None = None
-        self._depth = 0.0
+        self._depth, self._place = 0.0, (nan, nan, nan)
         self._when_us = self._failed_us = 0
         self._held = HeldField()
         self._vector = UNKNOWN_VECTOR
@@ -119,6 +119,7 @@ class Position:
         latitude, longitude = lat * 1e-7, lon * 1e-7
         if self._where != (latitude, longitude) or self._depth != -altitude:
             self._where, self._depth, self._failed_us = (latitude, longitude), -altitude, 0
+            self._place = latitude, longitude, -altitude
         self._when_us = time_us
         self._watch_for_jumps(time_us)
 
@@ -155,7 +156,7 @@ class Position:
         ):
             return nan
         try:
-            return self._held.field_at((*self._where, self._depth), utc_us)
+            return self._held.field_at(self._place, utc_us)
         except (OSError, MagbridgeError) as error:  # OSError: no file handle is left
             self._failed_us = utc_us
             self._notify(str(error))

@@ -139,14 +139,14 @@ class TelemetryMap:
 
         STATUSTEXTs report a second sender, and a change of the source.
         """
-        source, sender = self._sources[name], f"{message.system}:{message.component}"
+        source = self._sources[name]
         before = source.component
         if not source.admit(message.component, time_us):
-            text = f"{name} also from {sender}: not used"
+            text = f"{name} also from {message.system}:{message.component}: not used"
             output.announce(f"source {name} {message.component}", text, MAV_SEVERITY.WARNING)
             return False
         if message.component != before and before is not None:
-            text = f"{name} now from {sender}, not {before}"
+            text = f"{name} now from {message.system}:{message.component}, not {before}"
             output.announce(f"source {name}", text, MAV_SEVERITY.WARNING)
         return True
 
