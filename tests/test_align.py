@@ -75,6 +75,15 @@ def test_stale_telemetry_is_flagged_and_its_sigma_grows() -> None:
     assert sigmas[-1] == pytest.approx(2.0 * 29)
 
 
+def test_telemetry_never_seen_spans_the_whole_range() -> None:
+    ballast = Input("ballast", -1.0, 3.0, max_age=10.0)
+    sample = Aligner((ballast,), Align()).reading(reading(), START)
+    assert flags(sample) == {"stale_telemetry"}
+    assert sample.values == (1.0,)  # the middle of the range
+    assert sample.spans == ((0, -1.0, 3.0),)
+    assert sample.age == inf
+
+
 def test_before_the_first_telemetry_its_age_is_the_time_until_then() -> None:
     aligner = Aligner((BATTERY,), Align(filter_delay=5.0))
     aligner.telemetry("battpos", START, 0.3)

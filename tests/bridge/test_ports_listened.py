@@ -23,6 +23,7 @@ from magbridge.bridge.ports import listen, recognise
 from magbridge.config import load
 from magbridge.errors import PortError
 from magbridge.mavlink import Codec
+from magbridge.sensors.options import driver_names, options_of
 
 
 def nmea(text: str) -> bytes:
@@ -111,6 +112,15 @@ def test_a_busy_port_is_reported_as_such() -> None:
             listen(name, (9600,), 0.1)
         other.communicate(b"\n")
     assert refused.value.reason.startswith("busy: ")
+
+
+@pytest.mark.parametrize("driver", driver_names())
+def test_every_option_of_a_driver_is_reported(driver: str, command: Command) -> None:
+    output = command("drivers", driver).out
+    for one in options_of(driver):
+        assert one.name in output
+        assert one.kind
+        assert one.meaning, one.name
 
 
 @pytest.mark.parametrize(

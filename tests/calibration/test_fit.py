@@ -248,6 +248,14 @@ def test_a_stuck_channel_and_counts_are_named(glider: Gliders) -> None:
         fit(replace(runs, field=runs.field * [1.0, 0.0, 1.0] + [0.0, 43_000.0, 0.0]))
 
 
+def test_nominal_constraints(glider: Gliders) -> None:
+    posed, found, _ = ellipsoid(glider(0).runs, constrained=True)
+    assert found.coefficients[0] == found.coefficients[2]
+    assert not found.coefficients[3:6].any()
+    assert not found.covariance[3:6].any()
+    assert posed.samples.phi.shape[1] == 1
+
+
 @pytest.mark.parametrize(
     ("unmapped", "map_sigma", "bias"), [(0.0, None, 0.0), (1.0, None, MAIN_FIELD_SIGMA_NT), (1.0, 30.0, 30.0)]
 )

@@ -85,6 +85,13 @@ def test_only_real32(link: Line) -> None:
     assert link.only(received, "PARAM_VALUE")[0].param_value == 2.5
 
 
+def test_a_rate_parameter_is_obeyed(link: Line) -> None:
+    write(link, "MB_R_HEARTBEAT", 5.0)
+    assert len(link.only(link.to(10.05), "HEARTBEAT")) == pytest.approx(50, abs=1)
+    write(link, "MB_R_STATUS", -1.0)
+    assert not link.only(link.to(20), "MAG_STATUS")
+
+
 def test_kept_parameters_come_back(make_link: MakeLine) -> None:
     link = make_link(kept={"MB_GAP_FACTOR": 3.5, "MB_R_RAW": 2.0, "GONE": 1.0})
     assert link.component.parameters["MB_GAP_FACTOR"] == 3.5

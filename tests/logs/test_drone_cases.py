@@ -291,6 +291,14 @@ def test_every_field_is_as_pymavlink_reads_it(name: str, tmp_path: Path) -> None
     assert same_as_pymavlink(path, DFReader_text if is_text else DFReader_binary, ours) == 40 * 8
 
 
+@pytest.mark.parametrize("records", [1, 2])
+def test_a_log_in_which_no_record_joins_another_holds_none(records: int, tmp_path: Path) -> None:
+    fmt = described(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")
+    (tmp_path / "log.bin").write_bytes((fmt + b"?") * records)
+    ours = read_binary(tmp_path / "log.bin", EVERYTHING)
+    assert (ours.records, ours.skipped) == ({}, 90 * records)
+
+
 def test_of_a_record_with_a_field_of_unknown_length_what_stands_before_it_is_read(tmp_path: Path) -> None:
     """The reader reads nothing beyond the record's end, even with a damaged description."""
     log = Log({"MAG": (14, "Qhh", "TimeUS,MagX,MagY")})
