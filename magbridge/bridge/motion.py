@@ -27,7 +27,7 @@ from magbridge.navigate.attitude import AttitudeFilter
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.records import Corrected, Quality
 
-__all__ = ["FIX_3D", "LONGEST_US", "Autopilot", "Motion", "MotionSource"]
+__all__ = ["FIX_3D", "GPS_RAW", "LONGEST_US", "Autopilot", "Motion", "MotionSource"]
 
 MAX_MAIN_FIELD_AGE_US = 60_000_000
 """Longest time for which the main field at one position is used, µs."""

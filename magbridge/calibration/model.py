@@ -42,9 +42,9 @@ from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.wording import counted
 
 __all__ = [
-    "LEVEL_STEP_SIGMA", "MIN_HALF_RANGE", "Boresight", "CalibratedRange", "CalibratedSensor", "Calibration",
-    "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "facts", "identity", "rotation_matrix",
-    "skew", "to_paper",
+    "LEVEL_STEP_SIGMA", "MIN_HALF_RANGE", "SLOT", "Boresight", "CalibratedRange", "CalibratedSensor",
+    "Calibration", "Noise", "Parameter", "Reference", "Run", "coefficient_tensor", "facts", "identity",
+    "rotation_matrix", "skew", "to_paper",
 ]  # fmt: skip
 
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))

@@ -26,7 +26,10 @@ from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.sparse import SparseFactor
 
-__all__ = ["ColumnProducts", "FieldEliminated", "LinearisedRows", "SampleSums", "eliminate_field", "sum_rows"]
+__all__ = [
+    "MAX_CONDITION", "ColumnProducts", "FieldEliminated", "LinearisedRows", "SampleSums", "eliminate_field",
+    "sum_rows",
+]  # fmt: skip
 
 MAX_CONDITION = 1e16
 """Largest condition number of a prior's precision. Beyond it, rounding changes the log evidence by 3 to 10,
