@@ -19,6 +19,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,8 +93,9 @@ class Flash(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    """A kind of record, as an ``FMT`` record describes it."""
+    """A kind of record, as an ``FMT`` record describes it, and the first byte for which it is valid."""
 
+    since: int
     length: int
     name: str
     letters: str
@@ -110,37 +112,70 @@ def read_binary(path: Path, wanted: Collection[str]) -> Flash:
         found.append(start + np.flatnonzero(is_header))
     headers = np.concatenate(found) if found else np.empty(0, dtype=np.intp)
     kinds = _kinds(data, headers)
-    table = np.zeros(256, dtype=np.intp)
-    for number, kind in kinds.items():
-        table[number] = kind.length
-    lengths = table[data[headers + 2]]  # 0 for a kind that is not described
+    table, numbers = np.zeros(256, dtype=np.intp), data[headers + 2]
+    for number, described in kinds.items():
+        table[number] = described[0].length
+    lengths = table[numbers]  # 0 for a kind that is not described
+    for number, (_, *again) in kinds.items():
+        for kind in again:
+            lengths[(numbers == number) & (headers >= kind.since)] = kind.length
     headers, lengths = headers[lengths > 0], lengths[lengths > 0]
     believed = _chained(headers, headers + lengths, data.size)
     at = headers[believed]
     numbers = data[at + 2]
-    records: dict[str, Records] = {}
+    pieces: dict[str, list[Records]] = {}
     letters: dict[tuple[str, str], str] = {}
-    for number, kind in kinds.items():
-        if kind.name in wanted and len(here := at[numbers == number]):
-            records[kind.name] = Records(here, _decoders(data, kind))
-            fields = zip(kind.columns, kind.letters, strict=False)
-            letters |= {(kind.name, name): letter for name, letter in fields}
+    for number, described in kinds.items():
+        here = at[numbers == number]
+        ends = np.searchsorted(here, [kind.since for kind in described[1:]])
+        for kind, positions in zip(described, np.split(here, ends), strict=True):
+            if kind.name in wanted and len(positions):
+                pieces.setdefault(kind.name, []).append(Records(positions, _decoders(data, kind)))
+                fields = zip(kind.columns, kind.letters, strict=False)
+                letters |= {(kind.name, name): letter for name, letter in fields}
+    records = {name: _joined(found) for name, found in pieces.items()}
     return Flash(records, letters, int(data.size - lengths[believed].sum()))
 
 
-def _kinds(data: Bytes, headers: IndexArray) -> dict[int, _Kind]:
-    """Return number -> kind of record that a log describes, without contradictory descriptions."""
+def _joined(pieces: Sequence[Records]) -> Records:
+    """Return records of one kind that several descriptions read, with the fields that all of them have."""
+    first, *others = pieces
+    if not others:
+        return first
+
+    def values(field: str, starts: IndexArray) -> Any:
+        chosen = [part.part(np.isin(part.at, starts)) for part in pieces]
+        found = [[*part[field]] for part in chosen]
+        order = np.argsort(np.concatenate([part.at for part in chosen]))
+        together = [*chain(*found)]
+        in_order = [together[k] for k in order.tolist()]
+        return in_order if in_order and isinstance(in_order[0], str) else np.array(in_order, float)
+
+    shared = [field for field in first if all(field in other for other in others)]
+    positions = np.sort(np.concatenate([part.at for part in pieces]))
+    return Records(positions, {field: partial(values, field) for field in shared})
+
+
+def _kinds(data: Bytes, headers: IndexArray) -> dict[int, list[_Kind]]:
+    """Return number -> layouts of a kind of record in file order, without contradictory descriptions.
+
+    Of a kind that is described again, as after a boot with other firmware, each layout is valid from its
+    description on.
+    """
     at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
     at = at[data[at + 2] == FMT]
-    kinds: dict[int, _Kind] = {}
-    for one in _gather(data, at, FORMAT_LAYOUT):
+    kinds: dict[int, list[_Kind]] = {}
+    for start, one in zip(at.tolist(), _gather(data, at, FORMAT_LAYOUT), strict=True):
         name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
         size = int(one["length"])
         known = all(letter in LETTERS for letter in letters)
         sizes = [np.dtype(LETTERS[letter]).itemsize for letter in letters] if known else []
         is_sound = not known or RECORD_HEADER_BYTES + sum(sizes) == size
         if is_sound and size > RECORD_HEADER_BYTES and name.isalnum():
-            kinds.setdefault(int(one["type"]), _Kind(size, name, letters, columns.split(",")))
+            before = kinds.setdefault(int(one["type"]), [])
+            kind = _Kind(start if before else 0, size, name, letters, columns.split(","))
+            if not before or before[-1][1:] != kind[1:]:
+                before.append(kind)
     return kinds
 
 

@@ -19,6 +19,7 @@ from magbridge.diagnose.assessment import (
     Assessment,
     assess,
     level,
+    not_separated,
 )
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.columns import GridPoint
@@ -172,6 +173,26 @@ def test_a_shift_of_the_whole_field_with_a_wrong_reference_is_reported() -> None
 
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))
+
+
+def test_a_rival_on_another_channel_is_the_same_cause() -> None:
+    """A second thermometer that fits as well does not weaken the name."""
+    own, twin, other = (
+        candidate(cause, np.ones(1), channel=channel)
+        for cause, channel in (
+            ("temperature_offset", "hull"), ("temperature_offset", "water"), ("offset_drift", None)
+        )
+    )  # fmt: skip
+    cause = CAUSES["temperature_offset"]
+    alone, channels, causes = (
+        not_separated(own, cause, [CompetingHypothesis(one, 1.0) for one in competing]).text
+        for competing in ([], [twin], [twin, other])
+    )
+    assert "water would do nearly as well" in channels
+    for output in (alone, channels):
+        assert "none comes within odds of 20:1" in output
+    assert "cannot distinguish it from temperature offset (water) or offset drift (" in causes
+    assert cause.disambiguation in causes
 
 
 def variants(clear: Diagnosis) -> dict[str, Diagnosis]:

@@ -352,6 +352,20 @@ def test_a_record_that_was_cut_short_is_not_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mag["MagZ"], -300)
 
 
+@pytest.mark.parametrize("number", [16, 99])
+def test_a_kind_that_is_described_again(number: int, tmp_path: Path) -> None:
+    """After a boot with other firmware, each record is read by the description that precedes it."""
+    first, second = Log(), Log({**KINDS, "BARO": (number, "QBffH", "TimeUS,I,Alt,Press,More")})
+    for log, alt in ((first, 1.0), (second, 2.0)):
+        for k in range(5):
+            log.write_message("BARO", k, 0, alt, 1e5, *([7] if log is second else []))
+    first.data += second.data
+    ours = read_binary(write(tmp_path, first), EVERYTHING)
+    assert ours.skipped == 0
+    np.testing.assert_array_equal(ours.records["BARO"]["Alt"], [1.0] * 5 + [2.0] * 5)
+    assert "More" not in ours.records["BARO"]
+
+
 @pytest.mark.parametrize(
     "damaged",
     [
