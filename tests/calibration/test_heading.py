@@ -96,6 +96,18 @@ def test_where_there_is_no_horizontal_field_the_heading_is_unknown() -> None:
     assert np.isinf(found.sigma[1])
 
 
+@pytest.mark.parametrize("added", [0.0, 30.0])
+def test_variance_beyond_the_calibration_s_is_shared_by_the_axes(added: float) -> None:
+    """The boresight's part of the published variance comes from naive cross products."""
+    rng = np.random.default_rng(4)
+    root, turn = rng.normal(0.0, 3.0, (3, 3)), np.diag([1e-5, 2e-5, 4e-5])
+    stated, vector = root @ root.T, np.array([20_000.0, -9_000.0, 45_000.0])
+    cross = np.cross(np.eye(3), vector)
+    published = np.trace(stated) + np.trace(cross @ turn @ cross.T) + 3.0 * added
+    (found,) = published_covariance(stated[None], turn, vector[None], np.array([published]))
+    np.testing.assert_allclose(found, stated + added * np.eye(3), atol=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_one_sample_gives_the_heading_of_the_array_path(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -8,17 +8,19 @@ import pytest
 from numpy.typing import NDArray
 from posed import calibrated, candidate, missed, right, surveyed
 from scipy.signal import lfilter
-from scipy.stats import chi2
+from scipy.stats import chi2, ncx2
 
 from magbridge.calibration.effects import TimeEffect
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.reference import ReferenceBias
 from magbridge.diagnose.columns import Candidate, GridPoint
 from magbridge.diagnose.evidence import (
+    FALSE_ALARM_RATE,
     ODDS,
     Information,
     bayes_factor_threshold,
     evidence_of,
+    isolability,
     likeness,
     log_bayes,
     log_odds,
@@ -287,6 +289,16 @@ def test_number_of_hypotheses_counts_those_that_differ(correlation: float, expec
     assert look_elsewhere_factors(info, steps, places)["offset_step"] == pytest.approx(expected, abs=0.02)
     more = look_elsewhere_factors(info, [*steps, chart], places)["offset_step"]
     assert more == pytest.approx(expected + 1.0, abs=0.02)
+
+
+def test_visible_size_is_found_with_a_probability_of_95_percent() -> None:
+    """Compare with the power of the chi-square test at the false-alarm rate of one of twelve hypotheses."""
+    step = candidate("offset_step", np.zeros((1, 1)), width=np.array([10.0]))
+    info = Information(np.array([[400.0]]), np.zeros(1), np.zeros((0, 1)))
+    ((_, _, sizes),) = isolability([step], info, {"offset_step": 3.0}, 4, {}).visible
+    ((size, _),) = sizes.values()
+    threshold = chi2.isf(FALSE_ALARM_RATE / (12.0 * step.tail), 1)
+    assert ncx2.sf(threshold, 1, 400.0 * (size / 10.0) ** 2) == pytest.approx(0.95, abs=1e-6)
 
 
 def test_likeness_is_the_correlation_of_two_columns_less_what_a_prior_prevents() -> None:

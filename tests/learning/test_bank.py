@@ -96,6 +96,21 @@ def test_the_result_of_an_alarm_is_accepted_if_it_is_far_better() -> None:
     assert bank.best is bank.quiet
 
 
+def test_an_explained_cause_moves_the_baseline_and_its_covariance_only() -> None:
+    bank, _, _ = bank_of(calibration())
+    others = [(one.coefficients.copy(), one.covariance.copy()) for one in bank.all[1:]]
+    before, spread = bank.quiet.coefficients.copy(), bank.quiet.covariance.copy()
+    n = len(bank.quiet.filter.mean)
+    step, root = np.random.default_rng(2).normal(size=n), np.eye(n) * 0.3
+    bank.explained(step, root @ root.T, 20.0)
+    size = len(before)
+    np.testing.assert_allclose(bank.quiet.coefficients - before, step[:size])
+    np.testing.assert_allclose(bank.quiet.covariance - spread, 0.09 * np.eye(size), atol=1e-6)
+    for one, (mean, covariance) in zip(bank.all[1:], others, strict=True):
+        np.testing.assert_array_equal(one.coefficients, mean)
+        np.testing.assert_array_equal(one.covariance, covariance)
+
+
 def test_a_calibration_that_follows_the_temperature_is_not_supposed_to() -> None:
     """Then only the drifting estimator and the baseline remain."""
     known = calibration()

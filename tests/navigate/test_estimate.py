@@ -97,6 +97,20 @@ def test_a_search_begins_where_dead_reckoning_since_the_last_fix_is(
     assert np.linalg.norm(estimate.x[:2] - fix) < 3.0 * sqrt(estimate.alone[0, 0])
 
 
+@pytest.mark.parametrize(("sigmas", "jumps"), [(2.0, 0), (20.0, 1)])
+def test_a_fix_restarts_the_filter_only_beyond_its_own_sigma(
+    grid: AnomalyGrid,
+    options: NavigationOptions,
+    measured: list[tuple[Block, float]],
+    sigmas: float,
+    jumps: int,
+) -> None:
+    estimate = begun(grid, options, measured[0][0], 5.0)
+    estimate.update(*measured[0])
+    estimate.correct(estimate.x[:2] + np.array([sigmas * 100.0, 0.0]), 100.0)
+    assert len(estimate.jumps) == jumps
+
+
 @pytest.mark.parametrize("share", [0.1, 0.6])
 def test_another_position_widens_the_covariance_and_one_that_is_likelier_means_lost(
     grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]], share: float
