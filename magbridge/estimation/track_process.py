@@ -96,7 +96,9 @@ def matern_transition(rate: float, metres: float) -> tuple[float, float, float, 
     """Return the four entries of F of the module's notes, row by row, for `rate` lambda, 1/m."""
     x = min(rate * metres, 300.0)
     fall = exp(-x)
-    return fall * (1.0 + x), fall * x / rate, -fall * rate * x, fall * (1.0 - x)
+    # lambda = 0: a field that is the same everywhere, as of a flat map
+    slope = fall * x / rate if rate else metres
+    return fall * (1.0 + x), slope, -fall * rate * x, fall * (1.0 - x)
 
 
 class TrackProcess:
