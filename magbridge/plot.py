@@ -173,6 +173,9 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
         above.plot(below.lines[0].get_xdata(), read, ".", ms=2, label=f"{rms(read):.0f} nT RMS")
     axes[0, 0].set_ylabel("as read minus reference, nT")
     axes[0, 0].legend(frameon=False, fontsize="small")
+    for right in axes[1, 1:]:  # label and legend of the first panel hold for its row
+        right.set_ylabel("")
+        right.get_legend().remove()
     # the median, because samples with masses in motion must not set the scale
     left = np.asarray(axes[1, 0].lines[0].get_ydata(), float)
     edge = HALF_HEIGHT_SIGMA * max(calibration.noise.sensor, robust_scale(left))

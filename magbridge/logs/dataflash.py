@@ -159,7 +159,7 @@ def _joined(pieces: Sequence[Records]) -> Records:
 def _kinds(data: Bytes, headers: IndexArray) -> dict[int, list[_Kind]]:
     """Return number -> layouts of a kind of record in file order, without contradictory descriptions.
 
-    Of a kind that is described again, as after a boot with other firmware, each layout is valid from its
+    A log describes a kind again after a boot with other firmware. Each layout is then valid from its own
     description on.
     """
     at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
