@@ -188,11 +188,9 @@ class StateChanges:
         self._stalled_since_us = self._stalled_us = self._last_stall_us = 0
         self._clock_unset = False
 
-    def end_overload(self, time_us: int) -> None:
-        """End an overload if no stall was reported for `PAUSE_US` before `time_us` (µs)."""
-        if time_us - self._last_stall_us > PAUSE_US:
-            self.is_overloaded = False
-            self._output.announce("overload", "overload is over")
+    def _end_overload(self, _: int) -> None:
+        self.is_overloaded = False
+        self._output.announce("overload", "overload is over")
 
     def _find_overload(self, time_us: int, duration_us: int) -> None:
         """Detect that successive stalls, the last of `duration_us` until `time_us`, fill most of the time."""
@@ -205,6 +203,8 @@ class StateChanges:
             self.is_overloaded = True
             text = "overload: learning pauses, fewer messages"
             self._output.announce("overload", text, MAV_SEVERITY.WARNING)
+        if self.is_overloaded:  # a timer, because a replay lacks events without data
+            self._output.run_once("overload", time_us + PAUSE_US, self._end_overload)
 
     @staticmethod
     def held_up(data: bytes) -> int:

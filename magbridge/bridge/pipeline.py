@@ -183,7 +183,7 @@ class Pipeline:
         component, recorder = self.component, self.recorder
         output, time_us, channel, data = component.output, event.time_us, event.channel, event.data
         if channel is Channel.STATE and data and (held_us := self._changes.held_up(data)):
-            for name in ("autopilot", *(stream.timer for stream in self.streams)):
+            for name in ("autopilot", "overload", *(stream.timer for stream in self.streams)):
                 output.delay(name, held_us)  # during a stall, silence cannot be observed
         output.advance(time_us)
         due: list[tuple[int, bytes]] = []
@@ -193,8 +193,6 @@ class Pipeline:
         if self._late and time_us > self._changes.until_us:
             self._late = False
             self._set_late(0)
-        if self._changes.is_overloaded:
-            self._changes.end_overload(time_us)
         if channel is SENSOR:
             recorder.sensor(time_us, data, event.sensor_id)
             if (stream := self._by_id.get(event.sensor_id)) is not None:
