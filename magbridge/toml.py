@@ -77,13 +77,17 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
         if match := re.match(r"Object (contains unknown|missing required) field `([^`]*)`", sentence):
             sentence = "missing key"
             if "unknown" in match[1]:
-                sentence = "unknown key" + suggestion(match[2], _valid_keys(kind, keys))
+                sentence = "unknown key" + suggestion(match[2], _valid(kind, keys))
             keys = f"{keys}.{match[2]}".lstrip(".")
+        elif match := re.match("Invalid enum value (.*)", sentence):
+            sentence = f"expected one of {', '.join(_valid(kind, keys))}, not {match[1]}"
+        elif (match := re.match(r"([\w.]+): ", sentence)) and match[1].split(".")[0] in _valid(kind, keys):
+            keys, sentence = f"{keys}.{match[1]}".lstrip("."), sentence[match.end() :]
         raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error
 
 
-def _valid_keys(kind: Any, keys: str) -> list[str]:
-    """Return the keys of the table at the dotted path `keys` in `kind`; empty if it is not a struct."""
+def _valid(kind: Any, keys: str) -> list[str]:
+    """Return what is valid at the dotted path `keys` in `kind`: the keys of a table, or the listed values."""
     tables = [inspect.type_info(kind)]
     for key in [*filter(None, re.split(r"\.|(?=\[)", keys)), None]:
         tables = [
@@ -93,7 +97,8 @@ def _valid_keys(kind: Any, keys: str) -> list[str]:
             break
         tables = [inner for one in tables for inner in _entries(one, key)]
     fields = [field for one in tables if isinstance(one, inspect.StructType) for field in one.fields]
-    return [field.encode_name for field in fields]
+    values = [value for one in tables if isinstance(one, inspect.LiteralType) for value in one.values]
+    return [field.encode_name for field in fields] or list(map(repr, values))
 
 
 def _entries(table: inspect.Type, key: str) -> list[inspect.Type]:

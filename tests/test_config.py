@@ -83,9 +83,9 @@ def test_another_encoding(tmp_path: Path) -> None:
         ("[telemetry", "signing_key = 'key.bin'\n[telemetry", "link.signing_key: no such file"),
         ("[log]", "[navigation]\nmap = 'grid.nc'\n[log]", "navigation.map: no such file"),
         ('unit = "in"', "max_age = inf", "telemetry.battpos.max_age: expected `float` <= 1000000000"),
-        ('unit = "in"', "scale = 0.0", "telemetry.battpos: scale: expected a finite number other than 0"),
-        ('unit = "in"', "offset = nan", "telemetry.battpos: offset: expected a finite number, got nan"),
-        ('unit = "in"', "delay = 1e4", "battpos: delay: expected at most 600 s either way, got 10000.0"),
+        ('unit = "in"', "scale = 0.0", "telemetry.battpos.scale: expected a finite number other than 0"),
+        ('unit = "in"', "offset = nan", "telemetry.battpos.offset: expected a finite number, got nan"),
+        ('unit = "in"', "delay = 1e4", "battpos.delay: expected at most 600 s either way, got 10000.0"),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = 'fast'", "publish.HIGHRES_IMU: expected `float`, got `str`"),
         (
             'url = "udpout:192.0.2.1:14550"',
@@ -96,7 +96,7 @@ def test_another_encoding(tmp_path: Path) -> None:
         (
             "[telemetry",
             "component = 1\n[telemetry",
-            "component: expected another number than the autopilot's, got 1",
+            "link.component: expected another number than the autopilot's, got 1",
         ),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = inf", "publish.HIGHRES_IMU: expected `float` <= 1000000000"),
         ("[sensor]", "path = 'x'\n[sensor]", "path: unknown key"),

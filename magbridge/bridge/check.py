@@ -81,12 +81,19 @@ def findings(path: Path) -> list[ConfigFault]:
 
 
 def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[ConfigError]:
-    """Yield the errors of `attempt`; remove the faulty key from `table` before each further attempt."""
+    """Yield the errors of `attempt`; remove the faulty key from `table` before each further attempt.
+
+    A required key is missing after its removal, which ends the attempts.
+    """
+    removed = set[str]()
     while True:
         try:
             attempt()
         except ConfigError as error:
+            if error.key in removed:
+                return
             yield error
+            removed.add(error.key)
             if _remove_key(table, error.key):
                 continue
         return
@@ -122,6 +129,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
     if config.link.url.partition(":")[0] not in LINKS:
         yield from _device(config, "link.url", config.link.url.removeprefix("serial:"))
     yield from _tried(lambda: nmea_port(config))
+    yield from _tried(lambda: ports(config))
     if config.link.signing_key and (key := config.resolve(config.link.signing_key)).exists():
         yield from _tried(lambda: load_key(key))
     for name, one in config.telemetry.items():

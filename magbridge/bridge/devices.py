@@ -346,16 +346,16 @@ class BusPort(Port):
 def sensor_port(sensor: Sensor, path: Path) -> SerialPort | BusPort:
     """Return the (unopened) port of a sensor in the configuration `path`: a serial line, or a part on a bus.
 
-    ConfigError: the port's name is neither, the driver cannot read a bus, or the bus library is not
-        installed.
+    ConfigError: the port's name is neither, the driver is not one for this kind of port or has a wrong
+        option, or the bus library is not installed.
     """
     source, key = str(path), sensor.key
-    if not sensor.port.startswith(("i2c:", "spi:")):
+    driver = open_driver(sensor.driver, sensor.options, source, key)
+    if not sensor.port.startswith(("i2c:", "spi:")) and not isinstance(driver, BusDriver):
         return serial_line(sensor.port, sensor.baudrate, source, f"{key}.port")
     if not BUS_ADDRESS.fullmatch(sensor.port):
         expected = "expected i2c:BUS:ADDRESS such as i2c:1:0x20, or spi:BUS.DEVICE such as spi:0.0"
         raise ConfigError(source, f"{key}.port", f"{expected}, got {sensor.port!r}")
-    driver = open_driver(sensor.driver, sensor.options, source, key)
     if not isinstance(driver, BusDriver):
         raise ConfigError(source, f"{key}.driver", f"expected rm3100 on a bus, got {sensor.driver!r}")
     library = "smbus2" if sensor.port.startswith("i2c:") else "spidev"

@@ -349,7 +349,7 @@ def open_link(
         if not port and kind in ("udpout", "tcp"):  # as a local port, 0 is any that is free
             raise ValueError(url)  # noqa: TRY301 - as `parse_address` does
     except ValueError as error:
-        raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
+        raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {address!r}") from error
     peers = Peers(autopilot, budget=budget, signed=signed) if kind.endswith("in") else None
     if kind.startswith("udp"):
         return UdpPort(url, (host, port), peers)

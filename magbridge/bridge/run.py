@@ -9,6 +9,7 @@ the sequence numbers.
 from __future__ import annotations
 
 import gc
+import glob
 import os
 import signal
 import sys
@@ -23,14 +24,14 @@ from threading import Thread
 import msgspec
 
 from magbridge.bridge import events
-from magbridge.bridge.devices import sensor_port
+from magbridge.bridge.devices import BusPort, SerialPort, sensor_port
 from magbridge.bridge.events import HostClock, LiveEdge, StartEvent, port_number
 from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.links import nmea_port, open_link
 from magbridge.bridge.pipeline import Pipeline, drive, set_up
 from magbridge.bridge.port import Port
 from magbridge.config import Config, load
-from magbridge.errors import FormatError
+from magbridge.errors import ConfigError, DataError, FormatError, WrongUse
 from magbridge.files import atomic_path
 from magbridge.link.files import FtpServer, LogTransfer, Tree
 from magbridge.logs.tlog import TlogWriter
@@ -156,10 +157,15 @@ def run(path: Path) -> None:
     """
     if sys.stderr.isatty():
         print(f"{path}: running until Ctrl-C; announcements on the link are repeated here", file=sys.stderr)
-    config, clock = load(path), HostClock()
-    keeper = Keeper(config)
-    pipeline = set_up(config, keeper.start(clock.now_us()))
-    opened = ports(config)
+    clock = HostClock()
+    try:
+        config = load(path)
+        keeper = Keeper(config)
+        pipeline = set_up(config, keeper.start(clock.now_us()))
+        opened = ports(config)
+    except (ConfigError, DataError) as error:
+        error.exit_code = WrongUse.exit_code  # a service restarts the bridge after any other code
+        raise
     link, edge = opened[Channel.LINK], LiveEdge(opened, clock)
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
@@ -221,7 +227,7 @@ def ports(config: Config) -> dict[int, Port]:
 
     The link is the first, so that the bridge can report another port that does not open.
 
-    ConfigError: a port's name is not valid.
+    ConfigError: a port's name is not valid, or two ports are one device.
     """
     own = config.link
     link = open_link(
@@ -234,7 +240,18 @@ def ports(config: Config) -> dict[int, Port]:
     )
     sensors = {port_number(one.id or 0): sensor_port(one, config.path) for one in config.sensors}
     nmea = nmea_port(config)
-    return {Channel.LINK: link, **sensors, **({MAG_PORT_NAME.NMEA: nmea} if nmea is not None else {})}
+    opened = {Channel.LINK: link, **sensors, **({MAG_PORT_NAME.NMEA: nmea} if nmea is not None else {})}
+    keys = "link.url", *(f"{one.key}.port" for one in config.sensors), "heading.nmea"
+    used = dict[str, str]()
+    for key, port in zip(keys, opened.values(), strict=False):
+        is_local = isinstance(port, SerialPort | BusPort) and "://" not in port.name
+        if is_local and not glob.has_magic(port.name):
+            other = used.setdefault(os.path.realpath(port.name), key)
+            if other != key:
+                raise ConfigError(
+                    config.path, key, f"expected another device than {other}, got {port.name!r}"
+                )
+    return opened
 
 
 def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:

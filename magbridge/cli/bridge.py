@@ -113,9 +113,7 @@ def _check(config: Path, *, live: bool, json: bool) -> None:
     FailedResult: the bridge would not start.
     """
     from magbridge.bridge.check import findings
-    from magbridge.toml import load_toml
 
-    load_toml(config)  # an unreadable file is an error, not a finding
     found, arriving = findings(config), dict[str, Any]()
     errors = sum(one.fatal for one in found)
     if live and not errors:
@@ -327,7 +325,8 @@ def init(
     asks = not json and sys.stdin.isatty() and sys.stdout.isatty()
     names = f"drivers: {', '.join(driver_names())} (magbridge drivers NAME: its options)"
     driver = driver or _ask("1. Which sensor?", names, "digitizer", asks, "--driver")
-    port = port or _ask("2. On which port?", _ports_listed(), "/dev/ttyUSB*", asks, "--port")
+    default = "i2c:1:0x20" if driver == "rm3100" else "/dev/ttyUSB*"
+    port = port or _ask("2. On which port?", _ports_listed(), default, asks, "--port")
     default = "udpout:127.0.0.1:14550"
     link = link or _ask("3. Where is the autopilot or the ground station?", "", default, asks, "--link")
     number = system or _system(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))

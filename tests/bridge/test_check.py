@@ -64,7 +64,7 @@ def test_all_findings_come_at_once(config: Path) -> None:
     for words in (
         "sensor.baudrat: unknown key; did you mean baudrate?",
         "lgo: unknown key; did you mean log?",
-        "sensor.options.rate: invalid enum value 21",
+        "sensor.options.rate: expected one of 10, 20,",
         "sensor.options.speed: unknown key",
         "link.url: expected udpin, udpout",
         "telemetry.battpos.message: unknown MAVLink message 'NAMED_VALUE'",
@@ -100,9 +100,17 @@ BARE = GOOD.replace('[calibration]\nfile = "cal.json"\n', "")
         (GOOD + "[learning]\nranges = {battpos = [1.0, -1.0]}", True, "ranges.battpos"),
         (GOOD + "[learning]\nmax_rate = 0.0", True, "learning.max_rate"),
         (GOOD + "[learning]\nspeed = 3", True, "learning.speed: unknown key"),
-        (GOOD + '[heading]\nsend = "gps"', True, "heading.send"),
+        (
+            GOOD + '[heading]\nsend = "gps"',
+            True,
+            "heading.send: expected one of 'odometry', 'vision_position_estimate', not 'gps'",
+        ),
         (GOOD + "[heading]\nrat = 1", True, "heading.rat: unknown key"),
-        (GOOD + '[heading]\nnmea = "udp:nowhere"', True, "heading.nmea"),
+        (
+            GOOD + '[heading]\nnmea = "udp:nowhere"',
+            True,
+            "heading.nmea: expected HOST:PORT or [IPV6]:PORT, got 'nowhere'",
+        ),
         (BARE + '[navigation]\nmap = "none.nc"\nfix = "TELEPATHY"', True, "navigation.fix: expected one of"),
         (GOOD.replace("hmr2300", "twinleaf"), False, "every sample would be uncalibrated"),
         (GOOD.replace('"logs"', '"bridge.toml"'), False, "bridge.toml is a file"),
@@ -111,6 +119,43 @@ BARE = GOOD.replace('[calibration]\nfile = "cal.json"\n', "")
 def test_what_run_would_end_at_or_warn_of(text: str, is_fatal: bool, words: str, config: Path) -> None:
     config.write_text(text)
     assert any(words in line for line in lines(config, fatal=is_fatal))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ("udpout:127.0.0.1:14550", "", "link.url: expected `str` of length >= 1"),
+        ("[link]", "[link]\ncomponent = 1", "link.component: expected another number than the autopilot's"),
+        ('"hmr2300"', '"ascii"\noptions.columns = ["x"]', "sensor.options.columns: expected x, y and z,"),
+        ("udpout:127.0.0.1:14550", "/dev/null", "sensor.port: expected another device than link.url, got"),
+    ],
+)
+def test_a_wrong_value_is_one_error(config: Path, old: str, new: str, error: str) -> None:
+    config.write_text(GOOD.replace("options = {}\n", "").replace(old, new))
+    (line,) = lines(config, fatal=True)
+    assert line.startswith(error)
+
+
+def test_two_sensors_are_two_devices(tmp_path: Path) -> None:
+    (tmp_path / "tty").symlink_to("/dev/null")
+    names = {"a": "/dev/null", "b": str(tmp_path / "tty")}
+    sensors = [f'[sensor.{name}]\ndriver = "ascii"\nport = "{port}"' for name, port in names.items()]
+    path = tmp_path / "bridge.toml"
+    path.write_text("\n".join([*sensors, '[link]\nurl = "udpout:127.0.0.1:14550"']))
+    assert lines(path, fatal=True) == [
+        f"sensor.b.port: expected another device than sensor.a.port, got {names['b']!r}"
+    ]
+
+
+@pytest.mark.parametrize("more", ["", '[learning]\nreference = "grid.nc"', '[navigation]\nmap = "grid.nc"'])
+def test_a_damaged_file_ends_run_as_a_wrong_configuration(config: Path, more: str, command: Command) -> None:
+    """The service unit does not restart after exit code 2."""
+    (config.parent / ("grid.nc" if more else "cal.json")).write_text("damaged")
+    config.write_text(GOOD + more)
+    command.refuses("run", "--config", config, code=2)
+    config.write_text("[sensor")
+    assert "expected TOML" in command.refuses("run", "--config", config, code=2)
+    assert "expected TOML" in command("run", "--check", "--config", config, code=2).err
 
 
 @pytest.mark.parametrize(

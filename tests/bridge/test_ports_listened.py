@@ -17,6 +17,7 @@ import pytest
 from commands import Command
 from devices import serial_line
 
+from magbridge.bridge import devices as devices_of_bridge
 from magbridge.bridge.check import findings
 from magbridge.bridge.init import Answers, bridge_toml
 from magbridge.bridge.ports import listen, recognise
@@ -143,6 +144,14 @@ def test_init_writes_what_run_would_start_with(
     assert "would start" in command("run", "--check", "--config", "bridge.toml").out
     assert "exists already and is not overwritten" in command.refuses("init", code=2)
     assert not (here / "logs").exists()
+
+
+def test_init_offers_a_port_on_which_the_sensor_can_be(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(devices_of_bridge, "find_spec", lambda _: True)  # the library of the bus
+    command("init", "--driver", "rm3100")
+    assert load("bridge.toml").sensor.port == "i2c:1:0x20"
 
 
 def test_init_names_the_autopilots_own_message_of_a_parameter() -> None:

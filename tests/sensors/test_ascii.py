@@ -174,5 +174,5 @@ def test_lines_of_scalar_instruments(line: str, options: dict[str, Any], total: 
 
 
 def test_a_scale_of_zero_is_an_error() -> None:
-    with pytest.raises(ConfigError, match="options: scale: expected a number other than 0"):
+    with pytest.raises(ConfigError, match=r"options\.scale: expected a number other than 0"):
         open_driver("ascii", {"scale": 0.0})

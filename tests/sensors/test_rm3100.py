@@ -189,6 +189,7 @@ def test_a_bus_that_fails_is_a_lost_port_and_comes_back(bus: Rm3100Registers) ->
         ("i2c:one", "rm3100", "expected i2c:BUS:ADDRESS"),
         ("spi:0", "rm3100", "or spi:BUS.DEVICE"),
         ("i2c:1:0x20", "ascii", "expected rm3100 on a bus"),
+        ("/dev/ttyUSB0", "rm3100", "sensor.port: expected i2c:BUS:ADDRESS"),
     ],
 )
 def test_a_wrong_bus_is_named(tmp_path: Path, port: str, name: str, text: str) -> None:
