@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.columns import absent
+from magbridge.columns import YEAR_1980, absent
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.checks import Faults, Validity, validity_of, without_invalid
 from magbridge.logs.clocks import BY_HOUR, SUMS, CountState, TimeFormat, clock_of, date_order, seconds
@@ -95,6 +95,8 @@ class TableReader:
             self.guesses.append(f"time: {self._clock.assumed}")
         self.guesses += [*notes, *dated]
         self._is_from_boot = self._clock.boot and not dated
+        # seconds in a column ``time``, of which those before 1980 count from a boot
+        self._is_plain = clock is None and self._clock == TimeFormat("s")
         self.attrs: dict[str, Any] = {}
         if self._is_from_boot or dated or self._clock.is_dated:
             self.attrs["time_reference"] = "boot" if self._is_from_boot else "utc"
@@ -193,7 +195,8 @@ class TableReader:
             column = column.str.replace(",", ".")
         times = seconds(self._clock, column)
         wrong = np.isnan(times) & column.notna().to_numpy()
-        if self._is_from_boot or (self._clock.boot and self._clock.is_text):
+        is_small = self._is_plain and not (times >= YEAR_1980).any()
+        if self._is_from_boot or is_small or (self._clock.boot and self._clock.is_text):
             times, self._counter, boots = self._counter.go_on(times, self._clock)
             if boots:
                 again = counted(boots, "time")
