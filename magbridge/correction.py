@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from magbridge.align import Aligner, Input, Sample
 from magbridge.calibration.correct import Corrector
-from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
+from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, identity
 from magbridge.columns import TEMPERATURE, usual
 from magbridge.config import Align
 from magbridge.field.igrf import HeldField
@@ -95,7 +95,7 @@ class Correction:
         self.health = self._health(calibration) if calibration.method != "none" else None
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
-        self._conditions = _unmodelled_conditions(calibration)
+        self._conditions = {one.name: (one, nan) for one in calibration.unmodelled_conditions}
         self.is_suited = False
         self.is_contradicted, self.is_learning = False, True
         cutoff_hz = calibration.sensor.filter_cutoff
@@ -320,9 +320,3 @@ class Correction:
         ):  # also NaN, if a parameter has neither value nor range
             more = inf
         return more
-
-
-def _unmodelled_conditions(calibration: Calibration) -> dict[str, tuple[CalibratedRange, float]]:
-    """Return the conditions without a parameter or effect in the calibration, with an unknown value (NaN)."""
-    modelled = calibration.channels
-    return {one.name: (one, nan) for one in calibration.conditions if one.name not in modelled}

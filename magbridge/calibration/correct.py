@@ -50,7 +50,7 @@ class Corrector:
         self._omega = _omega_of(calibration)
         self._steps = _steppers(calibration)
         self._base = _base_flags(calibration)
-        self._ranges = _valid_ranges(calibration)
+        self._ranges = valid_ranges(calibration)
         self._wanted = len(calibration.channels)
         self._values: tuple[float, ...] | None = None
         self._flags = self._base
@@ -238,7 +238,7 @@ def _base_flags(calibration: Calibration) -> int:
     return int(flags | Quality.UNCALIBRATED) if calibration.method == "none" else int(flags)
 
 
-def _valid_ranges(calibration: Calibration) -> list[tuple[float, float]]:
+def valid_ranges(calibration: Calibration) -> list[tuple[float, float]]:
     """Return the lowest and highest value of each parameter for which samples are not ``extrapolated``."""
     return [
         (
@@ -309,7 +309,7 @@ def correct(
             out[:, part] = apply(hx, hy, hz, prepared, turn, np.sqrt)
         # The flags of :class:`Corrector`, for arrays.
         quality = np.full(n, _base_flags(calibration))
-        for value, (low, high) in zip(channels.T, _valid_ranges(calibration), strict=False):
+        for value, (low, high) in zip(channels.T, valid_ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
             quality |= np.where(np.isnan(value), STALE_TELEMETRY, 0)
         lost = ~(out[0] < MAX_MEASURED_NT)

@@ -13,9 +13,10 @@ from string import Template
 
 import numpy as np
 
+from magbridge.calibration.correct import valid_ranges
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.kernel import TABLE_SUMS
-from magbridge.calibration.model import SLOT, Calibration, Parameter
+from magbridge.calibration.model import SLOT, CalibratedRange, Calibration, Parameter
 from magbridge.calibration.scalar import ScalarChannel
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
@@ -27,6 +28,8 @@ def c_header(calibration: Calibration) -> str:
         id=f"{calibration_id(calibration):08x}",
         count=len(calibration.parameters),
         names=inputs("parameter", calibration.parameters),
+        conditions=len(calibration.unmodelled_conditions),
+        condition_names=inputs("condition", calibration.unmodelled_conditions),
         boresight=int(calibration.boresight is not None),
     )
 
@@ -42,12 +45,13 @@ def c_source(calibration: Calibration) -> str:
     # the tables of the compiled kernel, so that C and Python do the same sums in the same order
     kernel = calibration.kernel
     omega = calibration.boresight.covariance if calibration.boresight else ((0.0,) * 3,) * 3
-    # C has no empty arrays: without parameters, write one row of zeros
-    ranges = [[float(one.low), float(one.high)] for one in calibration.parameters]
+    # C has no empty arrays: without inputs, write one row
+    conditions = [one.middle_and_half for one in calibration.unmodelled_conditions]
     tables = [
         reals("centre[]", kernel.centre or (0.0,)),
         reals("scale[]", kernel.scale or (1.0,)),
-        rows("range[][2]", ranges or [[0.0, 0.0]]),
+        rows("range[][2]", valid_ranges(calibration) or [[0.0, 0.0]]),
+        rows("condition[][2]", conditions or [[0.0, 1.0]]),
         rows("parent[][2]", kernel.parents or [(0, 0)]),
         rows("pair[][2]", kernel.pairs),
         rows("place[3][3]", SLOT),
@@ -61,6 +65,8 @@ def c_source(calibration: Calibration) -> str:
         monomials=len(kernel.parents) + 1,
         products=len(kernel.pairs),
         columns=TABLE_SUMS,
+        noise=hexadecimal(calibration.noise.sensor**2),
+        level=hexadecimal(calibration.reference.level_sigma**2),
         tables="\n".join(tables),
     )
 
@@ -70,8 +76,8 @@ def c_template(name: str) -> Template:
     return Template(files("magbridge.calibration").joinpath("c_templates", name).read_text("utf-8"))
 
 
-def inputs(kind: str, channels: Sequence[Parameter | ScalarChannel]) -> str:
-    """Return a C comment for each telemetry input: its number, name, unit and calibrated range."""
+def inputs(kind: str, channels: Sequence[Parameter | ScalarChannel | CalibratedRange]) -> str:
+    """Return a C comment for each input: its number, name, unit and calibrated range."""
     return "\n".join(
         f"/* {kind} {k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}".replace("*/", "")
         + " */"

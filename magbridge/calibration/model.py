@@ -37,6 +37,7 @@ from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
 from magbridge.calibration.kernel import TABLE_SUMS, Kernel
 from magbridge.calibration.scalar import ScalarSensor
 from magbridge.calibration.terms import Effect, Exponents, Parameter, Polynomial
+from magbridge.columns import COLUMNS
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.wording import counted
@@ -266,11 +267,22 @@ class CalibratedRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     high: float
     """`low`, `high`: Range in the data; depth in m (0 above the surface), temperature in degC."""
 
+    @property
+    def unit(self) -> str:
+        """Return the unit of `low` and `high`."""
+        return COLUMNS[self.name].units
+
+    @property
+    def middle_and_half(self) -> tuple[float, float]:
+        """Return the middle and the half of the range in which the calibration is valid."""
+        half = max(0.5 * (self.high - self.low), MIN_HALF_RANGE[self.name])
+        return 0.5 * (self.low + self.high), half
+
     def excess(self, value: float) -> float:
         """Return the distance of a value from the range, in half ranges; 0 if it lies inside or is NaN."""
         # in half ranges from the middle: 1 is the edge
-        half = max(0.5 * (self.high - self.low), MIN_HALF_RANGE[self.name])
-        distance = abs(value - 0.5 * (self.low + self.high)) / half
+        middle, half = self.middle_and_half
+        distance = abs(value - middle) / half
         return distance - 1.0 if distance > 1.0 else 0.0
 
 
@@ -349,6 +361,11 @@ class Calibration:
         for effect in self.effects:
             names += [name for name in effect.channels() if name not in names]
         return tuple(names)
+
+    @property
+    def unmodelled_conditions(self) -> tuple[CalibratedRange, ...]:
+        """Conditions without a parameter or effect."""
+        return tuple(one for one in self.conditions if one.name not in self.channels)
 
     @property
     def units(self) -> dict[str, str]:

@@ -23,9 +23,19 @@ from magbridge.calibration.export_compass import (
 )
 from magbridge.calibration.file import load, save
 from magbridge.calibration.heading import heading
-from magbridge.calibration.model import Boresight, Calibration, Parameter, identity
+from magbridge.calibration.model import (
+    Boresight,
+    CalibratedRange,
+    Calibration,
+    Noise,
+    Parameter,
+    Reference,
+    identity,
+)
 from magbridge.calibration.terms import Polynomial
 from magbridge.cli import main
+from magbridge.correction import Correction
+from magbridge.records import Quality, Reading
 
 GCC = shutil.which("gcc") or shutil.which("cc")
 
@@ -63,8 +73,14 @@ def compiled(calibration: Calibration, folder: Path, *flags: str) -> ctypes.CDLL
     return ctypes.CDLL(str(library))
 
 
-def in_c(library: ctypes.CDLL, kind: Any, field: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return total, its sigma, vector and its sigmas (n, 8)."""
+def in_c(
+    library: ctypes.CDLL,
+    kind: Any,
+    field: np.ndarray,
+    values: np.ndarray,
+    conditions: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return total, its sigma, vector, its sigmas, and whether the sample is extrapolated (n, 9)."""
 
     class Corrected(ctypes.Structure):
         _fields_ = [
@@ -74,8 +90,10 @@ def in_c(library: ctypes.CDLL, kind: Any, field: np.ndarray, values: np.ndarray)
         ]
 
     out, rows = Corrected(), []
-    for h, x in zip(field, values, strict=True):
-        library.magbridge_correct((kind * 3)(*h), (kind * max(len(x), 1))(*x), ctypes.byref(out))
+    conditions = np.empty((len(field), 0)) if conditions is None else conditions
+    for h, x, c in zip(field, values, conditions, strict=True):
+        inputs = (kind * 3)(*h), (kind * max(len(x), 1))(*x), (kind * max(len(c), 1))(*c)
+        library.magbridge_correct(*inputs, ctypes.byref(out))
         rows.append([out.total, out.total_sigma, *out.field, *out.field_sigma, out.extrapolated])
     return np.array(rows)
 
@@ -101,11 +119,33 @@ def test_c_gives_what_python_gives(name: str, turned: bool, tmp_path: Path) -> N
     double = in_c(compiled(calibration, tmp_path), ctypes.c_double, field, values)
     np.testing.assert_allclose(double[:, [0, 2, 3, 4]], expected[:, [0, 2, 3, 4]], rtol=0, atol=1e-7)
     np.testing.assert_allclose(double[:, [1, 5, 6, 7]], expected[:, [1, 5, 6, 7]], rtol=1e-6)
-    outside = ((values < low) | (values > high)).any(axis=1)
-    np.testing.assert_array_equal(double[:, 8], outside)
+    np.testing.assert_array_equal(double[:, 8], ours.quality & Quality.EXTRAPOLATED != 0)
     single = in_c(compiled(calibration, tmp_path, "-DMAGBRIDGE_FLOAT"), ctypes.c_float, field, values)
     np.testing.assert_allclose(single[:, [0, 2, 3, 4]], expected[:, [0, 2, 3, 4]], rtol=0, atol=0.05)
     np.testing.assert_allclose(single[:, [1, 5, 6, 7]], expected[:, [1, 5, 6, 7]], rtol=2e-2)
+
+
+def test_c_widens_sigma_outside_the_conditions_of_the_fit(tmp_path: Path) -> None:
+    """Depths and temperatures inside, outside and unknown; the temperature has a single value in the fit."""
+    ranges = CalibratedRange("depth", 50.0, 90.0), CalibratedRange("sensor_temperature", 15.0, 15.0)
+    known = replace(
+        made(*TWO), conditions=ranges, reference=Reference(50_000.0, level_sigma=3.0), noise=Noise(sensor=2.0)
+    )
+    random, n = np.random.default_rng(6), 100
+    field, values = random.normal(0.0, 30_000.0, (n, 3)), random.uniform([-1.0, -200.0], [1.0, 200.0], (n, 2))
+    conditions = np.column_stack([random.uniform(0.0, 200.0, n), random.uniform(5.0, 25.0, n)])
+    conditions[random.uniform(size=(n, 2)) < 0.2] = np.nan
+    expected = []
+    for h, x, (depth, temperature) in zip(field, values, conditions, strict=True):
+        correction = Correction(known)
+        for name, value in zip(("battpos", "ballast"), x, strict=True):
+            correction.telemetry(name, value, 10**15)
+        reading = Reading(tuple(h), temperature=temperature)
+        ours = correction.reading(reading, 10**15, depth=depth)[1]
+        extrapolated = bool(ours.quality & Quality.EXTRAPOLATED)
+        expected.append([ours.total_field, ours.stated_sigma, *ours.field, *ours.field_sigma, extrapolated])
+    found = in_c(compiled(known, tmp_path), ctypes.c_double, field, values, conditions)
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
 
 
 def test_c_passes_nan_on(tmp_path: Path) -> None:

@@ -18,9 +18,9 @@ typedef magbridge_real real;
 $tables
 
 void magbridge_correct(const magbridge_real field[3], const magbridge_real *parameters,
-                       magbridge_corrected *out)
+                       const magbridge_real *conditions, magbridge_corrected *out)
 {
-    real phi[MONOMIALS], t[$columns], v[6], d[3], b[3], u[3], e[6];
+    real phi[MONOMIALS], t[$columns], v[6], d[3], b[3], u[3], e[6], variance, own, beyond = (real)0;
     int i, j, k;
 
     out->extrapolated = 0;
@@ -72,13 +72,23 @@ void magbridge_correct(const magbridge_real field[3], const magbridge_real *para
     }
     for (i = 0; i < 3; i++)
         u[i] = b[i] / (out->total + (real)1e-30);
-    out->total_sigma = ROOT(SIZE(u[0] * u[0] * v[0] + u[1] * u[1] * v[1] + u[2] * u[2] * v[2]
-                                 + (real)2 * (u[0] * u[1] * v[3] + u[0] * u[2] * v[4] + u[1] * u[2] * v[5])));
+    variance = SIZE(u[0] * u[0] * v[0] + u[1] * u[1] * v[1] + u[2] * u[2] * v[2]
+                    + (real)2 * (u[0] * u[1] * v[3] + u[0] * u[2] * v[4] + u[1] * u[2] * v[5]));
+    /* conditions as in magbridge's Correction: in half ranges beyond the range, without the level's error */
+    own = variance - $level > $noise ? variance - $level : $noise;
+    for (i = 0; i < MAGBRIDGE_CONDITIONS; i++) {
+        const real excess = SIZE(conditions[i] - condition[i][0]) / condition[i][1] - (real)1;
+        if (excess > (real)0)
+            beyond += own * excess * excess;
+    }
+    if (beyond > variance)
+        out->extrapolated = 1;
+    out->total_sigma = ROOT(variance + beyond);
     for (i = 0; i < 3; i++) {
         const int y = (i + 1) % 3, z = (i + 2) % 3;
         const real turned = b[z] * b[z] * omega[y][y] + b[y] * b[y] * omega[z][z]
                             - (real)2 * b[y] * b[z] * omega[y][z];
         out->field[i] = b[i];
-        out->field_sigma[i] = ROOT(SIZE(v[i] + turned));
+        out->field_sigma[i] = ROOT(SIZE(v[i] + turned) + beyond);
     }
 }
