@@ -238,9 +238,10 @@ def ports(config: Config) -> dict[int, Port]:
         budget=1e3 * own.max_other_peers_rate,
         signed=own.signing_key is not None,
     )
-    sensors = {port_number(one.id or 0): sensor_port(one, config.path) for one in config.sensors}
-    nmea = nmea_port(config)
-    opened = {Channel.LINK: link, **sensors, **({MAG_PORT_NAME.NMEA: nmea} if nmea is not None else {})}
+    opened: dict[int, Port] = {Channel.LINK: link}
+    opened |= {port_number(one.id or 0): sensor_port(one, config.path) for one in config.sensors}
+    if (nmea := nmea_port(config)) is not None:
+        opened[MAG_PORT_NAME.NMEA] = nmea
     keys = "link.url", *(f"{one.key}.port" for one in config.sensors), "heading.nmea"
     used = dict[str, str]()
     for key, port in zip(keys, opened.values(), strict=False):
