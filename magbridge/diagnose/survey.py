@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
-from magbridge.calibration.fitting.rounds import beside_motion
+from magbridge.calibration.fitting.observations import beside_motion
 from magbridge.calibration.model import Calibration
 from magbridge.columns import AGE, CHANNELS, require
 from magbridge.errors import DataError

@@ -29,12 +29,16 @@ CLIP_SIGMA = 3.0
 """Robust standard deviations at which residuals are clipped before the autocorrelation is estimated."""
 SHORT_MEMORY = 0.2
 """Smallest autocorrelation of the slow part with which its search begins."""
+MIN_CORRELATION_TIMES = 30.0
+"""Number of its correlation times that the samples must cover, so that the variance of a slow part is known
+within a quarter. Longer errors are rather errors of the coefficients."""
 MIN_LOG_LIKELIHOOD_GAIN = 5.0
 """Gain in log likelihood that a white part must bring over an AR(1) process alone."""
 MAX_AUTOCORRELATION = 0.99
 """Largest autocorrelation that :func:`estimate_noise` returns."""
 MIN_PAIRS = 30
-"""Fewest pairs of successive samples from which their autocorrelation is estimated."""
+"""Fewest pairs of successive samples from which their autocorrelation is estimated, and fewest samples with a
+variance of their own."""
 WINDOW_TIMES = 5.0
 """Integrated autocorrelation times up to which :func:`samples_per_independent` sums."""
 STEADY_STATE_TOLERANCE = 1e-13
@@ -52,12 +56,18 @@ class NoiseModel:
     white: float = 0.0
     """Fraction of the variance that is white."""
     weight: FloatArray | None = None
-    """(n,): 1 for a sample that counts, 0 for an outlier; None if all samples count."""
+    """(n,): 1 for a sample that counts, 0 for an outlier; between 0 and 1 the ratio of this sigma squared to
+    the sample's own variance. None if all samples count."""
 
     @property
     def shape(self) -> tuple[float, float]:
         """Autocorrelation of the slow part, and fraction of the variance that is white."""
         return self.autocorrelation, self.white
+
+    def root_weights(self, n: int) -> FloatArray:
+        """Return the sigma of most samples divided by each sample's own sigma, (n,); 1 for an outlier."""
+        weight = np.ones(n) if self.weight is None else self.weight
+        return np.sqrt(np.where(weight > 0.0, weight, 1.0))
 
     @property
     def rejected(self) -> int:
@@ -199,6 +209,7 @@ def estimate_noise(
     steps: FloatArray,
     free: float,
     shape: tuple[float, float] | None = None,
+    moving: BoolArray | None = None,
 ) -> NoiseModel:
     """Estimate the noise model from the residuals of a fit.
 
@@ -212,17 +223,22 @@ def estimate_noise(
         Number of parameters that the data determined.
     shape : tuple of 2 float, optional
         Autocorrelation and white fraction, if they are known: see :func:`fit_slow_and_white`.
+    moving : (n,) array, optional
+        True for samples that may have a larger error, with a variance of their own.
     """
     if shape is None:
         shape = (_autocorrelation(_clipped(e), steps == 1), 0.0)
     white = whiten(e, steps, *shape)
-    weight = (np.abs(white) <= OUTLIER_SIGMA * _scale(white)).astype(float)
-    kept = weight.sum()
+    weight = _variance_ratio(white, moving)
+    weight *= np.abs(white) * np.sqrt(weight) <= OUTLIER_SIGMA * _scale(white * np.sqrt(weight))
+    kept = np.count_nonzero(weight)
     sigma = float(np.sqrt((weight * white * white).sum() / max(kept - free, 1.0)))
     return NoiseModel(sigma or 1e-9, *shape, None if weight.all() else weight)
 
 
-def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel, free: float) -> NoiseModel:
+def fit_slow_and_white(
+    e: FloatArray, steps: FloatArray, noise: NoiseModel, free: float, moving: BoolArray | None = None
+) -> NoiseModel:
     """Return the noise as a slow and a white part, if that is likelier than the given AR(1) process.
 
     The correlation time of noise is a property of the sensor. At a high sampling rate, the slow part of
@@ -230,10 +246,12 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel, free
     slow part in white noise of many samples hardly shows in neighbours, but it limits the mean.
 
     `e` (n,): Residuals, nT. `steps` (n,): sampling intervals since the previous sample. `noise`: the result
-    of :func:`estimate_noise`. `free`: number of parameters that the data determined.
+    of :func:`estimate_noise`. `free`: number of parameters that the data determined. `moving`: samples with
+    a variance of their own, (n,).
     """
-    clipped, rho = _clipped(e), noise.autocorrelation
-    longest = float(np.isfinite(steps).sum()) + 2.0
+    clipped, rho = _clipped(e * np.sqrt(_variance_ratio(e, moving))), noise.autocorrelation
+    # the variance of a slow part is known only from many of its correlation times
+    longest = max(np.isfinite(steps).sum() / MIN_CORRELATION_TIMES, 2.0)
 
     def negative_log_likelihood(rho: float, white: float) -> float:
         # sigma is profiled out: n/2 log(v^T v) + 1/2 sum log S
@@ -246,7 +264,7 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel, free
         return float(np.exp(-np.exp(-x[0]))), float(1.0 / (1.0 + np.exp(-x[1])))
 
     bounds = [(np.log(1.0), np.log(longest)), (-12.0, 6.0)]
-    starts = ((-1.0 / np.log(max(rho, SHORT_MEMORY)), 0.05), (longest / 20.0, 0.3))
+    starts = ((min(-1.0 / np.log(max(rho, SHORT_MEMORY)), longest), 0.05), (0.7 * longest, 0.3))
     answers = [
         minimize(
             lambda x: negative_log_likelihood(*shape(x)), np.log(start), method="L-BFGS-B", bounds=bounds
@@ -257,7 +275,15 @@ def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel, free
     if best.fun > negative_log_likelihood(rho, 0.0) - MIN_LOG_LIKELIHOOD_GAIN:
         return noise
     # The standard deviation and the outliers belong to the same model.
-    return estimate_noise(e, steps, free, shape=shape(best.x))
+    return estimate_noise(e, steps, free, shape(best.x), moving)
+
+
+def _variance_ratio(e: FloatArray, moving: BoolArray | None) -> FloatArray:
+    """Return the variance of the other residuals divided by each residual's own variance, (n,), at most 1."""
+    ratio = np.ones(len(e))
+    if moving is not None and moving.sum() >= MIN_PAIRS:
+        ratio[moving] = min(_scale(e[~moving]) / _scale(e[moving]), 1.0) ** 2
+    return ratio
 
 
 def _clipped(e: FloatArray) -> FloatArray:

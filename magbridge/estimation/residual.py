@@ -52,12 +52,14 @@ class ResidualSamples:
     """Total field that the coefficients of A refer to, nT: ``A = I + a / F_0``."""
     kappa: float = 0.0
     """Noise of the reference divided by the sensor's."""
+    moving: BoolArray | None = None
+    """(n,): True for samples beside a motion of a mass, which have a larger error; None if there are none."""
 
     def part(self, rows: slice | BoolArray | IndexArray) -> ResidualSamples:
         """Return the samples `rows`, given as a mask (n,), indices or a slice."""
-        return ResidualSamples(
-            self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.F_0, self.kappa
-        )
+        moving = None if self.moving is None else self.moving[rows]
+        columns = self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows]
+        return ResidualSamples(*columns, self.F_0, self.kappa, moving)
 
 
 def residuals(samples: ResidualSamples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from gliders import Glider, Gliders, codes
+from msgspec.structs import replace as replace_struct
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import METHODS, fit
 from magbridge.calibration.fitting.methods import ellipsoid
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.uncertainty import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import full_order
@@ -22,6 +24,7 @@ from magbridge.estimation.noise import Whitening, whiten
 from magbridge.estimation.optimise import normal_equations
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.estimation.residual import ResidualSamples, residuals
+from sitl import load, simulate
 
 
 def survey_error(calibration: Calibration, glider: Glider) -> tuple[float, float]:
@@ -332,3 +335,16 @@ def test_a_long_log_is_fitted_with_a_part_of_its_samples() -> None:
     found = fit(data, "nominal")
     assert len(found.residual) == n // 2
     np.testing.assert_allclose(found.calibration.coefficients[6:9], offset, atol=0.1)
+
+
+def test_rows_beside_a_motion_do_not_bias_the_fit_of_a_survey() -> None:
+    # While a mass moves, a row's position is uncertain. These rows, 5 % of a survey, have errors of 10 nT.
+    survey = load("survey")
+    spirals, legs = survey.mission
+    log = simulate(replace_struct(survey, mission=(spirals, replace_struct(legs, hours=4.0))), 5)
+    data = observations(log, ("battpos", "ballast"))
+    corrected = correct(fit(data).calibration, data.field, data.parameters, data.time)
+    error = (corrected.total - data.reference)[data.at_rest]
+    # the sensor's own noise, 1 nT on each of three axes, is the floor
+    assert np.sqrt(np.mean(error**2)) < 1.4
+    assert np.std(error / corrected.sigma[data.at_rest]) == pytest.approx(0.9, abs=0.2)

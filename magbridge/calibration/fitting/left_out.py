@@ -125,7 +125,10 @@ def _forward(parts: list[IndexArray]) -> list[Split]:
 def _predicted(
     found: CoefficientPosterior, parts: list[IndexArray], splits: list[Split]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors (m,), nT, of all splits by linearised predictions, and their variances (m,), nT²."""
+    """Return the errors (m,), nT, of all splits by linearised predictions, and their variances (m,), nT².
+
+    Both are in the units of a sample at rest: samples beside a motion have a larger variance.
+    """
     samples, prior, noise, s2_fit = found.samples, found.prior, found.noise, found.weighted.sigma**2
     c, weight = found.coefficients, found.weighted.weight
     # Normal equations are sums over samples, so one Newton step from the common fit gives the coefficients of
@@ -146,11 +149,12 @@ def _predicted(
         # at the minimum the whole gradient balances the prior, so the other parts' gradients are missing
         lacking = np.sum([normals[j].gradient for j in range(len(parts)) if j not in fitted], axis=0)
         P = covariance_of(hessian / s2_fit + prior.precision)
-        tested = samples.part(parts[k][counted[parts[k]]][::every])
+        rows = parts[k][counted[parts[k]]][::every]
+        tested, root = samples.part(rows), noise.root_weights(len(counted))[rows]
         off, g = residuals(tested, c)
-        J = jacobian(tested.phi, g) @ prior.E
+        J = jacobian(tested.phi, g * root[:, None]) @ prior.E
         # prediction error, and its variance: noise plus J P J^T
-        e.append(off + J @ (P @ lacking / s2_fit))
+        e.append(off * root + J @ (P @ lacking / s2_fit))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
     return np.concatenate(e), np.concatenate(s2)
 
@@ -164,7 +168,8 @@ def _refitted_error(found: CoefficientPosterior, parts: list[IndexArray], splits
         rows = np.sort(np.concatenate([parts[j] for j in fitted]))
         own = replace(noise, weight=weight[rows])
         again = gauss_newton(successive(samples, rows), prior, own, found.z, steps=REFIT_STEPS)
-        errors.append(residuals_of(samples.part(parts[k]), prior.coefficients(again.z)))
+        e = residuals_of(samples.part(parts[k]), prior.coefficients(again.z))
+        errors.append(e * noise.root_weights(len(weight))[parts[k]])
     e = np.concatenate(errors)
     limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))

@@ -14,6 +14,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import CalibratedRange, Calibration, Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.columns import TEMPERATURE
+from magbridge.config import Align
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
@@ -184,6 +185,16 @@ class Observations:
             steps[1:][near] = np.maximum(np.rint(apart[near] / np.median(apart)), 1.0)
         return steps
 
+    @property
+    def at_rest(self) -> BoolArray:
+        """Mask (n,) that is True for samples without a motion of a mass.
+
+        The mask is True throughout if at least half of the samples have a motion, for example of a current.
+        """
+        span = np.ptp(self.parameters, axis=0) if len(self) else np.zeros(len(self.names))
+        rest = ~beside_motion(self.time, self.parameters, span)
+        return rest if rest.mean() > 0.5 else np.ones(len(self), bool)
+
     def conditions(self) -> tuple[CalibratedRange, ...]:
         """Return the ranges of depth and temperature in the data, for each condition that is known."""
         found = []
@@ -211,6 +222,21 @@ class Observations:
                 )
             found.append(Parameter(name, unit, low, high, (low + high) / 2, (high - low) / 2))
         return tuple(found)
+
+
+def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
+    """Return a mask (n,) that is True for samples before or after a motion of a mass.
+
+    A mass moves if its position changes faster than the default ``moving_rate`` of the alignment. `time`
+    (n,): s. `values` (n, k): positions of the masses. `spans` (k,): their ranges, in the same units.
+    """
+    # a step of a position that is larger than the slowest motion means that the mass moves
+    fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
+    step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
+    moving = np.zeros(len(time), bool)
+    moving[1:] |= step
+    moving[:-1] |= step
+    return moving
 
 
 def _enough(
@@ -280,7 +306,9 @@ def polynomial_samples(
     `ranges`: parameters whose scales apply; default: the ranges in the data.
     """
     phi = monomials(data.parameters, data.ranges() if ranges is None else ranges, exponents)
-    return ResidualSamples(data.field, data.reference, phi, data.steps, float(data.reference.mean()))
+    at_rest, F_0 = data.at_rest, float(data.reference.mean())
+    moving = None if at_rest.all() else ~at_rest
+    return ResidualSamples(data.field, data.reference, phi, data.steps, F_0, moving=moving)
 
 
 MIN_SLOPE_TIME_CONSTANTS = 4.0

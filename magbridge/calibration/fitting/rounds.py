@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
@@ -24,7 +24,6 @@ from magbridge.calibration.fitting.field_search import (
 )
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.solve import approach, starts
-from magbridge.config import Align
 from magbridge.errors import NoSolutionError
 from magbridge.estimation.blocks import (
     BLOCK_ROWS,
@@ -325,31 +324,6 @@ class Rounds:
         return residuals_of(known, self.family.E @ z + self.family.offset)
 
 
-def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
-    """Return a mask (n,) that is True for samples before or after a motion of a mass.
-
-    A mass moves if its position changes faster than the default ``moving_rate`` of the alignment. `time`
-    (n,): s. `values` (n, k): positions of the masses. `spans` (k,): their ranges, in the same units.
-    """
-    # a step of a position that is larger than the slowest motion means that the mass moves
-    fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
-    step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
-    moving = np.zeros(len(time), bool)
-    moving[1:] |= step
-    moving[:-1] |= step
-    return moving
-
-
-def _at_rest(data: Observations) -> BoolArray:
-    """Return a mask (n,) that is True for samples without a motion of a mass.
-
-    The mask is True throughout if at least half of the samples have a motion, for example of a current.
-    """
-    span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
-    rest = ~beside_motion(data.time, data.parameters, span)
-    return rest if rest.mean() > 0.5 else np.ones(len(data), bool)
-
-
 class SurveySamples:
     """Samples of a joint fit, with the unknowns besides coefficients and field, and their linearisation.
 
@@ -372,7 +346,7 @@ class SurveySamples:
         self.place = self.as_logged = data.place[:, :2]
         self.middle = float(np.nanmedian(data.place[:, 2]))
         self.deeper = np.nan_to_num(data.place[:, 2] - self.middle)
-        self.at_rest = _at_rest(data)
+        self.at_rest = data.at_rest
         self.kept = self.at_rest.copy()
         if drift is not None:
             nothing = np.zeros((len(samples.field), 0))

@@ -220,7 +220,7 @@ def climb(
             prior = family.prior(eta)
             e = residuals_of(samples, prior.coefficients(z))
             steps = np.where(white, np.inf, samples.steps)
-            found = estimate_noise(e, steps, widths.determined, shape)
+            found = estimate_noise(e, steps, widths.determined, shape, samples.moving)
             noise = replace(found, sigma=widths.sigma)
     prior = family.prior(eta)
     spread = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
@@ -233,12 +233,14 @@ def climb(
 def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
     """Return the log evidence of all samples.
 
-    An outlier counts as a sample at the outlier limit. The Jacobian of the whitening is included.
+    An outlier counts as a sample at the outlier limit. The Jacobians of the whitening and of the weights are
+    included.
     """
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
     variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
     whitening = 0.5 * np.log(variance).sum()
-    return float(widths.log_evidence - noise.rejected * outlier - whitening)
+    weights = 0.0 if noise.weight is None else 0.5 * np.log(noise.weight[noise.weight > 0.0]).sum()
+    return float(widths.log_evidence - noise.rejected * outlier - whitening + weights)
 
 
 def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
@@ -264,15 +266,20 @@ def best_climb(samples: ResidualSamples, family: PriorFamily) -> Climbed:
 
 
 def with_slow_noise(answer: Climbed) -> Climbed:
-    """Return the posterior, fitted again with slow and white noise if the residuals have both."""
-    for _ in range(2):
-        noise = fit_slow_and_white(
-            answer.residual, answer.samples.steps, answer.noise, answer.widths.determined
-        )
-        if noise is answer.noise:
-            break
-        answer = climb(answer.samples, answer.family, answer.z, answer.widths.eta, noise, shaped=True)
-    return answer
+    """Return the posterior, fitted again with slow and white noise if the residuals have both.
+
+    Slow noise can also describe an error of the coefficients, such as a step at each move of a mass. The fit
+    then leaves this error in its residuals, where a second estimate of the noise would find more of it.
+    Therefore the noise is estimated once, and a fit with less evidence is discarded.
+    """
+    samples = answer.samples
+    noise = fit_slow_and_white(
+        answer.residual, samples.steps, answer.noise, answer.widths.determined, samples.moving
+    )
+    if noise is answer.noise:
+        return answer
+    again = climb(samples, answer.family, answer.z, answer.widths.eta, noise, shaped=True)
+    return again if again.log_evidence > answer.log_evidence else answer
 
 
 # ---- Where a fit begins, and with which samples ----
