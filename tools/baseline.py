@@ -34,8 +34,12 @@ from study import table
 from study_worlds import NOISES
 from voyages import Map
 
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
+from magbridge.estimation.residual import rms
 from magbridge.logs import Options, read
+from sitl import load, simulate
 
 FILE = Path(__file__).with_name("baseline.json")
 MIN_STANDARD_ERRORS, MIN_RELATIVE_CHANGE, MIN_RELATIVE_CHANGE_SINGLE = 2.0, 0.01, 0.02
@@ -118,6 +122,20 @@ def real_logs() -> list[Row]:
     return [figures | {f"ArduSub, second half: {row['method']}, nT": row["rms"] for row in halves}]
 
 
+def whole_log(seed: int) -> list[Row]:
+    """Calibrate with a whole simulated log, including rows beside a motion of a mass; return the errors."""
+    data = observations(simulate(load("survey"), seed), ("battpos", "ballast"))
+    corrected = correct(fit(data).calibration, data.field, data.parameters, data.time)
+    error = corrected.total - data.reference
+    return [
+        {
+            "error at rest, nT": rms(error[data.at_rest]),
+            "error beside a motion, nT": rms(error[~data.at_rest]),
+            "normalised error at rest": rms((error / corrected.sigma)[data.at_rest]),
+        }
+    ]
+
+
 def replay() -> list[Row]:
     """Run ``magbridge demo``, a simulated survey through the unmodified bridge; return its figures."""
     with tempfile.TemporaryDirectory() as folder:
@@ -170,6 +188,7 @@ PARTS = (
         {"error on the runs, nT": "runs", "error on the survey, nT": "survey"},
     ),
     Part("measured", real_logs, [()] if DATA.is_dir() else []),
+    Part("whole log", whole_log, [(seed,) for seed in range(1, 6)]),
     Part("replay", replay, [()]),
 )  # fmt: skip
 
