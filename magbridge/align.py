@@ -28,6 +28,8 @@ __all__ = ["Aligner", "Input", "Sample", "Track"]
 
 TRACK_LENGTH: Final = 1024
 """Number of telemetry values that are stored for each parameter: enough for 20 s at 50 Hz."""
+MOTION_US: Final = 1_000_000
+"""Time over which the change of a parameter decides whether it is moving, µs."""
 
 
 class Input(NamedTuple):
@@ -46,15 +48,17 @@ class Input(NamedTuple):
 class Track:
     """Recent telemetry of one parameter.
 
-    The parameter is moving if it differs from an earlier value, the anchor, by more than ``moving_rate``
-    times the elapsed time. ``moving_rate`` is a fraction of the calibrated range per second. The elapsed time
-    counts as at least 1 s, because the noise of the telemetry would look like motion over shorter times. The
-    first value 1 s or more after the anchor becomes the next anchor.
+    The parameter is moving if the last value differs from that of 1 s before by more than ``moving_rate``, a
+    fraction of the calibrated range per second. The noise of the telemetry would look like motion over
+    shorter times. Values farther apart than 1 s are interpolated.
+
+    From one value to the next, a moving parameter lies between the two. If the next value is late, its bounds
+    grow by `rate`, the rate of the last value, up to the calibrated range.
     """
 
     __slots__ = (
-        "anchor", "before", "first_us", "guess", "guess_us", "history", "input", "lacking", "last", "last_us",
-        "max_age", "moved_us",
+        "before", "began_us", "first_us", "guess", "guess_us", "history", "input", "lacking", "last",
+        "last_us", "max_age", "moved_us", "rate", "recent",
     )  # fmt: skip
 
     def __init__(self, quantity: Input) -> None:
@@ -65,8 +69,9 @@ class Track:
         # interval of times (µs) with values of unknown time, and interval of these values
         self.guess_us, self.guess = (NEVER, NEVER), (nan, nan)
         self.lacking = True
-        self.anchor: tuple[int, float] | None = None
-        self.moved_us = NEVER
+        self.recent: deque[tuple[int, float]] = deque()  # the last second, and the value before it
+        self.began_us = self.moved_us = NEVER
+        self.rate = 0.0  # magnitude, per second, if moving
 
     def update(self, time_us: int, value: float, moving_rate: float, since_us: int = 0) -> None:
         """Add a value measured at `time_us`, µs; ignore a value that is older than the last one.
@@ -86,19 +91,30 @@ class Track:
             self.guess = (min(low, value), max(high, value)) if isfinite(low) else (value, value)
         if time_us == self.last_us:  # of several values at one time, keep the newest
             self.history.pop()
+            self.recent.pop()
         else:
             self.before = self.last if self.history else value
         self.last_us, self.last = time_us, value
-        self.history.append((time_us, value))
+        newest = time_us, value
+        self.history.append(newest)
         self.first_us = self.history[0][0]
-        if self.anchor is None:
-            self.anchor = time_us, value
-        anchor_us, anchor = self.anchor
-        elapsed = (time_us - anchor_us) * 1e-6
-        if abs(value - anchor) > moving_rate * (self.input.high - self.input.low) * max(elapsed, 1.0):
+        recent, past_us = self.recent, time_us - MOTION_US
+        recent.append(newest)
+        while len(recent) > 1 and recent[1][0] <= past_us:
+            recent.popleft()
+        # value at past_us, interpolated; the first value if all are newer
+        then_us, past = recent[0]
+        if then_us < past_us:
+            after_us, after = recent[1]
+            past += (past_us - then_us) / (after_us - then_us) * (after - past)
+        change, what = abs(value - past), self.input
+        if change > moving_rate * (what.high - what.low):
+            before_us = self.reported_before_us
+            if self.moved_us < before_us:
+                self.began_us = before_us  # the previous value was at rest
             self.moved_us = time_us
-        if elapsed >= 1.0:
-            self.anchor = time_us, value
+            # a motion that began within the second has made all of the change since then
+            self.rate = change / min((time_us - self.began_us) * 1e-6, 1.0)
 
     def stale(self, time_us: int) -> bool:
         """Return True if the value is unknown, or older than ``max_age``, at `time_us`."""
@@ -126,13 +142,27 @@ class Track:
         """
         after_us, after = self.last_us, self.last
         if after_us <= time_us:
-            return after, (time_us - after_us) * 1e-6, self.before, after
+            low, high = self._bounds(time_us) if self.moved_us == after_us else (self.before, after)
+            return after, (time_us - after_us) * 1e-6, low, high
         for then_us, value in reversed(self.history):
             if then_us <= time_us:
                 weight = (time_us - then_us) / (after_us - then_us)
                 return value + weight * (after - value), 0.0, value, after
             after_us, after = then_us, value
         return after, (after_us - time_us) * 1e-6, after, after
+
+    def _bounds(self, time_us: int) -> tuple[float, float]:
+        """Return two values that bound the moving parameter at `time_us` (µs), after the last value."""
+        interval_us = self.last_us - self.reported_before_us
+        late_us = time_us - self.last_us - interval_us  # since the next value was due
+        if late_us <= 0:
+            return self.before, self.last
+        # half the width grows from half an interval's motion to that since the last value
+        what, growth = self.input, self.rate * min(2 * late_us, late_us + interval_us // 2) * 1e-6
+        # an interval of this width that lies in the calibrated range and about the last values if it can
+        width = min(abs(self.last - self.before) + 2.0 * growth, what.high - what.low)
+        low = min(max(min(self.before, self.last) - growth, what.low), what.high - width)
+        return low, low + width
 
 
 STALE_FLAG: Final = int(Quality.STALE_TELEMETRY)

@@ -47,7 +47,7 @@ class Quality(IntFlag):
     EXTRAPOLATED = 2
     """A parameter, the depth or the temperature lies outside the calibrated range."""
     MOVING = 4
-    """A mass was moving at the time of the sample, or had just moved."""
+    """A mass moved faster than ``align.moving_rate`` in the last second of telemetry, or had just moved."""
     SATURATED = 8
     """A channel was at the end of its range."""
     UNCALIBRATED = 16

@@ -137,13 +137,48 @@ def test_a_change_within_a_second_is_motion_above_the_moving_rate(
     assert ("moving" in flags(aligner.reading(reading(), at_us))) == moving
 
 
-def test_noisy_telemetry_of_a_resting_mass_is_not_motion() -> None:
-    aligner = Aligner((BATTERY,), Align())
-    rng = np.random.default_rng(1)
-    for k in range(400):
-        aligner.telemetry("battpos", START + k * 50_000, 0.3 + 1e-3 * rng.standard_normal())
-        sample = aligner.reading(reading(), START + k * 50_000)
-        assert "moving" not in flags(sample)
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 50.0])
+@pytest.mark.parametrize(("speed", "moves"), [(0.0, False), (1.08, True), (2.0, True)])
+def test_a_steady_motion_above_the_moving_rate_is_flagged_throughout(
+    rate_hz: float, speed: float, *, moves: bool
+) -> None:
+    """The telemetry's jitter is 3 % of its period; its noise is 0.5 % of the range for a mass at rest."""
+    aligner, rng = Aligner((BATTERY,), Align()), np.random.default_rng(1)
+    noise = 0.0 if moves else 1e-3
+    seen = []
+    for k in range(round(20 * rate_hz)):
+        t = (k + rng.uniform(0.0, 0.03)) / rate_hz
+        aligner.telemetry("battpos", START + round(t * SECOND), 0.01 * speed * t + noise * rng.normal())
+        seen.append("moving" in flags(aligner.reading(reading(), START + round((t + 0.01) * SECOND))))
+    assert np.mean(seen[round(rate_hz) :]) == float(moves)
+
+
+@pytest.mark.parametrize(
+    ("interval", "delay", "lost"),
+    [(0.25, 0.0, (8.0, 28.0)), (4.0, 0.0, (8.0, 28.0)), (0.2, 2.5, ()), (0.2, 0.0, (8.1, 12.0))],
+    ids=["lost at 4 Hz", "lost at 0.25 Hz", "late", "silent"],
+)
+@pytest.mark.parametrize("start", [-0.6, -1.0], ids=["inside", "from end to end"])
+def test_the_bounds_of_a_moving_mass_grow_until_its_telemetry_comes(
+    interval: float, delay: float, lost: tuple[float, ...], start: float
+) -> None:
+    """The mass moves by 4 % of its range a second; its total field changes by 1 nT per unit."""
+    aligner, began, z = Aligner((BATTERY,), Align()), 4.0, []
+
+    def position(t: float) -> float:
+        return min(start + 0.08 * max(t - began, 0.0), 1.0)
+
+    reports = [t for t in np.arange(0.0, 28.0, interval) if not lost or not lost[0] < t < lost[1]]
+    for t in np.arange(began + delay + 1.1 * interval, 28.0, 0.1):
+        while reports and reports[0] + delay <= t:
+            aligner.telemetry("battpos", START + round(reports[0] * SECOND), position(reports.pop(0)))
+        sample = aligner.reading(reading(), START + round(t * SECOND))
+        if "moving" in flags(sample):
+            ((_, low, high),) = sample.spans
+            assert -1.0 - 1e-9 <= min(low, high) <= max(low, high) <= 1.0 + 1e-9
+            z.append((sample.values[0] - position(t)) / (0.5 * abs(high - low) + 1e-6))
+    assert len(z) > 50
+    assert np.sqrt(np.mean(np.square(z))) < 1.3
 
 
 def test_out_of_order_telemetry_is_ignored_and_of_several_at_once_the_newest_counts() -> None:
