@@ -20,6 +20,7 @@ from magbridge.field.grid_netcdf import (
     LATITUDE,
     LONGITUDE,
     PROJECTED,
+    SIGMA,
     Axes,
     Parts,
     netcdf,
@@ -203,7 +204,7 @@ def geotiff(path: Path) -> Parts:
     unit_of_length = LENGTH_UNITS.get(settings.get(3076, 0), "unknown" if 3076 in settings else "")
     projected = Axes(unit_of_length, f"EPSG:{code}") if 1024 <= code < 32767 else Axes("m")
     axes = projected if kind == 1 else Axes("deg" if kind == 2 else "")
-    return x, y, values * scale + offset, {"axes": axes, "unit": unit}
+    return x, y, values * scale + offset, {"axes": axes, "units": {"anomaly": unit}}
 
 
 def _gdal(text: str) -> tuple[float, float, str]:
@@ -219,13 +220,13 @@ def _gdal(text: str) -> tuple[float, float, str]:
 REMARK = re.compile(r"\s*([#%/]|(line|tie)[\s:]*[\w.:]+\s*$|$)", re.IGNORECASE)
 """A comment, an empty line, or the heading of a survey line as Geosoft writes it."""
 NUMBER_PATTERN = re.compile(r"[-+.\deinfa]+")
-UNIT_SUFFIXES = ("nt", "ut", "µt", "deg", "m", "km")
+UNIT_SUFFIXES = ("nt", "ut", "µt", "deg", "m", "km", "ft")
 """Units that may end a column's name, after an underscore."""
-OTHERS = (
-    "sigma", "error", "std", "line", "flight", "date", "time", "fid", "alt", "altitude", "height", "depth",
-    "elev",
-)  # fmt: skip
+ALTITUDE, DEPTH = ("altitude", "alt", "height"), ("depth",)
+OTHERS = {*SIGMA, *ALTITUDE, *DEPTH, "line", "flight", "date", "time", "fid", "elev"}
 """Names of columns that are never the anomaly."""
+LEVEL_TOLERANCE = 1.0
+"""Largest range of the altitudes of a level grid, in their unit."""
 HEADER_HINT = "name the columns in the first row: longitude,latitude,anomaly"
 
 
@@ -240,17 +241,20 @@ class GridColumn(NamedTuple):
 def table(path: Path) -> Parts:
     """Read a grid from a table of x, y and anomaly, with or without column names, rows in any order.
 
-    Missing nodes are holes. FormatError: missing or ambiguous columns, or nodes that do not form a grid.
+    Missing nodes are holes. FormatError: missing or ambiguous columns, nodes that do not form a grid, or
+    altitudes that vary.
     """
     words, delimiter, skip = _beginning(path)
     header = not all(NUMBER_PATTERN.fullmatch(word) for word in words)
-    unit, axes = "", Axes()
+    axes, units, further = Axes(), {}, {}
     if header:
-        x, y, z = _named(path, words)
-        unit, axes = z.unit, Axes(stated(x.unit, x.name))
-        places = x.place, y.place, z.place
+        x, y, z, *others = _named(path, words)
+        axes, units["anomaly"] = Axes(stated(x.unit, x.name)), z.unit
+        further = {("sigma" if c.name in SIGMA else "altitude"): c for c in others}
+        units |= {name: c.unit for name, c in further.items()}
+        places = [c.place for c in (x, y, z, *further.values())]
     elif len(words) == 3:
-        places = 0, 1, 2
+        places = [0, 1, 2]
     else:
         raise FormatError(path, f"{counted(len(words), 'column')} without names: {HEADER_HINT}", row=1)
     rows = _numbers(path, delimiter, skip, places)
@@ -261,11 +265,27 @@ def table(path: Path) -> Parts:
     )
     if x_levels.size * y_levels.size > 4 * len(rows):
         raise FormatError(path, f"expected a grid, found {len(rows)} scattered points: grid them first")
-    values = np.full((y_levels.size, x_levels.size), np.nan)
     if np.unique(row * x_levels.size + column).size < len(rows):
         raise FormatError(path, "expected one row for each node, some are there twice")
-    values[row, column] = rows[:, 2]
-    return x_levels, y_levels, values, {"unit": unit, "axes": axes}
+    fields = np.full((len(places) - 2, y_levels.size, x_levels.size), np.nan)
+    fields[:, row, column] = rows[:, 2:].T
+    options: dict[str, Any] = dict(zip(further, fields[1:], strict=True))
+    if "altitude" in options:
+        options["altitude"] = _level(path, further["altitude"], options["altitude"])
+    return x_levels, y_levels, fields[0], {"units": units, "axes": axes, **options}
+
+
+def _level(path: Path, column: GridColumn, heights: RealArray) -> float:
+    """Return the altitude of a grid from the heights or depths of its nodes; FormatError: they vary."""
+    low, high = np.nanquantile(heights, [0.0, 1.0]) if np.isfinite(heights).any() else (np.nan, np.nan)
+    if high - low > LEVEL_TOLERANCE:
+        raise FormatError(
+            path,
+            f"expected one height of all nodes, found {low:g} to {high:g}: grid the samples at one height by "
+            "magbridge survey, or leave the column out",
+            column=column.name,
+        )
+    return float(0.5 * (low + high)) * (-1.0 if column.name in DEPTH else 1.0)
 
 
 def _beginning(path: Path) -> tuple[list[str], str | None, int]:
@@ -296,12 +316,18 @@ def _is_remark(line: str, remarks: list[str]) -> bool:
     return found
 
 
-def _named(path: Path, words: list[str]) -> tuple[GridColumn, GridColumn, GridColumn]:
-    """Return the columns of x, y and anomaly, found by their names among `words`."""
+def _named(path: Path, words: list[str]) -> list[GridColumn]:
+    """Return the columns of x, y, anomaly, and if given of sigma and height, by their names in `words`."""
     columns = [_column(place, word) for place, word in enumerate(words)]
-    x, y, z = (
-        next((c for name in names for c in columns if c.name == name), None)
-        for names in ((*LONGITUDE, *PROJECTED[0]), (*LATITUDE, *PROJECTED[1]), ANOMALY_VARIABLES)
+    kinds = (
+        (*LONGITUDE, *PROJECTED[0]),
+        (*LATITUDE, *PROJECTED[1]),
+        ANOMALY_VARIABLES,
+        SIGMA,
+        ALTITUDE + DEPTH,
+    )
+    x, y, z, *others = (
+        next((c for name in names for c in columns if c.name == name), None) for names in kinds
     )
     if x is None or y is None:
         raise FormatError(path, "expected the columns longitude, latitude, anomaly", row=1)
@@ -312,7 +338,7 @@ def _named(path: Path, words: list[str]) -> tuple[GridColumn, GridColumn, GridCo
         raise FormatError(
             path, f"expected the columns longitude, latitude, anomaly{which} call it anomaly", row=1
         )
-    return x, y, z
+    return [x, y, z, *(c for c in others if c)]
 
 
 def _column(place: int, word: str) -> GridColumn:
@@ -336,7 +362,7 @@ def _order(path: Path, rows: RealArray) -> list[int]:
     raise FormatError(path, f"longitude or latitude first? {HEADER_HINT}", row=1)
 
 
-def _numbers(path: Path, delimiter: str | None, skip: int, places: tuple[int, int, int]) -> RealArray:
+def _numbers(path: Path, delimiter: str | None, skip: int, places: list[int]) -> RealArray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # for a file without rows; checked after this

@@ -7,7 +7,7 @@ that takes them for degrees would be wrong without a message.
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from magbridge.field.grid import AnomalyGrid
 
 __all__ = [
-    "ANOMALY_VARIABLES", "EVEN", "LATITUDE", "LONGITUDE", "PROJECTED", "Axes", "Parts", "geographic",
-    "netcdf", "stated", "write",
+    "ANOMALY_VARIABLES", "EVEN", "LATITUDE", "LONGITUDE", "METRES", "PROJECTED", "SIGMA", "Axes", "Parts",
+    "geographic", "netcdf", "stated", "write",
 ]  # fmt: skip
 
 LONGITUDE, LATITUDE = ("longitude", "lon", "long", "x"), ("latitude", "lat", "y")
@@ -180,7 +180,8 @@ def _sampled(values: RealArray, indices: RealArray) -> RealArray:
 
 Parts = tuple[RealArray, RealArray, RealArray, dict[str, Any]]
 """Contents of a file: coordinates x and y of the nodes, values (ny, nx), and options of AnomalyGrid. Further
-options are ``unit`` of the values, and ``axes``, the file's statements on x and y (:class:`Axes`)."""
+options are ``units``, those of the values ("anomaly") and of options, by name, and ``axes``, the file's
+statements on x and y (:class:`Axes`)."""
 ANOMALY_VARIABLES = (
     "anomaly", "magnetic_anomaly", "mag_anomaly", "mag_anom", "total_field_anomaly", "tfa",
     "tmi_anomaly", "tmi", "mag", "residual", "nt", "value", "z",
@@ -217,20 +218,28 @@ def netcdf(path: Path) -> Parts:
         order, x, y, axes = bent
     else:
         order, x, y, axes = _along_its_axes(path, grid, data)
-    options: dict[str, Any] = {"unit": str(grid.attrs.get("units", "")), "axes": axes}
+    units = {"anomaly": str(grid.attrs.get("units", ""))}
+    options: dict[str, Any] = {"units": units, "axes": axes}
     if sigmas:
-        options["sigma"] = flat[sigmas[0]].transpose(*order).to_numpy()
-        length = flat[sigmas[0]].attrs.get("length_m", 0.0)
-        options["sigma_length"] = float(length) if isinstance(length, (int, float, np.number)) else 0.0
-    altitude = grid.attrs.get("altitude", data.attrs.get("altitude"))
-    level = data.attrs.get("level_sigma", 0.0)
-    options["level_sigma"] = float(level) if isinstance(level, (int, float, np.number)) else 0.0
-    if altitude is not None:
-        try:
-            options["altitude"] = float(altitude)
-        except (TypeError, ValueError):
-            raise FormatError(path, f"expected the altitude as a number of m, found {altitude!r}") from None
+        sigma = flat[sigmas[0]]
+        options["sigma"], units["sigma"] = (
+            sigma.transpose(*order).to_numpy(),
+            str(sigma.attrs.get("units", "")),
+        )
+        options["sigma_length"] = _stated_number(path, sigma.attrs, "length_m")
+    over = grid.attrs if "altitude" in grid.attrs else data.attrs
+    for name, attrs, default in (("altitude", over, nan), ("level_sigma", data.attrs, 0.0)):
+        options[name] = _stated_number(path, attrs, name, default)
+        units[name] = str(attrs.get(f"{name}_units", ""))
     return x, y, grid.transpose(*order).to_numpy().astype(float), options
+
+
+def _stated_number(path: Path, attrs: dict[str, Any], name: str, default: float = 0.0) -> float:
+    """Return the attribute `name` as a number; FormatError: it is not one."""
+    try:
+        return float(attrs.get(name, default))
+    except (TypeError, ValueError):
+        raise FormatError(path, f"expected {name} as a number, found {attrs[name]!r}") from None
 
 
 Coordinates = tuple[tuple[str, str], RealArray, RealArray, Axes]
@@ -324,4 +333,5 @@ def _old_gmt(path: Path, data: Any) -> Parts:
         step = (high - low) / max(n - 1 + 2 * half, 1)
         axes.append(low + (np.arange(n) + half) * step)
     unit = stated(str(data["x_range"].attrs.get("units", "")))
-    return axes[0], axes[1], values, {"unit": str(data["z"].attrs.get("units", "")), "axes": Axes(unit)}
+    units = {"anomaly": str(data["z"].attrs.get("units", ""))}
+    return axes[0], axes[1], values, {"units": units, "axes": Axes(unit)}

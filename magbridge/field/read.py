@@ -20,7 +20,7 @@ from magbridge.columns import NT_PER_UNIT, usual
 from magbridge.errors import FormatError
 from magbridge.field.grid import HOLE, AnomalyGrid
 from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, libraries, table
-from magbridge.field.grid_netcdf import Axes, Parts, geographic, netcdf
+from magbridge.field.grid_netcdf import METRES, Axes, Parts, geographic, netcdf
 from magbridge.files import contents, existing
 from magbridge.guard import guarded
 
@@ -32,8 +32,9 @@ CERTAIN = 9_000.0
 """Smallest absolute value of a missing-value code that is never an anomaly, nT; -999 may be an anomaly."""
 TINY = 1.0
 """Smallest maximum of a map without a unit; a map with smaller values is hardly in nT."""
-NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
-"""nT in one unit, by the unit's name in lower case."""
+UNITS_OF_FIELD = "a magnetic field in nT", {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
+UNITS_OF_HEIGHT = "a height in m", METRES
+"""Quantity, and size of each of its units, by the unit's name in lower case."""
 
 READERS: dict[str, Callable[..., Parts]] = {
     ".nc": netcdf,
@@ -63,7 +64,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     Raises
     ------
     FormatError
-        A file of another format, damaged, in a unit that is not one of a magnetic field, or on axes that are
+        A file of another format, damaged, in a unit that is not one of its quantity, or on axes that are
         neither degrees nor lengths of a known projection.
 
     Notes
@@ -86,19 +87,24 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     else:
         found = parts()
     x, y, values, options = found
-    scale = _scale(path, options.get("unit", ""))
+    units = options.get("units", {})
+    scale = _scale(path, unit := units.get("anomaly", ""), *UNITS_OF_FIELD)
     anomaly = without_fill(path, values) * scale
     # Mark holes before reprojection: a spline would spread a hole of 1e32 over the whole map.
     fields = {"anomaly": np.where(np.abs(anomaly) < HOLE, anomaly, nan)}
-    if not options.get("unit") and 0.0 < np.nanmax(np.abs(fields["anomaly"]), initial=0.0) < TINY:
+    if not unit and 0.0 < np.nanmax(np.abs(fields["anomaly"]), initial=0.0) < TINY:
         raise FormatError(path, f"no value is beyond {TINY:g}: state the unit, nT, uT or T")
     if "sigma" in options:
-        fields["sigma"] = options["sigma"] * scale
+        fields["sigma"] = options["sigma"] * _scale(path, units.get("sigma") or unit, *UNITS_OF_FIELD)
     longitude, latitude, fields = geographic(path, x, y, fields, options.get("axes", Axes()))
-    altitude = options.get("altitude", nan)
+    altitude, level = options.get("altitude", nan), options.get("level_sigma", 0.0)
+    # a height's unit may name its zero: "m above the ellipsoid"
+    above, _, _ = units.get("altitude", "").strip().partition(" ")
     return AnomalyGrid(
-        longitude, latitude, fields["anomaly"], fields.get("sigma", 0.0), altitude, name=str(path),
-        sigma_length=options.get("sigma_length", 0.0), level_sigma=options.get("level_sigma", 0.0),
+        longitude, latitude, fields["anomaly"], fields.get("sigma", 0.0),
+        altitude * _scale(path, above, *UNITS_OF_HEIGHT), name=str(path),
+        sigma_length=options.get("sigma_length", 0.0),
+        level_sigma=level * _scale(path, units.get("level_sigma", ""), *UNITS_OF_FIELD),
     )  # fmt: skip
 
 
@@ -152,10 +158,11 @@ def read_polygon(path: str | Path) -> RealArray:
     return np.array(corners)
 
 
-def _scale(path: Path, unit: str) -> float:
+def _scale(path: Path, unit: str, quantity: str, sizes: dict[str, float]) -> float:
+    """Return the size of a unit, 1 if it is not stated; FormatError: it is not one of the `quantity`."""
     if not unit.strip():
         return 1.0
     try:
-        return NANOTESLA[usual(unit.strip().lower()).lower()]
+        return sizes[usual(unit.strip().lower()).lower()]
     except KeyError:
-        raise FormatError(path, f"expected a magnetic field in nT, found the unit {unit!r}") from None
+        raise FormatError(path, f"expected {quantity}, found the unit {unit!r}") from None

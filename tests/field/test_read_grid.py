@@ -166,6 +166,57 @@ def test_a_gap_in_a_table_is_a_hole(tmp_path: Path) -> None:
     assert np.isnan(read_grid(tmp_path / "a.xyz").anomaly).sum() == 1
 
 
+def stated(path: Path, sigma: str = "nT", **attrs: str | float) -> None:
+    """Write the map in uT, with a sigma of 2 in a unit, and further statements."""
+    grid = AnomalyGrid(LON, LAT, MAP, 2.0, 328.084, level_sigma=3.0)
+    grid.save(path)
+    data = xr.load_dataset(path).assign_attrs(attrs)
+    data["anomaly"] = data["anomaly"].copy(data=MAP / 1000.0).assign_attrs(units="uT")
+    data["sigma"] = data["sigma"].assign_attrs(units=sigma)
+    data.to_netcdf(path)
+
+
+@pytest.mark.parametrize(
+    ("unit", "altitude"), [("m above the ellipsoid", 328.084), ("ft", 100.0), ("Feet above sea level", 100.0)]
+)
+@pytest.mark.parametrize(("of_sigma", "sigma"), [("nT", 2.0), ("pT", 0.002), ("", 2000.0)])
+def test_each_number_of_a_netcdf_grid_has_its_own_unit(
+    tmp_path: Path, unit: str, altitude: float, of_sigma: str, sigma: float
+) -> None:
+    """Without a unit, sigma is in that of the anomaly."""
+    stated(tmp_path / "a.nc", of_sigma, altitude_units=unit, level_sigma_units="uT")
+    grid = read_grid(tmp_path / "a.nc")
+    np.testing.assert_allclose(grid.anomaly, MAP, atol=1e-4)
+    np.testing.assert_allclose(grid.sigma, sigma, rtol=1e-6)
+    assert grid.altitude == pytest.approx(altitude)
+    assert grid.level_sigma == 3000.0
+
+
+def with_columns(path: Path, **columns: np.ndarray) -> None:
+    """Write the map as a table with further columns (ny, nx)."""
+    x, y = np.meshgrid(LON, LAT)
+    fields = {"longitude": x, "latitude": y, "anomaly": MAP} | columns
+    rows = np.column_stack([field.ravel() for field in fields.values()])
+    np.savetxt(path, rows, delimiter=",", header=",".join(fields), comments="")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "altitude"),
+    [
+        ("altitude", 100.0, 100.0),
+        ("Alt [ft]", 328.084, 100.0),
+        ("height_km", 0.1, 100.0),
+        ("depth", 30.0, -30.0),
+    ],
+)
+def test_a_table_states_sigma_and_height(tmp_path: Path, name: str, value: float, altitude: float) -> None:
+    columns = {"error [uT]": np.abs(MAP) / 1000.0, name: np.full_like(MAP, value)}
+    with_columns(tmp_path / "a.csv", **columns)
+    grid = read_grid(tmp_path / "a.csv")
+    np.testing.assert_allclose(grid.sigma, np.abs(MAP))
+    assert grid.altitude == pytest.approx(altitude)
+
+
 def scattered(path: Path) -> None:
     np.savetxt(path, np.random.default_rng(0).uniform(10, 11, (50, 3)), header="lon lat anomaly")
 
@@ -184,7 +235,24 @@ def scattered(path: Path) -> None:
             "projected coordinates of an unknown",
         ),
         ("a.nc", lambda p: cf(p, names=("y", "x"), units="m"), "projected coordinates of an unknown"),
-        ("a.nc", lambda p: cf(p, altitude="300 m"), "expected the altitude as a number of m, found '300 m'"),
+        ("a.nc", lambda p: cf(p, altitude="300 m"), "expected altitude as a number, found '300 m'"),
+        (
+            "a.nc",
+            lambda p: stated(p, altitude_units="fathom"),
+            "expected a height in m, found the unit 'fathom'",
+        ),
+        ("a.nc", lambda p: stated(p, sigma="mGal"), "expected a magnetic field in nT, found the unit 'mGal'"),
+        ("a.nc", lambda p: stated(p, level_sigma="none"), "expected level_sigma as a number"),
+        (
+            "a.csv",
+            lambda p: with_columns(p, altitude=MAP),
+            "column 'altitude': expected one height of all nodes",
+        ),
+        (
+            "a.csv",
+            lambda p: with_columns(p, **{"alt [mi]": 0 * MAP}),
+            "expected a height in m, found the unit",
+        ),
         ("a.nc", lambda p: cf(p, "", 1e-3), "no value is beyond 1: state the unit, nT, uT or T"),
         ("a.grd", lambda p: surfer_7(p, rotation=30.0), "rotated by 30 degrees: expected rows along x"),
         (
