@@ -44,7 +44,8 @@ class Continued(NamedTuple):
 
     grid: AnomalyGrid
     sigma: float
-    """1-sigma of the continuation's error, nT; 0 for an upward continuation to a single depth."""
+    """1-sigma of the error of series and slope, nT; 0 for an upward continuation to a single depth. The sigma
+    of the grid includes the error at its edges and holes."""
     length: float
     """Correlation length of the error, m: its correlation at a short distance r is exp(-r²/2 length²)."""
 
@@ -70,7 +71,7 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     if not isfinite(height):
         return Continued(grid, 0.0, float("inf"))
     # Laplace: a component of wave number k grows as exp(k h) downward.
-    k = _wavenumber(grid)
+    k = _wavenumber(grid.anomaly.shape, _spacing(grid))
     surveyed = dctn(filled(grid.anomaly), norm="ortho")
     gain = _growth(k, height, SURE)
     # Spectrum of the error of the truncated series and of the linear term, over quantiles of depth.
@@ -81,6 +82,11 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     hole = np.isnan(grid.anomaly)
     anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
     there = grid.replaced(anomaly=anomaly, altitude=-level, vertical=filled(vertical))
+    if height:
+        own = np.nan_to_num(grid.sigma)
+        # The error at edges varies over as long a distance as the field; elsewhere, the map's own dominates.
+        length = grid.sigma_length if own.any() or not isfinite(L := grid.correlation_length) else L
+        there = there.replaced(sigma=np.hypot(own, _outside_sigma(grid, height)), sigma_length=length)
     # Parseval: mean square of the error and of its slope.
     sigma2, steepness2 = float(error2.mean()), float((k * k * error2).mean())
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
@@ -88,8 +94,55 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
 
 def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatArray]:
     """Return a function that continues values (ny, nx), nT, on a grid's nodes to another altitude, m."""
-    gain = _growth(_wavenumber(grid), grid.altitude - altitude, SURE)
+    gain = _growth(_wavenumber(grid.anomaly.shape, _spacing(grid)), grid.altitude - altitude, SURE)
     return lambda values: _filtered(values, gain)
+
+
+CUTS = (1 / 3, 1 / 2, 2 / 3)
+"""Places of the cuts at which a map's edge error is measured, as fractions of its side."""
+
+
+def _outside_sigma(grid: AnomalyGrid, height: float) -> FloatArray:
+    """Return the 1-sigma (ny, nx), nT, of what a continuation by `height`, m, downward, takes from outside.
+
+    Notes
+    -----
+    A value continued upward is a mean of the field, weighted by Poisson's kernel, which reaches over the
+    edges; downward, each term of the series contains such means. Errors from the four edges add as
+    independent ones. Near a hole, the error is that at the edge's distance d with the same weight of unknown
+    nodes, ``w = 1/2 - arctan(d/|h|) / π``.
+    """
+    spacing, hole = _spacing(grid), np.isnan(grid.anomaly)
+    values = filled(grid.anomaly)
+    north = _edge_variance(values, spacing, height)
+    east = _edge_variance(values.T, spacing[::-1], height)
+    variance = (north + north[::-1])[:, None] + east + east[::-1]
+    unknown = _moved(hole.astype(float), spacing, -abs(height))
+    for step, measured in zip(spacing, (north, east), strict=True):
+        w = 0.5 - np.arctan((np.arange(measured.size) + 0.5) * step / abs(height)) / np.pi
+        variance += 0.5 * np.interp(unknown, [0.0, *w[::-1]], [0.0, *measured[::-1]])
+    return np.asarray(np.sqrt(variance))
+
+
+def _edge_variance(values: FloatArray, spacing: tuple[float, float], height: float) -> FloatArray:
+    """Return the mean square error (ny,), nT², of a continuation at each distance from a northern edge.
+
+    It is measured on the map itself: a part that ends at a cut is continued and compared with the whole.
+    """
+    whole = _moved(values, spacing, height)
+    squares, count = np.zeros((2, len(values)))
+    for side in (1, -1):
+        for n in (int(part * len(values)) for part in CUTS):
+            error = _moved(values[::side][:n], spacing, height) - whole[::side][:n]
+            squares[:n] += (error[::-1] ** 2).mean(axis=1)
+            count[:n] += 1.0
+    reach = int(np.count_nonzero(count))
+    return np.asarray((squares / np.maximum(count, 1.0))[np.minimum(np.arange(len(values)), reach - 1)])
+
+
+def _moved(values: FloatArray, spacing: tuple[float, float], height: float) -> FloatArray:
+    """Return values (ny, nx) on nodes with a `spacing`, m, continued by `height`, m, downward."""
+    return _filtered(values, _growth(_wavenumber(values.shape, spacing), height, SURE))
 
 
 def _filtered(values: FloatArray, gain: FloatArray) -> FloatArray:
@@ -113,7 +166,7 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The added sigma is the RMS
     of the removed part over the whole map, because around a node too few waves determine it.
     """
-    gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
+    gain = np.exp2(-((_wavenumber(grid.anomaly.shape, _spacing(grid)) * wavelength / (2.0 * np.pi)) ** 2))
     anomaly = np.where(np.isnan(grid.anomaly), np.nan, _filtered(grid.anomaly, gain))
     # The removed part is an error of the smoothed map, correlated over a fraction of the wavelength.
     removed = np.sqrt(np.nanmean((grid.anomaly - anomaly) ** 2))
@@ -131,14 +184,18 @@ def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:
     return np.asarray(sum((p**n for n in range(1, terms)), np.ones_like(p)))
 
 
-def _wavenumber(grid: AnomalyGrid) -> FloatArray:
-    """Return |k| (ny, nx), rad/m, of the cosine transform's terms."""
+def _spacing(grid: AnomalyGrid) -> tuple[float, float]:
+    """Return the distance of the nodes to the north and to the east, m."""
     per_latitude, per_longitude = metres_per_degree(float(np.mean(grid.latitude)))
-    ny, nx = grid.anomaly.shape
+    north, east = (float(axis[1] - axis[0]) for axis in (grid.latitude, grid.longitude))
+    return per_latitude * north, per_longitude * east
+
+
+def _wavenumber(shape: tuple[int, ...], spacing: tuple[float, float]) -> FloatArray:
+    """Return |k| (ny, nx), rad/m, of the cosine transform's terms."""
     # The cosine transform mirrors the grid: half waves over its sides.
-    height = ny * per_latitude * (grid.latitude[1] - grid.latitude[0])
-    width = nx * per_longitude * (grid.longitude[1] - grid.longitude[0])
-    return np.asarray(np.hypot(np.pi / height * np.arange(ny)[:, None], np.pi / width * np.arange(nx)))
+    north, east = (np.pi / (n * step) * np.arange(n) for n, step in zip(shape, spacing, strict=True))
+    return np.asarray(np.hypot(north[:, None], east))
 
 
 MAX_MERGED_NODES = 10_000_000

@@ -48,6 +48,38 @@ def test_continuation_keeps_a_constant_and_the_holes() -> None:
     np.testing.assert_allclose(raised.anomaly[~np.isnan(values)], 7.0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("up", "ragged"), [(-60.0, False), (80.0, False), (250.0, False), (250.0, True), (700.0, True)]
+)
+def test_sigma_covers_what_a_continuation_takes_from_outside(up: float, *, ragged: bool) -> None:
+    """Poles at random places, also beyond the map: standardised errors are near 1 at the edges and inside."""
+    per_lat, per_lon = metres_per_degree(49.5)
+    lon, lat = LON[::2], LAT[::2]
+    x, y = np.meshgrid((lon + 58.0) * per_lon, (lat - 49.5) * per_lat)
+    rng, standardised, at_edge = np.random.default_rng(5), [], []
+    for _ in range(12):
+        places, depths = rng.uniform(-20e3, 20e3, (2, 300)), rng.uniform(800.0, 1600.0, 300)
+        sources = [*zip(*places, depths, rng.normal(0.0, 1e7, 300), strict=True)]
+
+        def field(height: float, sources: list[tuple[float, ...]] = sources) -> np.ndarray:
+            of_each = [
+                strength * (z + height) / ((x - e) ** 2 + (y - n) ** 2 + (z + height) ** 2) ** 1.5
+                for e, n, z, strength in sources
+            ]
+            return np.asarray(np.sum(of_each, axis=0))
+
+        surveyed = field(100.0)
+        if ragged:
+            surveyed[x + y > 5_000.0] = surveyed[14:16, 12:15] = np.nan
+        there, missing, _ = continued(AnomalyGrid(lon, lat, surveyed, altitude=100.0), -100.0 - up)
+        sigma = np.hypot(there.sigma, missing)
+        standardised.append((there.anomaly - field(100.0 + up)) / sigma)
+        at_edge.append(sigma > np.quantile(sigma[~np.isnan(surveyed)], 0.8))
+    z, edge = np.array(standardised), np.array(at_edge)
+    for part in (edge, ~edge):
+        assert 0.8 < np.sqrt(np.nanmean(z[part] ** 2)) < 1.25
+
+
 @pytest.mark.parametrize("depth", [0.0, 60.0, 150.0])
 def test_below_a_map_the_error_is_reported(depth: float) -> None:
     """Continuation restores half of the lost amplitude, and sigma predicts the remainder within a third."""
